@@ -1,0 +1,165 @@
+"""Sec. III-B, "Encoding feature space statistics": features to the signature psi.
+
+counts (B,), PairTable  --statistics_of_counts-->   Statistics
+features (M, 12)        --statistics_of_features--> Statistics   (exact, the oracle)
+Statistics  --fisher_vector-->  phi (25 G)
+H of them   --signature-->      psi (25 G H)   --quantise-->  uint8
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.mixture import Mixture, moments
+from sceneprint.geometry.table import PairTable
+from sceneprint.types import Bytes, Floats, Ints32
+
+#: Added to a quantised component: 0 is stored in the middle of the byte.
+ZERO = 128
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """Sums over all pairs of one level, from which Eq. (2) follows.
+
+    Parameters
+    ----------
+    zeroth : (G,) sum of posteriors
+    first, second : (G, 12) sums of posterior times feature, and times squared feature
+    n_pairs : number of ordered pairs
+    """
+
+    zeroth: Floats
+    first: Floats
+    second: Floats
+    n_pairs: int
+
+
+@kernel
+def _accumulate(
+    counts: Ints32, features: np.ndarray, components: np.ndarray, shares: np.ndarray, sums: Floats
+) -> None:
+    """sums (G, 25): zeroth, first (12), second (12)."""
+    dimension = features.shape[1]
+    moments = np.empty(2 * dimension)
+    for b in range(len(counts)):
+        if counts[b] == 0:
+            continue
+        for d in range(dimension):
+            f = float(features[b, d])
+            moments[d] = f
+            moments[dimension + d] = f * f
+        for k in range(components.shape[1]):
+            share = float(shares[b, k])
+            if share < 1e-4:
+                break
+            weight = counts[b] * share
+            row = sums[components[b, k]]
+            row[0] += weight
+            for d in range(2 * dimension):
+                row[1 + d] += weight * moments[d]
+
+
+def statistics_of_counts(
+    counts: Ints32, n_pairs: int, table: PairTable, n_components: int
+) -> Statistics:
+    """Statistics of pairs counted in the 4-D table.
+
+    Parameters
+    ----------
+    counts : (B,) ordered pairs by bin
+    n_pairs : their sum
+    table : of the model
+    n_components : G
+    """
+    dimension = table.features.shape[1]
+    sums = np.zeros((n_components, 1 + 2 * dimension))
+    _accumulate(counts, table.features, table.components, table.posteriors, sums)
+    return Statistics(sums[:, 0], sums[:, 1 : 1 + dimension], sums[:, 1 + dimension :], n_pairs)
+
+
+def statistics_of_features(features: Floats, mixture: Mixture) -> Statistics:
+    """Statistics of pairs one by one, with all posteriors: the oracle of the table.
+
+    Parameters
+    ----------
+    features : (M, 12)
+    mixture : G components
+    """
+    zeroth, first, second = moments(features, mixture)
+    return Statistics(zeroth, first, second, len(features))
+
+
+def fisher_vector(s: Statistics, mixture: Mixture) -> Floats:
+    """The Fisher vector phi of one level: Eq. (2), Sec. III-B.
+
+    Parameters
+    ----------
+    s : of at least one pair
+    mixture : G components
+
+    Returns
+    -------
+    phi : (25 G,) for each component m0, m1 (12), m2 (12); neither rooted nor normalised
+
+    Notes
+    -----
+    Readings R2-R4, R9 (docs/paper.md): true posteriors; the mean over all pairs used;
+    d^2 / var - 1 in each dimension; 1/sqrt(p_g) and 1/sqrt(2 p_g) are the closed form of the
+    inverse Fisher information's factor.
+    """
+    p, nu, variance = mixture.weights, mixture.means, mixture.variances
+    root = np.sqrt(p)[:, None]
+    zeroth = s.zeroth[:, None]
+    deviation = s.first - nu * zeroth
+    spread = s.second - 2 * nu * s.first + nu**2 * zeroth
+    m0 = (zeroth - s.n_pairs * p[:, None]) / (s.n_pairs * root)  # Eq. (2a)
+    m1 = deviation / (np.sqrt(variance) * s.n_pairs * root)  # Eq. (2b)
+    m2 = (spread / variance - zeroth) / (s.n_pairs * np.sqrt(2) * root)  # Eq. (2c)
+    return np.concatenate([m0, m1, m2], axis=1).ravel()
+
+
+def normalised(phi: Floats) -> Floats:
+    """Component-wise signed square root, then unit l2 norm (after Eq. 2).
+
+    Parameters
+    ----------
+    phi : (n,); zeros, of a level without pairs, stay zeros
+    """
+    rooted = np.sign(phi) * np.sqrt(np.abs(phi))
+    norm = float(np.linalg.norm(rooted))
+    result: Floats = rooted / norm if norm > 0 else rooted
+    return result
+
+
+def signature(levels: Sequence[Floats]) -> Floats:
+    """psi: the normalised Fisher vectors of all levels, finest first, end to end.
+
+    Parameters
+    ----------
+    levels : H Fisher vectors (25 G,)
+
+    Returns
+    -------
+    psi : (25 G H,)
+    """
+    return np.concatenate([normalised(phi) for phi in levels])
+
+
+def quantise(psi: Floats, scale: float) -> Bytes:
+    """One byte a component: round(psi / scale) + 128, clipped.
+
+    L1 distances of quantised signatures times `scale` are those of the signatures, up to
+    rounding: one scale serves all frames of a model.
+
+    Parameters
+    ----------
+    psi : (n,)
+    scale : the model's step
+    """
+    result: Bytes = np.clip(np.rint(psi / scale) + ZERO, 0, 255).astype(np.uint8)
+    return result
