@@ -1,0 +1,18 @@
+"""Models: what they consist of, their files, and their tables on disk."""
+
+from sceneprint.models.files import PRESETS, parse_model, read_model, save_model
+from sceneprint.models.model import SCHEMA_VERSION, Model, ModelParameters
+from sceneprint.models.tables import build_table, default_cache_dir, open_table
+
+__all__ = [
+    "PRESETS",
+    "SCHEMA_VERSION",
+    "Model",
+    "ModelParameters",
+    "build_table",
+    "default_cache_dir",
+    "open_table",
+    "parse_model",
+    "read_model",
+    "save_model",
+]

@@ -1,0 +1,153 @@
+"""Model files: safetensors with a JSON header; no pickle, nothing executed."""
+
+from __future__ import annotations
+
+import json
+import math
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sceneprint.errors import UnreadableModel
+from sceneprint.geometry.mixture import Mixture
+from sceneprint.geometry.projection import DIMENSION, Projection
+from sceneprint.geometry.properties import DIMENSION as PROPERTY_DIMENSION
+from sceneprint.models.model import SCHEMA_VERSION, Model, ModelParameters, from_mapping
+
+#: Names of the models that ship with the package.
+PRESETS = ("paper", "compact")
+#: A model of G = 32,000 fits; a larger file is refused unread.
+MAXIMUM_BYTES = 16 << 20
+
+
+def save_model(model: Model, path: Path) -> None:
+    """Write a model to a file, whole or not at all.
+
+    Parameters
+    ----------
+    model : see Model
+    path : of the file; its folder must exist
+    """
+    from safetensors.numpy import save
+
+    header = model.header | {
+        "id": model.id,
+        "name": model.name,
+        "provenance": dict(model.provenance),
+    }
+    data = save(model.tensors, {"sceneprint": json.dumps(header, sort_keys=True)})
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(data)
+    partial.replace(path)
+
+
+def read_model(model: str | Path) -> Model:
+    """Read a preset by its name, or a model file by its path.
+
+    Parameters
+    ----------
+    model : one of PRESETS, or a path
+
+    Raises
+    ------
+    UnreadableModel : no such preset or file, not a model, another schema, or content that
+        does not give the id in its header.
+    """
+    if str(model) in PRESETS:
+        source = resources.files("sceneprint") / "presets" / f"{model}.safetensors"
+        return parse_model(source.read_bytes(), f"preset {model}")
+    path = Path(model)
+    try:
+        if path.stat().st_size > MAXIMUM_BYTES:
+            raise UnreadableModel(
+                f"{path}: {path.stat().st_size} bytes are more than any model has. "
+                "Give the path of a file that `sceneprint train` wrote."
+            )
+        data = path.read_bytes()
+    except OSError as error:
+        raise UnreadableModel(
+            f"{path}: cannot be read ({error.strerror or error}). Give one of the presets "
+            f"({', '.join(PRESETS)}), or the path of a file that `sceneprint train` wrote."
+        ) from error
+    return parse_model(data, str(path))
+
+
+def parse_model(data: bytes, name: str) -> Model:
+    """Read a model from the bytes of its file.
+
+    Parameters
+    ----------
+    data : the file
+    name : of the file, for errors
+
+    Raises
+    ------
+    UnreadableModel : see `read_model`.
+    """
+    from safetensors.numpy import load
+
+    try:
+        length = int.from_bytes(data[:8], "little")
+        metadata = json.loads(data[8 : 8 + length])["__metadata__"]
+        header: dict[str, Any] = json.loads(metadata["sceneprint"])
+        tensors = load(data)
+    except Exception as error:  # safetensors raises its own, json and Python theirs
+        raise UnreadableModel(
+            f"{name}: not a model file ({type(error).__name__}: {error}). "
+            "Give the path of a file that `sceneprint train` wrote."
+        ) from error
+    if header.get("schema_version") != SCHEMA_VERSION:
+        raise UnreadableModel(
+            f"{name}: schema {header.get('schema_version')} is not {SCHEMA_VERSION}, the one "
+            "this version of sceneprint reads. Train it again, or use the version that wrote it."
+        )
+    try:
+        model = _assemble(header, tensors)
+    except (KeyError, TypeError, ValueError) as error:
+        raise UnreadableModel(
+            f"{name}: a part of the model is missing or misshapen ({error}). "
+            "Fetch or train it again."
+        ) from error
+    if model.id != header["id"]:
+        raise UnreadableModel(
+            f"{name}: its content gives the id {model.id[:12]}, its header says "
+            f"{str(header['id'])[:12]}: the file was damaged. Fetch or train it again."
+        )
+    return model
+
+
+def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
+    g = len(tensors["mixture.weights"])
+    shapes = {
+        "projection.mean": (PROPERTY_DIMENSION,),
+        "projection.matrix": (DIMENSION, PROPERTY_DIMENSION),
+        "mixture.weights": (g,),
+        "mixture.means": (g, DIMENSION),
+        "mixture.variances": (g, DIMENSION),
+    }
+    for name, shape in shapes.items():
+        tensor = tensors[name]
+        if tensor.shape != shape or tensor.dtype != np.float64 or not np.isfinite(tensor).all():
+            raise ValueError(f"{name} should be finite float64 {shape}")
+    if (
+        g < 1
+        or (tensors["mixture.weights"] <= 0).any()
+        or (tensors["mixture.variances"] <= 0).any()
+    ):
+        raise ValueError("weights and variances should be positive")
+    step, d0 = float(header["quantiser_step"]), float(header["unrelated_distance"])
+    if not (math.isfinite(step) and step > 0 and math.isfinite(d0) and d0 > 0):
+        raise ValueError("quantiser step and unrelated distance should be positive")
+    return Model(
+        name=str(header["name"]),
+        parameters=from_mapping(ModelParameters, header["parameters"], "parameters"),
+        projection=Projection(tensors["projection.mean"], tensors["projection.matrix"]),
+        mixture=Mixture(
+            tensors["mixture.weights"], tensors["mixture.means"], tensors["mixture.variances"]
+        ),
+        quantiser_step=step,
+        unrelated_distance=d0,
+        provenance=dict(header["provenance"]),
+    )

@@ -1,0 +1,138 @@
+"""A model: everything that decides what a signature looks like, named by its content."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from functools import cached_property
+from typing import Any, TypeVar, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import UnreadableModel
+from sceneprint.geometry.depth import DepthParameters
+from sceneprint.geometry.hierarchy import HierarchyParameters
+from sceneprint.geometry.mixture import Mixture
+from sceneprint.geometry.normals import NormalParameters
+from sceneprint.geometry.projection import Projection
+from sceneprint.geometry.properties import PropertyParameters
+from sceneprint.geometry.segmentation import SegmentationParameters
+from sceneprint.geometry.table import TableLayout
+
+#: Of the file and of what the numbers in it mean. Raise it when code changes signatures.
+SCHEMA_VERSION = 1
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class ModelParameters:
+    """The numbers of every stage, in the order of the paper."""
+
+    depth: DepthParameters = field(default_factory=DepthParameters)
+    normals: NormalParameters = field(default_factory=NormalParameters)
+    segmentation: SegmentationParameters = field(default_factory=SegmentationParameters)
+    hierarchy: HierarchyParameters = field(default_factory=HierarchyParameters)
+    properties: PropertyParameters = field(default_factory=PropertyParameters)
+    table: TableLayout = field(default_factory=TableLayout)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Projection, mixture, quantiser and the parameters they were made with.
+
+    Parameters
+    ----------
+    name : what people call it; not part of its identity
+    parameters : see ModelParameters
+    projection, mixture : see there
+    quantiser_step : one unit of a stored byte
+    unrelated_distance : d0, the median L1 distance of stored signatures of unrelated training
+        frames, in units of a byte; similarity = 1 - d / d0
+    provenance : what the model was trained on and with; not part of its identity
+    """
+
+    name: str
+    parameters: ModelParameters
+    projection: Projection
+    mixture: Mixture
+    quantiser_step: float
+    unrelated_distance: float
+    provenance: Mapping[str, Any]
+
+    @property
+    def tensors(self) -> dict[str, NDArray[np.float64]]:
+        """The learnt arrays by the names they have in the file."""
+        return {
+            "projection.mean": self.projection.mean,
+            "projection.matrix": self.projection.matrix,
+            "mixture.weights": self.mixture.weights,
+            "mixture.means": self.mixture.means,
+            "mixture.variances": self.mixture.variances,
+        }
+
+    @property
+    def header(self) -> dict[str, Any]:
+        """Everything but the arrays that changes a signature or its meaning."""
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "parameters": asdict(self.parameters),
+            "quantiser_step": self.quantiser_step,
+            "unrelated_distance": self.unrelated_distance,
+        }
+
+    @cached_property
+    def id(self) -> str:
+        """SHA-256 over header and arrays, as 64 hexadecimal digits."""
+        digest = hashlib.sha256(json.dumps(self.header, sort_keys=True).encode())
+        for name, tensor in sorted(self.tensors.items()):
+            digest.update(f"{name} {tensor.shape} ".encode())
+            digest.update(np.ascontiguousarray(tensor, "<f8").tobytes())
+        return digest.hexdigest()
+
+    @property
+    def label(self) -> str:
+        """Name and the first twelve digits of the id, for people."""
+        return f"{self.name}-{self.id[:12]}"
+
+    @property
+    def level_length(self) -> int:
+        """Components of one level's Fisher vector: 25 G."""
+        return int(2 * self.mixture.means.shape[1] + 1) * len(self.mixture)
+
+    @property
+    def signature_bytes(self) -> int:
+        """Bytes of a stored signature: 25 G H."""
+        return self.level_length * self.parameters.hierarchy.n_levels
+
+
+def from_mapping(kind: type[T], values: Any, where: str) -> T:
+    """A parameter record from parsed JSON, nothing missing, nothing unknown.
+
+    Raises
+    ------
+    UnreadableModel : the fields are not those of `kind`.
+    """
+    hints = get_type_hints(kind)
+    names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    if not isinstance(values, dict) or set(values) != names:
+        given = sorted(values) if isinstance(values, dict) else values
+        raise UnreadableModel(
+            f"The model's {where} should have the fields {sorted(names)}, not {given}. "
+            "It was made by another version of sceneprint: train it again, or use that version."
+        )
+    made: dict[str, Any] = {}
+    for name, value in values.items():
+        if is_dataclass(hints[name]):
+            made[name] = from_mapping(hints[name], value, f"{where}.{name}")
+        elif isinstance(value, bool) or not isinstance(value, int | float):
+            raise UnreadableModel(
+                f"The model's {where}.{name} is {value!r}, not a number: the file is damaged. "
+                "Fetch or train it again."
+            )
+        else:
+            made[name] = hints[name](value)
+    return kind(**made)

@@ -1,0 +1,217 @@
+"""The paper's Fig. 1 as functions, one line a stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sceneprint.errors import ModelMismatch, UselessFrame
+from sceneprint.geometry.depth import inverse_depth
+from sceneprint.geometry.encoding import (
+    Statistics,
+    fisher_vector,
+    quantise,
+    signature,
+    statistics_of_counts,
+    statistics_of_features,
+)
+from sceneprint.geometry.hierarchy import hierarchy
+from sceneprint.geometry.normals import surface
+from sceneprint.geometry.projection import project
+from sceneprint.geometry.properties import neighbour_pairs, pair_properties
+from sceneprint.geometry.retrieval import distances
+from sceneprint.geometry.segmentation import segment
+from sceneprint.geometry.table import PairTable, count_pairs
+from sceneprint.models import Model, ModelParameters, build_table, open_table, read_model
+from sceneprint.types import Bytes, Floats, Frame, Hierarchy, Patches
+
+#: Signs the statistics of one level: table or exact.
+LevelStatistics = Callable[[Patches], Statistics]
+
+
+@dataclass(frozen=True, eq=False)
+class Signature:
+    """psi of one frame, as it is stored and compared.
+
+    Parameters
+    ----------
+    vector : (25 G H,) uint8
+    model_id : of the model that made it; signatures of two models are never compared
+    n_patches : patches of each level, finest first
+    n_pairs : ordered pairs of each level
+    """
+
+    vector: Bytes
+    model_id: str
+    n_patches: tuple[int, ...]
+    n_pairs: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Signer:
+    """A model made ready to sign: with its pair table opened.
+
+    Parameters
+    ----------
+    model : see Model
+    table : of this model
+    """
+
+    model: Model
+    table: PairTable
+
+
+def open_signer(
+    model: str | Path | Model = "paper",
+    cache_dir: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    cached: bool = True,
+) -> Signer:
+    """Open a preset, a model file or a model, and its pair table.
+
+    The first call on a machine builds the table (seconds) and caches it; later ones map it.
+
+    Parameters
+    ----------
+    model : "paper", "compact", the path of a model file, or a model
+    cache_dir : folder of derived files; default: the user's cache folder
+    progress : called with bins done and their total while the table is being built
+    cached : False for a model that will not be seen again: nothing is read or written
+
+    Raises
+    ------
+    UnreadableModel : see `read_model`.
+    """
+    read = model if isinstance(model, Model) else read_model(model)
+    if not cached:
+        return Signer(read, build_table(read, progress))
+    return Signer(read, open_table(read, cache_dir, progress))
+
+
+def sign(frame: Frame, signer: Signer) -> Signature:
+    """The signature psi of a frame: Sec. III-A, III-B, III-F.
+
+    Parameters
+    ----------
+    frame : depth in metres
+    signer : see `open_signer`
+
+    Raises
+    ------
+    UselessFrame : nothing within the sensor's range, or no two patches to relate.
+    """
+    patches = describe(frame, signer.model.parameters)
+    return encode(patches, signer, frame.name)
+
+
+def describe(frame: Frame, p: ModelParameters) -> Hierarchy:
+    """The segmentation hierarchy of a frame: Sec. III-F.
+
+    Parameters
+    ----------
+    frame : depth in metres
+    p : of the model
+
+    Raises
+    ------
+    UselessFrame : nothing within the sensor's range, or no surface in it.
+    """
+    q, camera = inverse_depth(frame, p.depth)
+    seen = surface(q, camera, p.normals)
+    finest = segment(seen, p.segmentation)
+    if finest.max(initial=-1) < 0:
+        raise UselessFrame(
+            f"{_named(frame.name)}its depth samples lie on no surface: they are too scattered for "
+            "a patch. Check that the image is depth and its scale is right, or send another."
+        )
+    return hierarchy(seen, finest, p.hierarchy)
+
+
+def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
+    """Quantised signature of a hierarchy of patches: Sec. III-A and III-B.
+
+    Parameters
+    ----------
+    patches : H levels
+    signer : see `open_signer`
+    name : of the frame, for errors
+
+    Raises
+    ------
+    UselessFrame : the finest level has no pair of patches within reach.
+    """
+    model = signer.model
+    levels = [table_statistics(level, signer) for level in patches.levels]
+    psi = float_signature(levels, model, name)
+    return Signature(
+        vector=quantise(psi, model.quantiser_step),
+        model_id=model.id,
+        n_patches=tuple(len(level) for level in patches.levels),
+        n_pairs=tuple(level.n_pairs for level in levels),
+    )
+
+
+def table_statistics(level: Patches, signer: Signer) -> Statistics:
+    """Pair statistics of one level through the 4-D table."""
+    p = signer.model.parameters
+    counts, n_pairs = count_pairs(level.means, level.normals, p.table, p.properties)
+    return statistics_of_counts(counts, n_pairs, signer.table, len(signer.model.mixture))
+
+
+def exact_statistics(level: Patches, model: Model) -> Statistics:
+    """Pair statistics of one level, pair by pair: slow, the oracle of the table."""
+    p = model.parameters.properties
+    properties = pair_properties(level, neighbour_pairs(level, p), p)
+    return statistics_of_features(project(properties, model.projection), model.mixture)
+
+
+def float_signature(levels: list[Statistics], model: Model, name: str = "") -> Floats:
+    """psi before quantisation: Eq. (2) of every level, rooted, normalised, end to end.
+
+    A coarse level without pairs says nothing, and its part of psi is zero.
+
+    Parameters
+    ----------
+    levels : H, finest first
+    model : see Model
+    name : of the frame, for errors
+
+    Raises
+    ------
+    UselessFrame : the finest level has no pairs.
+    """
+    if levels[0].n_pairs == 0:
+        radius = model.parameters.properties.radius
+        raise UselessFrame(
+            f"{_named(name)}no two surface patches lie within {radius:g} m of each other, so there "
+            "is no geometry between them to describe. Send a frame that sees more of the scene."
+        )
+    return signature(
+        [
+            fisher_vector(level, model.mixture) if level.n_pairs else np.zeros(model.level_length)
+            for level in levels
+        ]
+    )
+
+
+def distance(a: Signature, b: Signature) -> int:
+    """L1 distance of two stored signatures, in units of a byte: -s(X, Y) of Sec. III-C.
+
+    Raises
+    ------
+    ModelMismatch : they are of two models.
+    """
+    if a.model_id != b.model_id:
+        raise ModelMismatch(
+            f"Signatures of two models cannot be compared: {a.model_id[:12]} and "
+            f"{b.model_id[:12]}. Sign both frames with one model."
+        )
+    return int(distances(a.vector, b.vector[None])[0])
+
+
+def _named(name: str) -> str:
+    return f"{name}: " if name else ""
