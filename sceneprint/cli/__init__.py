@@ -1,0 +1,49 @@
+"""The `sceneprint` command."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from sceneprint import __version__
+from sceneprint.cli import picture, sign, synth, train
+from sceneprint.errors import SceneprintError
+
+#: Exit code of a command that was asked for something it cannot do.
+USAGE = 2
+
+
+def parser() -> argparse.ArgumentParser:
+    """All commands with their options."""
+    top = argparse.ArgumentParser(
+        prog="sceneprint",
+        description="Place recognition from pure geometry: depth frames in, signatures out.",
+    )
+    top.add_argument("--version", action="version", version=f"sceneprint {__version__}")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for module in (sign, picture, synth, train):
+        module.add_to(commands)
+    return top
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; errors are one line on standard error and exit code 2."""
+    options = parser().parse_args(arguments)
+    try:
+        return int(options.run(options))
+    except SceneprintError as error:
+        print(f"sceneprint {options.command}: {error}", file=sys.stderr)
+        return USAGE
+    except OSError as error:
+        print(
+            f"sceneprint {options.command}: {error.filename or 'input/output'}: "
+            f"{error.strerror or error}. Check the path and its permissions.",
+            file=sys.stderr,
+        )
+        return USAGE
+    except KeyboardInterrupt:
+        print(f"sceneprint {options.command}: stopped", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        return 0

@@ -1,0 +1,93 @@
+"""`sceneprint synth`: synthetic rooms as a data set in 7-Scenes layout."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from sceneprint.cli.numbers import positive, whole
+from sceneprint.datasets import Camera, write_depth_png, write_intrinsics, write_pose
+from sceneprint.errors import DatasetError
+
+#: Stored units per metre.
+DEPTH_SCALE = 1000.0
+
+
+def add_to(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "synth",
+        help="make synthetic rooms with known poses",
+        description="Ray-cast furnished rooms as a Kinect would see them, and write them in "
+        "7-Scenes layout: OUT/room-000/seq-01/frame-000000.depth.png and .pose.txt.",
+    )
+    command.add_argument("out", type=Path, metavar="OUT", help="folder; new or empty")
+    command.add_argument("--rooms", type=positive, default=4, metavar="N", help="default: 4")
+    command.add_argument(
+        "--views", type=positive, default=25, metavar="M", help="of each room (default: 25)"
+    )
+    command.add_argument("--seed", type=whole, default=0, metavar="S", help="default: 0")
+    command.add_argument(
+        "--path",
+        action="store_true",
+        help="views along a hand-held path, a few centimetres apart, not scattered",
+    )
+    command.add_argument("--perfect", action="store_true", help="without sensor noise")
+    command.add_argument(
+        "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help="processes"
+    )
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Make the rooms."""
+    if options.out.exists() and any(options.out.iterdir()):
+        raise DatasetError(
+            f"{options.out}: is not empty, and frames of two runs must not mix. "
+            "Name a new folder, or empty this one."
+        )
+    options.out.mkdir(parents=True, exist_ok=True)
+    with tqdm(total=options.rooms, desc="synth", unit="room", disable=None) as bar:
+        for _ in _rooms(options):
+            bar.update()
+    print(f"{options.rooms} rooms of {options.views} views in {options.out}")
+    return 0
+
+
+def _rooms(options: argparse.Namespace) -> Iterator[None]:
+    make = partial(
+        _write_room,
+        options.out,
+        options.seed,
+        options.views,
+        along_path=options.path,
+        perfect=options.perfect,
+    )
+    jobs = min(options.jobs, options.rooms)
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(make, range(options.rooms))
+
+
+def _write_room(
+    out: Path, seed: int, views: int, index: int, *, along_path: bool, perfect: bool
+) -> None:
+    from sceneprint.synth import KinectNoise, synthesise_room
+
+    noise = None if perfect else KinectNoise()
+    room = synthesise_room(seed, index, views, along_path=along_path, noise=noise)
+    folder = out / room.name
+    sequence = folder / "seq-01"
+    sequence.mkdir(parents=True)
+    write_intrinsics(folder, Camera(room.frames[0].intrinsics, DEPTH_SCALE, along_ray=False))
+    for number, frame in enumerate(room.frames):
+        write_depth_png(sequence / f"frame-{number:06d}.depth.png", frame.depth, DEPTH_SCALE)
+        if frame.pose is not None:
+            write_pose(sequence / f"frame-{number:06d}.pose.txt", frame.pose)

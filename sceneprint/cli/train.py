@@ -1,0 +1,93 @@
+"""`sceneprint train`: synthetic rooms, and frames of one's own, to a model."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from sceneprint.cli.numbers import positive, whole
+from sceneprint.datasets import FrameReference, find_sequences
+from sceneprint.models import save_model
+
+
+def add_to(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "train",
+        help="train a model",
+        description="Train a model on synthetic rooms. The shipped presets suit depth cameras "
+        "indoors; docs/model.md says when to train one of your own.",
+    )
+    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="model file")
+    command.add_argument(
+        "--preset", choices=("paper", "compact"), default="paper", help="size (default: paper)"
+    )
+    command.add_argument(
+        "--rooms", type=whole, default=100, metavar="N", help="synthetic rooms (default: 100)"
+    )
+    command.add_argument("--seed", type=whole, default=0, metavar="S")
+    command.add_argument(
+        "--frames",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="DIR",
+        help="frames of your own besides, as for `sceneprint sign`",
+    )
+    command.add_argument("--projection", choices=("pca", "ica"), default="pca", help="default: pca")
+    command.add_argument(
+        "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help="processes"
+    )
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Train and write the model."""
+    from sceneprint.training import TrainingParameters, preset_parameters, train
+
+    references: list[tuple[str, FrameReference]] = [
+        (f"{path.resolve()}: {sequence.parent_frame}", reference)
+        for path in options.frames
+        for sequence in find_sequences(path)
+        for reference in sequence.frames
+    ]
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    p = TrainingParameters(rooms=options.rooms, seed=options.seed, projection=options.projection)
+    with _Bars() as bars:
+        model = train(
+            options.preset, *preset_parameters(options.preset), p,
+            references, options.jobs, bars.report,
+        )  # fmt: skip
+    save_model(model, options.out)
+    print(
+        f"{options.out}: model {model.label}, {model.signature_bytes} bytes a signature, "
+        f"trained on {model.provenance['frames_used']} frames and "
+        f"{model.provenance['pairs_used']} pairs"
+    )
+    return 0
+
+
+class _Bars:
+    """A progress bar for each stage, in the order in which they come."""
+
+    def __init__(self) -> None:
+        self.stage = ""
+        self.bar: Any = None
+
+    def __enter__(self) -> _Bars:
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+    def report(self, stage: str, done: int, total: int) -> None:
+        """Advance the bar of a stage, closing the one before it."""
+        if stage != self.stage:
+            self.__exit__()
+            self.stage, self.bar = stage, tqdm(desc=stage, total=total, disable=None)
+        self.bar.update(done - self.bar.n)

@@ -1,0 +1,209 @@
+"""Learning a model: synthetic rooms and, if wished, frames of one's own, to a `Model`.
+
+    rooms, frames  --train-->  Model
+
+What is learnt (projection, mixture) lives with its stage in `geometry`; here the stages are
+put in order, and the quantiser and d0 are fixed from the signatures that come out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from multiprocessing import get_context
+from typing import Literal
+
+import numpy as np
+
+from sceneprint.datasets import FrameReference
+from sceneprint.errors import FrameError, TrainingError
+from sceneprint.geometry.encoding import quantise
+from sceneprint.geometry.hierarchy import HierarchyParameters
+from sceneprint.geometry.mixture import MixtureParameters, fit_mixture
+from sceneprint.geometry.projection import fit_projection, project
+from sceneprint.geometry.properties import neighbour_pairs, pair_properties
+from sceneprint.geometry.retrieval import distances
+from sceneprint.models import Model, ModelParameters
+from sceneprint.pipeline import describe, float_signature, open_signer, table_statistics
+from sceneprint.synth import synthesise_room
+from sceneprint.types import Bytes, Floats, Frame, Hierarchy
+
+#: Called with the stage's name, steps done and their total.
+Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class TrainingParameters:
+    """What a model is trained on and how; all of it decides the outcome."""
+
+    rooms: int = 100  #: synthetic rooms
+    views: int = 6  #: frames taken in each
+    seed: int = 0  #: of rooms, of the pairs drawn and of the fits
+    pairs: int = 120_000  #: properties that projection and mixture are fitted to
+    projection: Literal["pca", "ica"] = "pca"
+    clipped_share: float = 0.0005  #: of signature components, beyond the quantiser's range
+
+
+@dataclass(frozen=True, eq=False)
+class Lesson:
+    """What training keeps of one frame."""
+
+    place: str  #: frames of different places are unrelated
+    properties: Floats  #: (n, 13) of pairs drawn from all levels
+    patches: Hierarchy
+
+
+#: Sizes of the presets: G components, H levels.
+PRESET_SIZES = {"paper": (1250, 4), "compact": (256, 2)}
+
+
+def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
+    """Parameters of a preset: `paper` has the sizes of Sec. III-F, `compact` a tenth of them.
+
+    Raises
+    ------
+    TrainingError : no such preset.
+    """
+    if preset not in PRESET_SIZES:
+        raise TrainingError(
+            f"There is no preset {preset!r}. Choose one of {', '.join(PRESET_SIZES)}."
+        )
+    g, h = PRESET_SIZES[preset]
+    return ModelParameters(hierarchy=HierarchyParameters(h)), MixtureParameters(g)
+
+
+def train(
+    name: str,
+    model_p: ModelParameters,
+    mixture_p: MixtureParameters,
+    p: TrainingParameters,
+    references: Sequence[tuple[str, FrameReference]] = (),
+    jobs: int = 1,
+    report: Report | None = None,
+) -> Model:
+    """Learn a model; the same arguments give the same model, however many processes help.
+
+    Parameters
+    ----------
+    name : what to call the model
+    model_p, mixture_p : its parameters, such as those of a preset
+    p : see TrainingParameters
+    references : frames of one's own beside the rooms, each with the name of its place
+    jobs : processes that make and segment frames
+    report : called as the stages advance
+
+    Raises
+    ------
+    TrainingError : too little data, or frames of fewer than two places.
+    """
+    tell = report or _silent
+    n_frames = p.rooms * p.views + len(references)
+    per_level = math.ceil(p.pairs / max(n_frames * model_p.hierarchy.n_levels, 1))
+    lessons = list(_lessons(model_p, p, per_level, references, jobs, tell))
+    if len({lesson.place for lesson in lessons}) < 2:
+        raise TrainingError(
+            f"{len(lessons)} usable frames of fewer than two places: d0, the distance of "
+            "unrelated frames, needs two. Add --rooms, or frames of another place."
+        )
+    properties = np.concatenate([lesson.properties for lesson in lessons])
+    projection = fit_projection(properties, p.projection, p.seed)
+    features = project(properties, projection)
+    fit = fit_mixture(features, mixture_p, p.seed)
+    mixture = next(fit)
+    for step, mixture in enumerate(fit, 1):  # noqa: B007 -- the last one is kept
+        tell("mixture", step, mixture_p.iterations)
+    seen = {
+        "training": asdict(p),
+        "mixture": asdict(mixture_p),
+        "own_frames": len(references),
+        "frames_used": len(lessons),
+        "pairs_used": len(features),
+    }
+    return calibrated(Model(name, model_p, projection, mixture, 1.0, 1.0, seen), lessons, p)
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    del stage, done, total
+
+
+def calibrated(model: Model, lessons: Sequence[Lesson], p: TrainingParameters) -> Model:
+    """The model with its quantiser step and d0 fixed, from one frame of each place.
+
+    Parameters
+    ----------
+    model : with projection and mixture
+    lessons : of at least two places
+    p : see TrainingParameters
+    """
+    signer = open_signer(model, cached=False)
+    first = {lesson.place: lesson for lesson in reversed(lessons)}
+    psi = [
+        float_signature([table_statistics(level, signer) for level in lesson.patches.levels], model)
+        for lesson in sorted(first.values(), key=lambda lesson: lesson.place)
+    ]
+    step = float(np.quantile(np.abs(np.stack(psi)), 1.0 - p.clipped_share)) / 127
+    stored = np.stack([quantise(one, step) for one in psi])
+    return replace(model, quantiser_step=step, unrelated_distance=_median_distance(stored))
+
+
+def _median_distance(stored: Bytes) -> float:
+    rows = [distances(one, stored[i + 1 :]) for i, one in enumerate(stored[:-1])]
+    return float(np.median(np.concatenate(rows)))
+
+
+def _lessons(
+    model_p: ModelParameters, p: TrainingParameters, per_level: int,
+    references: Sequence[tuple[str, FrameReference]], jobs: int, report: Report,
+) -> Iterator[Lesson]:  # fmt: skip
+    room = partial(_room_lessons, model_p, p, per_level)
+    frame = partial(_own_lesson, model_p, p, per_level)
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for done, lessons in enumerate(pool.map(room, range(p.rooms)), 1):
+            report("rooms", done, p.rooms)
+            yield from lessons
+        own = pool.map(frame, range(len(references)), references, chunksize=4)
+        for done, lessons in enumerate(own, 1):
+            report("frames", done, len(references))
+            yield from lessons
+
+
+def _room_lessons(
+    model_p: ModelParameters, p: TrainingParameters, per_level: int, index: int
+) -> list[Lesson]:
+    room = synthesise_room(p.seed, index, p.views)
+    return [
+        lesson
+        for view, frame in enumerate(room.frames)
+        for lesson in _lesson(frame, room.name, (p.seed, 0, index, view), model_p, per_level)
+    ]
+
+
+def _own_lesson(
+    model_p: ModelParameters, p: TrainingParameters, per_level: int,
+    index: int, reference: tuple[str, FrameReference],
+) -> list[Lesson]:  # fmt: skip
+    place, frame = reference
+    try:
+        return _lesson(frame.read(), place, (p.seed, 1, index), model_p, per_level)
+    except FrameError:  # one bad frame of a recording teaches nothing; that is all
+        return []
+
+
+def _lesson(
+    frame: Frame, place: str, seed: tuple[int, ...], model_p: ModelParameters, per_level: int
+) -> list[Lesson]:
+    rng = np.random.default_rng(seed)
+    try:
+        patches = describe(frame, model_p)
+    except FrameError:
+        return []
+    drawn = []
+    for level in patches.levels:
+        pairs = neighbour_pairs(level, model_p.properties)
+        if len(pairs):
+            some = np.sort(rng.permutation(len(pairs))[:per_level])
+            drawn.append(pair_properties(level, pairs[some], model_p.properties))
+    return [Lesson(place, np.concatenate(drawn), patches)] if drawn else []
