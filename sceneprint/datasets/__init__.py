@@ -1,0 +1,43 @@
+"""Frames in and out: depth images, cameras, poses, and the sequences they come in.
+
+path  --find_sequences-->  Sequence  --FrameReference.read-->  Frame
+bytes  --decode_png | decode_npy-->  samples  --make_frame-->  Frame
+"""
+
+from sceneprint.datasets.images import make_frame, read_frame
+from sceneprint.datasets.intrinsics import Camera, find_camera, read_camera
+from sceneprint.datasets.npy import decode_npy
+from sceneprint.datasets.png import decode_png
+from sceneprint.datasets.poses import (
+    Trajectory,
+    interpolate,
+    read_pose,
+    read_trajectory,
+    rigid_transform,
+)
+from sceneprint.datasets.records import FrameReference, Layout, Sequence, Split
+from sceneprint.datasets.sequences import find_sequences
+from sceneprint.datasets.writing import write_depth_png, write_intrinsics, write_pose
+
+__all__ = [
+    "Camera",
+    "FrameReference",
+    "Layout",
+    "Sequence",
+    "Split",
+    "Trajectory",
+    "decode_npy",
+    "decode_png",
+    "find_camera",
+    "find_sequences",
+    "interpolate",
+    "make_frame",
+    "read_camera",
+    "read_frame",
+    "read_pose",
+    "read_trajectory",
+    "rigid_transform",
+    "write_depth_png",
+    "write_intrinsics",
+    "write_pose",
+]

@@ -1,0 +1,94 @@
+"""Sequences out: the files that `find_sequences` reads, each whole or absent.
+
+Camera, depth (H, W), T_parent_sensor (4, 4)  -->  intrinsics.json, *.png, *.txt
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import secrets
+from pathlib import Path
+
+import numpy as np
+
+from sceneprint.datasets.intrinsics import FILE_NAME, Camera
+from sceneprint.datasets.poses import rigid_transform
+from sceneprint.types import Floats, Floats32
+
+_LARGEST = 65_534  #: stored units; 65535 reads as missing
+
+
+def write_intrinsics(folder: Path, camera: Camera) -> Path:
+    """Write `intrinsics.json` into the folder and return its path."""
+    lens = camera.intrinsics
+    fields: dict[str, object] = {
+        "width": lens.width,
+        "height": lens.height,
+        "fx": lens.fx,
+        "fy": lens.fy,
+        "cx": lens.cx,
+        "cy": lens.cy,
+        "depth_scale": camera.depth_scale,
+    }
+    if lens.distortion:
+        fields["distortion"] = list(lens.distortion)
+    if camera.along_ray:
+        fields["depth_along_ray"] = True
+    path = folder / FILE_NAME
+    _replace(path, (json.dumps(fields, indent=2) + "\n").encode())
+    return path
+
+
+def write_depth_png(path: Path, depth: Floats32, depth_scale: float) -> None:
+    """Write a depth image as a 16-bit greyscale PNG.
+
+    Parameters
+    ----------
+    path : the file
+    depth : (H, W) metres; what is not finite, not positive, or beyond 65534 stored units
+        is written as 0, missing
+    depth_scale : stored units per metre
+
+    Raises
+    ------
+    ValueError : the depth is not two-dimensional or empty, or the scale is no positive
+        number.
+    """
+    from PIL import Image
+
+    if depth.ndim != 2 or depth.size == 0:
+        raise ValueError(f"depth has shape {depth.shape}, not (H, W)")
+    if not (math.isfinite(depth_scale) and depth_scale > 0):
+        raise ValueError(f"depth_scale is {depth_scale}, not a positive number")
+    with np.errstate(all="ignore"):
+        units = np.rint(depth.astype(np.float64) * depth_scale)
+        units[~((units > 0) & (units <= _LARGEST))] = 0.0
+    buffer = io.BytesIO()
+    Image.fromarray(units.astype(np.uint16)).save(buffer, format="PNG")
+    _replace(path, buffer.getvalue())
+
+
+def write_pose(path: Path, T_parent_sensor: Floats) -> None:
+    """Write a (4, 4) pose as text, row by row, without loss.
+
+    Raises
+    ------
+    InvalidPose : it is not a rigid transform.
+    """
+    rows = rigid_transform(T_parent_sensor)
+    text = "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows)
+    _replace(path, text.encode())
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Put the file there in one step: a process killed here leaves the old one or none."""
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        part.write_bytes(data)
+        os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise

@@ -1,0 +1,162 @@
+"""The door: what becomes of samples of either kind, and what is said where nothing can."""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sceneprint.datasets import decode_png, make_frame, png, read_frame, write_depth_png
+from sceneprint.errors import InvalidIntrinsics, InvalidPose, UnreadableFrame, UselessFrame
+from sceneprint.types import Intrinsics
+
+CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)
+SAMPLES = np.array([[0, 1, 1000, 65535], [1234, 65534, 2, 3], [500, 501, 502, 503]], np.uint16)
+METRES = np.array([[0, 0.001, 1, 0], [1.234, 65.534, 0.002, 0.003], [0.5, 0.501, 0.502, 0.503]])
+
+
+def test_stored_units_become_metres() -> None:
+    frame = make_frame(SAMPLES, CAMERA, name="a")
+    assert frame.depth.dtype == np.float32
+    np.testing.assert_array_equal(frame.depth, METRES.astype(np.float32))
+    assert (frame.intrinsics, frame.name, frame.pose) == (CAMERA, "a", None)
+    half = make_frame(SAMPLES, CAMERA, depth_scale=2000)
+    np.testing.assert_array_equal(half.depth, (METRES / 2).astype(np.float32))
+    assert SAMPLES[0, 3] == 65535  # the caller's array is as it was
+
+
+@pytest.mark.parametrize("dtype", ["<f4", ">f4", "<f8", "<f2", ">f8"])
+def test_floats_are_metres_whatever_the_scale(dtype: str) -> None:
+    values = np.array([[0.5, 0, -1, np.nan], [np.inf, -np.inf, -0.0, 2.0], [1, 2, 3, 65.5]])
+    frame = make_frame(values.astype(dtype), CAMERA, depth_scale=5000)
+    assert frame.depth.tolist() == [[0.5, 0, 0, 0], [0, 0, 0, 2], [1, 2, 3, 65.5]]
+    assert frame.depth.dtype == np.float32
+    assert not np.signbit(frame.depth).any()
+
+
+def test_float64_beyond_float32_is_missing() -> None:
+    values = np.full((3, 4), 1e300)
+    values[0, 0] = 1.5
+    assert make_frame(values, CAMERA).depth.sum() == 1.5
+
+
+def test_range_and_lens_are_removed() -> None:
+    # f = 4, c = (1, 0): directions -1/4, 0, 1/4 and 1/2; the lens shows 1/2 at
+    # 1/2 (1 + 1/4 k1) = 1/4 for k1 = -2, but there 1 + 3 k1/4 < 0: beyond the fold
+    camera = Intrinsics(4, 1, 4.0, 4.0, 1.0, 0.0, (-2.0, 0.0, 0.0, 0.0))
+    frame = make_frame(np.full((1, 4), 1000, np.uint16), camera, along_ray=True)
+    assert frame.intrinsics == dataclasses.replace(camera, distortion=())
+    # x = +-1/4 is seen at 1/4 (1 - 1/8) = 0.21875, u = 1 +- 0.875, so it takes pixels 0 and 2.
+    # Pixel 2 looks along x with x - 2 x^3 = 1/4: x = 0.29956
+    x = next(r.real for r in np.roots([-2, 0, 1, -0.25]) if 0 < r.real < 0.4)
+    cosine = 1 / np.hypot(1, x)
+    np.testing.assert_allclose(frame.depth, [[cosine, 1, cosine, 0]], rtol=1e-6)
+
+
+def test_pose_is_checked_and_kept() -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = 1, 2, 3
+    np.testing.assert_array_equal(make_frame(SAMPLES, CAMERA, pose=pose).pose, pose)
+    with pytest.raises(InvalidPose, match=r"here: .*mirrors"):
+        make_frame(SAMPLES, CAMERA, pose=np.diag([1.0, 1, -1, 1]), name="here")
+
+
+def test_read_frame_by_content(tmp_path: Path) -> None:
+    write_depth_png(tmp_path / "a.png", METRES.astype(np.float32), 1000)
+    np.save(tmp_path / "b.npy", METRES)
+    os.link(tmp_path / "a.png", tmp_path / "c.npy")
+    for name in ("a.png", "b.npy", "c.npy"):
+        frame = read_frame(tmp_path / name, CAMERA, name="x/y")
+        np.testing.assert_array_equal(frame.depth, METRES.astype(np.float32))
+        assert frame.name == "x/y"
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [(b"", "empty"), (png.SIGNATURE, "ends early"), (b"\x93NUMPY", "header"), (b"P5", "neither")],
+)
+def test_errors_of_a_file_name_it_on_one_line(data: bytes, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "seven.png"
+    path.write_bytes(data)
+    with pytest.raises(UnreadableFrame, match=r"seven\.png: .*" + message) as caught:
+        read_frame(path, CAMERA, name="seven")
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_file(tmp_path: Path, monkeypatch) -> None:
+    with pytest.raises(UnreadableFrame, match=r"absent\.png: .*No such file"):
+        read_frame(tmp_path / "absent.png", CAMERA)
+    with pytest.raises(UnreadableFrame, match="no regular file"):
+        read_frame(tmp_path, CAMERA)
+    os.mkfifo(tmp_path / "pipe.png")  # opening it would wait for a writer
+    with pytest.raises(UnreadableFrame, match="no regular file"):
+        read_frame(tmp_path / "pipe.png", CAMERA)
+    with pytest.raises(UnreadableFrame, match="cannot be read"):
+        read_frame(Path("nul\0.png"), CAMERA)
+    (tmp_path / "a.jpg").write_bytes(b"\xff\xd8\xff\xe0JFIF")
+    with pytest.raises(UnreadableFrame, match=r"a\.jpg: .*neither PNG nor NPY"):
+        read_frame(tmp_path / "a.jpg", CAMERA)
+    with (tmp_path / "huge.png").open("wb") as file:
+        file.truncate(10**12)  # sparse
+    monkeypatch.setattr(png, "MAXIMUM_BYTES", 1000)
+    with pytest.raises(UnreadableFrame, match="more than 1000 bytes"):
+        read_frame(tmp_path / "huge.png", CAMERA)
+    with pytest.raises(UnreadableFrame, match="1001 bytes, the limit is 1000"):
+        decode_png(b"\0" * 1001)
+
+
+@pytest.mark.parametrize("scale", [0, -1, float("nan"), float("inf"), -0.0])
+@pytest.mark.parametrize("samples", [SAMPLES, METRES])
+def test_bad_scale(scale: float, samples: np.ndarray) -> None:
+    with pytest.raises(InvalidIntrinsics, match=r"depth scale .* positive"):
+        make_frame(samples, CAMERA, depth_scale=scale)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e300])
+def test_a_scale_that_leaves_nothing(scale: float) -> None:
+    with pytest.raises(UselessFrame, match="All 12 samples"):
+        make_frame(SAMPLES, CAMERA, depth_scale=scale)
+
+
+@pytest.mark.parametrize(
+    "samples",
+    [
+        np.zeros((3, 4), np.uint16),
+        np.full((3, 4), 65535, np.uint16),
+        np.full((3, 4), np.nan),
+        np.full((3, 4), -np.inf, np.float32),
+        np.full((3, 4), -2.0),
+    ],
+)
+def test_nothing_seen(samples: np.ndarray) -> None:
+    with pytest.raises(UselessFrame, match="f: All 12 samples are missing"):
+        make_frame(samples, CAMERA, name="f")
+
+
+def test_nothing_left_by_the_lens() -> None:
+    camera = Intrinsics(4, 3, 5.0, 5.0, -400.0, 1.0, (-0.3, 0.0, 0.0, 0.0))
+    with pytest.raises(UselessFrame):
+        make_frame(SAMPLES, camera)
+
+
+@pytest.mark.parametrize("shape", [(12,), (3, 4, 1), (0, 4), ()])
+def test_bad_shape(shape: tuple[int, ...]) -> None:
+    with pytest.raises(UnreadableFrame, match="two dimensions"):
+        make_frame(np.ones(shape, np.float32), CAMERA)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int32, np.uint32, bool, complex, object])
+def test_bad_type(dtype) -> None:
+    with pytest.raises(UnreadableFrame, match="Convert them"):
+        make_frame(np.ones((3, 4), dtype), CAMERA)
+
+
+def test_no_array_is_the_callers_mistake() -> None:
+    with pytest.raises(TypeError, match="list"):
+        make_frame([[1.0]], CAMERA)  # type: ignore[arg-type]
+
+
+def test_intrinsics_of_another_image() -> None:
+    with pytest.raises(InvalidIntrinsics, match="3 x 4 pixels, the intrinsics are of 4 x 3"):
+        make_frame(SAMPLES.T, CAMERA)

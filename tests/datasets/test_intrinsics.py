@@ -1,0 +1,122 @@
+"""intrinsics.json: where it is looked for, what it may say, what is said about bad ones."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sceneprint.datasets import Camera, find_camera, read_camera, write_intrinsics
+from sceneprint.errors import DatasetError, InvalidIntrinsics
+from sceneprint.types import Intrinsics
+
+GOOD = {"width": 640, "height": 480, "fx": 525, "fy": 526.5, "cx": 319.5, "cy": 239}
+
+
+def write(path: Path, fields: object) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(fields))
+    return path
+
+
+def test_the_least_that_is_needed(tmp_path: Path) -> None:
+    camera = read_camera(write(tmp_path / "intrinsics.json", GOOD))
+    assert camera == Camera(Intrinsics(640, 480, 525.0, 526.5, 319.5, 239.0), 1000.0, False)
+
+
+def test_all_that_may_be_said(tmp_path: Path) -> None:
+    fields = GOOD | {
+        "depth_scale": 5000, "distortion": [0.1, -0.2, 0, 1e-3, 4], "depth_along_ray": True,
+    }  # fmt: skip
+    camera = read_camera(write(tmp_path / "intrinsics.json", fields))
+    assert camera.intrinsics.distortion == (0.1, -0.2, 0.0, 0.001, 4.0)
+    assert (camera.depth_scale, camera.along_ray) == (5000.0, True)
+
+
+@pytest.mark.parametrize("k", [(), (0.1, -0.2, 0.3, 1 / 3)])
+@pytest.mark.parametrize("along_ray", [True, False])
+def test_written_is_read(k: tuple[float, ...], along_ray: bool, tmp_path: Path) -> None:
+    camera = Camera(Intrinsics(64, 48, 52.1, 1 / 3, 0.1, -7.0, k), 1234.5, along_ray)
+    assert read_camera(write_intrinsics(tmp_path, camera)) == camera
+    assert [file.name for file in tmp_path.iterdir()] == ["intrinsics.json"]
+
+
+def test_the_nearest_wins_up_to_four_folders_above(tmp_path: Path) -> None:
+    deep = tmp_path / "a/b/c/d"
+    deep.mkdir(parents=True)
+    write(tmp_path / "intrinsics.json", GOOD | {"width": 1})
+    assert find_camera(deep).intrinsics.width == 1
+    write(tmp_path / "a/intrinsics.json", GOOD | {"width": 2})
+    assert find_camera(deep).intrinsics.width == 2
+    write(deep / "intrinsics.json", GOOD | {"width": 3})
+    assert find_camera(deep).intrinsics.width == 3
+    assert find_camera(deep / "..").intrinsics.width == 2
+
+
+def test_none_is_found(tmp_path: Path, monkeypatch) -> None:
+    deep = tmp_path / "a/b/c/d/e"
+    deep.mkdir(parents=True)
+    write(tmp_path / "intrinsics.json", GOOD)  # five above
+    with pytest.raises(DatasetError, match=r"no intrinsics\.json here") as caught:
+        find_camera(deep)
+    text = str(caught.value)
+    example = text[text.index("{") : text.index("}") + 1]
+    read_camera(write(tmp_path / "b" / "intrinsics.json", json.loads(example)))  # it can be used
+
+
+BAD = {
+    "no JSON": ("{'width': 640}", "not JSON"),
+    "empty": ("", "not JSON"),
+    "cut": (json.dumps(GOOD)[:-4], "not JSON"),
+    "a list": ("[1, 2]", "no JSON object"),
+    "deep": ("[" * 60_000, "not JSON"),
+    "no fields": ("{}", "width, height, fx, fy, cx, cy is missing"),
+    "missing": (GOOD | {"cy": None}, "cy is None, not a number"),
+    "unknown": (GOOD | {"distorsion": []}, "distorsion' is no field"),
+    "bool": (GOOD | {"fx": True}, "fx is True, not a number"),
+    "bool size": (GOOD | {"width": True}, "width is True, not a whole"),
+    "text": (GOOD | {"fy": "525"}, "fy is '525'"),
+    "broken size": (GOOD | {"height": 480.5}, "height is 480.5, not a whole"),
+    "zero size": (GOOD | {"height": 0}, "640 x 0 is empty"),
+    "negative size": (GOOD | {"width": -640}, "empty"),
+    "huge size": (GOOD | {"width": 10**9}, "exceeds the limit"),
+    "zero focal length": (GOOD | {"fx": 0}, "focal length fx"),
+    "negative focal length": (GOOD | {"fy": -1.0}, "focal length fy"),
+    "not a number": (json.dumps(GOOD).replace("319.5", "NaN"), "principal point"),
+    "infinite": (json.dumps(GOOD).replace("319.5", "1e999"), "principal point"),
+    "beyond floats": (GOOD | {"fx": 10**400}, "fx is 1000000000"),
+    "beyond Python": (json.dumps(GOOD).replace("640", "9" * 5000), "not JSON"),
+    "zero scale": (GOOD | {"depth_scale": 0}, "depth scale 0.0"),
+    "negative scale": (GOOD | {"depth_scale": -1000}, "depth scale -1000"),
+    "no scale": (json.dumps(GOOD)[:-1] + ', "depth_scale": NaN}', "depth scale nan"),
+    "null scale": (GOOD | {"depth_scale": None}, "depth_scale is None"),
+    "three coefficients": (GOOD | {"distortion": [1, 2, 3]}, "3 distortion coefficients"),
+    "no coefficients": (GOOD | {"distortion": [1, 2, 3, "4"]}, "distortion is '4'"),
+    "infinite coefficients": (
+        json.dumps(GOOD)[:-1] + ', "distortion": [0, 0, 0, Infinity]}', "not all finite",
+    ),
+    "distortion by name": (GOOD | {"distortion": {"k1": 1}}, "distortion is no list"),
+    "half along the ray": (GOOD | {"depth_along_ray": 1}, "neither true nor false"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files(case: str, tmp_path: Path) -> None:
+    content, message = BAD[case]
+    path = tmp_path / "intrinsics.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(InvalidIntrinsics, match=message) as caught:
+        find_camera(tmp_path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_no_text_and_too_much(tmp_path: Path) -> None:
+    path = tmp_path / "intrinsics.json"
+    path.write_bytes(b"\xff\xfe{")
+    with pytest.raises(InvalidIntrinsics, match="no text"):
+        read_camera(path)
+    path.write_text(" " * 70_000)
+    with pytest.raises(InvalidIntrinsics, match="more than 65536 bytes"):
+        read_camera(path)
+    path.write_text("\ufeff" + json.dumps(GOOD))  # as some editors save it
+    assert read_camera(path).intrinsics.fy == 526.5

@@ -1,0 +1,106 @@
+"""Each layout by itself: which files are frames, in which order, with which pose."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sceneprint.datasets import Camera, Layout, find_sequences, write_depth_png, write_intrinsics
+from sceneprint.datasets.layouts import natural
+from sceneprint.errors import DatasetError
+from sceneprint.types import Intrinsics
+
+CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)
+DEPTH = np.arange(12, dtype=np.float32).reshape(3, 4) / 8
+
+
+def pose_at(x: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+def tum(folder: Path) -> Path:
+    (folder / "depth").mkdir(parents=True)
+    (folder / "rgb").mkdir()
+    (folder / "rgb/9.0.png").write_bytes(b"colour")
+    for stamp in ("9.5", "10.02", "10.5"):
+        write_depth_png(folder / f"depth/{stamp}.png", DEPTH, 5000.0)
+    (folder / "depth.txt").write_text(
+        "# timestamp filename\n10.5 depth/10.5.png\n9.5 depth/9.5.png\n10.02 depth/10.02.png\n"
+    )
+    (folder / "groundtruth.txt").write_text(
+        "# t tx ty tz qx qy qz qw\n10.00 1 0 0 0 0 0 1\n10.04 2 0 0 0 0 0 1\n10.9 3 0 0 0 0 0 1\n"
+    )
+    write_intrinsics(folder, Camera(CAMERA.intrinsics, 5000.0))
+    return folder
+
+
+def test_tum(tmp_path: Path) -> None:
+    (sequence,) = find_sequences(tum(tmp_path / "desk"))
+    assert (sequence.layout, sequence.parent_frame) == (Layout.TUM, "desk")
+    assert [f.timestamp for f in sequence.frames] == [9.5, 10.02, 10.5]
+    assert [f.name for f in sequence.frames] == ["desk/9.5", "desk/10.02", "desk/10.5"]
+    early, between, gap = sequence.frames
+    assert early.pose is None
+    assert gap.pose is None  # 0.86 s between its neighbours
+    np.testing.assert_allclose(between.pose, pose_at(1.5), atol=1e-9)
+    np.testing.assert_array_equal(between.read().depth, DEPTH)  # at 5000 units a metre
+
+
+def test_tum_without_poses(tmp_path: Path) -> None:
+    (tum(tmp_path / "desk") / "groundtruth.txt").unlink()
+    assert [f.pose for f in find_sequences(tmp_path)[0].frames] == [None] * 3
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("11.0 ../secret.png", "line 1: .*outside"),
+        ("11.0 depth/../../secret.png", "line 1: .*outside"),
+        ("11.0 ..\\secret.png", "line 1: .*outside"),
+        ("11.0 /etc/passwd", "line 1: .*outside"),
+        ("11.0 depth/absent.png", "line 1: .*no file depth/absent.png"),
+        ("11.0", "line 1: .*no time stamp and file"),
+        ("soon depth/9.5.png", "line 1: .*no time stamp"),
+        ("inf depth/9.5.png", "line 1: .*not finite"),
+        ("# nothing", "list is empty"),
+        ("1 depth/9.5.png\n2 depth/9.5.png", "same name"),
+    ],
+)
+def test_bad_lists(line: str, message: str, tmp_path: Path) -> None:
+    folder = tum(tmp_path / "desk")
+    (tmp_path / "secret.png").write_bytes(b"secret")
+    (folder / "depth.txt").write_text(line + "\n")
+    with pytest.raises(DatasetError, match=message):
+        find_sequences(folder)
+
+
+def test_a_plain_folder_in_natural_order(tmp_path: Path) -> None:
+    for name in ("d10.png", "d9.png", "d1.PNG"):
+        write_depth_png(tmp_path / name, DEPTH, 1000.0)
+    np.save(tmp_path / "d2.npy", DEPTH)
+    for name in ("a.color.png", "rgb_1.png", "x_RGB.png", ".hidden.png", "notes.txt", "p.pose.txt"):
+        (tmp_path / name).write_bytes(b"no depth")
+    write_intrinsics(tmp_path, CAMERA)
+    (sequence,) = find_sequences(tmp_path)
+    assert sequence.layout is Layout.PLAIN
+    assert [f.path.name for f in sequence.frames] == ["d1.PNG", "d2.npy", "d9.png", "d10.png"]
+    assert sequence.frames[1].name == f"{tmp_path.name}/d2"
+    for reference in sequence.frames:
+        np.testing.assert_array_equal(reference.read().depth, DEPTH)
+        assert reference.pose is None
+
+
+def test_natural_order() -> None:
+    names = ["a10", "a9", "a", "10", "9", "a01", "a1", "b²", "b", "a1b2", "a1b10", "9" * 5000]
+    expected = ["9", "10", "9" * 5000, "a", "a01", "a1", "a1b2", "a1b10", "a9", "a10", "b", "b²"]
+    assert sorted(names, key=natural) == expected
+
+
+def test_a_file_of_two_kinds_has_one_name(tmp_path: Path) -> None:
+    write_intrinsics(tmp_path, CAMERA)
+    np.save(tmp_path / "a.npy", DEPTH)
+    write_depth_png(tmp_path / "a.png", DEPTH, 1000.0)
+    with pytest.raises(DatasetError, match=r"a\.png: .*same name"):
+        find_sequences(tmp_path)

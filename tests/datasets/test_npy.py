@@ -1,0 +1,180 @@
+"""NPY files of metres: right samples from good files, a clear error from every bad one."""
+
+import io
+import struct
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sceneprint.datasets import decode_npy, make_frame
+from sceneprint.errors import FrameError, UnreadableFrame
+from sceneprint.types import Frame, Intrinsics
+
+CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)
+METRES = np.array([[0, 0.001, 1, 0], [1.234, 65.534, 0.002, 0.003], [0.5, 0.501, 0.502, 0.503]])
+
+
+def npy(array: np.ndarray, **options) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, **options)
+    return buffer.getvalue()
+
+
+def npy_with(header: str, data: bytes = b"", version: int = 1) -> bytes:
+    text = header.encode()
+    size = struct.pack("<H" if version == 1 else "<I", len(text))
+    return b"\x93NUMPY" + bytes([version, 0]) + size + text + data
+
+
+GOOD_NPY = npy(METRES.astype(np.float32))
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("dtype", ["<f4", ">f4", "<f8", "<f2"])
+def test_npy(order: str, dtype: str) -> None:
+    array = np.asarray(np.array([[1.5, np.nan, 2], [0.25, np.inf, 4]]), dtype=dtype, order=order)
+    decoded = decode_npy(npy(array))
+    np.testing.assert_array_equal(decoded, [[1.5, np.nan, 2], [0.25, np.inf, 4]])
+    assert decoded.dtype == np.float32
+    assert decoded.flags.c_contiguous
+    decoded[:] = 0  # and one's own
+
+
+def test_npy_of_later_versions() -> None:
+    data = np.array([[1, 2]], "<f4").tobytes()
+    header = "{'descr': '<f4', 'fortran_order': False, 'shape': (1, 2), }\n"
+    for version in (1, 2, 3):
+        assert decode_npy(npy_with(header, data, version)).tolist() == [[1, 2]]
+
+
+BAD_NPY = {
+    "empty": (b"", "empty"),
+    "no NPY": (b"PK\x03\x04" * 9, "no NPY"),
+    "only the signature": (b"\x93NUMPY", "header of the NPY"),
+    "unknown version": (b"\x93NUMPY\x09" + GOOD_NPY[7:], "header of the NPY"),
+    "truncated": (GOOD_NPY[:-1], "47 of 48 bytes"),
+    "more than announced": (GOOD_NPY + b"\0", "49 of 48 bytes"),
+    "header beyond the file": (GOOD_NPY[:8] + b"\x10\x27" + GOOD_NPY[10:], "announces 10000"),
+    "endless header": (
+        b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + b" " * 99_999, "announces 4294967295",
+    ),
+    "whole numbers": (npy(np.ones((3, 4), np.uint16)), "'<u2'.* 16-bit PNG"),
+    "complex": (npy(np.ones((3, 4), complex)), "'<c16'"),
+    "long double": (npy(np.ones((3, 4), np.longdouble)), "Convert it"),
+    "text": (npy(np.array([["a", "b"]])), "'<U1'"),
+    "records": (npy(np.zeros((3, 4), [("z", "<f4")])), "records"),
+    "pickled": (npy(np.array([[{}]], object), allow_pickle=True), "pickled"),
+    "flat": (npy(np.ones(12, np.float32)), "two dimensions"),
+    "colour": (npy(np.ones((3, 4, 3), np.float32)), "two dimensions"),
+    "no samples": (npy(np.ones((0, 4), np.float32)), "no samples"),
+    "bomb": (
+        npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (99999, 99999), }"),
+        "more than 16777216",
+    ),
+    "numbers without end": (
+        npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (0x" + "f" * 9000 + ", 1), }"),
+        "more than",
+    ),
+    "negative": (
+        npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (-3, -4)}"), "two dimensions",
+    ),
+    "truth as a size": (
+        npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (True, 1)}", b"1234"),
+        "two dimensions",
+    ),
+    "order is no truth": (
+        npy_with("{'descr': '<f4', 'fortran_order': 1, 'shape': (1, 1)}", b"1234"),
+        "cannot be read",
+    ),
+    "a field too few": (npy_with("{'descr': '<f4', 'shape': (1, 1)}", b"1234"), "cannot be read"),
+    "code": (npy_with("__import__('os').getcwd()"), "cannot be read"),
+    "no literal": (npy_with("{'descr':"), "cannot be read"),
+    "no text": (npy(np.ones((1, 1), "<f4")).replace(b"descr", b"\xff" * 5), "cannot be read"),
+    "nul": (npy_with("{'descr': '\0'}"), "cannot be read"),
+    "deep brackets": (npy_with("[" * 9000), "cannot be read"),
+    "deep signs": (npy_with("-" * 9000 + "1"), "cannot be read"),
+    "deep calls": (npy_with("a(" * 4500), "cannot be read"),
+    "long sums": (npy_with("1+" * 4500 + "1"), "cannot be read"),
+    "unhashable": (npy_with("{[]: 1}"), "cannot be read"),
+    "Python 2": (
+        npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (1L, 1L)}", b"1234"),
+        "cannot be read",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD_NPY)
+def test_bad_npy(case: str) -> None:
+    data, message = BAD_NPY[case]
+    with pytest.raises(UnreadableFrame, match=message):
+        decode_npy(data)
+
+
+def frame_or_error(data: bytes) -> Frame | None:
+    """Whatever the bytes: a frame that can be used, or a FrameError on one line."""
+    try:
+        frame = make_frame(decode_npy(data), CAMERA)
+    except FrameError as error:
+        assert "\n" not in str(error)  # noqa: PT017  (an error is a right outcome too)
+        return None
+    assert np.isfinite(frame.depth).all()
+    assert (frame.depth >= 0).all()
+    assert frame.depth.any()
+    assert frame.depth.shape == (3, 4)
+    return frame
+
+
+def mutations(data: bytes, number: int) -> Iterator[bytes]:
+    """The file with one to three bytes changed, bits flipped, pieces lost or put in."""
+    random = np.random.default_rng(7)
+    for _ in range(number):
+        mutated = bytearray(data)
+        for _ in range(int(random.integers(1, 4))):
+            place = int(random.integers(0, len(mutated)))
+            match random.integers(0, 4):
+                case 0:
+                    mutated[place] = int(random.integers(0, 256))
+                case 1:
+                    mutated[place] ^= 1 << int(random.integers(0, 8))
+                case 2:
+                    del mutated[place : place + int(random.integers(1, 9))]
+                case _:
+                    mutated[place:place] = random.bytes(int(random.integers(1, 9)))
+        yield bytes(mutated)
+
+
+def test_mutations() -> None:
+    frames = errors = 0
+    for data in (GOOD_NPY, npy(METRES), npy(np.asfortranarray(METRES))):
+        for mutated in mutations(data, 700):
+            outcome = frame_or_error(mutated)
+            frames += outcome is not None
+            errors += outcome is None
+    assert min(frames, errors) > 50  # both ends were reached
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=300), st.sampled_from([b"", GOOD_NPY[:8], GOOD_NPY[:10], GOOD_NPY[:128]]))
+def test_any_bytes(data: bytes, start: bytes) -> None:
+    frame_or_error(start + data)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.text(max_size=200), st.binary(max_size=20))
+def test_any_header(header: str, data: bytes) -> None:
+    frame_or_error(npy_with(header, data))
+    frame_or_error(npy_with("{" + header + "}", data))
+
+
+any_values = st.lists(st.floats(width=64), min_size=12, max_size=12)
+
+
+@settings(max_examples=100, deadline=None)
+@given(any_values, st.sampled_from(["<f2", "<f4", ">f8"]))
+def test_any_values(values: list[float], dtype: str) -> None:
+    with np.errstate(all="ignore"):
+        data = npy(np.array(values).reshape(3, 4).astype(dtype))
+    frame_or_error(data)

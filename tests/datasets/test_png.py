@@ -1,0 +1,244 @@
+"""16-bit greyscale PNG: right samples from good files, a clear error from every bad one."""
+
+import io
+import struct
+import zlib
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image, ImageFile
+
+from sceneprint.datasets import decode_png, make_frame, png
+from sceneprint.errors import FrameError, UnreadableFrame
+from sceneprint.types import MAXIMUM_SAMPLES, Frame, Intrinsics
+
+CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)
+SAMPLES = np.array([[0, 1, 1000, 65535], [1234, 65534, 2, 3], [500, 501, 502, 503]], np.uint16)
+
+
+def pillow_png(samples: np.ndarray, **options) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(samples).save(buffer, "PNG", **options)
+    return buffer.getvalue()
+
+
+def chunk(kind: bytes, content: bytes = b"") -> bytes:
+    crc = zlib.crc32(kind + content)
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc)
+
+
+def raw_png(
+    width: int, height: int, rows: bytes, *, bits: int = 16, colour: int = 0, interlace: int = 0,
+    before: bytes = b"", after: bytes = b"",
+) -> bytes:  # fmt: skip
+    header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, interlace)
+    return b"".join([
+        png.SIGNATURE, chunk(b"IHDR", header), before, chunk(b"IDAT", zlib.compress(rows)), after,
+        chunk(b"IEND"),
+    ])  # fmt: skip
+
+
+def rows_of(samples: np.ndarray) -> bytes:
+    return b"".join(b"\0" + row.astype(">u2").tobytes() for row in samples)
+
+
+GOOD_PNG = pillow_png(SAMPLES)
+
+
+def test_png_by_pillow_and_by_hand() -> None:
+    np.testing.assert_array_equal(decode_png(GOOD_PNG), SAMPLES)
+    np.testing.assert_array_equal(decode_png(raw_png(4, 3, rows_of(SAMPLES))), SAMPLES)
+    assert decode_png(GOOD_PNG).dtype == np.uint16
+    big = np.random.default_rng(0).integers(0, 65536, (480, 640), dtype=np.uint16)
+    np.testing.assert_array_equal(decode_png(pillow_png(big)), big)
+    smooth = np.add.outer(np.arange(480) * 60, np.arange(640) * 50).astype(np.uint16)
+    np.testing.assert_array_equal(decode_png(pillow_png(smooth)), smooth)  # filters at work
+
+
+def test_png_of_many_data_chunks_and_trailing_bytes() -> None:
+    data = zlib.compress(rows_of(SAMPLES))
+    header = struct.pack(">IIBBBBB", 4, 3, 16, 0, 0, 0, 0)
+    pieces = b"".join(chunk(b"IDAT", data[i : i + 1]) for i in range(len(data)))
+    file = png.SIGNATURE + chunk(b"IHDR", header) + pieces + chunk(b"IDAT") + chunk(b"IEND")
+    np.testing.assert_array_equal(decode_png(file + b"and more"), SAMPLES)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 4), (5, 2), (8, 8), (13, 21)])
+def test_interlaced_png(shape: tuple[int, int]) -> None:
+    samples = np.random.default_rng(1).integers(0, 65536, shape, dtype=np.uint16)
+    rows = b""
+    for column, row, across, down in ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4),
+                                      (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)):  # fmt: skip
+        if samples[row::down, column::across].size:
+            rows += rows_of(samples[row::down, column::across])
+    decoded = decode_png(raw_png(shape[1], shape[0], rows, interlace=1))
+    np.testing.assert_array_equal(decoded, samples)
+
+
+def test_text_and_profiles_are_not_even_unpacked() -> None:
+    bomb = zlib.compress(b"\0" * 50_000_000, 9)
+    before = (
+        chunk(b"zTXt", b"Comment\0\0" + bomb)
+        + chunk(b"iCCP", b"icc\0\0" + bomb)
+        + chunk(b"tEXt", b"a\0" + b"x" * 1_000_000)
+        + chunk(b"tRNS", b"\x03\xe8")  # makes 1000 transparent, for display
+        + chunk(b"gAMA", b"bad")
+        + chunk(b"eXIf", b"\xff" * 30)
+    )
+    data = raw_png(4, 3, rows_of(SAMPLES), before=before, after=chunk(b"iTXt", b"\xff\xff"))
+    np.testing.assert_array_equal(decode_png(data), SAMPLES)
+
+
+def test_the_largest_image_is_read() -> None:
+    side = int(MAXIMUM_SAMPLES**0.5)
+    rows = (b"\0" + b"\x03\xe8" * side) * side
+    assert (decode_png(raw_png(side, side, rows)) == 1000).all()
+
+
+BAD_PNG = {
+    "empty": (b"", "empty"),
+    "no PNG": (b"\xff\xd8\xff\xe0JFIF" * 9, "no PNG"),
+    "only the signature": (png.SIGNATURE, "ends early"),
+    "truncated in the data": (GOOD_PNG[:-20], "ends early"),
+    "truncated in the end": (GOOD_PNG[:-1], "ends early"),
+    "damaged": (GOOD_PNG[:45] + bytes([GOOD_PNG[45] ^ 1]) + GOOD_PNG[46:], "check sum"),
+    "8 bit": (pillow_png(SAMPLES.astype(np.uint8)), "greyscale with 8 bits"),
+    "1 bit": (pillow_png(SAMPLES > 2), "greyscale with 1 bits"),
+    "colour": (pillow_png(np.zeros((3, 4, 3), np.uint8)), "RGB"),
+    "16-bit colour": (raw_png(4, 3, b"\0" * 99, colour=2), "RGB"),
+    "alpha": (pillow_png(np.zeros((3, 4, 4), np.uint8)), "colour with alpha"),
+    "grey alpha": (raw_png(4, 3, b"\0" * 99, colour=4), "greyscale with alpha"),
+    "palette": (raw_png(4, 3, b"\0" * 9, bits=8, colour=3), "palette"),
+    "palette chunk": (raw_png(4, 3, rows_of(SAMPLES), before=chunk(b"PLTE", b"abc")), "PLTE"),
+    "animated": (
+        raw_png(4, 3, rows_of(SAMPLES), before=chunk(b"acTL", struct.pack(">II", 2, 0))),
+        "animated",
+    ),
+    "bomb by its header": (raw_png(65_535, 65_535, b"\0" * 99), "65535 x 65535"),
+    "just over the limit": (raw_png(4096, 4097, b"\0" * 99), "4096 x 4097"),
+    "no size": (raw_png(0, 3, b""), "0 x 3"),
+    "fewer rows than announced": (raw_png(4, 4, rows_of(SAMPLES)), "holds fewer"),
+    "more rows than announced": (raw_png(4, 2, rows_of(SAMPLES)), "holds more"),
+    "bomb in the data": (raw_png(4, 3, b"\0" * 30_000_000), "holds more"),
+    "no data": (png.SIGNATURE + GOOD_PNG[8:33] + chunk(b"IEND"), "holds fewer"),
+    "no zlib": (
+        png.SIGNATURE + GOOD_PNG[8:33] + chunk(b"IDAT", b"hello world") + chunk(b"IEND"),
+        "do not decompress",
+    ),
+    "data without their end": (
+        png.SIGNATURE + GOOD_PNG[8:33]
+        + chunk(b"IDAT", zlib.compress(rows_of(SAMPLES))[:-3]) + chunk(b"IEND"),
+        "holds fewer",
+    ),
+    "unknown filter": (raw_png(4, 3, b"\x09" + rows_of(SAMPLES)[1:]), "rows do not decode"),
+    "unknown interlacing": (raw_png(4, 3, rows_of(SAMPLES), interlace=2), "interlacing"),
+    "no header": (png.SIGNATURE + chunk(b"IEND"), "begin with its header"),
+    "two headers": (GOOD_PNG[:33] + GOOD_PNG[8:], "two headers"),
+    "short header": (png.SIGNATURE + chunk(b"IHDR", b"abc") + chunk(b"IEND"), "wrong length"),
+    "chunk longer than the file": (
+        GOOD_PNG[:33] + b"\xff\xff\xff\xff" + GOOD_PNG[37:], "ends early",
+    ),
+    "endless chunks": (
+        png.SIGNATURE + GOOD_PNG[8:33] + chunk(b"tEXt") * 65_536, "more than 65536 chunks",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD_PNG)
+def test_bad_png(case: str) -> None:
+    data, message = BAD_PNG[case]
+    with pytest.raises(UnreadableFrame, match=message):
+        decode_png(data)
+
+
+def test_truncated_png_whatever_the_program_told_pillow(monkeypatch) -> None:
+    monkeypatch.setattr(ImageFile, "LOAD_TRUNCATED_IMAGES", True)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100_000)
+    for case in ("fewer rows than announced", "truncated in the data", "bomb by its header"):
+        with pytest.raises(UnreadableFrame):
+            decode_png(BAD_PNG[case][0])
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1)  # a program's own, lower limit
+    with pytest.raises(UnreadableFrame, match="exceeds limit"):
+        decode_png(GOOD_PNG)
+
+
+def frame_or_error(data: bytes) -> Frame | None:
+    """Whatever the bytes: a frame that can be used, or a FrameError on one line."""
+    try:
+        frame = make_frame(decode_png(data), CAMERA)
+    except FrameError as error:
+        assert "\n" not in str(error)  # noqa: PT017  (an error is a right outcome too)
+        return None
+    assert np.isfinite(frame.depth).all()
+    assert (frame.depth >= 0).all()
+    assert frame.depth.any()
+    assert frame.depth.shape == (3, 4)
+    return frame
+
+
+def mutations(data: bytes, number: int) -> Iterator[bytes]:
+    """The file with one to three bytes changed, bits flipped, pieces lost or put in."""
+    random = np.random.default_rng(7)
+    for _ in range(number):
+        mutated = bytearray(data)
+        for _ in range(int(random.integers(1, 4))):
+            place = int(random.integers(0, len(mutated)))
+            match random.integers(0, 4):
+                case 0:
+                    mutated[place] = int(random.integers(0, 256))
+                case 1:
+                    mutated[place] ^= 1 << int(random.integers(0, 8))
+                case 2:
+                    del mutated[place : place + int(random.integers(1, 9))]
+                case _:
+                    mutated[place:place] = random.bytes(int(random.integers(1, 9)))
+        yield bytes(mutated)
+
+
+def repaired(data: bytes) -> bytes:
+    """The same PNG with right check sums, so that damage reaches what lies behind them."""
+    out, position = data[:8], 8
+    while position + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, position)
+        content = data[position + 8 : position + 8 + length]
+        out += chunk(data[position + 4 : position + 8], content)
+        position += 12 + length
+    return out
+
+
+def test_mutations() -> None:
+    frames = errors = 0
+    text = raw_png(4, 3, rows_of(SAMPLES), before=chunk(b"tEXt", b"a\0b"))
+    for data in (GOOD_PNG, text):
+        for mutated in mutations(data, 1000):
+            both = [mutated]
+            if mutated.startswith(png.SIGNATURE):
+                both.append(repaired(mutated))
+            outcomes = [frame_or_error(one) for one in both]
+            frames += sum(one is not None for one in outcomes)
+            errors += sum(one is None for one in outcomes)
+    assert min(frames, errors) > 50  # both ends were reached
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=300), st.sampled_from([b"", png.SIGNATURE, GOOD_PNG[:33]]))
+def test_any_bytes(data: bytes, start: bytes) -> None:
+    frame_or_error(start + data)
+    frame_or_error(repaired(start + data))
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.tuples(st.integers(0, 9), st.integers(0, 9)),
+    st.binary(max_size=200),
+    st.sampled_from([1, 2, 4, 8, 16]),
+    st.sampled_from([0, 0, 0, 2, 3, 4, 6]),
+    st.integers(0, 1),
+)
+def test_any_pixels(
+    size: tuple[int, int], rows: bytes, bits: int, colour: int, interlace: int
+) -> None:
+    frame_or_error(raw_png(*size, rows, bits=bits, colour=colour, interlace=interlace))

@@ -1,0 +1,187 @@
+"""Poses: by hand, round trips, and every way in which sixteen words are no pose."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from sceneprint.datasets import (
+    Trajectory,
+    interpolate,
+    read_pose,
+    read_trajectory,
+    rigid_transform,
+    write_pose,
+)
+from sceneprint.errors import InvalidPose
+
+HALF = math.sqrt(0.5)
+
+
+def pose_of(rotation: Rotation, position: tuple[float, float, float]) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
+    return pose
+
+
+POSE = pose_of(Rotation.from_rotvec([0.3, -1.1, 0.7]), (1 / 3, -2e5, 1e-9))
+
+
+def test_written_is_read(tmp_path: Path) -> None:
+    write_pose(tmp_path / "a.txt", POSE)
+    np.testing.assert_allclose(read_pose(tmp_path / "a.txt"), POSE, rtol=0, atol=2e-15)
+    np.testing.assert_array_equal(read_pose(tmp_path / "a.txt")[:3, 3], POSE[:3, 3])
+
+
+def test_seven_scenes_text_by_hand(tmp_path: Path) -> None:
+    path = tmp_path / "frame-000000.pose.txt"
+    path.write_text(" 0 -1 0\t1.5 \n1 0 0 2\n 0.000e+00 0 1 -3\r\n0 0 0 1\n\n")
+    expected = [[0, -1, 0, 1.5], [1, 0, 0, 2], [0, 0, 1, -3], [0, 0, 0, 1]]
+    np.testing.assert_allclose(read_pose(path), expected, atol=1e-15)
+
+
+def test_a_rounded_rotation_becomes_the_nearest_true_one() -> None:
+    rough = np.round(POSE, 3)
+    exact = rigid_transform(rough)
+    rotation = exact[:3, :3]
+    np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=3e-15)
+    assert np.linalg.det(rotation) == pytest.approx(1.0, abs=1e-14)
+    np.testing.assert_allclose(rotation, Rotation.from_matrix(rough[:3, :3]).as_matrix(), atol=1e-3)
+    # nearest (Frobenius): the remainder R^T A is symmetric
+    remainder = rotation.T @ rough[:3, :3]
+    np.testing.assert_allclose(remainder, remainder.T, atol=3e-15)
+    np.testing.assert_array_equal(exact[:, 3], rough[:, 3])
+    assert rough[0, 0] == round(POSE[0, 0], 3)  # the caller's matrix is as it was
+
+
+ROWS = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+BAD = {
+    "": "0 words",
+    "1 2 3": "3 words",
+    "1 " * 17: "17 words",
+    "a " + "1 " * 15: "no number",
+    "1 0 0 nan 0 1 0 0 0 0 1 0 0 0 0 1": "not finite",
+    "-inf " * 16: "not finite",
+    "1 0 0 1 0 1 0 2 0 0 1 3 0 0 0 2": "last row",
+    "1 0 0 0 0 1 0 0 0 0 1 0 1 2 3 1": "last row",  # column by column
+    "1.02 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1": "not orthonormal",
+    "0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 1": "not orthonormal",
+    "1e300 0 0 0 0 1e300 0 0 0 0 1e300 0 0 0 0 1": "not orthonormal",
+    "1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1": "mirrors",
+}
+
+
+@pytest.mark.parametrize("text", BAD)
+def test_bad_pose_files(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "frame-000007.pose.txt"
+    path.write_text(text)
+    with pytest.raises(InvalidPose, match=r"frame-000007\.pose\.txt: .*" + BAD[text]) as caught:
+        read_pose(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_pose_file(tmp_path: Path) -> None:
+    with pytest.raises(InvalidPose, match=r"a\.txt: .*No such file"):
+        read_pose(tmp_path / "a.txt")
+    (tmp_path / "b.txt").write_bytes(b"\x00\xff\x89")
+    with pytest.raises(InvalidPose, match=r"b\.txt: .*no text"):
+        read_pose(tmp_path / "b.txt")
+
+
+@pytest.mark.parametrize("matrix", [np.eye(3), np.ones(16), [["a"] * 4] * 4, [[1], [2, 3]], None])
+def test_bad_matrices(matrix) -> None:
+    with pytest.raises(InvalidPose):
+        rigid_transform(matrix)
+
+
+def test_only_whole_poses_are_written(tmp_path: Path) -> None:
+    with pytest.raises(InvalidPose):
+        write_pose(tmp_path / "a.txt", np.zeros((4, 4)))
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---- trajectories
+
+
+def test_slerp_by_hand() -> None:
+    # 90 deg about z within 1 s; a third of the way is 30 deg
+    trajectory = Trajectory(
+        np.array([10.0, 11.0]),
+        np.array([[0.0, 0.0, 0.0], [3.0, -6.0, 9.0]]),
+        np.array([[0, 0, 0, 1.0], [0, 0, HALF, HALF]]),
+    )
+    a, b, c = interpolate(trajectory, [10.0, 10.0 + 1 / 3, 11.0], longest_gap=1.0)
+    r = math.sqrt(3) / 2
+    np.testing.assert_allclose(a, np.eye(4), atol=1e-15)
+    np.testing.assert_allclose(
+        b, [[r, -0.5, 0, 1], [0.5, r, 0, -2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        c, [[0, -1, 0, 3], [1, 0, 0, -6], [0, 0, 1, 9], [0, 0, 0, 1]], atol=1e-15
+    )
+
+
+def test_quaternion_order_by_hand(tmp_path: Path) -> None:
+    path = tmp_path / "groundtruth.txt"
+    path.write_text("# t tx ty tz qx qy qz qw\n1.0 1 2 3 1 0 0 0\n")  # half a turn about x
+    (pose,) = interpolate(read_trajectory(path), [1.0])
+    np.testing.assert_allclose(
+        pose, [[1, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 3], [0, 0, 0, 1]], atol=1e-15
+    )
+
+
+def test_interpolation_equals_scipy() -> None:
+    random = np.random.default_rng(5)
+    stamps = np.cumsum(random.uniform(0.01, 0.09, 40)) + 1.3e9
+    rotations = Rotation.random(40, random)
+    signs = random.choice([-1.0, 1.0], (40, 1))  # q and -q are the same rotation
+    trajectory = Trajectory(stamps, random.normal(size=(40, 3)), signs * rotations.as_quat())
+    times = random.uniform(stamps[0], stamps[-1], 200)
+    expected = Slerp(stamps, rotations)(times).as_matrix()
+    for i, pose in enumerate(interpolate(trajectory, times)):
+        np.testing.assert_allclose(pose[:3, :3], expected[i], atol=1e-12)
+        position = [np.interp(times[i], stamps, trajectory.positions[:, k]) for k in range(3)]
+        np.testing.assert_allclose(pose[:3, 3], position, atol=1e-12)
+        np.testing.assert_allclose(rigid_transform(pose), pose, atol=1e-14)
+
+
+def test_nothing_is_made_up() -> None:
+    one = np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
+    trajectory = Trajectory(np.array([1.0, 1.05, 2.0, 2.05]), np.eye(4)[:, :3], one)
+    stamps = [0.99, 1.0, 1.02, 1.05, 1.06, 1.99, 2.0, 2.05, 2.06, math.nan]
+    known = [pose is not None for pose in interpolate(trajectory, stamps)]
+    assert known == [False, True, True, True, False, False, True, True, False, False]
+    wide = interpolate(trajectory, stamps, longest_gap=1.0)
+    assert [pose is not None for pose in wide] == [False, *[True] * 7, False, False]
+    assert interpolate(trajectory, []) == []
+
+
+def test_trajectory_files(tmp_path: Path) -> None:
+    path = tmp_path / "groundtruth.txt"
+    path.write_text("# a\n\n2.5 4 5 6 0 0 0.7071 0.7071\n1.5 1 2 3 0 0 0 1\n1.5 9 9 9 0 0 0 1\n")
+    trajectory = read_trajectory(path)
+    assert trajectory.stamps.tolist() == [1.5, 2.5]
+    assert trajectory.positions.tolist() == [[1, 2, 3], [4, 5, 6]]
+    np.testing.assert_allclose(trajectory.quaternions, [[0, 0, 0, 1], [0, 0, HALF, HALF]])
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 2 3", "line 2: .*3 words"),
+        ("1 2 3 4 0 0 0 x", "line 2: .*no number"),
+        ("nan 2 3 4 0 0 0 1", "line 2: .*not finite"),
+        ("1 inf 3 4 0 0 0 1", "line 2: .*not finite"),
+        ("1 2 3 4 0 0 0 0", "line 2: .*unit length"),
+        ("1 2 3 4 1e200 0 0 1e200", "line 2: .*unit length"),
+        ("# only comments", "holds no pose"),
+    ],
+)
+def test_bad_trajectories(line: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "groundtruth.txt"
+    good = "" if line.startswith("#") else "2 1 2 3 0 0 0 1\n"
+    path.write_text(f"# comment\n{line}\n{good}")
+    with pytest.raises(InvalidPose, match=r"groundtruth\.txt.*" + message):
+        read_trajectory(path)

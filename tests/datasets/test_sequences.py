@@ -1,0 +1,191 @@
+"""Folders made by the writers are found again; folders that are wrong say so."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sceneprint.datasets import (
+    Camera,
+    Layout,
+    find_sequences,
+    sequences,
+    write_depth_png,
+    write_intrinsics,
+    write_pose,
+)
+from sceneprint.errors import DatasetError, InvalidPose, UnreadableFrame
+from sceneprint.types import Intrinsics
+
+CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)
+DEPTH = np.arange(12, dtype=np.float32).reshape(3, 4) / 8
+
+
+def pose_at(x: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+def seven_scenes(folder: Path, frames: int = 2) -> Path:
+    folder.mkdir(parents=True)
+    for i in range(frames):
+        write_depth_png(folder / f"frame-{i:06d}.depth.png", DEPTH + np.float32(i), 1000.0)
+        write_pose(folder / f"frame-{i:06d}.pose.txt", pose_at(i))
+        (folder / f"frame-{i:06d}.color.png").write_bytes(b"colour")
+    return folder
+
+
+@pytest.fixture
+def kitchen(tmp_path: Path) -> Path:
+    scene = tmp_path / "kitchen"
+    for number in (1, 2, 10):
+        seven_scenes(scene / f"seq-{number:02d}")
+    (scene / "TrainSplit.txt").write_text("sequence1\r\nsequence 10\r\n")
+    (scene / "TestSplit.txt").write_text("sequence2\n")
+    (scene / "kitchen.png").write_bytes(b"a picture of the scene")
+    write_intrinsics(scene, CAMERA)
+    return scene
+
+
+def test_a_scene(kitchen: Path) -> None:
+    found = find_sequences(kitchen)
+    assert [s.name for s in found] == ["seq-01", "seq-02", "seq-10"]
+    assert [s.split for s in found] == ["train", "test", "train"]
+    assert {s.layout for s in found} == {Layout.SEVEN_SCENES}
+    assert {s.parent_frame for s in found} == {"kitchen"}
+    assert found[1].folder == kitchen / "seq-02"
+    assert [f.name for f in found[1].frames] == ["seq-02/frame-000000", "seq-02/frame-000001"]
+    frame = found[1].frames[1].read()
+    np.testing.assert_array_equal(frame.depth, DEPTH + 1)
+    np.testing.assert_array_equal(frame.pose, pose_at(1))
+    assert frame.name == "seq-02/frame-000001"
+    assert found[1].frames[1].timestamp is None
+
+
+def test_a_folder_of_scenes(kitchen: Path) -> None:
+    root = kitchen.parent
+    write_intrinsics(seven_scenes(root / "desk"), CAMERA)
+    (root / "empty/rgb").mkdir(parents=True)
+    (root / "empty/rgb/1.png").write_bytes(b"colour")
+    (root / "readme.txt").write_text("hello")
+    names = ["desk", "kitchen/seq-01", "kitchen/seq-02", "kitchen/seq-10"]
+    assert [s.name for s in find_sequences(root)] == names
+    assert [s.parent_frame for s in find_sequences(root)] == ["desk", *["kitchen"] * 3]
+    assert find_sequences(root)[2].frames[0].name == "kitchen/seq-02/frame-000000"
+
+
+def test_one_sequence_of_a_scene(kitchen: Path, monkeypatch) -> None:
+    monkeypatch.chdir(kitchen / "seq-02")
+    for path in (kitchen / "seq-02", Path(), Path("../seq-02")):
+        (sequence,) = find_sequences(path)
+        assert (sequence.name, sequence.parent_frame, sequence.split) == (
+            "seq-02", "kitchen", "test",
+        )  # fmt: skip
+
+
+def test_frames_in_the_folder_of_the_scene(tmp_path: Path) -> None:
+    folder = seven_scenes(tmp_path / "studyroom")
+    write_intrinsics(folder, CAMERA)
+    (sequence,) = find_sequences(folder)
+    assert (sequence.name, sequence.parent_frame, sequence.split) == (
+        "studyroom", "studyroom", None,
+    )  # fmt: skip
+
+
+def test_a_pose_is_read_when_asked_for(kitchen: Path) -> None:
+    (kitchen / "seq-01/frame-000000.pose.txt").unlink()
+    (kitchen / "seq-01/frame-000001.pose.txt").write_text("nan " * 16)
+    first, second = find_sequences(kitchen / "seq-01")[0].frames
+    assert first.pose is None
+    assert first.read().pose is None
+    for read in (second.read, lambda: second.pose):
+        with pytest.raises(InvalidPose, match=r"frame-000001\.pose\.txt: .*not finite"):
+            read()
+
+
+def test_a_single_file(kitchen: Path) -> None:
+    (sequence,) = find_sequences(kitchen / "seq-02/frame-000001.depth.png")
+    assert (sequence.name, sequence.parent_frame, sequence.split) == ("seq-02", "kitchen", "test")
+    (reference,) = sequence.frames
+    assert reference.name == "seq-02/frame-000001"
+    np.testing.assert_array_equal(reference.read().pose, pose_at(1))
+
+    np.save(kitchen / "rgbd.npy", DEPTH)
+    (sequence,) = find_sequences(kitchen / "rgbd.npy")
+    assert (sequence.layout, sequence.frames[0].name) == (Layout.PLAIN, "kitchen/rgbd")
+    np.testing.assert_array_equal(sequence.frames[0].read().depth, DEPTH)
+    (sequence,) = find_sequences(kitchen / "TrainSplit.txt")
+    with pytest.raises(UnreadableFrame, match=r"TrainSplit\.txt: .*neither PNG nor NPY"):
+        sequence.frames[0].read()
+
+
+def test_nothing_there(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"absent: There is no such file or folder"):
+        find_sequences(tmp_path / "absent")
+    with pytest.raises(DatasetError, match=r"no depth image .*7-Scenes .*TUM .*NPY"):
+        find_sequences(tmp_path)
+
+
+def test_depth_without_a_camera(tmp_path: Path) -> None:
+    folder = seven_scenes(tmp_path / "a/b/c/d/e/room")
+    with pytest.raises(DatasetError, match=r"room: There is no intrinsics\.json"):
+        find_sequences(folder)
+
+
+def test_four_folders_down_and_no_further(tmp_path: Path) -> None:
+    write_intrinsics(tmp_path, CAMERA)
+    seven_scenes(tmp_path / "1/2/3/4")
+    seven_scenes(tmp_path / "1/2/3/x/5")
+    assert [s.name for s in find_sequences(tmp_path)] == ["1/2/3/4"]
+
+
+def test_symlinks_do_not_go_in_circles(kitchen: Path) -> None:
+    (kitchen / "again").symlink_to(kitchen, target_is_directory=True)
+    (kitchen / "self").symlink_to(kitchen / "self")
+    (kitchen / "seq-01/up").symlink_to(kitchen.parent, target_is_directory=True)
+    assert len(find_sequences(kitchen)) == 3
+    # but a data set on another disk is reached
+    shelf = kitchen.parent / "shelf"
+    shelf.mkdir()
+    (shelf / "room").symlink_to(kitchen, target_is_directory=True)
+    assert find_sequences(shelf)[0].name == "room/seq-01"
+
+
+@pytest.mark.parametrize(
+    ("train", "message"),
+    [
+        ("sequence1\nsequence2", "for training and for testing"),
+        ("sequence1\nfirst", "line 2: This names no sequence"),
+        ("sequence1\n\nsequence3", "line 3: There is no folder seq-03"),
+    ],
+)
+def test_bad_splits(train: str, message: str, kitchen: Path) -> None:
+    (kitchen / "TrainSplit.txt").write_text(train)
+    with pytest.raises(DatasetError, match=message):
+        find_sequences(kitchen)
+
+
+def test_two_scenes_of_one_name(kitchen: Path) -> None:
+    seven_scenes(kitchen.parent / "old/kitchen/seq-01")
+    write_intrinsics(kitchen.parent, CAMERA)
+    with pytest.raises(DatasetError, match=r"Another scene is called kitchen"):
+        find_sequences(kitchen.parent)
+
+
+def test_a_folder_that_may_not_be_read(kitchen: Path, monkeypatch) -> None:
+    def refuse(folder: Path) -> None:  # root, as in a container, may read every folder
+        raise PermissionError(13, "Permission denied", str(folder))
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    with pytest.raises(DatasetError, match=r"kitchen: .*cannot be read \(Permission denied\)"):
+        find_sequences(kitchen)
+
+
+def test_a_whole_disk_is_not_searched(tmp_path: Path, monkeypatch) -> None:
+    for i in range(7):
+        (tmp_path / str(i)).mkdir()
+    monkeypatch.setattr(sequences, "_MAXIMUM_FOLDERS", 5)
+    with pytest.raises(DatasetError, match="more than 5 folders"):
+        find_sequences(tmp_path)

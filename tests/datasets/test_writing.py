@@ -1,0 +1,73 @@
+"""What is written is read again, and a file is whole or not there."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sceneprint.datasets import decode_png, write_depth_png, write_pose
+from sceneprint.datasets import writing as module
+
+
+def test_depth_by_hand(tmp_path: Path) -> None:
+    depth = np.array(
+        [[0, 1, 0.0004, 0.0006], [65.534, 65.5346, 66, 1e30], [np.nan, np.inf, -1, 2.5]], np.float32
+    )
+    write_depth_png(tmp_path / "a.png", depth, 1000.0)
+    expected = [[0, 1000, 0, 1], [65534, 0, 0, 0], [0, 0, 0, 2500]]
+    assert decode_png((tmp_path / "a.png").read_bytes()).tolist() == expected
+    with Image.open(tmp_path / "a.png") as image:  # and by others
+        assert np.asarray(image).tolist() == expected
+    write_depth_png(tmp_path / "a.png", depth, 5000.0)
+    assert decode_png((tmp_path / "a.png").read_bytes())[2, 3] == 12500
+
+
+def test_depth_round_trip_is_within_half_a_unit(tmp_path: Path) -> None:
+    depth = np.random.default_rng(3).uniform(0.3, 8.0, (48, 64)).astype(np.float32)
+    write_depth_png(tmp_path / "a.png", depth, 1000.0)
+    read = decode_png((tmp_path / "a.png").read_bytes()) / 1000
+    assert np.abs(read - depth).max() <= 0.0005 + 1e-6
+
+
+def test_a_killed_writer_leaves_the_old_file(tmp_path: Path, monkeypatch) -> None:
+    write_pose(tmp_path / "a.txt", np.eye(4))
+    before = (tmp_path / "a.txt").read_bytes()
+
+    def killed(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    moved = np.eye(4)
+    moved[0, 3] = 1.0
+    with monkeypatch.context() as patch:
+        patch.setattr(module.os, "replace", killed)
+        with pytest.raises(KeyboardInterrupt):
+            write_pose(tmp_path / "a.txt", moved)
+        with pytest.raises(KeyboardInterrupt):
+            write_depth_png(tmp_path / "b.png", np.ones((2, 2), np.float32), 1000.0)
+    assert (tmp_path / "a.txt").read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["a.txt"]
+    write_pose(tmp_path / "a.txt", moved)
+    assert (tmp_path / "a.txt").read_text().split()[3] == "1"
+
+
+def test_others_may_read_what_is_written(tmp_path: Path) -> None:
+    mask = os.umask(0o022)
+    try:
+        write_pose(tmp_path / "a.txt", np.eye(4))
+    finally:
+        os.umask(mask)
+    assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
+def test_bad_scale(scale: float, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="depth_scale"):
+        write_depth_png(tmp_path / "a.png", np.ones((2, 2), np.float32), scale)
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 2, 1), (0, 3)])
+def test_bad_shape(shape: tuple[int, ...], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not \\(H, W\\)"):
+        write_depth_png(tmp_path / "a.png", np.ones(shape, np.float32), 1000.0)

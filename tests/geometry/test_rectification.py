@@ -1,0 +1,224 @@
+"""Undistortion and range to z, against a point-by-point oracle and known planes."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+
+from sceneprint.geometry import rectification
+from sceneprint.geometry.rectification import ray_to_axis, undistort
+from sceneprint.types import Intrinsics
+
+LENS = (-0.28, 0.09, 0.0015, -0.0022, -0.012)  # every term of the model is at work
+CAMERA = Intrinsics(64, 48, 50.0, 52.0, 30.5, 24.25, LENS)
+
+
+def seen(x: float, y: float, k: tuple[float, ...]) -> tuple[float, float]:
+    """OpenCV's formula, written a second time from its documentation."""
+    k1, k2, p1, p2, k3 = (*k, 0.0)[:5]
+    r = math.hypot(x, y)
+    radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
+        y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
+    )
+
+
+def true_ray(u: float, v: float, c: Intrinsics) -> tuple[float, float]:
+    """Direction whose picture is (u, v), by a general solver."""
+    target = ((u - c.cx) / c.fx, (v - c.cy) / c.fy)
+    solution = least_squares(
+        lambda q: np.subtract(seen(q[0], q[1], c.distortion), target), target, xtol=1e-14
+    )
+    return float(solution.x[0]), float(solution.x[1])
+
+
+def test_undistort_by_hand() -> None:
+    # x = (u - 2) / 2; k1 = 1: x = 1/2 is seen at 1/2 (1 + 1/4) = 0.625, u = 3.25 -> 3;
+    # x = 1 is seen at 2, u = 6, outside
+    camera = Intrinsics(5, 1, 2.0, 2.0, 2.0, 0.0, (1.0, 0.0, 0.0, 0.0))
+    depth = np.array([[1, 2, 3, 4, 5]], np.float32)
+    assert undistort(depth, camera).tolist() == [[0, 2, 3, 4, 0]]
+    # k1 = -0.4: x = 1 is seen at 0.6, u = 3.2 -> 3, but 1 + 3 k1 x^2 < 0: folded
+    camera = Intrinsics(5, 1, 2.0, 2.0, 2.0, 0.0, (-0.4, 0.0, 0.0, 0.0))
+    assert undistort(depth, camera).tolist() == [[0, 2, 3, 4, 0]]
+
+
+def test_tangential_order_by_hand() -> None:
+    # at x = 1/2, y = 0: p1 = 0.8 moves y to p1 / 4 = 0.2, p2 = 0.4 moves x to 1/2 + 3/4 p2 = 0.8
+    depth = np.arange(1, 82, dtype=np.float32).reshape(9, 9)
+    for k, column, row in (((0, 0, 0.8, 0), 6, 4.8), ((0, 0, 0, 0.4), 7.2, 4)):
+        camera = Intrinsics(9, 9, 4.0, 4.0, 4.0, 4.0, tuple(float(c) for c in k))
+        assert undistort(depth, camera)[4, 6] == depth[round(row), round(column)]
+
+
+def test_undistort_equals_the_loop() -> None:
+    numbers = np.arange(1, CAMERA.width * CAMERA.height + 1, dtype=np.float32)
+    image = numbers.reshape(CAMERA.height, CAMERA.width)
+    expected = np.zeros_like(image)
+    for v in range(CAMERA.height):
+        for u in range(CAMERA.width):
+            x, y = seen((u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, LENS)
+            column = math.floor(x * CAMERA.fx + CAMERA.cx + 0.5)
+            row = math.floor(y * CAMERA.fy + CAMERA.cy + 0.5)
+            if 0 <= column < CAMERA.width and 0 <= row < CAMERA.height:
+                expected[v, u] = image[row, column]
+    result = undistort(image, CAMERA)
+    np.testing.assert_array_equal(result, expected)
+    assert (result > 0).mean() > 0.8
+
+
+def test_a_plane_seen_through_a_lens_comes_back() -> None:
+    """n . p = 2 is filmed as ranges through the lens; z must be right at each pixel."""
+    normal, offset = np.array([0.3, -0.2, 0.933]), 2.0
+    ranges = np.zeros((CAMERA.height, CAMERA.width), np.float32)
+    z_taken = np.zeros_like(ranges)
+    for v in range(CAMERA.height):
+        for u in range(CAMERA.width):
+            ray = np.array([*true_ray(u, v, CAMERA), 1.0])
+            z_taken[v, u] = offset / (normal @ ray)
+            ranges[v, u] = z_taken[v, u] * np.linalg.norm(ray)
+    z = ray_to_axis(ranges, CAMERA)
+    np.testing.assert_allclose(z, z_taken, rtol=2e-6)
+
+    flat = undistort(z, CAMERA)
+    v, u = np.indices(flat.shape)
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)])
+    expected = offset / np.tensordot(normal, rays, axes=1)
+    known = flat > 0
+    # nearest sampling is off by half a pixel; the plane changes by so much over one
+    change = np.hypot(*np.gradient(expected))
+    assert known.mean() > 0.8
+    assert (np.abs(flat - expected)[known] <= 1.1 * change[known]).all()
+    # and forgetting the lens would not have passed
+    assert (np.abs(z - expected) > 1.1 * change).mean() > 0.3
+
+
+def test_edges_are_not_mixed() -> None:
+    image = np.where(np.indices((48, 64))[1] < 30, 1.0, 5.0).astype(np.float32)
+    assert set(np.unique(undistort(image, CAMERA))) <= {0.0, 1.0, 5.0}
+
+
+def test_ray_to_axis_by_hand() -> None:
+    # directions (-3/4, 0, 1), (0, 0, 1), (3/4, 0, 1) have lengths 5/4, 1, 5/4
+    camera = Intrinsics(3, 1, 4.0, 4.0, 1.0, 0.0)
+    wide = Intrinsics(3, 1, 4.0 / 3.0, 4.0, 1.0, 0.0)
+    np.testing.assert_allclose(
+        ray_to_axis(np.array([[5.0, 5.0, 0.0]], np.float32), wide), [[4.0, 5.0, 0.0]], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        ray_to_axis(np.full((1, 3), 17**0.5, np.float32), camera), [[4, 17**0.5, 4]], rtol=1e-6
+    )
+
+
+def test_no_distortion_changes_nothing() -> None:
+    image = np.arange(12, dtype=np.float32).reshape(3, 4)
+    for k in ((), (0.0,) * 4, (0.0,) * 5):
+        result = undistort(image, Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.0, k))
+        np.testing.assert_array_equal(result, image)
+        result[:] = 9.0  # a copy: the input is the caller's
+    assert image.max() == 11.0
+
+
+@pytest.mark.parametrize(
+    "k",
+    [(-0.8, 0, 0, 0), (-3.0, 0, 0, 0), (-1.0, 0.3, 0, 0), (0, 0, 0.4, -0.3), (-0.5, 0, 0.1, 0.1)],
+)
+def test_a_fold_leaves_no_ghosts(k: tuple[float, ...]) -> None:
+    """Each sample lands on one patch of pixels, never again on the far side of a fold."""
+    camera = Intrinsics(80, 60, 30.0, 30.0, 39.5, 29.5, tuple(float(c) for c in k))
+    image = np.arange(1, 80 * 60 + 1, dtype=np.float32).reshape(60, 80)
+    result = undistort(image, camera)
+    assert (result > 0).sum() > 50  # the centre is always seen
+    v, u = np.nonzero(result)
+    row, column = np.divmod(result[v, u].astype(int) - 1, 80)
+    # inverse of a one-to-one lens: going right in the image never goes left in the picture
+    across = (np.diff(u) == 1) & (np.diff(v) == 0)
+    if not any(k[2:]):
+        assert (np.diff(column)[across] >= 0).all()
+        assert (np.sign(u - 39.5) * (column - 39.5) >= -0.5).all()  # no flip through the centre
+        assert (np.sign(v - 29.5) * (row - 29.5) >= -0.5).all()
+    # pixels that share a sample touch one another, up to where the lens stops growing
+    for sample in np.unique(result[result > 0]):
+        rows, columns = np.nonzero(result == sample)
+        assert np.ptp(rows) <= len(rows)
+        assert np.ptp(columns) <= len(columns)
+
+
+@pytest.mark.parametrize("k1", [-0.8, -3.0])
+def test_a_fold_has_rays_only_before_it(k1: float) -> None:
+    """The picture of r ends at r = 1/sqrt(-3 k1), at 2/3 of it; beyond there is no ray."""
+    camera = Intrinsics(81, 61, 60.0, 60.0, 40.0, 30.0, (k1, 0.0, 0.0, 0.0))
+    z = ray_to_axis(np.ones((61, 81), np.float32), camera)
+    v, u = np.indices(z.shape)
+    r_seen = np.hypot(u - 40.0, v - 30.0) / 60.0
+    fold = 1.0 / math.sqrt(-3.0 * k1)
+    assert (z[r_seen > 2 / 3 * fold] == 0).all()
+    inner = r_seen < 0.98 * 2 / 3 * fold
+    assert inner.sum() > 50
+    # cosine of the true ray: root of k1 r^3 + r = r_seen below the fold
+    for rs, got in zip(r_seen[inner][::7], z[inner][::7], strict=True):
+        roots = np.roots([k1, 0.0, 1.0, -rs])
+        r = min(q.real for q in roots if abs(q.imag) < 1e-9 and q.real > -1e-9)
+        assert got == pytest.approx(1.0 / math.hypot(1.0, r), rel=1e-5)
+
+
+def test_nothing_is_taken_behind_a_narrow_fold() -> None:
+    """Growth (1 - r^2 / a)(1 - r^2 / b) is negative for 0.51 < r < 0.53 and positive beyond."""
+    a, b = 0.51**2, 0.53**2
+    k1, k2 = -(1 / a + 1 / b) / 3, 1 / (a * b) / 5
+    camera = Intrinsics(201, 3, 100.0, 100.0, 100.0, 1.0, (k1, k2, 0.0, 0.0))
+    result = undistort(np.ones((3, 201), np.float32), camera)
+    assert result[1, 100 - 50 : 100 + 51].all()
+    assert not result[:, : 100 - 51].any()
+    assert not result[:, 100 + 52 :].any()
+
+
+coefficient = st.one_of(
+    st.floats(-3, 3), st.floats(allow_nan=False, allow_infinity=False), st.just(0.0)
+)
+length = st.one_of(st.floats(1.0, 100.0), st.floats(min_value=1e-308, allow_infinity=False))
+centre = st.one_of(st.floats(-10, 20), st.floats(allow_nan=False, allow_infinity=False))
+
+
+@settings(max_examples=150, deadline=None)
+@given(length, length, centre, centre, st.lists(coefficient, min_size=5, max_size=5))
+def test_any_camera_gives_samples_or_nothing(
+    fx: float, fy: float, cx: float, cy: float, k: list[float]
+) -> None:
+    camera = Intrinsics(9, 7, fx, fy, cx, cy, tuple(k))
+    image = np.linspace(1, 5, 63, dtype=np.float32).reshape(7, 9)
+    z = ray_to_axis(image, camera)
+    assert np.isfinite(z).all()
+    assert ((z >= 0) & (z <= image)).all()
+    assert np.isin(undistort(image, camera), [0.0, *image.ravel()]).all()
+
+
+def test_blocks_fit_together() -> None:
+    """An image of more than one block: undistorted pixel by pixel as a shifted crop."""
+    camera = Intrinsics(1024, 600, 900.0, 900.0, 512.0, 300.0, (-0.2, 0.05, 0.001, 0.001))
+    image = np.arange(1, 1024 * 600 + 1, dtype=np.int64).reshape(600, 1024)
+    result = undistort((image % 65521).astype(np.float32), camera)
+    for v, u in ((0, 512), (255, 1023), (256, 0), (300, 512), (512, 100), (599, 700)):
+        x, y = seen((u - 512.0) / 900.0, (v - 300.0) / 900.0, camera.distortion)
+        row, column = math.floor(y * 900 + 300.5), math.floor(x * 900 + 512.5)
+        assert result[v, u] == image[row, column] % 65521
+
+
+def test_a_camera_is_prepared_once() -> None:
+    camera = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, LENS)
+    image = np.ones((480, 640), np.float32)
+    undistort(ray_to_axis(image, camera), camera)
+    before = rectification._sources.cache_info().misses, rectification._cosines.cache_info().misses
+    undistort(ray_to_axis(image, camera), camera)
+    after = rectification._sources.cache_info().misses, rectification._cosines.cache_info().misses
+    assert after == before
+
+
+@pytest.mark.parametrize("function", [undistort, ray_to_axis])
+def test_a_wrong_size_is_the_callers_mistake(function) -> None:
+    with pytest.raises(ValueError, match=r"shape \(48, 48\)"):
+        function(np.ones((48, 48), np.float32), CAMERA)
