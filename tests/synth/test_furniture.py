@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+
+from sceneprint.synth import clutter, seats, storage, tables
+from sceneprint.synth.fittings import curtain, radiator
+from sceneprint.synth.mesh import Mesh, area, face_normals, volume
+from sceneprint.synth.piece import Surface, scatter
+
+PIECES = [
+    tables.table, tables.round_table, tables.desk, seats.chair, seats.swivel_chair, seats.stool,
+    seats.sofa, seats.bed, storage.cupboard, storage.shelf, storage.kitchen_row, storage.fridge,
+    storage.counter, storage.floor_thing, storage.stairs,
+]  # fmt: skip
+THINGS = [builder for builder, _ in clutter.SMALL]
+
+
+def assert_solid(mesh: Mesh) -> None:
+    assert np.isfinite(mesh.vertices).all()
+    np.testing.assert_allclose(face_normals(mesh).sum(axis=0), 0, atol=1e-9)
+    assert volume(mesh) > 0
+
+
+@pytest.mark.parametrize("maker", PIECES)
+def test_a_piece_is_solid_and_stands_on_its_footprint(maker):
+    for seed in range(25):
+        piece = maker(np.random.default_rng(seed))
+        assert_solid(piece.mesh)
+        low, high = piece.mesh.vertices.min(axis=0), piece.mesh.vertices.max(axis=0)
+        assert -0.02 < low[2] < 0.12
+        assert high[2] < 2.8
+        assert (high - low)[0] < piece.width + 0.3
+        assert (high - low)[1] < piece.depth + 0.45
+        for s in piece.surfaces:
+            assert 0 < s.z <= high[2] + 0.1
+
+
+@pytest.mark.parametrize("builder", THINGS)
+def test_a_thing_is_solid_and_small(builder):
+    for seed in range(25):
+        mesh = builder(np.random.default_rng(seed))
+        assert_solid(mesh)
+        assert abs(mesh.vertices[:, 2].min()) < 0.15
+        assert np.ptp(mesh.vertices, axis=0).max() < 1.2
+
+
+def test_scattered_things_stay_on_their_surface():
+    surface = Surface(1.0, 2.0, 1.5, 0.8, 0.7, 0.5, 15)
+    mesh = scatter(surface, np.random.default_rng(1))
+    assert len(mesh.faces) > 100
+    assert mesh.vertices[:, 2].min() > 0.7 - 0.15
+    assert mesh.vertices[:, 2].max() <= 0.7 + 0.5
+    assert np.abs(mesh.vertices[:, 0] - 1.0).max() < 0.75 + 0.3
+    assert np.abs(mesh.vertices[:, 1] - 2.0).max() < 0.4 + 0.3
+
+
+def test_curtain_and_radiator_are_solid():
+    rng = np.random.default_rng(0)
+    assert_solid(curtain(1.0, 2.0, rng))
+    for _ in range(5):
+        assert_solid(radiator(1.0, 0.6, rng))
+    assert area(curtain(1.0, 2.0, rng)) > 2 * 1.0 * 2.0  # waves are longer than the line

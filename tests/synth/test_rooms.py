@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+
+from sceneprint.synth import corridor, make_room, symmetric_box
+from sceneprint.synth.layout import CELL, Floor, Place, inside
+from sceneprint.synth.mesh import area, face_normals, volume
+from sceneprint.synth.shell import Ceiling, Opening, Wall, ceiling, floor_plan, shell, walls_of
+
+L_PLAN = np.array([(0, 0), (4, 0), (4, 2), (2, 2), (2, 3), (0, 3)], float)
+
+
+def test_shell_encloses_the_room_and_its_recesses():
+    walls = walls_of(L_PLAN)
+    w = walls[0]
+    walls[0] = Wall(
+        w.corner, w.along, w.length, (Opening(1, 2, 0, 2, 0.2), Opening(2.5, 3, 0.5, 1, 0.4, 0.9))
+    )
+    mesh = shell(L_PLAN, walls, Ceiling(2.5, np.zeros(2)))
+    # normals face the room, so the volume is negative
+    assert volume(mesh) == pytest.approx(-(10 * 2.5 + 1 * 2 * 0.2 + 0.5 * 0.5 * 0.4))
+    np.testing.assert_allclose(face_normals(mesh).sum(axis=0), 0, atol=1e-12)
+    lost = mesh.loss > 0
+    assert np.linalg.norm(face_normals(mesh)[lost], axis=1).sum() / 2 == pytest.approx(0.5 * 0.5)
+
+
+def test_sloped_ceiling_closes_the_shell():
+    top = Ceiling(2.0, np.array([0.25, 0.0]))
+    outline = np.array([(0, 0), (4, 0), (4, 3), (0, 3)], float)
+    mesh = shell(outline, walls_of(outline), top)
+    assert volume(mesh) == pytest.approx(-4 * 3 * 2.5)
+    np.testing.assert_allclose(face_normals(mesh).sum(axis=0), 0, atol=1e-12)
+
+
+def test_plans_and_ceilings_keep_to_their_bounds():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        outline = floor_plan(rng)
+        x, y = outline.T
+        assert np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)) > 0  # counter-clockwise
+        assert 2.5 <= np.ptp(x) <= 8.0
+        assert 2.5 <= np.ptp(y) <= 8.2
+        assert 2.09 < ceiling(rng, outline).at(outline).min() < 3.2
+
+
+def test_inside_by_hand():
+    points = np.array([(1, 1), (3, 1), (3, 2.5), (1, 2.5), (-1, 1), (5, 1)], float)
+    assert inside(L_PLAN, points).tolist() == [True, True, False, True, False, False]
+
+
+def test_floor_is_claimed_once_and_only_inside():
+    floor = Floor(L_PLAN)
+    assert np.count_nonzero(floor.inside) * CELL**2 == pytest.approx(10.0)
+    assert floor.claim(Place(1, 1, 0.5), 0.8, 0.6)
+    assert np.count_nonzero(floor.claimed & floor.inside) * CELL**2 == pytest.approx(0.48, abs=0.05)
+    before = floor.claimed.copy()
+    assert not floor.claim(Place(1.3, 1, 0), 0.8, 0.6)
+    assert not floor.claim(Place(3.5, 2.5, 0), 0.4, 0.4)
+    np.testing.assert_array_equal(floor.claimed, before)
+    assert floor.claim(Place(1.5, 1, 0), 0.6, 0.6, overlap=0.6)
+
+
+def test_rooms_are_furnished():
+    for seed in range(8):
+        room = make_room(np.random.default_rng(seed))
+        assert room.vertices.dtype == np.float32
+        assert room.faces.dtype == np.int32
+        assert room.faces.max() < len(room.vertices)
+        assert len(room.mesh.loss) == len(room.faces) > 2000
+        bare = area(shell(room.outline, walls_of(room.outline), room.ceiling))
+        assert area(room.mesh) > 1.3 * bare
+        top = room.ceiling.at(room.mesh.vertices[:, :2])
+        assert (room.mesh.vertices[:, 2] < top + 0.01).all()
+
+
+def test_symmetric_box_is_the_same_after_a_quarter_turn():
+    mesh = symmetric_box().mesh
+    turned = mesh.moved(yaw=np.pi / 2)
+
+    def corners(v):
+        return sorted(map(tuple, (v.round(6) + 0.0).tolist()))
+
+    assert corners(turned.vertices) == corners(mesh.vertices)
+    assert volume(mesh) == pytest.approx(-12 * 12 * 4 + 0.6**3)
+
+
+def test_corridor_repeats_itself():
+    room = corridor(5)
+    np.testing.assert_allclose(room.size, (10.0, 1.8, 2.5))
+    assert volume(room.mesh) == pytest.approx(
+        -10 * 1.8 * 2.5 - 10 * 0.9 * 2.03 * 0.12 + 10 * 0.12 * 0.04 * 0.02
+    )
+    with pytest.raises(ValueError, match="0 doors"):
+        corridor(0)
