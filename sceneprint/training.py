@@ -42,7 +42,7 @@ class TrainingParameters:
     rooms: int = 100  #: synthetic rooms
     views: int = 6  #: frames taken in each
     seed: int = 0  #: of rooms, of the pairs drawn and of the fits
-    pairs: int = 120_000  #: properties that projection and mixture are fitted to
+    pairs: int = 240_000  #: properties that projection and mixture are fitted to
     projection: Literal["pca", "ica"] = "pca"
     clipped_share: float = 0.0005  #: of signature components, beyond the quantiser's range
 
@@ -99,6 +99,8 @@ def train(
     ------
     TrainingError : too little data, or frames of fewer than two places.
     """
+    from threadpoolctl import threadpool_limits
+
     tell = report or _silent
     n_frames = p.rooms * p.views + len(references)
     per_level = math.ceil(p.pairs / max(n_frames * model_p.hierarchy.n_levels, 1))
@@ -109,12 +111,13 @@ def train(
             "unrelated frames, needs two. Add --rooms, or frames of another place."
         )
     properties = np.concatenate([lesson.properties for lesson in lessons])
-    projection = fit_projection(properties, p.projection, p.seed)
-    features = project(properties, projection)
-    fit = fit_mixture(features, mixture_p, p.seed)
-    mixture = next(fit)
-    for step, mixture in enumerate(fit, 1):  # noqa: B007 -- the last one is kept
-        tell("mixture", step, mixture_p.iterations)
+    with threadpool_limits(1):  # sums in one order, whatever the number of processors
+        projection = fit_projection(properties, p.projection, p.seed)
+        features = project(properties, projection)
+        fit = fit_mixture(features, mixture_p, p.seed)
+        mixture = next(fit)
+        for step, mixture in enumerate(fit, 1):  # noqa: B007 -- the last one is kept
+            tell("mixture", step, mixture_p.iterations)
     seen = {
         "training": asdict(p),
         "mixture": asdict(mixture_p),

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from sceneprint import __version__
-from sceneprint.cli import picture, sign, synth, train
+from sceneprint.cli import demo, picture, sign, synth, train
 from sceneprint.errors import SceneprintError
 
 #: Exit code of a command that was asked for something it cannot do.
@@ -22,7 +22,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"sceneprint {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (sign, picture, synth, train):
+    for module in (demo, sign, picture, synth, train):
         module.add_to(commands)
     return top
 

@@ -26,7 +26,8 @@ class DepthParameters:
     same_surface: float = 0.03  #: samples within this share of the nearest are averaged
     focal_length_px: float = 146.0  #: the image is halved until f is nearest to this
     maximum_pixels: int = 160 * 120 * 4  #: and on, until the map is no larger than this
-    minimum_valid: int = 64  #: fewer valid pixels hold no geometry
+    minimum_valid: int = 64  #: fewer valid pixels of the map hold no geometry
+    minimum_side: int = 8  #: an image with fewer rows or columns shows no surface, pixels
 
 
 @kernel
@@ -104,12 +105,18 @@ def inverse_depth(frame: Frame, p: DepthParameters) -> tuple[Floats32, Intrinsic
 
     Raises
     ------
-    UselessFrame : fewer than `minimum_valid` pixels lie within the range.
+    UselessFrame : fewer than `minimum_valid` pixels lie within the range, or the image has
+        fewer than `minimum_side` rows or columns.
     ValueError : the depth is not (H, W) as the intrinsics say.
     """
     camera = frame.intrinsics
     if frame.depth.shape != (camera.height, camera.width):
         raise ValueError(f"depth {frame.depth.shape} is not {camera.height, camera.width}")
+    if min(frame.depth.shape) < p.minimum_side:
+        raise UselessFrame(
+            f"{frame.name or 'The frame'}: {camera.width} x {camera.height} samples show no "
+            f"surface. Send an image of at least {p.minimum_side} rows and columns."
+        )
     q = _in_range(np.ascontiguousarray(frame.depth, np.float32), p.minimum_depth, p.maximum_depth)
     for _ in range(halvings(camera, p)):
         q, camera = _halve(q, p.same_surface), halved(camera)
@@ -124,8 +131,15 @@ def _why_useless(frame: Frame, p: DepthParameters) -> str:
     name = f"{frame.name}: " if frame.name else ""
     if not given.size:
         return f"{name}every depth sample is missing. Check the sensor, or send another frame."
+    within = (given >= p.minimum_depth) & (given <= p.maximum_depth)
+    counted = f"{within.sum()} of its {given.size} valid depth samples lie within"
+    span = f"the model's range of {p.minimum_depth:g} to {p.maximum_depth:g} m"
+    if within.mean() > 0.5:
+        return (
+            f"{name}only {counted} {span}, too few for a surface. "
+            "Send a frame that sees more of the scene."
+        )
     return (
-        f"{name}too few depth samples lie within the model's range of {p.minimum_depth:g} to "
-        f"{p.maximum_depth:g} m: the {given.size} given have a median of {np.median(given):.3g} m. "
+        f"{name}{counted} {span}; their median is {np.median(given):.3g} m. "
         "Check the depth scale (stored units per metre), or use a model made for this range."
     )

@@ -12,11 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.mixture import Mixture, moments
-from sceneprint.geometry.table import PairTable
-from sceneprint.types import Bytes, Floats, Ints32
+from sceneprint.geometry.projection import DIMENSION
+from sceneprint.geometry.table import LEADING, PairTable
+from sceneprint.types import Bytes, Floats, Floats32, Ints32
 
 #: Added to a quantised component: 0 is stored in the middle of the byte.
 ZERO = 128
@@ -41,27 +43,30 @@ class Statistics:
 
 @kernel
 def _accumulate(
-    counts: Ints32, features: np.ndarray, components: np.ndarray, shares: np.ndarray, sums: Floats
+    counts: Ints32,
+    features: Floats32,
+    components: NDArray[np.int16],
+    shares: Floats32,
+    sums: Floats,
 ) -> None:
-    """sums (G, 25): zeroth, first (12), second (12)."""
-    dimension = features.shape[1]
-    moments = np.empty(2 * dimension)
+    """sums (G, 32): first 12, second 12, zeroth in the 25th; the rest fills a cache line."""
+    moments = np.empty(2 * DIMENSION)
     for b in range(len(counts)):
         if counts[b] == 0:
             continue
-        for d in range(dimension):
-            f = float(features[b, d])
-            moments[d] = f
-            moments[dimension + d] = f * f
-        for k in range(components.shape[1]):
+        feature = features[b]
+        for d in range(DIMENSION):
+            moments[d] = feature[d]
+            moments[DIMENSION + d] = moments[d] * moments[d]
+        for k in range(LEADING):
             share = float(shares[b, k])
-            if share < 1e-4:
+            if share == 0.0:
                 break
             weight = counts[b] * share
             row = sums[components[b, k]]
-            row[0] += weight
-            for d in range(2 * dimension):
-                row[1 + d] += weight * moments[d]
+            for d in range(2 * DIMENSION):
+                row[d] += weight * moments[d]
+            row[2 * DIMENSION] += weight
 
 
 def statistics_of_counts(
@@ -76,10 +81,10 @@ def statistics_of_counts(
     table : of the model
     n_components : G
     """
-    dimension = table.features.shape[1]
-    sums = np.zeros((n_components, 1 + 2 * dimension))
+    sums = np.zeros((n_components, 32))
     _accumulate(counts, table.features, table.components, table.posteriors, sums)
-    return Statistics(sums[:, 0], sums[:, 1 : 1 + dimension], sums[:, 1 + dimension :], n_pairs)
+    d = DIMENSION
+    return Statistics(sums[:, 2 * d], sums[:, :d], sums[:, d : 2 * d], n_pairs)
 
 
 def statistics_of_features(features: Floats, mixture: Mixture) -> Statistics:

@@ -22,47 +22,51 @@ class HierarchyParameters:
     """The numbers of the hierarchy."""
 
     n_levels: int = 4  #: H
-    factor: float = 2.0  #: each level has fewer patches by this factor
+    factor: float = 2.0**0.5  #: each level has fewer patches by this factor
     iterations: int = 4  #: of K-Means
     normal_weight: float = 3.0  #: of 1 - cos(normals), beside squared patch diameters
 
 
 @kernel
-def _distance(patches: Floats, k: int, centre: Floats, scale: float, weight: float) -> float:
-    dx = patches[k, 0] - centre[0]
-    dy = patches[k, 1] - centre[1]
-    dz = patches[k, 2] - centre[2]
-    cosine = patches[k, 3] * centre[3] + patches[k, 4] * centre[4] + patches[k, 5] * centre[5]
-    return float((dx * dx + dy * dy + dz * dz) * scale + weight * (1.0 - cosine))
+def _nearer(
+    patches: Floats, centre: Floats, scale: float, weight: float, c: int,
+    distance: Floats, nearest: Floats, labels: Ints32,
+) -> None:  # fmt: skip
+    """Move to cluster `c` all patches that are nearer to its centre than to their own."""
+    x, y, z, nx, ny, nz = (
+        patches[0], patches[1], patches[2], patches[3], patches[4], patches[5]
+    )  # fmt: skip
+    for k in range(len(labels)):
+        dx, dy, dz = x[k] - centre[0], y[k] - centre[1], z[k] - centre[2]
+        cosine = nx[k] * centre[3] + ny[k] * centre[4] + nz[k] * centre[5]
+        distance[k] = (dx * dx + dy * dy + dz * dz) * scale + weight * (1.0 - cosine)
+    for k in range(len(labels)):
+        labels[k] = c if distance[k] < nearest[k] else labels[k]
+    for k in range(len(labels)):
+        nearest[k] = min(distance[k], nearest[k])
 
 
 @kernel
 def _k_means(
     patches: Floats, areas: Floats, n_clusters: int, scale: float, weight: float, iterations: int
 ) -> Ints32:
-    """Labels of (P, 6) positions and normals; clusters that end empty are numbered still."""
-    n = len(patches)
+    """Labels of (6, P) positions and normals; clusters that end empty are numbered still."""
+    n = patches.shape[1]
     centres = np.empty((n_clusters, 6))
-    nearest = np.full(n, np.inf)
+    distance, nearest = np.empty(n), np.full(n, np.inf)
     labels = np.zeros(n, np.int32)
     chosen = int(np.argmax(areas))
     for c in range(n_clusters):  # farthest-point sampling
-        centres[c] = patches[chosen]
-        farthest = -1.0
-        for k in range(n):
-            d = _distance(patches, k, centres[c], scale, weight)
-            if d < nearest[k]:
-                nearest[k] = d
-                labels[k] = c
-            if nearest[k] > farthest:
-                farthest = nearest[k]
-                chosen = k
+        centres[c] = patches[:, chosen]
+        _nearer(patches, centres[c], scale, weight, c, distance, nearest, labels)
+        chosen = int(np.argmax(nearest))
     for _ in range(iterations):
         sums = np.zeros((n_clusters, 7))
         for k in range(n):
             for d in range(6):
-                sums[labels[k], d] += areas[k] * patches[k, d]
+                sums[labels[k], d] += areas[k] * patches[d, k]
             sums[labels[k], 6] += areas[k]
+        nearest[:] = np.inf
         for c in range(n_clusters):
             if sums[c, 6] > 0:
                 length = np.sqrt(sums[c, 3] ** 2 + sums[c, 4] ** 2 + sums[c, 5] ** 2)
@@ -70,20 +74,14 @@ def _k_means(
                     centres[c, d] = sums[c, d] / sums[c, 6]
                     if length > 1e-9:
                         centres[c, 3 + d] = sums[c, 3 + d] / length
-        for k in range(n):
-            best = np.inf
-            for c in range(n_clusters):
-                distance = _distance(patches, k, centres[c], scale, weight)
-                if distance < best:
-                    best = distance
-                    labels[k] = c
+            _nearer(patches, centres[c], scale, weight, c, distance, nearest, labels)
     return labels
 
 
 def _coarser(patches: Patches, n_clusters: int, p: HierarchyParameters) -> Ints32:
     """Index of each patch's parent among at most `n_clusters`, numbered without gaps."""
     scale = n_clusters / float(patches.areas.sum())
-    joined = np.concatenate([patches.means, patches.normals], axis=1)
+    joined = np.ascontiguousarray(np.concatenate([patches.means, patches.normals], axis=1).T)
     labels = _k_means(joined, patches.areas, n_clusters, scale, p.normal_weight, p.iterations)
     _, parents = np.unique(labels, return_inverse=True)
     numbered: Ints32 = parents.astype(np.int32)

@@ -3,7 +3,9 @@
 `nogil` lets threads of the service run kernels side by side. `cache` compiles once per
 installation. Never `parallel` (a forked child dies in OpenMP), and never `fastmath`: the
 compiler may then neither reorder sums nor fuse products, so that one frame gives the same
-bytes on every processor.
+bytes on every processor. Division follows IEEE, as numpy's does: a check before each would
+keep the compiler from working on eight or sixteen numbers at once, so kernels guard their
+divisors themselves. For the same reason inner loops write one array each.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ R = TypeVar("R")
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a loop over arrays to machine code on its first call; cached on disk."""
-    return cast(Callable[P, R], numba.njit(nogil=True, cache=True)(function))
+    return cast(Callable[P, R], numba.njit(nogil=True, cache=True, error_model="numpy")(function))
 
 
 def cached_at(function: Any) -> tuple[str, str]:

@@ -38,8 +38,8 @@ class MixtureParameters:
     """The numbers of the fit."""
 
     n_components: int = 1250  #: G
-    iterations: int = 10  #: of expectation maximisation
-    variance_floor: float = 1e-3  #: added to every variance; the features' own are 1
+    iterations: int = 8  #: of expectation maximisation
+    variance_floor: float = 0.02  #: added to every variance; the features' own are 1
     prior_variance: float = 0.02  #: towards which components with few samples are drawn
     prior_count: float = 5.0  #: as strongly as so many samples would
     minimum_weight: float = 1e-6  #: below which no p_g falls

@@ -144,7 +144,8 @@ def _lift(
             normals[y, x, 0] = -alpha / length
             normals[y, x, 1] = -beta / length
             normals[y, x, 2] = -gamma / length
-            areas[y, x] = z * z * ray / (fx * fy * cosine)
+            # solid angle 1 / (fx fy ray^3), times squared range (z ray)^2, over the cosine
+            areas[y, x] = z * z / (fx * fy * ray * cosine)
             valid[y, x] = True
 
 

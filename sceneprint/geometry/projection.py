@@ -44,7 +44,9 @@ def project(properties: Floats, projection: Projection) -> Floats:
     -------
     features : (M, 12), of unit variance and uncorrelated over the training pairs
     """
-    return (properties - projection.mean) @ projection.matrix.T
+    # not `@`: BLAS sums in an order that depends on its threads, and tables are compared by byte
+    features: Floats = np.einsum("md,fd->mf", properties - projection.mean, projection.matrix)
+    return features
 
 
 def fit_projection(
@@ -84,6 +86,11 @@ def fit_projection(
 
         pca = PCA(n_components=DIMENSION, whiten=True, svd_solver="covariance_eigh")
         pca.fit(standardised)
+        if pca.explained_variance_[-1] < 1e-9:
+            raise TrainingError(
+                "The properties of the training pairs depend on each other, so that twelve "
+                "directions cannot be told apart. Train on more frames of furnished rooms."
+            )
         components = pca.components_ / np.sqrt(pca.explained_variance_)[:, None]
     else:
         from sklearn.decomposition import FastICA

@@ -23,7 +23,7 @@ from sceneprint.types import Floats32, Ints32, Patches, Surface
 class SegmentationParameters:
     """The numbers of the finest segmentation."""
 
-    n_patches: int = 500  #: grid seeds of a full image
+    n_patches: int = 1000  #: grid seeds of a full image
     iterations: int = 5  #: rounds of assignment and update
     normal_weight: float = 6.0  #: of 1 - cos(normals), beside squared seed spacings
     minimum_size: float = 0.15  #: patches below this share of a grid cell are dropped
@@ -100,8 +100,8 @@ def _centres(sums: NDArray[np.float64], spacing: float, focal_length: float) -> 
 def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
     """Assign every valid pixel to a patch.
 
-    Patches smaller than both limits of the parameters are dropped (their pixels get -1):
-    their normals would be noise, and at an image's worth of 500 patches they hold under
+    Patches below either limit of the parameters are dropped (their pixels get -1):
+    their normals would be noise, and in an image of a thousand patches they hold under
     one per cent of the surface.
 
     Parameters

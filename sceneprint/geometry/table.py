@@ -22,20 +22,24 @@ from sceneprint.geometry.projection import Projection, project
 from sceneprint.geometry.properties import PropertyParameters, properties
 from sceneprint.types import Floats, Floats32, Ints32
 
-LEADING = 8  #: posteriors kept per bin; the rest of a bin's mass is below 1e-3
+LEADING = 8  #: posteriors kept per bin
+LEAST = 1e-3  #: and of these, those that are no smaller; what is kept sums to 1
 
 
 @dataclass(frozen=True)
 class TableLayout:
     """The grid over the four invariants of a pair.
 
-    The angular bins are centred on 0, 90 and 180 degrees: buildings are full of right
-    angles, and a right angle must not fall on the edge between two bins.
+    Angular bins are centred on right angles (and the dihedral ones on 0 and 180 degrees):
+    buildings are full of these, and they must not fall on the edge between two bins. With 27
+    of them the
+    tolerance of 10 degrees in Eq. (1) is an edge, so that no bin straddles the jump of the
+    robust sign; a third of the bins then serve as well as a finer grid without that.
     """
 
-    distance_bins: int = 36
-    angle_bins: int = 25  #: of each normal's angle to r; odd, so that one is centred on 90
-    dihedral_bins: int = 36  #: a multiple of 4, offset by half a bin
+    distance_bins: int = 20
+    angle_bins: int = 27  #: of each normal's angle to r; odd, so that one is centred on 90
+    dihedral_bins: int = 20  #: a multiple of 4, offset by half a bin
     distance_exponent: float = 1.3  #: distance edges are radius * (i / bins)^exponent
 
     @property
@@ -52,7 +56,7 @@ class PairTable:
     ----------
     features : (B, 12) float32, f of the bin's centre
     components : (B, 8) int16, mixture components by falling posterior
-    posteriors : (B, 8) float32, of sum 1
+    posteriors : (B, 8) float32, falling, of sum 1; 0 from the first below 1e-3 on
     """
 
     features: Floats32
@@ -88,83 +92,147 @@ def bin_edges(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Float
     Returns
     -------
     distance : (distance_bins,) metres
-    angle : (angle_bins,) minus the cosine of the angle, rising from -1 to 1
+    angle : (angle_bins,) minus the cosine of the angle, rising from -1; the last is infinite
     dihedral : (dihedral_bins + 1,) diamond angle in [0, 4]; the last bin is the first's half
     """
     distance = p.radius * (np.arange(1, layout.distance_bins + 1) / layout.distance_bins) ** (
         layout.distance_exponent
     )
     angle = -np.cos(np.pi * np.arange(1, layout.angle_bins + 1) / layout.angle_bins)
+    angle[-1] = np.inf  # a cosine may exceed 1 by a rounding
     phi = 2 * np.pi * (np.arange(layout.dihedral_bins) + 0.5) / layout.dihedral_bins
     dihedral = np.append(_diamond(np.cos(phi), np.sin(phi)), 4.0)
     return distance, angle, dihedral
 
 
 @kernel
-def _find(value: float, edges: Floats, hint: Ints32, origin: float, per_unit: float) -> int:
-    """Index of the first edge above `value`: a uniform grid of hints, then a short walk."""
-    cell = int((value - origin) * per_unit)
-    cell = min(max(cell, 0), len(hint) - 1)
-    b = int(hint[cell])
-    while b < len(edges) - 1 and value >= edges[b]:
-        b += 1
-    return b
+def _lengths(x: Floats, y: Floats, z: Floats, i: int, d: Floats) -> None:
+    ix, iy, iz = x[i], y[i], z[i]
+    for j in range(i + 1, len(d)):
+        rx, ry, rz = x[j] - ix, y[j] - iy, z[j] - iz
+        d[j] = np.sqrt(rx * rx + ry * ry + rz * rz)
+
+
+@kernel
+def _inverses(d: Floats, i: int, inverse: Floats) -> None:
+    for j in range(i + 1, len(d)):
+        inverse[j] = 1.0 / (d[j] + 1e-300)  # pairs in one place are left out by their distance
+
+
+@kernel
+def _projections(points: Floats, normals: Floats, i: int, inverse: Floats, i_u: Floats) -> None:
+    """n_i . u, with u from patch i to patch j."""
+    x, y, z = points[0], points[1], points[2]
+    ix, iy, iz = x[i], y[i], z[i]
+    ax, ay, az = normals[0, i], normals[1, i], normals[2, i]
+    for j in range(i + 1, len(i_u)):
+        along = (x[j] - ix) * ax + (y[j] - iy) * ay + (z[j] - iz) * az
+        i_u[j] = along * inverse[j]
+
+
+@kernel
+def _other_projections(
+    points: Floats, normals: Floats, i: int, inverse: Floats, j_u: Floats
+) -> None:
+    """n_j . u, with u from patch i to patch j."""
+    x, y, z = points[0], points[1], points[2]
+    nx, ny, nz = normals[0], normals[1], normals[2]
+    ix, iy, iz = x[i], y[i], z[i]
+    for j in range(i + 1, len(j_u)):
+        along = (x[j] - ix) * nx[j] + (y[j] - iy) * ny[j] + (z[j] - iz) * nz[j]
+        j_u[j] = along * inverse[j]
+
+
+@kernel
+def _sines(points: Floats, normals: Floats, i: int, inverse: Floats, sine: Floats) -> None:
+    """u . (n_i x n_j): sine part of the dihedral angle about u, from n_i to n_j."""
+    x, y, z = points[0], points[1], points[2]
+    nx, ny, nz = normals[0], normals[1], normals[2]
+    ix, iy, iz = x[i], y[i], z[i]
+    ax, ay, az = nx[i], ny[i], nz[i]
+    for j in range(i + 1, len(sine)):
+        rx, ry, rz = x[j] - ix, y[j] - iy, z[j] - iz
+        cx, cy, cz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
+        sine[j] = (cx * nx[j] + cy * ny[j] + cz * nz[j]) * inverse[j]
+
+
+@kernel
+def _cosines(normals: Floats, i: int, i_u: Floats, j_u: Floats, cosine: Floats) -> None:
+    """n_i . n_j less what both have along u: cosine part of the dihedral angle."""
+    nx, ny, nz = normals[0], normals[1], normals[2]
+    ax, ay, az = nx[i], ny[i], nz[i]
+    for j in range(i + 1, len(cosine)):
+        cosine[j] = ax * nx[j] + ay * ny[j] + az * nz[j] - i_u[j] * j_u[j]
+
+
+@kernel
+def _turns(cosine: Floats, sine: Floats, i: int, turn: Floats) -> None:
+    """Diamond angle of the dihedral angle, as `_diamond`."""
+    for j in range(i + 1, len(turn)):
+        t = sine[j] / (abs(cosine[j]) + abs(sine[j]) + 1e-300)
+        turn[j] = 2.0 - t if cosine[j] < 0.0 else (4.0 + t if sine[j] < 0.0 else t)
+
+
+@kernel
+def _bins(
+    values: Floats, sign: float, edges: Floats, hints: Ints32, origin: float, extent: float,
+    i: int, bins: Ints32,
+) -> None:  # fmt: skip
+    """Index of the first edge above sign * value. Cells of hints are narrower than bins."""
+    last, per_unit = len(hints) - 1, len(hints) / extent
+    for j in range(i + 1, len(values)):
+        value = sign * values[j]
+        cell = min(max(int((value - origin) * per_unit), 0), last)
+        b = hints[cell]
+        if value >= edges[b]:
+            b += 1
+        bins[j] = b
 
 
 @kernel
 def _count(
-    means: Floats, normals: Floats, radius: float, colinearity: float,
+    points: Floats, normals: Floats, radius: float, colinearity: float,
     distance: Floats, angle: Floats, dihedral: Floats,
     hints: Ints32, n_angles: int, n_dihedrals: int, counts: Ints32,
 ) -> int:  # fmt: skip
     """Count both orders of every pair; returns the number of ordered pairs."""
-    n = len(means)
+    n = points.shape[1]
+    d, inverse, i_u, j_u = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    sine, cosine, turn = np.empty(n), np.empty(n), np.empty(n)
+    row, mu = np.empty(n, np.int32), np.empty(n, np.int32)
+    alpha, phi = np.empty(n, np.int32), np.empty(n, np.int32)
     total = 0
-    n_hints = hints.shape[1]
-    per_metre, per_cosine, per_turn = n_hints / radius, n_hints / 2.0, n_hints / 4.0
     for i in range(n):
+        _lengths(points[0], points[1], points[2], i, d)
+        _inverses(d, i, inverse)
+        _projections(points, normals, i, inverse, i_u)
+        _other_projections(points, normals, i, inverse, j_u)
+        _sines(points, normals, i, inverse, sine)
+        _cosines(normals, i, i_u, j_u, cosine)
+        _turns(cosine, sine, i, turn)
+        _bins(d, 1.0, distance, hints[0], 0.0, radius, i, row)
+        _bins(i_u, -1.0, angle, hints[1], -1.0, 2.0, i, mu)
+        _bins(j_u, -1.0, angle, hints[1], -1.0, 2.0, i, alpha)
+        _bins(turn, 1.0, dihedral, hints[2], 0.0, 4.0, i, phi)
         for j in range(i + 1, n):
-            rx, ry, rz = (
-                means[j, 0] - means[i, 0], means[j, 1] - means[i, 1], means[j, 2] - means[i, 2]
-            )  # fmt: skip
-            d = np.sqrt(rx * rx + ry * ry + rz * rz)
-            if d <= 0.0 or d >= radius:
+            if d[j] >= radius or d[j] <= 0.0:
                 continue
-            ux, uy, uz = rx / d, ry / d, rz / d
-            ix, iy, iz = normals[i, 0], normals[i, 1], normals[i, 2]
-            jx, jy, jz = normals[j, 0], normals[j, 1], normals[j, 2]
-            i_u = ix * ux + iy * uy + iz * uz
-            j_u = jx * ux + jy * uy + jz * uz
-            spans_i, spans_j = abs(i_u) <= colinearity, abs(j_u) <= colinearity
-            if not (spans_i or spans_j):
-                continue
-            # dihedral angle about u, from n_i to n_j; the same from n_j to n_i about -u
-            x = ix * jx + iy * jy + iz * jz - i_u * j_u
-            y = ux * (iy * jz - iz * jy) + uy * (iz * jx - ix * jz) + uz * (ix * jy - iy * jx)
-            span = abs(x) + abs(y)
-            turn = 0.0
-            if span > 1e-300:
-                turn = y / span
-                if x < 0.0:
-                    turn = 2.0 - turn
-                elif y < 0.0:
-                    turn = 4.0 + turn
-            b_d = _find(d, distance, hints[0], 0.0, per_metre)
-            b_phi = _find(turn, dihedral, hints[2], 0.0, per_turn) % n_dihedrals
-            if spans_i:  # (i, j): angles of n_i and n_j to u
-                b_mu = _find(-i_u, angle, hints[1], -1.0, per_cosine)
-                b_alpha = _find(-j_u, angle, hints[1], -1.0, per_cosine)
-                counts[((b_d * n_angles + b_mu) * n_angles + b_alpha) * n_dihedrals + b_phi] += 1
+            last = phi[j] if phi[j] < n_dihedrals else 0
+            if abs(i_u[j]) <= colinearity:  # (i, j): angles of n_i and n_j to u
+                bin_ij = (row[j] * n_angles + mu[j]) * n_angles + alpha[j]
+                counts[bin_ij * n_dihedrals + last] += 1
                 total += 1
-            if spans_j:  # (j, i): u turns round, and the normals change places
-                b_mu = _find(j_u, angle, hints[1], -1.0, per_cosine)
-                b_alpha = _find(i_u, angle, hints[1], -1.0, per_cosine)
-                counts[((b_d * n_angles + b_mu) * n_angles + b_alpha) * n_dihedrals + b_phi] += 1
+            if abs(j_u[j]) <= colinearity:  # (j, i): u turns round, the normals change places
+                other_mu, other_alpha = n_angles - 1 - alpha[j], n_angles - 1 - mu[j]
+                bin_ji = (row[j] * n_angles + other_mu) * n_angles + other_alpha
+                counts[bin_ji * n_dihedrals + last] += 1
                 total += 1
     return total
 
 
 def _hints(edges: Floats, origin: float, extent: float, n: int = 4096) -> Ints32:
+    if n * np.diff(edges, prepend=origin).min() <= extent:
+        raise ValueError("bins are finer than the look-up allows: use fewer")
     starts = origin + extent * np.arange(n) / n
     return np.minimum(np.searchsorted(edges, starts, side="right"), len(edges) - 1).astype(np.int32)
 
@@ -190,7 +258,8 @@ def count_pairs(
     )
     counts = np.zeros(layout.n_bins, np.int32)
     n_pairs = _count(
-        means, normals, p.radius, p.colinearity, distance, angle, dihedral,
+        np.ascontiguousarray(means.T), np.ascontiguousarray(normals.T),
+        p.radius, p.colinearity, distance, angle, dihedral,
         hints, layout.angle_bins, layout.dihedral_bins, counts,
     )  # fmt: skip
     return counts, n_pairs
@@ -228,8 +297,14 @@ def _leading(
         for k in range(found):
             posteriors[i, k] = np.exp(logits[components[i, k]] - highest)
             total += posteriors[i, k]
+        kept = np.float32(0.0)
         for k in range(found):
             posteriors[i, k] /= total
+            if posteriors[i, k] < np.float32(LEAST):
+                posteriors[i, k] = np.float32(0.0)
+            kept += posteriors[i, k]
+        for k in range(found):
+            posteriors[i, k] /= kept
 
 
 def part(

@@ -1,0 +1,30 @@
+"""What the geometry tests share: golden cases and exact scenes, loaded without a package."""
+
+from __future__ import annotations
+
+from importlib import util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+
+def beside(name: str) -> ModuleType:
+    """The module `name` of this folder; importlib mode puts no folder on the path."""
+    path = Path(__file__).resolve().with_name(f"{name}.py")
+    spec = util.spec_from_file_location(f"geometry_{name}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="session")
+def goldens() -> ModuleType:
+    return beside("goldens")
+
+
+@pytest.fixture(scope="session")
+def scenes() -> ModuleType:
+    return beside("scenes")

@@ -1,0 +1,105 @@
+"""Exact scenes: planes seen by a pinhole camera, and sets of patches."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sceneprint.types import Floats, Intrinsics, Patches, Surface
+
+#: Half a reduced Kinect: the field of view of a room sensor at a quarter of the work.
+CAMERA = Intrinsics(80, 60, 73.0, 73.0, 39.5, 29.5)
+
+
+def rays(camera: Intrinsics) -> Floats:
+    """(h, w, 3) directions with z = 1, by the pinhole equation."""
+    y, x = np.mgrid[: camera.height, : camera.width]
+    return np.dstack(
+        [(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x, float)]
+    )
+
+
+def plane(camera: Intrinsics, normal: Floats, point: Floats) -> Floats:
+    """1/z of the plane through `point`, 0 where it is not in front of the camera."""
+    q: Floats = rays(camera) @ normal / float(np.dot(normal, point))
+    return np.maximum(q, 0.0)
+
+
+def unit(*v: float) -> Floats:
+    result: Floats = np.array(v) / np.linalg.norm(v)
+    return result
+
+
+def degrees_between(a: Floats, b: Floats) -> Floats:
+    """Angle of unit vectors in degrees; exact for small ones, as arccos is not."""
+    result: Floats = np.degrees(2 * np.arcsin(np.linalg.norm(a - b, axis=-1).clip(0, 2) / 2))
+    return result
+
+
+def corner(camera: Intrinsics = CAMERA) -> tuple[Surface, NDArray[np.int64]]:
+    """A room's corner seen from inside, without noise, and which of its planes each pixel sees."""
+    axes = Rotation.from_euler("xyz", [32, -40, 8], degrees=True).as_matrix().T
+    apex = np.array([0.1, 0.0, 2.5])
+    # every wall faces the sensor: its normal points against the ray to the corner
+    normals = np.array([-np.sign(a[2]) * a for a in axes])
+    q = np.array([plane(camera, n, apex) for n in normals])
+    seen = q.argmax(axis=0)
+    return lifted(camera, q.max(axis=0), normals[seen]), seen
+
+
+def lifted(camera: Intrinsics, q: Floats, normals: Floats) -> Surface:
+    """The surface with these exact inverse depths and normals; 0 is missing."""
+    valid = q > 0
+    z = np.where(valid, 1 / np.where(valid, q, 1.0), 0.0)
+    points = rays(camera) * z[..., None]
+    # solid angle 1 / (fx fy |ray|^3), times range^2, over the cosine of incidence:
+    # z^2 / (fx fy |ray| cosine), whose last two factors are -n . ray
+    lean = -(normals * rays(camera)).sum(axis=2)
+    areas = np.where(valid, z**2 / (camera.fx * camera.fy * np.where(valid, lean, 1.0)), 0.0)
+    return Surface(
+        points.astype(np.float32),
+        np.where(valid[..., None], normals, 0.0).astype(np.float32),
+        valid,
+        areas.astype(np.float32),
+        camera,
+    )
+
+
+def random_patches(rng: np.random.Generator, n: int, extent: float = 2.0) -> Patches:
+    normals = rng.normal(size=(n, 3))
+    return Patches(
+        rng.uniform(-extent, extent, (n, 3)),
+        normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        rng.uniform(0.01, 0.1, n),
+        np.full(n, 20, np.int32),
+    )
+
+
+def room(rng: np.random.Generator, n: int = 110) -> Patches:
+    """Patches on the walls of a box and on some boxes in it, normals off by 2 degrees."""
+    size = np.array([rng.uniform(2.5, 6), rng.uniform(2.5, 6), 2.5])
+    boxes = [(np.zeros(3), size, -1.0)]
+    for _ in range(rng.integers(1, 4)):
+        extent = rng.uniform(0.3, 1.5, 3)
+        boxes.append((rng.uniform(0, 1, 3) * (size - extent), extent, 1.0))
+    means, normals = [], []
+    for k in range(n):
+        low, extent, outwards = boxes[k % len(boxes)]
+        axis, side = rng.integers(3), rng.integers(2)
+        point = rng.uniform(0, 1, 3)
+        point[axis] = side
+        normal = rng.normal(0, 0.035, 3)
+        normal[axis] += outwards * (2 * side - 1)
+        means.append(low + point * extent)
+        normals.append(normal / np.linalg.norm(normal))
+    return Patches(np.array(means), np.array(normals), np.ones(n), np.full(n, 20, np.int32))
+
+
+def moved(patches: Patches, rotation: Rotation, translation: Floats) -> Patches:
+    return Patches(
+        rotation.apply(patches.means) + translation,
+        rotation.apply(patches.normals),
+        patches.areas,
+        patches.sizes,
+    )

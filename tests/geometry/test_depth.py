@@ -1,0 +1,194 @@
+"""Masking and halving of depth images, worked by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import UselessFrame
+from sceneprint.geometry.depth import DepthParameters, halved, halvings, inverse_depth
+from sceneprint.types import Floats32, Frame, Intrinsics
+
+
+def parameters(
+    *, focal_length_px: float = 10.0, maximum_pixels: int = 10**6, minimum_valid: int = 1
+) -> DepthParameters:
+    return DepthParameters(
+        minimum_side=1,
+        minimum_depth=0.5,
+        maximum_depth=8.0,
+        same_surface=0.05,
+        focal_length_px=focal_length_px,
+        maximum_pixels=maximum_pixels,
+        minimum_valid=minimum_valid,
+    )
+
+
+KINECT = DepthParameters(focal_length_px=146.0, maximum_pixels=160 * 120 * 4)
+
+
+def frame(depth: Floats32, focal_length: float = 10.0) -> Frame:
+    height, width = depth.shape
+    camera = Intrinsics(width, height, focal_length, focal_length, 0.0, 0.0)
+    return Frame(depth, camera, "kitchen/7")
+
+
+def test_two_by_two_by_hand() -> None:
+    # one block per case: depth in metres -> what is left of its four samples
+    blocks = {
+        (2.00, 2.00, 2.00, 2.00): 1 / 2,
+        (2.00, 2.05, 2.00, 2.05): (1 / 2 + 1 / 2.05) / 2,  # one surface: the mean of 1/z, not of z
+        (2.00, 2.09, 4.00, 4.00): (1 / 2 + 1 / 2.09) / 2,  # 2.09 < 2 * 1.05: still the nearest
+        (2.00, 2.11, 4.00, 4.00): 1 / 2,  # 2.11 > 2 * 1.05: background
+        (4.00, 1.00, 4.00, 4.00): 1 / 1,  # one near sample wins over three far ones
+        (0.00, 0.00, 3.00, 0.00): 1 / 3,  # missing ones have no say
+        (0.00, 0.00, 0.00, 0.00): 0.0,
+        (math.nan, 9.0, 0.1, -1.0): 0.0,
+    }
+    depth = np.zeros((2, 2 * len(blocks) + 2), np.float32)
+    for k, block in enumerate(blocks):
+        depth[:, 2 * k : 2 * k + 2] = np.reshape(block, (2, 2))
+    # as high as two rows only: pad to four, the least that is still halved
+    q, _ = inverse_depth(
+        frame(np.vstack([depth, np.zeros_like(depth)]), 20.0), parameters(focal_length_px=10.0)
+    )
+    assert q.shape == (2, len(blocks) + 1)
+    np.testing.assert_allclose(q[0], [*blocks.values(), 0.0], rtol=1e-6)
+    assert not q[1].any()
+
+
+def test_twice_halved_by_hand() -> None:
+    # first halving of each 4 x 4 quarter: 1/2, 1/4, missing, 1/2.04; of these the second keeps
+    # the nearest surface, 1/2 and 1/2.04 (not the 1/4 behind it)
+    quarter = np.repeat(np.repeat([[2.0, 4.0], [0.0, 2.04]], 2, axis=0), 2, axis=1)
+    depth = np.zeros((8, 8), np.float32)
+    depth[:4, 4:] = quarter
+    q, camera = inverse_depth(frame(depth, 40.0), parameters(focal_length_px=10.0))
+    np.testing.assert_allclose(q, [[0.0, (1 / 2 + 1 / 2.04) / 2], [0.0, 0.0]], rtol=1e-6)
+    # the principal point, 0 at first: (0 - .5) / 2 = -.25; (-.25 - .5) / 2 = -.375
+    assert (camera.width, camera.height, camera.fx, camera.cy) == (2, 2, 10.0, -0.375)
+
+
+def test_halved_camera_sees_the_same_points() -> None:
+    camera = Intrinsics(640, 481, 585.0, 570.0, 320.25, 239.5)
+    half = halved(camera)
+    assert (half.width, half.height) == (320, 240)
+    for x, y, z in ((0.3, -0.2, 1.5), (-1.0, 0.7, 3.0)):
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        # pixel (i, j) of the half stands for pixels 2i, 2i+1: its centre is at 2i + 1/2
+        assert 2 * (half.fx * x / z + half.cx) + 0.5 == pytest.approx(u, abs=1e-12)
+        assert 2 * (half.fy * y / z + half.cy) + 0.5 == pytest.approx(v, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "focal_length", "times"),
+    [
+        (640, 480, 585.0, 2),  # Kinect, VGA: 160 x 120
+        (320, 240, 292.5, 1),
+        (160, 120, 146.0, 0),
+        (80, 60, 73.0, 0),  # never enlarged
+        (640, 480, 250.0, 1),  # wide angle: 250 is nearer to 125 than to 250 in octaves
+        (640, 480, 200.0, 1),  # 200 would stay, were it not for 307200 > 76800 pixels
+        (1280, 960, 100.0, 2),  # very wide: only the number of pixels halves it
+        (1280, 720, 900.0, 3),
+        (3, 3, 9000.0, 0),  # nothing below four pixels is halved
+    ],
+)
+def test_number_of_halvings(width: int, height: int, focal_length: float, times: int) -> None:
+    camera = Intrinsics(width, height, focal_length, focal_length, width / 2, height / 2)
+    assert halvings(camera, KINECT) == times
+
+
+def test_map_is_bounded_whatever_the_sensor() -> None:
+    for width, height, focal_length in ((4096, 4096, 50.0), (640, 480, 585.0), (5000, 3000, 3e3)):
+        camera = Intrinsics(width, height, focal_length, focal_length, 0, 0)
+        for _ in range(halvings(camera, KINECT)):
+            camera = halved(camera)
+        assert camera.width * camera.height <= 160 * 120 * 4
+        assert camera.fx <= 146 * math.sqrt(2)
+
+
+def test_kinect_becomes_160_by_120() -> None:
+    depth = np.full((480, 640), 2.0, np.float32)
+    q, camera = inverse_depth(
+        Frame(depth, Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)), KINECT
+    )
+    assert q.shape == (120, 160)
+    assert q.dtype == np.float32
+    assert (q == 0.5).all()
+    assert (camera.width, camera.height, camera.fx) == (160, 120, 146.25)
+    assert camera.cx == (320.0 - 0.5 - 1.0) / 4  # ((320 - .5) / 2 - .5) / 2
+
+
+def test_masked_samples_never_enter() -> None:
+    bad = [0.0, math.nan, math.inf, -math.inf, -2.0, 0.499, 8.001, 1e30]
+    depth = np.array([[*bad, 0.5, 8.0, 2.0]], np.float32)
+    q, _ = inverse_depth(frame(depth), parameters())
+    assert q[0].tolist() == [0.0] * len(bad) + [2.0, 0.125, 0.5]
+
+
+def test_input_stays_as_it_was() -> None:
+    depth = np.array([[np.nan, 2.0, -1.0, 99.0]] * 4, np.float32)
+    copy = depth.copy()
+    inverse_depth(frame(depth, 20.0), parameters())
+    np.testing.assert_array_equal(depth, copy)
+
+
+def test_other_layouts_and_types_read_alike() -> None:
+    depth = np.random.default_rng(0).uniform(0.3, 9.0, (12, 10)).astype(np.float32)
+    expected, _ = inverse_depth(frame(depth, 20.0), parameters())
+    transposed = np.asfortranarray(depth)
+    for other in (transposed, depth[::-1][::-1], np.repeat(depth, 2, axis=1)[:, ::2]):
+        q, _ = inverse_depth(frame(other, 20.0), parameters())
+        np.testing.assert_array_equal(q, expected)
+
+
+def test_odd_edges_fall_off() -> None:
+    depth = np.full((5, 7), 2.0, np.float32)
+    depth[4, :] = depth[:, 6] = 1.0  # the row and column that have no partner
+    q, camera = inverse_depth(frame(depth, 20.0), parameters())
+    np.testing.assert_array_equal(q, np.full((2, 3), 0.5))
+    assert (camera.width, camera.height) == (3, 2)
+
+
+def test_useless_frames_say_why() -> None:
+    nothing = np.full((8, 8), np.nan, np.float32)
+    nothing[:4] = 0.0
+    with pytest.raises(UselessFrame, match=r"^kitchen/7: every depth sample is missing\."):
+        inverse_depth(frame(nothing), parameters())
+    millimetres = np.full((8, 8), 2000.0, np.float32)
+    with pytest.raises(
+        UselessFrame, match=r"0 of its 64 .* range of .*median is 2e\+03 m.*depth scale"
+    ):
+        inverse_depth(frame(millimetres), parameters())
+
+
+def test_minimum_number_of_valid_pixels() -> None:
+    depth = np.zeros((8, 8), np.float32)
+    depth[0, :5] = 2.0
+    assert np.count_nonzero(inverse_depth(frame(depth), parameters(minimum_valid=5))[0]) == 5
+    with pytest.raises(UselessFrame):
+        inverse_depth(frame(depth), parameters(minimum_valid=6))
+
+
+def test_wrong_shape_is_the_callers_mistake() -> None:
+    camera = Intrinsics(8, 6, 10.0, 10.0, 0.0, 0.0)
+    for shape in ((8, 6), (6, 8, 1), (48,)):
+        with pytest.raises(ValueError, match=r"is not \(6, 8\)"):
+            inverse_depth(Frame(np.ones(shape, np.float32), camera), parameters())
+
+
+@pytest.mark.parametrize("shape", [(1, 2), (7, 400), (400, 7)])
+def test_images_too_thin_for_a_surface(shape: tuple[int, int]) -> None:
+    thin = frame(np.ones(shape, np.float32))
+    with pytest.raises(UselessFrame, match=rf"{shape[1]} x {shape[0]} samples.*at least 8 rows"):
+        inverse_depth(thin, DepthParameters())
+
+
+def test_few_samples_in_range_are_not_blamed_on_the_scale() -> None:
+    few = np.zeros((8, 8), np.float32)
+    few[0, :5] = 2.0
+    with pytest.raises(UselessFrame, match=r"only 5 of its 5 .* sees more of the scene"):
+        inverse_depth(frame(few), DepthParameters())

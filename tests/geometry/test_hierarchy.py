@@ -1,0 +1,148 @@
+"""Levels of the hierarchy: counts, unions, and what coarsening must not change."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.hierarchy import HierarchyParameters, hierarchy
+from sceneprint.geometry.segmentation import SegmentationParameters, segment
+from sceneprint.types import Floats, Hierarchy, Ints32, Surface
+
+
+def parameters(n_levels: int = 4, factor: float = 2.0) -> HierarchyParameters:
+    return HierarchyParameters(n_levels=n_levels, factor=factor, iterations=4, normal_weight=3.0)
+
+
+def corner(scenes: ModuleType) -> tuple[Surface, Ints32]:
+    seen, _ = scenes.corner()
+    seen.valid[5:12, 60:70] = False
+    finest = segment(
+        seen,
+        SegmentationParameters(
+            n_patches=160, iterations=5, normal_weight=6.0, minimum_size=0.15, minimum_pixels=4
+        ),
+    )
+    return seen, finest
+
+
+@pytest.mark.parametrize("factor", [1.5, 2.0, 4.0])
+def test_counts_fall_by_the_factor(scenes: ModuleType, factor: float) -> None:
+    seen, finest = corner(scenes)
+    n = int(finest.max()) + 1
+    assert n > 100
+    result = hierarchy(seen, finest, parameters(4, factor))
+    assert len(result.levels) == len(result.labels) == 4
+    for h, (level, labels) in enumerate(zip(result.levels, result.labels, strict=True)):
+        # K-Means may leave a cluster empty, and never makes one more
+        assert 0.9 * round(n / factor**h) <= len(level) <= round(n / factor**h)
+        np.testing.assert_array_equal(np.unique(labels[labels >= 0]), np.arange(len(level)))
+        assert level.sizes.sum() == (finest >= 0).sum()
+    assert len(result.levels[0]) == n
+    np.testing.assert_array_equal(result.labels[0], finest)
+
+
+def weighted_mean(values: Floats, areas: Floats) -> Floats:
+    return np.average(values, axis=0, weights=areas)
+
+
+def test_area_and_mean_stay(scenes: ModuleType) -> None:
+    result = hierarchy(*corner(scenes), parameters())
+    finest = result.levels[0]
+    for level in result.levels[1:]:
+        assert level.areas.sum() == pytest.approx(finest.areas.sum(), rel=1e-12)
+        np.testing.assert_allclose(
+            weighted_mean(level.means, level.areas),
+            weighted_mean(finest.means, finest.areas),
+            rtol=1e-9,
+        )
+        np.testing.assert_allclose(np.linalg.norm(level.normals, axis=1), 1, rtol=1e-12)
+
+
+def test_coarse_patches_are_unions_of_finest(scenes: ModuleType) -> None:
+    result = hierarchy(*corner(scenes), parameters())
+    finest = result.labels[0]
+    for level, labels in zip(result.levels[1:], result.labels[1:], strict=True):
+        np.testing.assert_array_equal(labels >= 0, finest >= 0)
+        parent = [set(labels[finest == k].tolist()) for k in range(len(result.levels[0]))]
+        assert all(len(parents) == 1 for parents in parent)
+        # and a union's area is the sum of its parts
+        area = np.zeros(len(level))
+        for k, parents in enumerate(parent):
+            area[parents.pop()] += result.levels[0].areas[k]
+        np.testing.assert_allclose(level.areas, area, rtol=1e-9)
+
+
+def test_first_coarse_level_does_not_mix_walls(scenes: ModuleType) -> None:
+    seen, finest = corner(scenes)
+    coarse = hierarchy(seen, finest, parameters(2, 2.0))
+    at = finest >= 0
+    off = scenes.degrees_between(
+        seen.normals[at].astype(float), coarse.levels[1].normals[coarse.labels[1][at]]
+    )
+    assert (off < 5).mean() > 0.97
+
+
+def strip(
+    scenes: ModuleType, x: list[float], normals: list[list[float]], largest: float = 0.04
+) -> Hierarchy:
+    """One row of pixels, each a patch of its own, halved once."""
+    n = len(x)
+    areas = np.full((1, n), 0.04, np.float32)
+    areas[0, 0] = largest
+    points = np.zeros((1, n, 3), np.float32)
+    points[0, :, 0], points[0, :, 2] = x, 2.0
+    seen = Surface(
+        points,
+        np.array([normals], np.float32),
+        np.ones((1, n), bool),
+        areas,
+        scenes.CAMERA,
+    )
+    return hierarchy(seen, np.arange(n, dtype=np.int32)[None], parameters(2, 2.0))
+
+
+def test_two_clusters_by_hand(scenes: ModuleType) -> None:
+    front, side = [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]
+    # near and far: {0, .1} and {2, 2.1}, all facing alike
+    labels = strip(scenes, [0.0, 2.1, 0.1, 2.0], [front] * 4).labels[1][0].tolist()
+    assert labels in ([0, 1, 0, 1], [1, 0, 1, 0])
+    # side by side, but two of them face elsewhere
+    result = strip(scenes, [0.0, 0.1, 0.2, 0.3], [front, side, front, side])
+    assert result.labels[1][0].tolist() in ([0, 1, 0, 1], [1, 0, 1, 0])
+    order = np.argsort(result.levels[1].means[:, 0])
+    np.testing.assert_allclose(result.levels[1].means[order, 0], [0.1, 0.2], rtol=1e-6)
+    np.testing.assert_allclose(result.levels[1].normals[order], [front, side], atol=1e-7)
+
+
+def test_centres_move_by_hand(scenes: ModuleType) -> None:
+    # seeded at 0, the largest, and 10, the farthest: {0, 4.9} and {5.5, 10}. The largest holds
+    # its centre at 0.45, the other moves to 7.75: 4.9 changes over
+    result = strip(scenes, [0.0, 4.9, 5.5, 10.0], [[0.0, 0.0, -1.0]] * 4, largest=0.4)
+    labels = result.labels[1][0].tolist()
+    assert labels in ([0, 1, 1, 1], [1, 0, 0, 0])
+    np.testing.assert_allclose(result.levels[1].means[labels[3], 0], 6.8, rtol=1e-6)
+
+
+def test_a_single_patch_stays_one(scenes: ModuleType) -> None:
+    result = strip(scenes, [0.3], [[0.0, 0.0, -1.0]])
+    assert [len(level) for level in result.levels] == [1, 1]
+    np.testing.assert_allclose(result.levels[1].means, [[0.3, 0.0, 2.0]], rtol=1e-6)
+    np.testing.assert_array_equal(result.labels[1], [[0]])
+
+
+def test_deep_levels_never_fall_below_one(scenes: ModuleType) -> None:
+    levels = hierarchy(*corner(scenes), parameters(4, 40.0)).levels
+    assert [len(level) for level in levels[2:]] == [1, 1]
+    assert levels[3].areas[0] == pytest.approx(levels[0].areas.sum(), rel=1e-12)
+
+
+def test_same_input_same_bytes(scenes: ModuleType) -> None:
+    first, second = (hierarchy(*corner(scenes), parameters()) for _ in range(2))
+    for a, b in zip(first.levels, second.levels, strict=True):
+        for values, again in ((a.means, b.means), (a.normals, b.normals), (a.areas, b.areas)):
+            assert values.tobytes() == again.tobytes()
+    for c, d in zip(first.labels, second.labels, strict=True):
+        np.testing.assert_array_equal(c, d)

@@ -1,0 +1,183 @@
+"""The Gaussian mixture against scipy, scikit-learn and the theorem of EM."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import norm
+
+from sceneprint.errors import TrainingError
+from sceneprint.geometry.mixture import (
+    Mixture,
+    MixtureParameters,
+    em_step,
+    fit_mixture,
+    log_densities,
+    moments,
+    posteriors,
+)
+from sceneprint.types import Floats
+
+
+def parameters(
+    n: int, *, floor: float = 0.0, prior_count: float = 0.0, iterations: int = 10
+) -> MixtureParameters:
+    return MixtureParameters(
+        n_components=n, iterations=iterations, variance_floor=floor, prior_variance=0.02,
+        prior_count=prior_count, minimum_weight=0.0,
+    )  # fmt: skip
+
+
+def random_mixture(rng: np.random.Generator, n: int, dimension: int = 12) -> Mixture:
+    weights = rng.uniform(0.2, 1, n)
+    return Mixture(
+        weights / weights.sum(),
+        rng.normal(size=(n, dimension)),
+        rng.uniform(0.1, 2, (n, dimension)),
+    )
+
+
+def drawn(rng: np.random.Generator, mixture: Mixture, n: int) -> Floats:
+    g = rng.choice(len(mixture), n, p=mixture.weights)
+    noise = rng.normal(size=(n, mixture.means.shape[1]))
+    result: Floats = mixture.means[g] + noise * np.sqrt(mixture.variances[g])
+    return result
+
+
+def naive(features: Floats, mixture: Mixture) -> Floats:
+    """log p_g + log N, one normal density at a time."""
+    result = np.zeros((len(features), len(mixture)))
+    for i, f in enumerate(features):
+        for g in range(len(mixture)):
+            result[i, g] = math.log(mixture.weights[g])
+            for d in range(len(f)):
+                deviation = math.sqrt(mixture.variances[g, d])
+                result[i, g] += norm.logpdf(f[d], mixture.means[g, d], deviation)
+    return result
+
+
+def test_densities_and_posteriors_equal_scipy() -> None:
+    rng = np.random.default_rng(0)
+    mixture, features = random_mixture(rng, 5), rng.normal(0, 1.5, (30, 12))
+    expected = naive(features, mixture)
+    np.testing.assert_allclose(log_densities(features, mixture), expected, rtol=0, atol=1e-10)
+    shares = np.exp(expected - logsumexp(expected, axis=1, keepdims=True))
+    np.testing.assert_allclose(posteriors(features, mixture), shares, rtol=0, atol=1e-10)
+
+
+def test_posteriors_by_hand() -> None:
+    # one dimension; at f = 0 both unit normals, at +-1, are equally near: only p_g counts (R2)
+    mixture = Mixture(np.array([0.25, 0.75]), np.array([[-1.0], [1.0]]), np.ones((2, 1)))
+    np.testing.assert_allclose(posteriors(np.zeros((1, 1)), mixture), [[0.25, 0.75]])
+    # same mean, variances 1 and 4: at the mean, the narrow one is twice as dense (|Lambda|)
+    mixture = Mixture(np.array([0.5, 0.5]), np.zeros((2, 1)), np.array([[1.0], [4.0]]))
+    np.testing.assert_allclose(posteriors(np.zeros((1, 1)), mixture), [[2 / 3, 1 / 3]])
+
+
+def test_rows_sum_to_one_however_far() -> None:
+    rng = np.random.default_rng(1)
+    mixture = random_mixture(rng, 20)
+    features = rng.normal(size=(50, 12)) * np.logspace(-3, 5, 50)[:, None]
+    pi = posteriors(features, mixture)
+    np.testing.assert_allclose(pi.sum(axis=1), 1, rtol=1e-12)
+    assert (pi >= 0).all()
+    assert pi[-1].max() == 1.0  # far out, the widest component takes all
+
+
+def test_moments_do_not_depend_on_blocks() -> None:
+    rng = np.random.default_rng(2)
+    mixture, f = random_mixture(rng, 4), rng.normal(size=(103, 12))
+    pi = posteriors(f, mixture)
+    for block in (1, 50, 103, 1000):
+        zeroth, first, second = moments(f, mixture, block)
+        np.testing.assert_allclose(zeroth, pi.sum(axis=0), rtol=1e-12)
+        np.testing.assert_allclose(first, np.einsum("mg,md->gd", pi, f), rtol=0, atol=1e-11)
+        np.testing.assert_allclose(second, np.einsum("mg,md->gd", pi, f * f), rtol=1e-11)
+
+
+def log_likelihood(features: Floats, mixture: Mixture) -> float:
+    return float(logsumexp(log_densities(features, mixture), axis=1).mean())
+
+
+def test_em_never_lowers_the_likelihood() -> None:
+    rng = np.random.default_rng(3)
+    features = drawn(rng, random_mixture(rng, 4), 1500)
+    fits = list(fit_mixture(features, parameters(4, iterations=12), seed=0))
+    assert len(fits) == 13
+    climb = np.diff([log_likelihood(features, mixture) for mixture in fits])
+    assert (climb > -1e-10).all()
+    assert climb.sum() > 1e-3  # and the start was not the end
+
+
+def test_em_step_equals_scikit_learn() -> None:
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.mixture import GaussianMixture
+
+    rng = np.random.default_rng(4)
+    features, start = drawn(rng, random_mixture(rng, 6), 800), random_mixture(rng, 6)
+    step = em_step(features, start, parameters(6, floor=1e-3))
+    oracle = GaussianMixture(
+        6, covariance_type="diag", reg_covar=1e-3, max_iter=1, weights_init=start.weights,
+        means_init=start.means, precisions_init=1 / start.variances, random_state=0,
+    )  # fmt: skip
+    with warnings.catch_warnings():  # one step is no convergence, and is what is asked for
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        oracle.fit(features)
+    np.testing.assert_allclose(step.weights, oracle.weights_, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(step.means, oracle.means_, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(step.variances, oracle.covariances_, rtol=0, atol=1e-6)
+    assert np.abs(step.means - start.means).max() > 0.1
+
+
+def test_prior_and_floors_by_hand() -> None:
+    # two samples, at 0 and 2, of one component: mean 1, variance 1 + floor
+    features = np.array([[0.0], [2.0]])
+    start = Mixture(np.array([0.5, 0.5]), np.array([[1.0], [1000.0]]), np.ones((2, 1)))
+    p = MixtureParameters(
+        n_components=2, iterations=1, variance_floor=0.1, prior_variance=0.5, prior_count=2.0,
+        minimum_weight=0.01,
+    )  # fmt: skip
+    step = em_step(features, start, p)
+    # drawn half-way, 2 samples against a count of 2, from 1.1 to 0.5
+    assert step.means[0, 0] == pytest.approx(1.0)
+    assert step.variances[0, 0] == pytest.approx((2 * 1.1 + 2 * 0.5) / 4)
+    # the other saw nothing: it keeps the prior, and the least weight before normalisation
+    assert step.variances[1, 0] == pytest.approx(0.5)
+    np.testing.assert_allclose(step.weights, [1 / 1.01, 0.01 / 1.01])
+
+
+def test_recovers_a_known_mixture() -> None:
+    rng = np.random.default_rng(5)
+    means = np.zeros((3, 12))
+    means[0, 0], means[1, 1], means[2, 2] = 4.0, 4.0, -4.0
+    truth = Mixture(np.array([0.5, 0.3, 0.2]), means, rng.uniform(0.3, 1.0, (3, 12)))
+    *_, found = fit_mixture(drawn(rng, truth, 6000), parameters(3, floor=1e-6), seed=1)
+    order = [int(np.linalg.norm(found.means - mean, axis=1).argmin()) for mean in truth.means]
+    assert sorted(order) == [0, 1, 2]
+    # five standard errors of the smallest component: 1200 samples
+    np.testing.assert_allclose(found.weights[order], truth.weights, atol=5 * 0.5 / 6000**0.5)
+    np.testing.assert_allclose(found.means[order], truth.means, atol=5 / 1200**0.5)
+    np.testing.assert_allclose(found.variances[order], truth.variances, rtol=5 * (2 / 1200) ** 0.5)
+
+
+def test_same_seed_same_mixture() -> None:
+    rng = np.random.default_rng(6)
+    features = drawn(rng, random_mixture(rng, 5), 400)
+    a, b, c = (
+        list(fit_mixture(features, parameters(5, floor=1e-3, iterations=2), seed))[-1]
+        for seed in (0, 0, 1)
+    )
+    assert a.means.tobytes() == b.means.tobytes()
+    assert not np.array_equal(a.means, c.means)
+
+
+def test_too_few_features() -> None:
+    features = np.random.default_rng(7).normal(size=(30, 12))
+    with pytest.raises(TrainingError, match="29 training pairs are too few for 3 components"):
+        list(fit_mixture(features[:29], parameters(3), seed=0))
+    fit = list(fit_mixture(features, parameters(3, floor=1e-3, iterations=1), seed=0))
+    assert [len(mixture) for mixture in fit] == [3, 3]

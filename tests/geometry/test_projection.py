@@ -1,0 +1,103 @@
+"""The learnt subspace: whitening, signs, independence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import TrainingError
+from sceneprint.geometry.projection import Projection, fit_projection, project
+from sceneprint.types import Floats
+
+RNG_SEED = 11
+
+
+def correlated(n: int = 3000) -> Floats:
+    """13 properties of very different scales, far from zero, that depend on one another."""
+    rng = np.random.default_rng(RNG_SEED)
+    mixing = rng.normal(size=(13, 13))
+    return rng.normal(size=(n, 13)) @ mixing * np.logspace(-2, 2, 13) + rng.normal(size=13) * 10
+
+
+def test_project_by_hand() -> None:
+    matrix = np.zeros((12, 13))
+    matrix[0, 0], matrix[0, 12], matrix[3, 1] = 2.0, -1.0, 0.5
+    projection = Projection(np.arange(13.0), matrix)
+    # f' - mean = 1 everywhere, then 3 everywhere
+    f = project(np.array([np.arange(13.0) + 1, np.arange(13.0) + 3]), projection)
+    assert f.shape == (2, 12)
+    assert f[:, 0].tolist() == [1.0, 3.0]
+    assert f[:, 3].tolist() == [0.5, 1.5]
+    assert not np.delete(f, [0, 3], axis=1).any()
+
+
+def test_pca_whitens_its_training_data() -> None:
+    properties = correlated()
+    f = project(properties, fit_projection(properties, "pca"))
+    np.testing.assert_allclose(f.mean(axis=0), 0, atol=1e-9)
+    np.testing.assert_allclose(np.cov(f.T), np.eye(12), atol=1e-9)
+
+
+def test_pca_equals_an_eigendecomposition() -> None:
+    properties = correlated()
+    projection = fit_projection(properties, "pca")
+    values, vectors = np.linalg.eigh(np.corrcoef(properties.T))
+    scale = properties.std(axis=0)
+    # np.corrcoef is of the standardised properties; the smallest of 13 directions is left out
+    n = len(properties)
+    expected = (vectors / np.sqrt(values * n / (n - 1))).T[:0:-1] / scale
+    np.testing.assert_allclose(
+        np.abs(projection.matrix * scale), np.abs(expected * scale), rtol=1e-6, atol=1e-9
+    )
+    np.testing.assert_allclose(projection.mean, properties.mean(axis=0), rtol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["pca", "ica"])
+def test_signs_are_fixed(method: str) -> None:
+    # the largest weight of a row, on standardised properties, is positive; turning every
+    # property over gives the same subspace with all of its signs decided anew
+    properties = independent()[0]
+    for given in (properties, -properties):
+        projection = fit_projection(given, "pca" if method == "pca" else "ica", seed=3)
+        weights = projection.matrix * given.std(axis=0)
+        largest = np.abs(weights).argmax(axis=1)
+        assert (weights[np.arange(12), largest] > 0).all()
+
+
+@pytest.mark.parametrize("method", ["pca", "ica"])
+def test_same_data_same_bytes(method: str) -> None:
+    properties = independent()[0]
+    a, b = (fit_projection(properties, "pca" if method == "pca" else "ica", 5) for _ in range(2))
+    assert a.matrix.tobytes() == b.matrix.tobytes()
+    assert a.mean.tobytes() == b.mean.tobytes()
+
+
+def independent(n: int = 4000) -> tuple[Floats, Floats]:
+    """13 mixtures of 12 independent sources, and the sources: uniform ones and peaked ones."""
+    rng = np.random.default_rng(RNG_SEED)
+    sources = np.column_stack([rng.uniform(-1, 1, (n, 6)), rng.laplace(size=(n, 6))])
+    return sources @ rng.normal(size=(12, 13)) + 4, sources
+
+
+def test_ica_finds_independent_sources() -> None:
+    properties, sources = independent()
+    correlation = {}
+    for method in ("pca", "ica"):
+        f = project(properties, fit_projection(properties, "pca" if method == "pca" else "ica"))
+        np.testing.assert_allclose(np.cov(f.T), np.eye(12), atol=2e-3)
+        np.testing.assert_allclose(f.mean(axis=0), 0, atol=1e-9)
+        correlation[method] = np.abs(np.corrcoef(sources.T, f.T)[:12, 12:])
+    # every source has its own component, of which PCA knows nothing
+    assert sorted(correlation["ica"].argmax(axis=1)) == list(range(12))
+    assert correlation["ica"].max(axis=1).min() > 0.95
+    assert correlation["pca"].max(axis=1).min() < 0.8
+
+
+def test_nothing_to_learn_from() -> None:
+    properties = correlated(200)
+    properties[:, 9] = 2.5
+    with pytest.raises(TrainingError, match="200 training pairs leave a property without"):
+        fit_projection(properties)
+    with pytest.raises(TrainingError, match="13 training pairs"):
+        fit_projection(correlated(13))
+    assert fit_projection(correlated(14)).matrix.shape == (12, 13)

@@ -1,0 +1,184 @@
+"""Eq. (1): by hand, against the letter of the paper, and under rigid motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from types import ModuleType
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from sceneprint.geometry import properties as module
+from sceneprint.geometry.properties import (
+    PropertyParameters,
+    invariants,
+    neighbour_pairs,
+    pair_properties,
+    properties,
+)
+from sceneprint.types import Floats, Patches
+
+PARAMETERS = PropertyParameters(radius=3.0, angular_tolerance=math.radians(10), colinearity=0.9995)
+AXES: Floats = np.concatenate([np.eye(3), -np.eye(3)])
+
+
+def test_golden(goldens: ModuleType) -> None:
+    goldens.check_eq1(module)
+
+
+def test_robust_sign(goldens: ModuleType) -> None:
+    goldens.check_r1(module)
+
+
+def angle(a: Floats, b: Floats) -> float:
+    return math.acos(float(np.dot(a, b)))
+
+
+def eq1(l_mu: Floats, n_mu: Floats, l_alpha: Floats, n_alpha: Floats) -> list[float]:
+    """Eq. (1) as printed, from the vectors, with reading R1."""
+    r = l_alpha - l_mu
+    length = math.sqrt(float(r @ r))
+    u = r / length
+    v = n_mu - (n_mu @ u) * u
+    v = v / math.sqrt(float(v @ v))
+    w = np.cross(u, v)
+
+    def sgn(cosine: float) -> float:
+        return 0.0 if abs(cosine) <= math.sin(math.radians(10)) else math.copysign(1.0, cosine)
+
+    return [
+        angle(n_alpha, n_mu), angle(u, n_mu), angle(u, n_alpha),
+        float(r @ n_mu), float(n_alpha @ u), float(n_alpha @ v), float(n_alpha @ w),
+        float(r @ np.cross(n_alpha, n_mu)), length,
+        length * sgn(float(n_mu @ u)), length * sgn(float(n_alpha @ u)),
+        length * sgn(float(n_alpha @ v)), length * sgn(float(n_alpha @ w)),
+    ]  # fmt: skip
+
+
+def test_equals_the_letter_of_the_paper(scenes: ModuleType) -> None:
+    patches = scenes.random_patches(np.random.default_rng(0), 25)
+    pairs = neighbour_pairs(patches, PARAMETERS)
+    assert len(pairs) > 300
+    expected = [
+        eq1(patches.means[mu], patches.normals[mu], patches.means[alpha], patches.normals[alpha])
+        for mu, alpha in pairs
+    ]
+    f = pair_properties(patches, pairs, PARAMETERS)
+    assert f.shape == (len(pairs), 13)
+    np.testing.assert_allclose(f, expected, rtol=0, atol=1e-9)
+
+
+def test_invariants_give_back_what_they_were_made_of(goldens: ModuleType) -> None:
+    for given_ in ((0.7, 0.4, 2.9, -3.0), (2.0, 1.5, 0.1, 0.2), (1.0, 3.0, 1.6, 2.5)):
+        patches = goldens.from_invariants(*given_)
+        found = invariants(patches, np.array([[0, 1]]))
+        np.testing.assert_allclose(found, [given_], rtol=0, atol=1e-12)
+
+
+def test_right_angles_are_exact(goldens: ModuleType) -> None:
+    # parallel and perpendicular normals: where arccos of a rounded cosine would be off or NaN
+    for theta_alpha, phi, between in (
+        (math.pi / 2, 0.0, 0.0),
+        (math.pi / 2, math.pi, math.pi),
+        (math.pi / 2, math.pi / 2, math.pi / 2),
+        (0.0, 0.0, math.pi / 2),
+        (math.pi, 0.0, math.pi / 2),
+    ):
+        f = properties(np.array([[2.0, math.pi / 2, theta_alpha, phi]]), PARAMETERS)
+        assert f[0, 0] == pytest.approx(between, abs=1e-12)
+        assert f[0, 2] == pytest.approx(theta_alpha, abs=1e-12)
+        assert f[0, 9] == 0.0
+
+
+ROTATIONS = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
+SHIFTS = st.tuples(*[st.floats(-20, 20)] * 3)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(rotation=ROTATIONS, shift=SHIFTS, seed=st.integers(0, 10**6), room=st.booleans())
+def test_no_rigid_motion_changes_them(
+    scenes: ModuleType,
+    rotation: tuple[float, float, float],
+    shift: tuple[float, float, float],
+    seed: int,
+    room: bool,
+) -> None:
+    rng = np.random.default_rng(seed)
+    patches = scenes.random_patches(rng, 10)
+    if room:  # normals parallel or perpendicular to one another and to many r
+        patches = Patches(
+            rng.integers(0, 4, (10, 3)).astype(float) * 0.5 + 0.25,
+            AXES[rng.integers(0, 6, 10)],
+            patches.areas,
+            patches.sizes,
+        )
+    pairs = neighbour_pairs(patches, PARAMETERS)
+    turn = Rotation.from_rotvec(rotation)
+    np.testing.assert_allclose(
+        pair_properties(scenes.moved(patches, turn, np.array(shift)), pairs, PARAMETERS),
+        pair_properties(patches, pairs, PARAMETERS),
+        rtol=0,
+        atol=1e-9,
+    )
+
+
+def test_mirror_images_differ(scenes: ModuleType) -> None:
+    # what no rotation does, a mirror does: n_alpha . w turns its sign
+    patches = scenes.random_patches(np.random.default_rng(2), 12)
+    flip = np.array([1.0, 1.0, -1.0])
+    mirrored = Patches(patches.means * flip, patches.normals * flip, patches.areas, patches.sizes)
+    pairs = neighbour_pairs(patches, PARAMETERS)
+    f, g = (pair_properties(x, pairs, PARAMETERS) for x in (patches, mirrored))
+    signs = np.ones(13)
+    signs[[6, 7, 12]] = -1
+    np.testing.assert_allclose(g, f * signs, rtol=0, atol=1e-12)
+
+
+def test_swapped_pairs(scenes: ModuleType) -> None:
+    # u turns round: (theta_mu, theta_alpha, phi) -> (pi - theta_alpha, pi - theta_mu, phi)
+    patches = scenes.random_patches(np.random.default_rng(4), 20)
+    pairs = neighbour_pairs(patches, PARAMETERS)
+    pairs = pairs[(pairs[:, :1] < pairs[:, 1:]).ravel()]
+    d, theta_mu, theta_alpha, phi = invariants(patches, pairs).T
+    np.testing.assert_allclose(
+        invariants(patches, pairs[:, ::-1]),
+        np.column_stack([d, np.pi - theta_alpha, np.pi - theta_mu, phi]),
+        rtol=0,
+        atol=1e-12,
+    )
+
+
+def test_neighbours_by_hand() -> None:
+    # 0 and 1 a metre apart; 2 is 3.5 m from 0 and 2.5 m from 1; 3 is where 0 is
+    means = np.array([[0, 0, 0], [1, 0, 0], [3.5, 0, 0], [0, 0, 0]], float)
+    up, along, near = [0, 0, 1], [1, 0, 0], [math.cos(0.04), 0, math.sin(0.04)]
+
+    def pairs(normals: Sequence[Sequence[float]]) -> list[list[int]]:
+        patches = Patches(means, np.array(normals, float), np.ones(4), np.ones(4, np.int32))
+        return [[int(mu), int(alpha)] for mu, alpha in neighbour_pairs(patches, PARAMETERS)]
+
+    all_up = [[0, 1], [1, 0], [1, 2], [1, 3], [2, 1], [3, 1]]
+    assert pairs([up, up, up, up]) == all_up
+    # a normal along r spans no basis with it as n_mu, but may be n_alpha
+    assert pairs([up, along, up, up]) == [[0, 1], [2, 1], [3, 1]]
+    # arccos(.9995) = 0.0316 rad: at 0.04 it does
+    assert pairs([up, near, up, up]) == all_up
+
+
+def test_neighbours_equal_the_loop(scenes: ModuleType) -> None:
+    patches = scenes.random_patches(np.random.default_rng(9), 40)
+    patches.normals[:20] = AXES[np.arange(20) % 6]
+    patches.means[:20] = np.round(patches.means[:20])
+    expected = []
+    for mu in range(40):
+        for alpha in range(40):
+            r = patches.means[alpha] - patches.means[mu]
+            d = float(np.linalg.norm(r))
+            if mu != alpha and 0 < d < 3 and abs(r @ patches.normals[mu]) <= 0.9995 * d:
+                expected.append([mu, alpha])
+    assert 300 < len(expected) < 40 * 39
+    assert neighbour_pairs(patches, PARAMETERS).tolist() == expected

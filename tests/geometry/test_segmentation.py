@@ -1,0 +1,161 @@
+"""Segmentation of exact scenes, and the sums over its patches."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.segmentation import SegmentationParameters, kept, patches_of, segment
+from sceneprint.types import Surface
+
+
+def parameters(
+    n_patches: int = 120, minimum_size: float = 0.15, minimum_pixels: int = 4
+) -> SegmentationParameters:
+    return SegmentationParameters(
+        n_patches=n_patches,
+        iterations=5,
+        normal_weight=6.0,
+        minimum_size=minimum_size,
+        minimum_pixels=minimum_pixels,
+    )
+
+
+def wall(scenes: ModuleType, distance: float = 2.0) -> Surface:
+    towards = np.array([0.0, 0.0, -1.0])
+    q = scenes.plane(scenes.CAMERA, towards, np.array([0.0, 0.0, distance]))
+    seen: Surface = scenes.lifted(scenes.CAMERA, q, np.broadcast_to(towards, (*q.shape, 3)))
+    return seen
+
+
+def test_no_patch_mixes_two_planes(scenes: ModuleType) -> None:
+    seen, plane_of = scenes.corner()
+    assert [int((plane_of == k).sum()) > 300 for k in range(3)] == [True] * 3
+    labels = segment(seen, parameters())
+    patches = patches_of(seen, labels)
+    at = labels >= 0
+    off = scenes.degrees_between(seen.normals[at].astype(float), patches.normals[labels[at]])
+    assert off.max() < 0.1  # the planes are at right angles
+    for k in range(len(patches)):
+        assert len(set(plane_of[labels == k])) == 1
+
+
+def test_every_pixel_is_in_a_patch_or_in_a_dropped_one(scenes: ModuleType) -> None:
+    seen, _ = scenes.corner()
+    seen.valid[20:30, 15:40] = False
+    every = segment(seen, parameters(minimum_size=0.0, minimum_pixels=1))
+    np.testing.assert_array_equal(every >= 0, seen.valid)
+    some = segment(seen, parameters(minimum_size=0.79))
+    smallest = 0.79 * 80 * 60 / 120
+    sizes = np.bincount(every[every >= 0])
+    dropped = (every >= 0) & (sizes[every] < smallest)
+    assert 0 < dropped.sum() < 0.2 * seen.valid.sum()
+    np.testing.assert_array_equal(some >= 0, seen.valid & ~dropped)
+    assert np.bincount(some[some >= 0]).min() >= smallest
+    # the other limit, in pixels
+    few = segment(seen, parameters(minimum_size=0.0, minimum_pixels=15))
+    np.testing.assert_array_equal(few >= 0, seen.valid & (sizes[every] >= 15))
+
+
+def test_labels_have_no_gaps_and_follow_the_image(scenes: ModuleType) -> None:
+    seen = wall(scenes)
+    labels = segment(seen, parameters(n_patches=48))
+    assert labels.dtype == np.int32
+    # 48 cells of 10 x 10 pixels: 6 rows of 8, left to right and top to bottom
+    np.testing.assert_array_equal(np.unique(labels), np.arange(48))
+    for k in range(48):
+        y, x = np.nonzero(labels == k)
+        assert (y.mean() // 10, x.mean() // 10) == divmod(k, 8)
+    corner, _ = scenes.corner()
+    corner.valid[:, 30:50] = False
+    labels = segment(corner, parameters())
+    np.testing.assert_array_equal(np.unique(labels), np.arange(-1, labels.max() + 1))
+
+
+@pytest.mark.parametrize("n_patches", [30, 120, 300])
+def test_number_and_extent_of_patches(scenes: ModuleType, n_patches: int) -> None:
+    seen = wall(scenes)
+    labels = segment(seen, parameters(n_patches))
+    patches = patches_of(seen, labels)
+    assert len(patches) == pytest.approx(n_patches, rel=0.1)
+    spacing = np.sqrt(80 * 60 / n_patches) * 2.0 / 73.0  # metres, at 2 m
+    reach = np.linalg.norm(seen.points - patches.means[labels], axis=2)
+    # the corner of a square cell is at 0.71; cells at the border may be somewhat wider
+    assert reach.max() < 0.85 * spacing  # measured: 0.73
+    assert np.percentile(reach, 95) < 0.7 * spacing  # 0.62
+
+
+def test_patches_are_compact_on_slanted_walls(scenes: ModuleType) -> None:
+    seen, _ = scenes.corner()
+    labels = segment(seen, parameters())
+    patches = patches_of(seen, labels)
+    at = labels >= 0
+    spacing = np.sqrt(80 * 60 / 120) / 73.0 * patches.means[labels[at], 2]
+    reach = np.linalg.norm(seen.points[at] - patches.means[labels[at]], axis=1)
+    assert (reach / spacing).max() < 1.4  # measured: 1.22, where a wall leans away
+
+
+def test_patches_respect_depth_edges(scenes: ModuleType) -> None:
+    # one wall half a metre before the other, with the same normal: only position tells them apart
+    towards = np.array([0.0, 0.0, -1.0])
+    q = np.full((60, 80), 1 / 2.0)
+    q[:, :37] = 1 / 1.5
+    seen = scenes.lifted(scenes.CAMERA, q, np.broadcast_to(towards, (60, 80, 3)))
+    labels = segment(seen, parameters())
+    assert not set(labels[:, :37].ravel()) & set(labels[:, 37:].ravel())
+
+
+def test_kept_by_hand() -> None:
+    labels = np.array([[0, 1, -1, 2], [3, 3, 1, 0]], np.int32)
+    result = kept(labels, np.array([True, False, True, True]))
+    assert result.tolist() == [[0, -1, -1, 1], [2, 2, -1, 0]]
+    assert result.dtype == np.int32
+    assert kept(labels, np.zeros(4, bool)).tolist() == [[-1] * 4] * 2
+    assert kept(labels, np.ones(4, bool)).tolist() == labels.tolist()
+    assert labels.tolist() == [[0, 1, -1, 2], [3, 3, 1, 0]]
+
+
+def test_patches_of_equals_the_loop(scenes: ModuleType) -> None:
+    rng = np.random.default_rng(1)
+    seen, _ = scenes.corner()
+    labels = rng.integers(-1, 7, seen.valid.shape).astype(np.int32)
+    labels[~seen.valid] = -1
+    patches = patches_of(seen, labels)
+    assert len(patches) == 7
+    for k in range(7):
+        mean, normal, area, size = np.zeros(3), np.zeros(3), 0.0, 0
+        for y, x in np.argwhere(labels == k):
+            w = float(seen.areas[y, x])
+            mean += w * seen.points[y, x]
+            normal += w * seen.normals[y, x]
+            area += w
+            size += 1
+        np.testing.assert_allclose(patches.means[k], mean / area, rtol=1e-6)
+        np.testing.assert_allclose(patches.normals[k], normal / np.linalg.norm(normal), atol=1e-6)
+        assert patches.areas[k] == pytest.approx(area, rel=1e-6)
+        assert patches.sizes[k] == size
+
+
+def test_areas_weigh(scenes: ModuleType) -> None:
+    # two pixels of areas 1 and 3, whose normals are at right angles
+    seen = Surface(
+        np.array([[[0, 0, 1], [4, 0, 1]]], np.float32),
+        np.array([[[0, 0, -1], [-1, 0, 0]]], np.float32),
+        np.ones((1, 2), bool),
+        np.array([[1, 3]], np.float32),
+        scenes.CAMERA,
+    )
+    patches = patches_of(seen, np.zeros((1, 2), np.int32))
+    np.testing.assert_allclose(patches.means, [[3, 0, 1]])
+    np.testing.assert_allclose(patches.normals, [[-3 / 10**0.5, 0, -1 / 10**0.5]], rtol=1e-6)
+    assert (patches.areas.tolist(), patches.sizes.tolist()) == ([4.0], [2])
+
+
+def test_nothing_seen_gives_no_patch(scenes: ModuleType) -> None:
+    seen = wall(scenes)
+    seen.valid[:] = False
+    labels = segment(seen, parameters())
+    assert (labels == -1).all()
+    assert len(patches_of(seen, labels)) == 0

@@ -1,0 +1,196 @@
+"""Counting pairs in the 4-D table, against invariants computed pair by pair."""
+
+from __future__ import annotations
+
+import math
+from types import ModuleType
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sceneprint.geometry.mixture import Mixture, posteriors
+from sceneprint.geometry.projection import Projection, project
+from sceneprint.geometry.properties import (
+    PropertyParameters,
+    invariants,
+    neighbour_pairs,
+    properties,
+)
+from sceneprint.geometry.table import LEADING, LEAST, TableLayout, bin_centres, count_pairs, part
+from sceneprint.types import Floats, Ints32, Patches
+
+LAYOUT = TableLayout(distance_bins=36, angle_bins=25, dihedral_bins=36, distance_exponent=1.3)
+SMALL = TableLayout(distance_bins=7, angle_bins=5, dihedral_bins=8, distance_exponent=1.0)
+P = PropertyParameters(radius=3.0, angular_tolerance=math.radians(10), colinearity=0.9995)
+
+
+def count(patches: Patches, layout: TableLayout = LAYOUT) -> Ints32:
+    counts, n_pairs = count_pairs(patches.means, patches.normals, layout, P)
+    assert counts.sum() == n_pairs
+    return counts
+
+
+def bins_of(invariant: Floats, layout: TableLayout) -> tuple[NDArray[np.int64], ...]:
+    """Indices on the four axes, from the angles themselves."""
+    d, theta_mu, theta_alpha, phi = invariant.T
+    edges = P.radius * (np.arange(layout.distance_bins + 1) / layout.distance_bins) ** (
+        layout.distance_exponent
+    )
+    theta_edges = np.linspace(0, np.pi, layout.angle_bins + 1)
+    step = 2 * np.pi / layout.dihedral_bins
+    return (
+        np.searchsorted(edges, d, side="right") - 1,
+        np.searchsorted(theta_edges, theta_mu, side="right") - 1,
+        np.searchsorted(theta_edges, theta_alpha, side="right") - 1,
+        np.rint(phi / step).astype(int) % layout.dihedral_bins,
+    )
+
+
+def shape(layout: TableLayout) -> tuple[int, int, int, int]:
+    return layout.distance_bins, layout.angle_bins, layout.angle_bins, layout.dihedral_bins
+
+
+@pytest.mark.parametrize("layout", [LAYOUT, SMALL])
+@pytest.mark.parametrize("seed", range(4))
+def test_counts_equal_those_of_the_invariants(
+    scenes: ModuleType, layout: TableLayout, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    patches = scenes.room(rng) if seed % 2 else scenes.random_patches(rng, 130)
+    pairs = neighbour_pairs(patches, P)
+    assert 5000 < len(pairs) < len(patches) * (len(patches) - 1)
+    expected = np.zeros(shape(layout), int)
+    np.add.at(expected, bins_of(invariants(patches, pairs), layout), 1)
+    counts = count(patches, layout)
+    assert counts.shape == (layout.n_bins,)
+    np.testing.assert_array_equal(counts, expected.ravel())
+
+
+def test_every_centre_falls_in_its_bin(goldens: ModuleType) -> None:
+    rng = np.random.default_rng(7)
+    inner = rng.integers(0, LAYOUT.n_bins, 150)
+    ends = np.ravel_multi_index(np.array([[0, 0, 0, 0], [35, 24, 24, 35]]).T, shape(LAYOUT))
+    for b in (*inner.tolist(), *ends.tolist()):
+        centre = bin_centres(LAYOUT, b, b + 1, P)[0]
+        counts = count(goldens.from_invariants(*centre))
+        # (0, 1) in its own bin; (1, 0) in the one with both angles turned round and exchanged
+        i, j, k, m = np.unravel_index(b, shape(LAYOUT))
+        other = np.ravel_multi_index((i, 24 - k, 24 - j, m), shape(LAYOUT))
+        expected = np.zeros(LAYOUT.n_bins, int)
+        expected[b] += 1
+        expected[other] += 1
+        np.testing.assert_array_equal(counts, expected)
+
+
+def test_centres_by_hand() -> None:
+    # 7 x 5 x 5 x 8: the bin (3, 1, 4, 6) is the ((3 * 5 + 1) * 5 + 4) * 8 + 6 = 678th
+    centre = bin_centres(SMALL, 678, 679, P)
+    expected = [3.0 * 3.5 / 7, math.radians(54), math.radians(162), math.radians(-90)]
+    np.testing.assert_allclose(centre, [expected], rtol=1e-12)
+    assert SMALL.n_bins == 7 * 5 * 5 * 8
+    every = bin_centres(SMALL, 0, SMALL.n_bins, P)
+    np.testing.assert_allclose(every[678:679], centre)
+    np.testing.assert_array_equal(
+        np.unique(np.round(np.degrees(every[:, 1]))), [18, 54, 90, 126, 162]
+    )
+
+
+def index(counts: Ints32) -> set[int]:
+    return set(np.flatnonzero(counts).tolist())
+
+
+@pytest.mark.parametrize("phi", [0.0, 90.0, 180.0, -180.0, -90.0])
+def test_right_angles_lie_within_their_bins(goldens: ModuleType, phi: float) -> None:
+    rng = np.random.default_rng(3)
+    right = index(count(goldens.from_invariants(1.0, *np.radians([90, 90, phi]))))
+    for off in rng.uniform(-2, 2, (20, 3)):
+        angles = np.radians(np.array([90, 90, phi]) + off)
+        assert index(count(goldens.from_invariants(1.0, *angles))) == right
+    # and a bin is no wider than the layout says: 7.2 and 10 degrees, half of it each way
+    for off in ([4.0, 0, 0], [0, -4.0, 0], [0, 0, 5.5]):
+        angles = np.radians(np.array([90, 90, phi]) + off)
+        assert index(count(goldens.from_invariants(1.0, *angles))) != right
+
+
+def test_parallel_normals_lie_in_the_outermost_bins(goldens: ModuleType) -> None:
+    for degrees, expected in ((0.0, 0), (2.0, 0), (7.0, 0), (7.4, 1), (178.0, 24), (180.0, 24)):
+        counts = count(goldens.from_invariants(1.0, *np.radians([60, degrees, 45])))
+        alphas = {int(np.unravel_index(b, shape(LAYOUT))[2]) for b in index(counts)}
+        # beside the pair itself, and its reverse where n_alpha spans a basis: 180 - 60 = 120
+        assert expected in alphas
+        assert alphas <= {expected, 16}
+        assert len(index(counts)) == (1 if degrees in (0.0, 180.0) else 2)
+
+
+def test_no_rotation_changes_a_count(scenes: ModuleType) -> None:
+    rng = np.random.default_rng(5)
+    for patches in (scenes.random_patches(rng, 100), scenes.room(rng)):
+        before = count(patches)
+        for _ in range(5):
+            turn = Rotation.random(rng=rng)
+            after = count(scenes.moved(patches, turn, rng.uniform(-10, 10, 3)))
+            np.testing.assert_array_equal(after, before)
+
+
+def test_bins_finer_than_the_look_up_are_refused() -> None:
+    # 4096 cells of hints over the radius: 5000 bins would put two edges into one of them
+    fine = TableLayout(distance_bins=5000, angle_bins=1, dihedral_bins=4, distance_exponent=1.0)
+    with pytest.raises(ValueError, match="finer than the look-up allows"):
+        count_pairs(np.zeros((2, 3)), np.ones((2, 3)), fine, P)
+
+
+def test_few_patches_have_no_pairs(scenes: ModuleType) -> None:
+    patches = scenes.random_patches(np.random.default_rng(0), 2)
+    for n in (0, 1):
+        counts, n_pairs = count_pairs(patches.means[:n], patches.normals[:n], SMALL, P)
+        assert (n_pairs, counts.sum()) == (0, 0)
+    # in the same place, or out of reach
+    for means in (np.zeros((2, 3)), np.array([[0, 0, 0], [3, 0, 0]], float)):
+        assert count_pairs(means, patches.normals, SMALL, P)[1] == 0
+
+
+def model(rng: np.random.Generator, g: int) -> tuple[Projection, Mixture]:
+    weights = rng.uniform(0.2, 1, g)
+    projection = Projection(rng.normal(size=13), rng.normal(0, 0.5, (12, 13)))
+    mixture = Mixture(
+        weights / weights.sum(), rng.normal(0, 2, (g, 12)), rng.uniform(0.3, 6.0, (g, 12))
+    )
+    return projection, mixture
+
+
+def test_leading_posteriors() -> None:
+    projection, mixture = model(np.random.default_rng(1), 20)
+    first, last = 400_000, 400_600
+    table = part(first, last, LAYOUT, P, projection, mixture)
+    features = project(properties(bin_centres(LAYOUT, first, last, P), P), projection)
+    np.testing.assert_allclose(table.features, features, rtol=1e-6, atol=1e-6)
+    exact = posteriors(features, mixture)
+    order = np.argsort(-exact, axis=1)[:, :LEADING]
+    leading = np.take_along_axis(exact, order, axis=1)
+    expected = leading / leading.sum(axis=1, keepdims=True)
+    expected = np.where(expected < LEAST, 0.0, expected)
+    expected /= expected.sum(axis=1, keepdims=True)
+    clear = (np.abs(leading / leading.sum(axis=1, keepdims=True) - LEAST) > 1e-5).all(axis=1)
+    assert clear.mean() > 0.9
+    np.testing.assert_allclose(table.posteriors[clear], expected[clear], rtol=0, atol=1e-4)
+    # float32 may exchange two that are equal; the values at the named components must agree
+    named = np.take_along_axis(exact, table.components.astype(int), axis=1)
+    np.testing.assert_allclose(named, leading, rtol=0, atol=1e-4)
+    assert (np.diff(table.posteriors, axis=1) <= 0).all()
+    assert all(len(set(row)) == LEADING for row in table.components.tolist())
+    assert (table.components >= 0).all()
+    assert (table.components < 20).all()
+    np.testing.assert_allclose(table.posteriors.sum(axis=1), 1, atol=1e-6)
+
+
+def test_fewer_components_than_are_kept() -> None:
+    projection, mixture = model(np.random.default_rng(2), 3)
+    table = part(0, 100, SMALL, P, projection, mixture)
+    exact = posteriors(project(properties(bin_centres(SMALL, 0, 100, P), P), projection), mixture)
+    for shares, components, expected in zip(table.posteriors, table.components, exact, strict=True):
+        assert sorted(components[:3].tolist()) == [0, 1, 2]
+        kept = np.where(expected < LEAST, 0.0, expected)[components[:3]]
+        np.testing.assert_allclose(shares[:3], kept / kept.sum(), atol=1e-4)
+        assert not shares[3:].any()
