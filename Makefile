@@ -1,0 +1,59 @@
+# Every habit is a verb. Each target makes its own environment in .venv first.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+# Our kernels want one thread each; more processes, not more threads, use more processors.
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: help demo test lint format bench models lock clean
+
+help:
+	@echo "make demo    sign frames, find each one's nearest, and draw them [DATASET=folder]"
+	@echo "make test    lint, types, import contracts and all tests"
+	@echo "make lint    lint, types and import contracts only"
+	@echo "make bench   what signing costs, beside FPFH; rewrites its part of docs/performance.md"
+	@echo "make models  train the presets that ship with the package (minutes)"
+	@echo "make lock    resolve the dependencies anew into requirements.txt"
+
+$(STAMP): requirements.txt pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "sceneprint needs Python 3.11 or later; set PYTHON=/path/to/python3"; exit 2; }
+	$(PYTHON) -m venv $(VENV) || \
+		{ echo "python3 cannot make environments; on Debian or Ubuntu: apt install python3-venv"; exit 2; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $(STAMP)
+
+demo: $(STAMP)
+	$(BIN)/sceneprint demo --out demo $(if $(DATASET),--dataset $(DATASET))
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
+
+test: lint
+	$(BIN)/python -m pytest -n auto --dist loadfile
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(STAMP)
+	$(BIN)/python -m benchmarks --page docs/performance.md
+
+models: $(STAMP)
+	$(BIN)/sceneprint train --preset paper --out sceneprint/presets/paper.safetensors
+	$(BIN)/sceneprint train --preset compact --out sceneprint/presets/compact.safetensors
+
+lock: $(STAMP)
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --no-header \
+		--no-annotate --no-emit-index-url --output-file requirements.txt pyproject.toml
+
+clean:
+	rm -rf $(VENV) build out demo *.egg-info

@@ -1,0 +1,143 @@
+"""What signing costs, stage by stage, beside Open3D's FPFH of the same frames in the same run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sceneprint.errors import MissingDependency
+from sceneprint.geometry.depth import inverse_depth
+from sceneprint.geometry.encoding import quantise, statistics_of_counts
+from sceneprint.geometry.hierarchy import hierarchy
+from sceneprint.geometry.normals import surface
+from sceneprint.geometry.segmentation import segment
+from sceneprint.geometry.table import count_pairs
+from sceneprint.pipeline import Signer, float_signature, sign
+from sceneprint.types import Floats, Frame
+
+T = TypeVar("T")
+
+#: FPFH as its users run it: voxel, then normals (radius, neighbours), features (the same).
+VOXEL, NORMALS, FEATURES = 0.05, (0.10, 30), (0.25, 100)
+
+
+class Clock:
+    """Milliseconds by stage, for one frame."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, float] = {}
+
+    def run(self, stage: str, call: Callable[[], T]) -> T:
+        """Time one call and add it to its stage."""
+        start = time.perf_counter()
+        result = call()
+        self.stages[stage] = self.stages.get(stage, 0.0) + 1e3 * (time.perf_counter() - start)
+        return result
+
+
+def signing_stages(frame: Frame, signer: Signer) -> dict[str, float]:
+    """Milliseconds of each stage of `sign`; their sum is the time of `sign` itself."""
+    model, p, clock = signer.model, signer.model.parameters, Clock()
+    q, camera = clock.run("inverse depth", lambda: inverse_depth(frame, p.depth))
+    seen = clock.run("points and normals", lambda: surface(q, camera, p.normals))
+    finest = clock.run("segmentation", lambda: segment(seen, p.segmentation))
+    levels = clock.run("hierarchy", lambda: hierarchy(seen, finest, p.hierarchy)).levels
+    counted = clock.run(
+        "pairs",
+        lambda: [count_pairs(x.means, x.normals, p.table, p.properties) for x in levels],
+    )
+    sums = clock.run(
+        "statistics",
+        lambda: [statistics_of_counts(c, n, signer.table, len(model.mixture)) for c, n in counted],
+    )
+    clock.run(
+        "Fisher vector",
+        lambda: quantise(float_signature(sums, model), model.quantiser_step),
+    )
+    return clock.stages
+
+
+def open3d() -> Any:
+    """The open3d module.
+
+    Raises
+    ------
+    MissingDependency : it, or a system library it needs, is absent.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise MissingDependency(
+            f"open3d cannot be imported ({error}). On Debian or Ubuntu: "
+            "apt install libgl1 libegl1 libx11-6 libusb-1.0-0 libgomp1"
+        ) from error
+    return open3d
+
+
+def points_of(frame: Frame, minimum: float, maximum: float) -> Floats:
+    """All samples within range as points, (N, 3) metres; not part of any timing."""
+    k = frame.intrinsics
+    y, x = np.nonzero((frame.depth >= minimum) & (frame.depth <= maximum))
+    z = frame.depth[y, x].astype(float)
+    return np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=1)
+
+
+def fpfh_stages(points: Floats, o3d: Any) -> dict[str, float]:
+    """Milliseconds of each stage of FPFH."""
+    clock, search = Clock(), o3d.geometry.KDTreeSearchParamHybrid
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    thin = clock.run("FPFH voxel grid", lambda: cloud.voxel_down_sample(VOXEL))
+    clock.run("FPFH normals", lambda: thin.estimate_normals(search(*NORMALS)))
+    clock.run(
+        "FPFH features",
+        lambda: o3d.pipelines.registration.compute_fpfh_feature(thin, search(*FEATURES)),
+    )
+    return clock.stages
+
+
+@dataclass(frozen=True)
+class EncodeFigures:
+    """Medians over all frames, milliseconds; `ratio` is the median of each frame's own."""
+
+    frames: int
+    stages: dict[str, float]
+    signing: float
+    fpfh_stages: dict[str, float]
+    fpfh: float | None
+    ratio: float | None
+    note: str
+
+
+def measure(frames: list[Frame], signer: Signer, warm_up: int = 3) -> EncodeFigures:
+    """Sign every frame and, in turn, compute its FPFH, on the processor we are pinned to."""
+    p, note, o3d = signer.model.parameters.depth, "", None
+    try:
+        o3d = open3d()
+    except MissingDependency as error:
+        note = str(error)
+    for frame in frames[:warm_up]:
+        sign(frame, signer)
+    ours, theirs = [], []
+    for frame in frames:
+        ours.append(signing_stages(frame, signer))
+        if o3d is not None:
+            theirs.append(fpfh_stages(points_of(frame, p.minimum_depth, p.maximum_depth), o3d))
+    sums, other = [sum(s.values()) for s in ours], [sum(s.values()) for s in theirs]
+    ratios = [a / b for a, b in zip(sums, other, strict=False)]
+    return EncodeFigures(
+        frames=len(frames),
+        stages=_medians(ours),
+        signing=float(np.median(sums)),
+        fpfh_stages=_medians(theirs),
+        fpfh=float(np.median(other)) if other else None,
+        ratio=float(np.median(ratios)) if ratios else None,
+        note=note,
+    )
+
+
+def _medians(rows: list[dict[str, float]]) -> dict[str, float]:
+    return {s: float(np.median([row[s] for row in rows])) for s in rows[0]} if rows else {}

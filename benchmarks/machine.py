@@ -1,0 +1,86 @@
+"""The machine a figure was measured on, and what a process costs there."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What a reader needs to compare figures with their own."""
+
+    processor: str
+    cores: int
+    memory_gib: float
+    python: str
+    packages: dict[str, str]
+
+
+def describe_machine() -> Machine:
+    """This machine, as its kernel describes it."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    packages = {}
+    for name in ("numpy", "numba", "open3d"):
+        try:
+            packages[name] = version(name)
+        except PackageNotFoundError:
+            packages[name] = "absent"
+    model = [
+        line.split(":", 1)[1].strip()
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if line.startswith("model name")
+    ]
+    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return Machine(
+        processor=model[0] if model else platform.machine(),
+        cores=os.cpu_count() or 1,
+        memory_gib=round(pages / 2**30, 1),
+        python=platform.python_version(),
+        packages=packages,
+    )
+
+
+def seconds_to_import(runs: int = 5) -> float:
+    """Median wall time that `import sceneprint` adds to an interpreter's start."""
+
+    def start(code: str) -> float:
+        begin = time.perf_counter()
+        subprocess.run([sys.executable, "-c", code], check=True)
+        return time.perf_counter() - begin
+
+    return statistics.median(start("import sceneprint") - start("pass") for _ in range(runs))
+
+
+def peak_megabytes_of_signing(folder: Path, preset: str) -> float:
+    """Peak resident memory of a process that signs the frames of a folder, table mapped."""
+    code = (
+        "import resource, sys\n"
+        "from sceneprint.cli import main\n"
+        f"main(['sign', sys.argv[1], '--preset', {preset!r}])\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(folder)], check=True, capture_output=True, text=True
+    )
+    return int(done.stderr.split()[-1]) / 1024
+
+
+def pin_to_one_processor() -> int:
+    """Let this process, and every thread it starts, run on one processor only."""
+    cpu = max(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {cpu})
+    return cpu
+
+
+def own_peak_megabytes() -> float:
+    """Peak resident memory of this process."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
