@@ -3,9 +3,21 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from sceneprint.geometry.hierarchy import HierarchyParameters
+from sceneprint.geometry.mixture import Mixture
+from sceneprint.geometry.projection import Projection
+from sceneprint.geometry.segmentation import SegmentationParameters
+from sceneprint.geometry.table import TableLayout
+from sceneprint.models import Model, ModelParameters
+from sceneprint.pipeline import Signer, open_signer
+from sceneprint.synth import synthesise_room
+from sceneprint.types import Frame
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -17,3 +29,39 @@ def data_root() -> Path:
     if not root.is_dir():
         pytest.skip(f"no real recordings at {root} (set SCENEPRINT_DATA)")
     return root
+
+
+@pytest.fixture(scope="session")
+def small_model() -> Model:
+    """Eight components, two levels: quick to open, and signs like a real one."""
+    rng = np.random.default_rng(5)
+    matrix = np.asfortranarray(rng.normal(size=(12, 13)) / 3)  # as scikit-learn returns them
+    return Model(
+        name="small",
+        parameters=ModelParameters(
+            segmentation=SegmentationParameters(n_patches=150),
+            hierarchy=HierarchyParameters(n_levels=2),
+            table=TableLayout(8, 9, 8),
+        ),
+        projection=Projection(rng.normal(size=13), matrix),
+        mixture=Mixture(np.full(8, 0.125), rng.normal(size=(8, 12)), np.full((8, 12), 0.7)),
+        quantiser_step=0.002,
+        unrelated_distance=1000.0,
+        provenance={"made": "by a test"},
+    )
+
+
+@pytest.fixture(scope="session")
+def small_signer(small_model: Model) -> Signer:
+    return open_signer(small_model, cached=False)
+
+
+@pytest.fixture(scope="session")
+def room_frames() -> tuple[Frame, ...]:
+    """Three views of each of two synthetic rooms."""
+    rooms = [synthesise_room(21, i, 3) for i in range(2)]
+    return tuple(
+        replace(frame, name=f"{room.name}-{i}")
+        for room in rooms
+        for i, frame in enumerate(room.frames)
+    )

@@ -38,6 +38,7 @@ def save_model(model: Model, path: Path) -> None:
         "provenance": dict(model.provenance),
     }
     data = save(model.tensors, {"sceneprint": json.dumps(header, sort_keys=True)})
+    parse_model(data, str(path))  # what cannot be read back is not written
     partial = path.with_name(path.name + ".partial")
     partial.write_bytes(data)
     partial.replace(path)

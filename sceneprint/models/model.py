@@ -66,13 +66,15 @@ class Model:
     @property
     def tensors(self) -> dict[str, NDArray[np.float64]]:
         """The learnt arrays by the names they have in the file."""
-        return {
+        arrays = {
             "projection.mean": self.projection.mean,
             "projection.matrix": self.projection.matrix,
             "mixture.weights": self.mixture.weights,
             "mixture.means": self.mixture.means,
             "mixture.variances": self.mixture.variances,
         }
+        # safetensors writes memory as it lies: a Fortran-ordered matrix would come back garbled
+        return {name: np.ascontiguousarray(array, "<f8") for name, array in arrays.items()}
 
     @property
     def header(self) -> dict[str, Any]:
@@ -90,7 +92,7 @@ class Model:
         digest = hashlib.sha256(json.dumps(self.header, sort_keys=True).encode())
         for name, tensor in sorted(self.tensors.items()):
             digest.update(f"{name} {tensor.shape} ".encode())
-            digest.update(np.ascontiguousarray(tensor, "<f8").tobytes())
+            digest.update(tensor.tobytes())
         return digest.hexdigest()
 
     @property

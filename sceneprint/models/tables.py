@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from sceneprint.models.model import Model
 
 #: Layout of the cached file; a change makes new files beside the old.
 CACHE_VERSION = 1
+#: Bytes before the bins; a multiple of a cache line, so that the bins stay aligned.
+HEAD = 64
 #: Bins evaluated between two reports of progress.
 CHUNK = 16_384
 
@@ -43,7 +46,7 @@ def open_table(
     progress : called while the table is being built
     """
     folder = default_cache_dir() if cache_dir is None else cache_dir
-    path = folder / f"table-v{CACHE_VERSION}-{model.id}.npy"
+    path = folder / f"table-v{CACHE_VERSION}-{model.id}.bin"
     cached = _mapped(path, model)
     if cached is not None:
         return cached
@@ -72,12 +75,20 @@ def _unpacked(packed: np.ndarray) -> PairTable:
 
 def _mapped(path: Path, model: Model) -> PairTable | None:
     try:
-        packed = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError):
+        with path.open("rb") as file:
+            head = file.read(HEAD)
+        if path.stat().st_size != HEAD + model.parameters.table.n_bins * _record().itemsize:
+            return None
+        packed = np.memmap(path, _record(), "r", offset=HEAD, shape=model.parameters.table.n_bins)
+    except (OSError, ValueError):
         return None
-    if packed.dtype != _record() or packed.shape != (model.parameters.table.n_bins,):
-        return None
-    return _unpacked(packed)
+    return _unpacked(packed) if head == _head(packed) else None
+
+
+def _head(packed: np.ndarray) -> bytes:
+    """First bytes of the file: what it is, and a checksum of the rest (20 ms to verify)."""
+    checksum = zlib.crc32(packed.view(np.uint8).data)
+    return f"sceneprint table {CACHE_VERSION} {checksum:08x}".encode().ljust(HEAD)
 
 
 def build_table(model: Model, progress: Progress | None = None) -> PairTable:
@@ -110,7 +121,8 @@ def _publish(packed: np.ndarray, path: Path) -> None:
     descriptor, partial = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".partial")
     try:
         with os.fdopen(descriptor, "wb") as file:
-            np.save(file, packed, allow_pickle=False)
+            file.write(_head(packed))
+            file.write(packed.data)
         Path(partial).replace(path)
     except BaseException:
         Path(partial).unlink(missing_ok=True)

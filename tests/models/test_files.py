@@ -1,0 +1,141 @@
+"""Model files: what is read is what was written, and damage is noticed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load, save
+
+from sceneprint.errors import UnreadableModel
+from sceneprint.geometry.depth import DepthParameters
+from sceneprint.models import PRESETS, Model, parse_model, read_model, save_model
+
+
+def test_round_trip(small_model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "small.safetensors"
+    save_model(small_model, path)
+    read = read_model(path)
+    assert read.id == small_model.id
+    assert read.parameters == small_model.parameters
+    assert (read.name, read.provenance) == ("small", {"made": "by a test"})
+    for name, tensor in small_model.tensors.items():
+        np.testing.assert_array_equal(read.tensors[name], tensor)
+    assert [p.name for p in tmp_path.iterdir()] == ["small.safetensors"]
+
+
+def test_files_of_one_model_are_equal(small_model: Model, tmp_path: Path) -> None:
+    save_model(small_model, tmp_path / "a")
+    save_model(replace(small_model), tmp_path / "b")
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_id_is_the_content_not_the_name(small_model: Model) -> None:
+    assert len(small_model.id) == 64
+    assert replace(small_model, name="other", provenance={}).id == small_model.id
+    depth = replace(small_model.parameters, depth=DepthParameters(maximum_depth=8.99))
+    bent = replace(small_model.mixture, means=small_model.mixture.means + 1e-12)
+    others = [
+        replace(small_model, parameters=depth),
+        replace(small_model, mixture=bent),
+        replace(small_model, quantiser_step=0.003),
+        replace(small_model, unrelated_distance=1001.0),
+    ]
+    assert len({small_model.id, *(other.id for other in others)}) == 5
+
+
+def test_sizes(small_model: Model) -> None:
+    assert small_model.level_length == 25 * 8
+    assert small_model.signature_bytes == 25 * 8 * 2
+
+
+@pytest.mark.parametrize(("preset", "g", "h"), [("paper", 1250, 4), ("compact", 256, 2)])
+def test_presets_ship(preset: str, g: int, h: int) -> None:
+    model = read_model(preset)
+    assert model.name == preset
+    assert model.signature_bytes == 25 * g * h
+    assert model.mixture.weights.sum() == pytest.approx(1.0, abs=1e-12)
+    assert model.parameters.properties.radius == 3.0
+    assert preset in PRESETS
+
+
+def header_of(data: bytes) -> dict[str, object]:
+    length = int.from_bytes(data[:8], "little")
+    header: dict[str, object] = json.loads(
+        json.loads(data[8 : 8 + length])["__metadata__"]["sceneprint"]
+    )
+    return header
+
+
+def with_header(data: bytes, change: Callable[[dict[str, object]], None]) -> bytes:
+    header = header_of(data)
+    change(header)
+    return save(load(data), {"sceneprint": json.dumps(header)})
+
+
+def with_tensors(data: bytes, **changed: np.ndarray) -> bytes:
+    tensors = load(data) | {name.replace("_", "."): t for name, t in changed.items()}
+    return save(tensors, {"sceneprint": json.dumps(header_of(data))})
+
+
+@pytest.fixture
+def data(small_model: Model, tmp_path: Path) -> bytes:
+    save_model(small_model, tmp_path / "m")
+    return (tmp_path / "m").read_bytes()
+
+
+def test_damage_is_noticed(data: bytes) -> None:
+    def drop(key: str) -> Callable[[dict[str, object]], None]:
+        return lambda header: header.pop(key) and None
+
+    def put(key: str, value: object) -> Callable[[dict[str, object]], None]:
+        return lambda header: header.update({key: value})
+
+    cases = {
+        "not a model file": [b"", b"x" * 100, data[:40], data[:-5], save({"a": np.zeros(1)})],
+        "schema 9 is not 1": [with_header(data, put("schema_version", 9))],
+        "missing or misshapen": [
+            with_header(data, drop("quantiser_step")),
+            with_header(data, put("quantiser_step", 0.0)),
+            with_header(data, put("unrelated_distance", float("nan"))),
+            with_tensors(data, mixture_weights=np.zeros(8)),
+            with_tensors(data, mixture_means=np.zeros((8, 11))),
+            with_tensors(data, projection_mean=np.full(13, np.nan)),
+            with_tensors(data, projection_mean=np.zeros(13, np.float32)),
+        ],
+        "should have the fields": [with_header(data, put("parameters", {"depth": {}}))],
+        "was damaged": [
+            with_header(data, put("quantiser_step", 0.5)),
+            with_tensors(data, projection_mean=np.zeros(13)),
+        ],
+    }
+    for message, files in cases.items():
+        for file in files:
+            with pytest.raises(UnreadableModel, match=message):
+                parse_model(file, "a file")
+
+
+def test_a_parameter_that_is_no_number(data: bytes) -> None:
+    def break_it(header: dict[str, object]) -> None:
+        parameters = header["parameters"]
+        assert isinstance(parameters, dict)
+        parameters["properties"]["radius"] = "three"
+
+    with pytest.raises(UnreadableModel, match=r"parameters\.properties\.radius is 'three'"):
+        parse_model(with_header(data, break_it), "a file")
+
+
+def test_paths_that_hold_no_model(tmp_path: Path) -> None:
+    with pytest.raises(UnreadableModel, match=r"cannot be read .*presets \(paper, compact\)"):
+        read_model(tmp_path / "none")
+    with pytest.raises(UnreadableModel, match="cannot be read"):
+        read_model(tmp_path)
+    large = tmp_path / "large"
+    with large.open("wb") as file:
+        file.truncate(17 << 20)
+    with pytest.raises(UnreadableModel, match="more than any model has"):
+        read_model(large)

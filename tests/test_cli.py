@@ -1,0 +1,194 @@
+"""The commands as a user runs them: real processes, their output, files and exit codes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sceneprint.models import Model, save_model
+from sceneprint.pipeline import Signer, sign
+
+CAMERA = {"width": 160, "height": 120, "fx": 146, "fy": 146, "cx": 80, "cy": 60}
+
+
+def run(*arguments: object, expect: int = 0) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "sceneprint", *map(str, arguments)], capture_output=True, text=True
+    )
+    assert done.returncode == expect, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("synth") / "rooms"
+    done = run("synth", out, "--rooms", 2, "--views", 2, "--seed", 5)
+    assert "2 rooms of 2 views" in done.stdout
+    return out
+
+
+@pytest.fixture
+def model_file(small_model: Model, tmp_path: Path) -> Path:
+    path = tmp_path / "small.safetensors"
+    save_model(small_model, path)
+    return path
+
+
+def tree_hash(folder: Path) -> dict[str, str]:
+    return {
+        str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(folder.rglob("*"))
+        if p.is_file()
+    }
+
+
+def test_synth_writes_the_layout(rooms: Path, tmp_path: Path) -> None:
+    names = list(tree_hash(rooms))
+    assert names == [
+        f"room-00{r}/{name}"
+        for r in range(2)
+        for name in (
+            "intrinsics.json",
+            "seq-01/frame-000000.depth.png",
+            "seq-01/frame-000000.pose.txt",
+            "seq-01/frame-000001.depth.png",
+            "seq-01/frame-000001.pose.txt",
+        )
+    ]
+    run("synth", tmp_path / "again", "--rooms", 2, "--views", 2, "--seed", 5, "--jobs", 1)
+    assert tree_hash(tmp_path / "again") == tree_hash(rooms)
+    pose = np.loadtxt(rooms / "room-000/seq-01/frame-000001.pose.txt")
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6)
+    with Image.open(rooms / "room-001/seq-01/frame-000000.depth.png") as image:
+        assert (image.size, image.mode) == ((640, 480), "I;16")
+
+
+def test_synth_does_not_mix_two_runs(rooms: Path) -> None:
+    before = tree_hash(rooms)
+    done = run("synth", rooms, "--rooms", 1, expect=2)
+    assert "is not empty" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert tree_hash(rooms) == before
+
+
+def test_sign_says_a_line_and_writes_a_file_for_each_frame(
+    rooms: Path, model_file: Path, small_signer: Signer, tmp_path: Path
+) -> None:
+    from sceneprint.datasets import find_sequences
+
+    out = tmp_path / "out"
+    done = run("sign", rooms, "--model", model_file, "--out", out)
+    lines = done.stdout.splitlines()
+    assert len(lines) == 4
+    for line in lines:
+        assert small_signer.model.label in line
+        assert " patches " in line
+        assert " pairs " in line
+        assert " ms " in line
+    assert "4 of 4 frames signed" in done.stderr
+    index = json.loads((out / "signatures.json").read_text())
+    assert index["model"]["id"] == small_signer.model.id
+    frames = [r for s in find_sequences(rooms) for r in s.frames]
+    assert [entry["name"] for entry in index["frames"]] == [f.name for f in frames]
+    for entry, reference in zip(index["frames"], frames, strict=True):
+        stored = (out / entry["file"]).read_bytes()
+        assert stored == sign(reference.read(), small_signer).vector.tobytes()
+        assert hashlib.sha256(stored).hexdigest() == entry["sha256"]
+        assert len(entry["patches"]) == len(entry["pairs"]) == 2
+    assert sorted(tree_hash(out)) == sorted(
+        ["signatures.json", *(entry["file"] for entry in index["frames"])]
+    )
+
+
+def test_a_bad_frame_does_not_stop_the_others(model_file: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    (folder / "intrinsics.json").write_text(json.dumps(CAMERA))
+    y, x = np.mgrid[:120, :160]
+    good = np.where(x < 80, 1500 + 3 * y, 2500 - 4 * y).astype(np.uint16)
+    Image.fromarray(good).save(folder / "a.png")
+    Image.fromarray(good.astype(np.uint8)).save(folder / "b.png")
+    Image.fromarray(np.zeros_like(good)).save(folder / "c.png")
+    (folder / "d.png").write_bytes((folder / "a.png").read_bytes()[:200])
+    np.save(folder / "e.npy", (good / 1000).astype(np.float32))
+    out = tmp_path / "out"
+    done = run("sign", folder, "--model", model_file, "--out", out, expect=2)
+    lines = done.stdout.splitlines()
+    assert ["NOT SIGNED" in line for line in lines] == [False, True, True, True, False]
+    assert "2 of 5 frames signed" in done.stderr
+    assert "3 could not be signed" in done.stderr
+    entries = json.loads((out / "signatures.json").read_text())["frames"]
+    assert [entry["signed"] for entry in entries] == [True, False, False, False, True]
+    assert "8" in entries[1]["reason"]
+    # the same depth as PNG and as NPY, but for the rounding of 1/1000
+    assert (out / entries[0]["file"]).read_bytes() == (out / entries[4]["file"]).read_bytes()
+
+
+def test_two_paths_keep_their_names_apart(rooms: Path, model_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run("sign", rooms / "room-000", rooms / "room-001", "--model", model_file, "--out", out)
+    entries = json.loads((out / "signatures.json").read_text())["frames"]
+    assert len({entry["name"] for entry in entries}) == 4
+    done = run("sign", rooms / "room-000", rooms / "room-000", "--model", model_file, expect=2)
+    assert "is already the name of" in done.stderr
+
+
+def test_picture_shows_depth_normals_and_levels(
+    rooms: Path, model_file: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "new" / "frame.png"
+    run("picture", rooms, "--frame", 3, "--out", out, "--model", model_file)
+    with Image.open(out) as image:
+        pixels = np.asarray(image.convert("RGB"))
+    assert min(pixels.shape[:2]) > 500
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 1000
+    done = run("picture", rooms, "--frame", 4, "--out", out, "--model", model_file, expect=2)
+    assert "Choose --frame from 0 to 3" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["sign", "/nowhere/at/all"], "no such file or folder"),
+        (["sign", "README.md"], "README.md"),
+        (["sign", "{rooms}", "--model", "/nowhere.safetensors"], "Give one of the presets"),
+        (["picture", "/nowhere", "--out", "x.png"], "no such file or folder"),
+        (["train", "--out", "{tmp}/m", "--rooms", "1", "--jobs", "1"], "fewer than two places"),
+        (["synth", "/dev/null/x"], "/dev/null"),
+    ],
+)
+def test_errors_are_one_line_and_exit_code_2(
+    arguments: list[str], message: str, rooms: Path, tmp_path: Path
+) -> None:
+    done = run(*(a.format(rooms=rooms, tmp=tmp_path) for a in arguments), expect=2)
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith(f"sceneprint {arguments[0]}: ")
+    assert message in last
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["sign"],
+        ["synth", "x", "--rooms", "0"],
+        ["train", "--out", "x", "--rooms", "-1"],
+        ["nothing"],
+    ],
+)
+def test_wrong_usage(arguments: list[str]) -> None:
+    done = run(*arguments, expect=2)
+    assert done.stderr.startswith("usage: sceneprint")
+
+
+def test_demo_ends_well(tmp_path: Path, model_file: Path, rooms: Path) -> None:
+    done = run("demo", "--out", tmp_path / "demo", "--dataset", rooms, "--model", model_file)
+    assert "of 4 frames" in done.stdout
+    assert len(list((tmp_path / "demo").glob("*.png"))) == 3

@@ -1,0 +1,204 @@
+"""From frame to stored signature: the promises a caller relies on."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sceneprint
+from sceneprint.errors import ModelMismatch, UselessFrame
+from sceneprint.geometry.encoding import quantise
+from sceneprint.models import Model, save_model
+from sceneprint.pipeline import (
+    Signer,
+    describe,
+    distance,
+    encode,
+    exact_statistics,
+    float_signature,
+    open_signer,
+    sign,
+    table_statistics,
+)
+from sceneprint.types import Frame, Intrinsics
+
+CAMERA = Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)
+
+
+def flat(depth: float, camera: Intrinsics = CAMERA) -> Frame:
+    return Frame(np.full((camera.height, camera.width), depth, np.float32), camera, "wall")
+
+
+def test_a_signature_has_the_size_of_its_model(
+    small_signer: Signer, room_frames: tuple[Frame, ...]
+) -> None:
+    signature = sign(room_frames[0], small_signer)
+    assert signature.vector.dtype == np.uint8
+    assert signature.vector.shape == (25 * 8 * 2,)
+    assert signature.model_id == small_signer.model.id
+    assert len(signature.n_patches) == len(signature.n_pairs) == 2
+    pairs = zip(signature.n_pairs, signature.n_patches, strict=True)
+    ratio = signature.n_patches[0] / signature.n_patches[1]
+    assert ratio == pytest.approx(2**0.5, abs=0.03)
+    assert all(0 < n <= p * (p - 1) for n, p in pairs)
+
+
+def test_same_bytes_in_any_thread_and_order(
+    small_signer: Signer, room_frames: tuple[Frame, ...]
+) -> None:
+    alone = [sign(frame, small_signer).vector.tobytes() for frame in room_frames]
+    with ThreadPoolExecutor(4) as pool:
+        jobs = [pool.submit(sign, frame, small_signer) for frame in room_frames[::-1] * 2]
+        threaded = [job.result().vector.tobytes() for job in jobs]
+    assert threaded == alone[::-1] * 2
+    assert len(set(alone)) == len(alone)
+
+
+@pytest.mark.parametrize("processor", ["", "generic"])
+def test_another_process_and_another_processor(
+    small_model: Model, small_signer: Signer, room_frames: tuple[Frame, ...],
+    tmp_path: Path, processor: str,
+) -> None:  # fmt: skip
+    """Compiled for the plainest x86-64, the bytes are the same, not just near."""
+    save_model(small_model, tmp_path / "model")
+    np.save(tmp_path / "depth.npy", room_frames[0].depth)
+    code = (
+        "import sys, numpy as np, sceneprint as s\n"
+        "k = s.Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)\n"
+        f"signer = s.open_signer({str(tmp_path / 'model')!r}, cached=False)\n"
+        f"frame = s.Frame(np.load({str(tmp_path / 'depth.npy')!r}), k)\n"
+        "sys.stdout.buffer.write(s.sign(frame, signer).vector.tobytes())\n"
+    )
+    environment = {
+        "PATH": "/usr/bin:/bin",
+        "HOME": str(tmp_path),
+        # numba keeps code of different processors apart by itself
+        **({"NUMBA_CPU_NAME": processor} if processor else {}),
+    }
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment)
+    assert done.returncode == 0, done.stderr.decode()
+    expected = sign(replace(room_frames[0], name=""), small_signer).vector
+    assert room_frames[0].intrinsics == CAMERA
+    assert done.stdout == expected.tobytes()
+
+
+def test_the_frame_is_left_as_it_was(small_signer: Signer, room_frames: tuple[Frame, ...]) -> None:
+    before = hashlib.sha256(room_frames[1].depth.tobytes()).hexdigest()
+    sign(room_frames[1], small_signer)
+    assert hashlib.sha256(room_frames[1].depth.tobytes()).hexdigest() == before
+
+
+def test_stages_add_up_to_sign(small_signer: Signer, room_frames: tuple[Frame, ...]) -> None:
+    model = small_signer.model
+    patches = describe(room_frames[2], model.parameters)
+    psi = float_signature([table_statistics(x, small_signer) for x in patches.levels], model)
+    expected = quantise(psi, model.quantiser_step)
+    np.testing.assert_array_equal(sign(room_frames[2], small_signer).vector, expected)
+    np.testing.assert_array_equal(encode(patches, small_signer).vector, expected)
+    half = len(psi) // 2
+    assert np.linalg.norm(psi[:half]) == pytest.approx(1.0, abs=1e-12)
+    assert np.linalg.norm(psi[half:]) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_distance_of_two_models_is_an_error_that_names_both(
+    small_model: Model, small_signer: Signer, room_frames: tuple[Frame, ...]
+) -> None:
+    a = sign(room_frames[0], small_signer)
+    other = open_signer(replace(small_model, quantiser_step=0.004), cached=False)
+    b = sign(room_frames[0], other)
+    with pytest.raises(ModelMismatch) as error:
+        distance(a, b)
+    assert small_model.id[:12] in str(error.value)
+    assert other.model.id[:12] in str(error.value)
+    assert distance(a, a) == 0
+    assert distance(a, sign(room_frames[1], small_signer)) > 0
+
+
+def test_a_lone_flat_wall_signs(small_signer: Signer) -> None:
+    signature = sign(flat(2.0), small_signer)
+    assert signature.n_patches[0] > 100
+    exact = [
+        exact_statistics(x, small_signer.model)
+        for x in describe(flat(2.0), small_signer.model.parameters).levels
+    ]
+    assert np.isfinite(float_signature(exact, small_signer.model)).all()
+    # the same wall nearer has the same relations, over shorter distances: alike, not equal
+    assert distance(signature, sign(flat(1.0), small_signer)) > 0
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (flat(0.0), "every depth sample is missing"),
+        (flat(float("nan")), "every depth sample is missing"),
+        (flat(2000.0), "Check the depth scale"),
+        (flat(0.01), "Check the depth scale"),
+        (flat(1.0, Intrinsics(2, 1, 500.0, 500.0, 0.5, 0.0)), "2 x 1 samples show no surface"),
+    ],
+)
+def test_frames_with_nothing_to_sign(small_signer: Signer, frame: Frame, message: str) -> None:
+    with pytest.raises(UselessFrame, match=message):
+        sign(frame, small_signer)
+
+
+def test_noise_is_no_surface(small_signer: Signer) -> None:
+    depth = np.random.default_rng(0).uniform(0.5, 8.0, (480, 640)).astype(np.float32)
+    with pytest.raises(UselessFrame):
+        sign(Frame(depth, CAMERA, "noise"), small_signer)
+
+
+def test_one_patch_has_no_pair(small_model: Model) -> None:
+    few = replace(
+        small_model.parameters,
+        segmentation=replace(small_model.parameters.segmentation, n_patches=1),
+    )
+    signer = open_signer(replace(small_model, parameters=few), cached=False)
+    with pytest.raises(UselessFrame, match="no two surface patches lie within 3 m"):
+        sign(flat(2.0), signer)
+
+
+def test_any_depth_signs_or_says_why(small_signer: Signer) -> None:
+    """Shapes, cameras and values nobody planned for: a signature or a UselessFrame."""
+    rng = np.random.default_rng(3)
+    outcomes = {"signed": 0, "useless": 0}
+    for _ in range(60):
+        height, width = (int(x) for x in rng.integers(1, 200, 2))
+        f = float(10 ** rng.uniform(-1, 4))
+        camera = Intrinsics(width, height, f, f, float(rng.normal(0, 300)), height / 2)
+        plane = rng.normal(0, 0.01, 2)
+        y, x = np.mgrid[:height, :width]
+        depth = (3 + plane[0] * x + plane[1] * y).astype(np.float32)
+        depth[rng.random(depth.shape) < rng.uniform(0, 0.6)] = rng.choice([0, np.nan, np.inf, -1])
+        try:
+            signature = sign(Frame(depth, camera), small_signer)
+            assert signature.n_pairs[0] > 0
+            outcomes["signed"] += 1
+        except UselessFrame:
+            outcomes["useless"] += 1
+    assert min(outcomes.values()) >= 10
+
+
+def test_the_package_says_what_it_offers() -> None:
+    assert sceneprint.sign is sign
+    assert sorted(sceneprint.__all__) == sceneprint.__all__
+    assert all(getattr(sceneprint, name) is not None for name in sceneprint.__all__)
+    assert set(sceneprint.__all__) <= set(dir(sceneprint))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = sceneprint.nothing
+
+
+def test_importing_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, sceneprint\n"
+        "heavy = {'numpy', 'numba', 'sklearn', 'open3d', 'matplotlib', 'PIL', 'pydantic'}\n"
+        "sys.exit(', '.join(heavy & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")

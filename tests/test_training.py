@@ -1,0 +1,86 @@
+"""Training: the same command gives the same model, and too little data is said so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import TrainingError
+from sceneprint.geometry.hierarchy import HierarchyParameters
+from sceneprint.geometry.mixture import MixtureParameters
+from sceneprint.geometry.segmentation import SegmentationParameters
+from sceneprint.geometry.table import TableLayout
+from sceneprint.models import Model, ModelParameters
+from sceneprint.pipeline import distance, open_signer, sign
+from sceneprint.synth import synthesise_room
+from sceneprint.training import TrainingParameters, preset_parameters, train
+
+MODEL = ModelParameters(
+    segmentation=SegmentationParameters(n_patches=200),
+    hierarchy=HierarchyParameters(n_levels=2),
+    table=TableLayout(8, 9, 8),
+)
+MIXTURE = MixtureParameters(n_components=16, iterations=3)
+TRAINING = TrainingParameters(rooms=4, views=2, seed=3, pairs=4000)
+
+
+@pytest.fixture(scope="module")
+def trained() -> tuple[Model, list[tuple[str, int, int]]]:
+    steps: list[tuple[str, int, int]] = []
+    model = train("tiny", MODEL, MIXTURE, TRAINING, jobs=2, report=lambda *step: steps.append(step))
+    return model, steps
+
+
+def test_processes_do_not_matter(trained: tuple[Model, object]) -> None:
+    alone = train("tiny", MODEL, MIXTURE, TRAINING, jobs=1)
+    assert alone.id == trained[0].id
+    other = train("tiny", MODEL, MIXTURE, replace(TRAINING, seed=4), jobs=1)
+    assert other.id != alone.id
+
+
+def test_progress_is_told_to_the_end(trained: tuple[Model, list[tuple[str, int, int]]]) -> None:
+    steps = trained[1]
+    assert [s for s in steps if s[0] == "rooms"] == [("rooms", i, 4) for i in range(1, 5)]
+    assert [s for s in steps if s[0] == "mixture"] == [("mixture", i, 3) for i in range(1, 4)]
+
+
+def test_quantiser_and_d0_fit_new_rooms(trained: tuple[Model, object]) -> None:
+    """d0 is near the median distance of rooms it never saw; few bytes are clipped."""
+    signer = open_signer(trained[0], cached=False)
+    signed = [sign(synthesise_room(99, i, 1).frames[0], signer) for i in range(8)]
+    between = [distance(a, b) for i, a in enumerate(signed) for b in signed[:i]]
+    assert np.median(between) / trained[0].unrelated_distance == pytest.approx(1.0, abs=0.3)
+    stored = np.concatenate([s.vector for s in signed])
+    assert ((stored == 0) | (stored == 255)).mean() < 0.005
+    assert stored.astype(int).std() > 10  # the bytes are used
+
+
+def test_provenance_says_what_it_saw(trained: tuple[Model, object]) -> None:
+    seen = trained[0].provenance
+    assert (seen["frames_used"], seen["own_frames"]) == (8, 0)
+    assert seen["training"]["seed"] == 3
+    assert seen["pairs_used"] == 4000
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        (replace(TRAINING, rooms=0), "0 usable frames of fewer than two places"),
+        (replace(TRAINING, rooms=1), "2 usable frames of fewer than two places"),
+        (replace(TRAINING, pairs=100), "too few for 16 components"),
+    ],
+)
+def test_too_little_data(parameters: TrainingParameters, message: str) -> None:
+    with pytest.raises(TrainingError, match=message):
+        train("tiny", MODEL, MIXTURE, parameters)
+
+
+def test_presets() -> None:
+    model, mixture = preset_parameters("paper")
+    assert (mixture.n_components, model.hierarchy.n_levels) == (1250, 4)
+    model, mixture = preset_parameters("compact")
+    assert (mixture.n_components, model.hierarchy.n_levels) == (256, 2)
+    with pytest.raises(TrainingError, match=r"no preset .large.\. Choose one of paper, compact"):
+        preset_parameters("large")
