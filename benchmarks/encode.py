@@ -16,6 +16,7 @@ from sceneprint.geometry.hierarchy import hierarchy
 from sceneprint.geometry.normals import surface
 from sceneprint.geometry.segmentation import segment
 from sceneprint.geometry.table import count_pairs
+from sceneprint.geometry.weights import patch_weights
 from sceneprint.pipeline import Signer, float_signature, sign
 from sceneprint.types import Floats, Frame
 
@@ -48,11 +49,14 @@ def signing_stages(frame: Frame, signer: Signer) -> dict[str, float]:
     levels = clock.run("hierarchy", lambda: hierarchy(seen, finest, p.hierarchy)).levels
     counted = clock.run(
         "pairs",
-        lambda: [count_pairs(x.means, x.normals, p.table, p.properties) for x in levels],
+        lambda: [
+            count_pairs(x.means, x.normals, patch_weights(x, p.weights), p.table, p.properties)
+            for x in levels
+        ],
     )
     sums = clock.run(
         "statistics",
-        lambda: [statistics_of_counts(c, n, signer.table, len(model.mixture)) for c, n in counted],
+        lambda: [statistics_of_counts(c, signer.table, len(model.mixture)) for c in counted],
     )
     clock.run(
         "Fisher vector",

@@ -110,9 +110,11 @@ def save_picture(frame: Frame, model: Model, path: Path) -> None:
 
 
 def _draw_depth(figure: Any, axis: Any, frame: Frame, model: Model) -> None:
+    from matplotlib import colormaps
+
     p = model.parameters.depth
     used = (frame.depth >= p.minimum_depth) & (frame.depth <= p.maximum_depth)
-    image = axis.imshow(np.ma.masked_where(~used, frame.depth), cmap="turbo")
-    axis.patch.set_visible(True)
+    colours = colormaps["turbo"].with_extremes(bad=(UNKNOWN / 255,) * 3)
+    image = axis.imshow(np.ma.masked_where(~used, frame.depth), cmap=colours)
     axis.set_title(f"depth, {used.mean():.0%} of {frame.depth.size} samples used", fontsize=10)
     figure.colorbar(image, ax=axis, label="metres", shrink=0.8)

@@ -25,6 +25,7 @@ from sceneprint.geometry.properties import neighbour_pairs, pair_properties
 from sceneprint.geometry.retrieval import distances
 from sceneprint.geometry.segmentation import segment
 from sceneprint.geometry.table import PairTable, count_pairs
+from sceneprint.geometry.weights import patch_weights
 from sceneprint.models import Model, ModelParameters, build_table, open_table, read_model
 from sceneprint.types import Bytes, Floats, Frame, Hierarchy, Patches
 
@@ -158,15 +159,18 @@ def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
 def table_statistics(level: Patches, signer: Signer) -> Statistics:
     """Pair statistics of one level through the 4-D table."""
     p = signer.model.parameters
-    counts, n_pairs = count_pairs(level.means, level.normals, p.table, p.properties)
-    return statistics_of_counts(counts, n_pairs, signer.table, len(signer.model.mixture))
+    weights = patch_weights(level, p.weights)
+    counts = count_pairs(level.means, level.normals, weights, p.table, p.properties)
+    return statistics_of_counts(counts, signer.table, len(signer.model.mixture))
 
 
 def exact_statistics(level: Patches, model: Model) -> Statistics:
     """Pair statistics of one level, pair by pair: slow, the oracle of the table."""
     p = model.parameters.properties
-    properties = pair_properties(level, neighbour_pairs(level, p), p)
-    return statistics_of_features(project(properties, model.projection), model.mixture)
+    pairs = neighbour_pairs(level, p)
+    weights = patch_weights(level, model.parameters.weights)[pairs].prod(axis=1)
+    features = project(pair_properties(level, pairs, p), model.projection)
+    return statistics_of_features(features, weights, model.mixture)
 
 
 def float_signature(levels: list[Statistics], model: Model, name: str = "") -> Floats:

@@ -26,6 +26,7 @@ from sceneprint.geometry.mixture import MixtureParameters, fit_mixture
 from sceneprint.geometry.projection import fit_projection, project
 from sceneprint.geometry.properties import neighbour_pairs, pair_properties
 from sceneprint.geometry.retrieval import distances
+from sceneprint.geometry.weights import patch_weights
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import describe, float_signature, open_signer, table_statistics
 from sceneprint.synth import synthesise_room
@@ -207,6 +208,8 @@ def _lesson(
     for level in patches.levels:
         pairs = neighbour_pairs(level, model_p.properties)
         if len(pairs):
-            some = np.sort(rng.permutation(len(pairs))[:per_level])
+            # as often as they count in the statistics; one that comes twice does no harm
+            share = patch_weights(level, model_p.weights)[pairs].prod(axis=1).cumsum()
+            some = np.searchsorted(share, np.sort(rng.random(per_level)) * share[-1], "right")
             drawn.append(pair_properties(level, pairs[some], model_p.properties))
     return [Lesson(place, np.concatenate(drawn), patches)] if drawn else []

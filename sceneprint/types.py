@@ -135,12 +135,14 @@ class Patches:
     normals : (P, 3) float64, unit length, towards the sensor: n of Eq. (1)
     areas : (P,) float64, square metres
     sizes : (P,) int32, pixels of the surface map
+    coherences : (P,) float64 in (0, 1], length of the mean of the pixels' normals; 1 where flat
     """
 
     means: Floats
     normals: Floats
     areas: Floats
     sizes: Ints32
+    coherences: Floats
 
     def __len__(self) -> int:
         return len(self.means)

@@ -158,7 +158,7 @@ def test_picture_shows_depth_normals_and_levels(
     ("arguments", "message"),
     [
         (["sign", "/nowhere/at/all"], "no such file or folder"),
-        (["sign", "README.md"], "README.md"),
+        (["sign", "README.md"], "There is no intrinsics.json here"),
         (["sign", "{rooms}", "--model", "/nowhere.safetensors"], "Give one of the presets"),
         (["picture", "/nowhere", "--out", "x.png"], "no such file or folder"),
         (["train", "--out", "{tmp}/m", "--rooms", "1", "--jobs", "1"], "fewer than two places"),

@@ -1,6 +1,6 @@
 """Sec. III-B, "Encoding feature space statistics": features to the signature psi.
 
-counts (B,), PairTable  --statistics_of_counts-->   Statistics
+PairCounts, PairTable   --statistics_of_counts-->   Statistics
 features (M, 12)        --statistics_of_features--> Statistics   (exact, the oracle)
 Statistics  --fisher_vector-->  phi (25 G)
 H of them   --signature-->      psi (25 G H)   --quantise-->  uint8
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.mixture import Mixture, moments
 from sceneprint.geometry.projection import DIMENSION
-from sceneprint.geometry.table import LEADING, PairTable
-from sceneprint.types import Bytes, Floats, Floats32, Ints32
+from sceneprint.geometry.table import LEADING, PairCounts, PairTable
+from sceneprint.types import Bytes, Floats, Floats32
 
 #: Added to a quantised component: 0 is stored in the middle of the byte.
 ZERO = 128
@@ -30,20 +30,22 @@ class Statistics:
 
     Parameters
     ----------
-    zeroth : (G,) sum of posteriors
-    first, second : (G, 12) sums of posterior times feature, and times squared feature
+    zeroth : (G,) sum of weight times posterior
+    first, second : (G, 12) the same, times feature and times squared feature
     n_pairs : number of ordered pairs
+    total : sum of their weights; the number itself where all weigh 1
     """
 
     zeroth: Floats
     first: Floats
     second: Floats
     n_pairs: int
+    total: float
 
 
 @kernel
 def _accumulate(
-    counts: Ints32,
+    counts: Floats32,
     features: Floats32,
     components: NDArray[np.int16],
     shares: Floats32,
@@ -69,34 +71,31 @@ def _accumulate(
             row[2 * DIMENSION] += weight
 
 
-def statistics_of_counts(
-    counts: Ints32, n_pairs: int, table: PairTable, n_components: int
-) -> Statistics:
+def statistics_of_counts(counts: PairCounts, table: PairTable, n_components: int) -> Statistics:
     """Statistics of pairs counted in the 4-D table.
 
     Parameters
     ----------
-    counts : (B,) ordered pairs by bin
-    n_pairs : their sum
+    counts : of one level
     table : of the model
     n_components : G
     """
-    sums = np.zeros((n_components, 32))
-    _accumulate(counts, table.features, table.components, table.posteriors, sums)
-    d = DIMENSION
-    return Statistics(sums[:, 2 * d], sums[:, :d], sums[:, d : 2 * d], n_pairs)
+    d, sums = DIMENSION, np.zeros((n_components, 32))
+    _accumulate(counts.weights, table.features, table.components, table.posteriors, sums)
+    return Statistics(sums[:, 2 * d], sums[:, :d], sums[:, d : 2 * d], counts.n_pairs, counts.total)
 
 
-def statistics_of_features(features: Floats, mixture: Mixture) -> Statistics:
+def statistics_of_features(features: Floats, weights: Floats, mixture: Mixture) -> Statistics:
     """Statistics of pairs one by one, with all posteriors: the oracle of the table.
 
     Parameters
     ----------
     features : (M, 12)
+    weights : (M,) of the pairs
     mixture : G components
     """
-    zeroth, first, second = moments(features, mixture)
-    return Statistics(zeroth, first, second, len(features))
+    zeroth, first, second = moments(features, mixture, weights)
+    return Statistics(zeroth, first, second, len(features), float(weights.sum()))
 
 
 def fisher_vector(s: Statistics, mixture: Mixture) -> Floats:
@@ -113,7 +112,7 @@ def fisher_vector(s: Statistics, mixture: Mixture) -> Floats:
 
     Notes
     -----
-    Readings R2-R4, R9 (docs/paper.md): true posteriors; the mean over all pairs used;
+    Readings R2-R4, R9 (docs/paper.md): true posteriors; the weighted mean over all pairs;
     d^2 / var - 1 in each dimension; 1/sqrt(p_g) and 1/sqrt(2 p_g) are the closed form of the
     inverse Fisher information's factor.
     """
@@ -122,9 +121,9 @@ def fisher_vector(s: Statistics, mixture: Mixture) -> Floats:
     zeroth = s.zeroth[:, None]
     deviation = s.first - nu * zeroth
     spread = s.second - 2 * nu * s.first + nu**2 * zeroth
-    m0 = (zeroth - s.n_pairs * p[:, None]) / (s.n_pairs * root)  # Eq. (2a)
-    m1 = deviation / (np.sqrt(variance) * s.n_pairs * root)  # Eq. (2b)
-    m2 = (spread / variance - zeroth) / (s.n_pairs * np.sqrt(2) * root)  # Eq. (2c)
+    m0 = (zeroth - s.total * p[:, None]) / (s.total * root)  # Eq. (2a)
+    m1 = deviation / (np.sqrt(variance) * s.total * root)  # Eq. (2b)
+    m2 = (spread / variance - zeroth) / (s.total * np.sqrt(2) * root)  # Eq. (2c)
     return np.concatenate([m0, m1, m2], axis=1).ravel()
 
 

@@ -136,13 +136,16 @@ def em_step(features: Floats, mixture: Mixture, p: MixtureParameters) -> Mixture
     return _with_priors(zeroth, means, variances, len(features), p)
 
 
-def moments(features: Floats, mixture: Mixture, block: int = 4096) -> tuple[Floats, Floats, Floats]:
-    """Sums over features of pi, pi f and pi f^2, block by block.
+def moments(
+    features: Floats, mixture: Mixture, weights: Floats | None = None, block: int = 4096
+) -> tuple[Floats, Floats, Floats]:
+    """Weighted sums over features of pi, pi f and pi f^2, block by block.
 
     Parameters
     ----------
     features : (M, 12)
     mixture : G components
+    weights : (M,), or None where all are 1
     block : features at a time
 
     Returns
@@ -154,6 +157,8 @@ def moments(features: Floats, mixture: Mixture, block: int = 4096) -> tuple[Floa
     for at in range(0, len(features), block):
         f = features[at : at + block]
         pi = posteriors(f, mixture)
+        if weights is not None:
+            pi *= weights[at : at + block, None]
         zeroth += pi.sum(axis=0)
         first += pi.T @ f
         second += pi.T @ f**2

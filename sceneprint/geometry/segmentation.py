@@ -170,4 +170,5 @@ def patches_of(surface: Surface, labels: Ints32) -> Patches:
         normals=normal / length,
         areas=area,
         sizes=sums[:, 7].astype(np.int32),
+        coherences=np.minimum(length[:, 0] / area, 1.0),
     )

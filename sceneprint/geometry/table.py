@@ -1,6 +1,6 @@
 """The 4-D pair table: what a pair of patches contributes to Eq. (2), looked up.
 
-    Patches (P)  --count_pairs-->  counts (B,)
+    Patches (P)  --count_pairs-->  PairCounts (B bins)
     Model        --fill-->         PairTable (B bins: feature, leading posteriors)
 
 All ordered pairs are used: a sample of them would make the signature of one frame differ
@@ -193,15 +193,15 @@ def _bins(
 def _count(
     points: Floats, normals: Floats, radius: float, colinearity: float,
     distance: Floats, angle: Floats, dihedral: Floats,
-    hints: Ints32, n_angles: int, n_dihedrals: int, counts: Ints32,
-) -> int:  # fmt: skip
-    """Count both orders of every pair; returns the number of ordered pairs."""
+    hints: Ints32, n_angles: int, n_dihedrals: int, weights: Floats32, counts: Floats32,
+) -> tuple[int, float]:  # fmt: skip
+    """Add the weight of both orders of every pair; returns number and weight of all."""
     n = points.shape[1]
     d, inverse, i_u, j_u = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     sine, cosine, turn = np.empty(n), np.empty(n), np.empty(n)
     row, mu = np.empty(n, np.int32), np.empty(n, np.int32)
     alpha, phi = np.empty(n, np.int32), np.empty(n, np.int32)
-    total = 0
+    n_pairs, total = 0, 0.0
     for i in range(n):
         _lengths(points[0], points[1], points[2], i, d)
         _inverses(d, i, inverse)
@@ -218,16 +218,19 @@ def _count(
             if d[j] >= radius or d[j] <= 0.0:
                 continue
             last = phi[j] if phi[j] < n_dihedrals else 0
+            weight = weights[i] * weights[j]
             if abs(i_u[j]) <= colinearity:  # (i, j): angles of n_i and n_j to u
                 bin_ij = (row[j] * n_angles + mu[j]) * n_angles + alpha[j]
-                counts[bin_ij * n_dihedrals + last] += 1
-                total += 1
+                counts[bin_ij * n_dihedrals + last] += weight
+                total += weight
+                n_pairs += 1
             if abs(j_u[j]) <= colinearity:  # (j, i): u turns round, the normals change places
                 other_mu, other_alpha = n_angles - 1 - alpha[j], n_angles - 1 - mu[j]
                 bin_ji = (row[j] * n_angles + other_mu) * n_angles + other_alpha
-                counts[bin_ji * n_dihedrals + last] += 1
-                total += 1
-    return total
+                counts[bin_ji * n_dihedrals + last] += weight
+                total += weight
+                n_pairs += 1
+    return n_pairs, total
 
 
 def _hints(edges: Floats, origin: float, extent: float, n: int = 4096) -> Ints32:
@@ -237,32 +240,44 @@ def _hints(edges: Floats, origin: float, extent: float, n: int = 4096) -> Ints32
     return np.minimum(np.searchsorted(edges, starts, side="right"), len(edges) - 1).astype(np.int32)
 
 
+@dataclass(frozen=True, eq=False)
+class PairCounts:
+    """All ordered pairs of one level, by bin.
+
+    Parameters
+    ----------
+    weights : (B,) float32, sum of the weights of the pairs in each bin
+    n_pairs : number of pairs
+    total : sum of all their weights
+    """
+
+    weights: Floats32
+    n_pairs: int
+    total: float
+
+
 def count_pairs(
-    means: Floats, normals: Floats, layout: TableLayout, p: PropertyParameters
-) -> tuple[Ints32, int]:
-    """Count all ordered pairs of patches by bin.
+    means: Floats, normals: Floats, weights: Floats, layout: TableLayout, p: PropertyParameters
+) -> PairCounts:
+    """Count all ordered pairs of patches by bin, each with the product of its weights.
 
     Parameters
     ----------
     means, normals : (P, 3) float64, metres and unit length
+    weights : (P,) of the patches
     layout, p : of the model
-
-    Returns
-    -------
-    counts : (B,) int32
-    n_pairs : their sum
     """
     distance, angle, dihedral = bin_edges(layout, p)
     hints = np.stack(
         [_hints(distance, 0.0, p.radius), _hints(angle, -1.0, 2.0), _hints(dihedral, 0.0, 4.0)]
     )
-    counts = np.zeros(layout.n_bins, np.int32)
-    n_pairs = _count(
+    counts = np.zeros(layout.n_bins, np.float32)
+    n_pairs, total = _count(
         np.ascontiguousarray(means.T), np.ascontiguousarray(normals.T),
         p.radius, p.colinearity, distance, angle, dihedral,
-        hints, layout.angle_bins, layout.dihedral_bins, counts,
+        hints, layout.angle_bins, layout.dihedral_bins, weights.astype(np.float32), counts,
     )  # fmt: skip
-    return counts, n_pairs
+    return PairCounts(counts, n_pairs, total)
 
 
 @kernel

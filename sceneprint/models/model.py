@@ -21,6 +21,7 @@ from sceneprint.geometry.projection import Projection
 from sceneprint.geometry.properties import PropertyParameters
 from sceneprint.geometry.segmentation import SegmentationParameters
 from sceneprint.geometry.table import TableLayout
+from sceneprint.geometry.weights import WeightParameters
 
 #: Of the file and of what the numbers in it mean. Raise it when code changes signatures.
 SCHEMA_VERSION = 1
@@ -36,6 +37,7 @@ class ModelParameters:
     normals: NormalParameters = field(default_factory=NormalParameters)
     segmentation: SegmentationParameters = field(default_factory=SegmentationParameters)
     hierarchy: HierarchyParameters = field(default_factory=HierarchyParameters)
+    weights: WeightParameters = field(default_factory=WeightParameters)
     properties: PropertyParameters = field(default_factory=PropertyParameters)
     table: TableLayout = field(default_factory=TableLayout)
 

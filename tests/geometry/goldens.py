@@ -16,7 +16,11 @@ from sceneprint.types import Floats, Patches
 
 def two_patches(l_mu: Floats, n_mu: Floats, l_alpha: Floats, n_alpha: Floats) -> Patches:
     return Patches(
-        np.array([l_mu, l_alpha]), np.array([n_mu, n_alpha]), np.ones(2), np.ones(2, np.int32)
+        np.array([l_mu, l_alpha]),
+        np.array([n_mu, n_alpha]),
+        np.ones(2),
+        np.ones(2, np.int32),
+        np.ones(2),
     )
 
 
@@ -104,7 +108,7 @@ def check_eq2(module: ModuleType) -> None:
         np.array([[0.5, 1.5], [-1.0, 0.5]]),
         np.array([[4.0, 0.25], [0.25, 4.0]]),
     )
-    statistics = module.Statistics(pi.sum(axis=0), pi.T @ f, pi.T @ f**2, 2)
+    statistics = module.Statistics(pi.sum(axis=0), pi.T @ f, pi.T @ f**2, n_pairs=7, total=2.0)
     root2 = math.sqrt(2)
     expected = [
         # m0 of g = 1 is (.8 - 2 * .36) / (2 * .6)

@@ -73,6 +73,7 @@ def random_patches(rng: np.random.Generator, n: int, extent: float = 2.0) -> Pat
         normals / np.linalg.norm(normals, axis=1, keepdims=True),
         rng.uniform(0.01, 0.1, n),
         np.full(n, 20, np.int32),
+        np.ones(n),
     )
 
 
@@ -93,7 +94,8 @@ def room(rng: np.random.Generator, n: int = 110) -> Patches:
         normal[axis] += outwards * (2 * side - 1)
         means.append(low + point * extent)
         normals.append(normal / np.linalg.norm(normal))
-    return Patches(np.array(means), np.array(normals), np.ones(n), np.full(n, 20, np.int32))
+    sizes = np.full(n, 20, np.int32)
+    return Patches(np.array(means), np.array(normals), np.ones(n), sizes, np.ones(n))
 
 
 def moved(patches: Patches, rotation: Rotation, translation: Floats) -> Patches:
@@ -102,4 +104,5 @@ def moved(patches: Patches, rotation: Rotation, translation: Floats) -> Patches:
         rotation.apply(patches.normals),
         patches.areas,
         patches.sizes,
+        patches.coherences,
     )

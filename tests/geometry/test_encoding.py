@@ -22,8 +22,8 @@ from sceneprint.geometry.encoding import (
     statistics_of_features,
 )
 from sceneprint.geometry.mixture import Mixture, posteriors
-from sceneprint.geometry.table import LEADING, PairTable
-from sceneprint.types import Floats
+from sceneprint.geometry.table import LEADING, PairCounts, PairTable
+from sceneprint.types import Floats, Ints32
 
 
 def random_mixture(rng: np.random.Generator, n: int, spread: float = 1.0) -> Mixture:
@@ -55,7 +55,7 @@ def eq2(features: Floats, mixture: Mixture) -> list[float]:
 
 
 def phi_of(features: Floats, mixture: Mixture) -> Floats:
-    return fisher_vector(statistics_of_features(features, mixture), mixture)
+    return fisher_vector(statistics_of_features(features, np.ones(len(features)), mixture), mixture)
 
 
 def test_golden(goldens: ModuleType) -> None:
@@ -129,6 +129,11 @@ def table_of(features: Floats, mixture: Mixture) -> PairTable:
     return PairTable(features.astype(np.float32), components, shares)
 
 
+def counted(counts: Ints32) -> PairCounts:
+    n = int(counts.sum())
+    return PairCounts(counts.astype(np.float32), n, float(n))
+
+
 def test_statistics_of_counts_equal_those_of_the_pairs() -> None:
     # wide components, so that no share is so small that it is left out
     rng = np.random.default_rng(3)
@@ -138,9 +143,12 @@ def test_statistics_of_counts_equal_those_of_the_pairs() -> None:
     assert posteriors(bins, wide).min() > 2e-3
     counts = rng.integers(0, 4, 40).astype(np.int32)
     n = int(counts.sum())
-    found = statistics_of_counts(counts, n, table_of(bins, wide), 5)
-    exact = statistics_of_features(np.repeat(bins, counts, axis=0), wide)
-    assert found.n_pairs == exact.n_pairs == n
+    found = statistics_of_counts(counted(counts), table_of(bins, wide), 5)
+    exact = statistics_of_features(np.repeat(bins, counts, axis=0), np.ones(n), wide)
+    assert found.n_pairs == exact.n_pairs == found.total == exact.total == n
+    weighted = statistics_of_features(bins, counts.astype(float), wide)
+    np.testing.assert_allclose(weighted.second, exact.second, rtol=1e-12, atol=1e-12)
+    assert (weighted.n_pairs, weighted.total) == (40, n)
     for a, b in ((found.zeroth, exact.zeroth), (found.first, exact.first)):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(found.second, exact.second, rtol=1e-5, atol=1e-5)
@@ -152,7 +160,7 @@ def test_statistics_of_counts_by_hand() -> None:
         np.array([[1, 0, 2] + [0] * 5, [0, 1] + [0] * 6, [1] * 8], np.int16),
         np.array([[0.75, 0.25, 5e-3] + [0] * 5, [1, 0, 0.5] + [0] * 5, [1] + [0] * 7], np.float32),
     )
-    s = statistics_of_counts(np.array([4, 3, 0], np.int32), 7, table, 3)
+    s = statistics_of_counts(counted(np.array([4, 3, 0])), table, 3)
     # four pairs shared 3 : 1, with a trace of component 2; three of component 0, whose list
     # ends at the first share of 0; the last bin is empty
     zeroth = np.array([4.0, 3.0, 0.02])
@@ -187,7 +195,9 @@ def test_one_pair_is_enough() -> None:
     mixture = random_mixture(np.random.default_rng(4), 2)
     f = mixture.means[:1]
     pi = posteriors(f, mixture)[0]
-    phi = fisher_vector(Statistics(pi, np.outer(pi, f[0]), np.outer(pi, f[0] ** 2), 1), mixture)
+    phi = fisher_vector(
+        Statistics(pi, np.outer(pi, f[0]), np.outer(pi, f[0] ** 2), 1, 1.0), mixture
+    )
     np.testing.assert_allclose(phi, eq2(f, mixture), rtol=0, atol=1e-12)
     # at its own mean a component has no first-order term
     assert np.abs(phi[1:13]).max() < 1e-12

@@ -93,10 +93,20 @@ def test_moments_do_not_depend_on_blocks() -> None:
     mixture, f = random_mixture(rng, 4), rng.normal(size=(103, 12))
     pi = posteriors(f, mixture)
     for block in (1, 50, 103, 1000):
-        zeroth, first, second = moments(f, mixture, block)
+        zeroth, first, second = moments(f, mixture, block=block)
         np.testing.assert_allclose(zeroth, pi.sum(axis=0), rtol=1e-12)
         np.testing.assert_allclose(first, np.einsum("mg,md->gd", pi, f), rtol=0, atol=1e-11)
         np.testing.assert_allclose(second, np.einsum("mg,md->gd", pi, f * f), rtol=1e-11)
+
+
+def test_a_feature_of_weight_two_counts_twice() -> None:
+    rng = np.random.default_rng(3)
+    mixture, f = random_mixture(rng, 4), rng.normal(size=(9, 12))
+    weights = rng.integers(0, 3, 9)
+    weighted = moments(f, mixture, weights.astype(float), block=4)
+    repeated = moments(np.repeat(f, weights, axis=0), mixture)
+    for a, b in zip(weighted, repeated, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
 
 
 def log_likelihood(features: Floats, mixture: Mixture) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
@@ -115,6 +116,7 @@ def test_no_rigid_motion_changes_them(
             AXES[rng.integers(0, 6, 10)],
             patches.areas,
             patches.sizes,
+            patches.coherences,
         )
     pairs = neighbour_pairs(patches, PARAMETERS)
     turn = Rotation.from_rotvec(rotation)
@@ -130,7 +132,7 @@ def test_mirror_images_differ(scenes: ModuleType) -> None:
     # what no rotation does, a mirror does: n_alpha . w turns its sign
     patches = scenes.random_patches(np.random.default_rng(2), 12)
     flip = np.array([1.0, 1.0, -1.0])
-    mirrored = Patches(patches.means * flip, patches.normals * flip, patches.areas, patches.sizes)
+    mirrored = replace(patches, means=patches.means * flip, normals=patches.normals * flip)
     pairs = neighbour_pairs(patches, PARAMETERS)
     f, g = (pair_properties(x, pairs, PARAMETERS) for x in (patches, mirrored))
     signs = np.ones(13)
@@ -158,7 +160,8 @@ def test_neighbours_by_hand() -> None:
     up, along, near = [0, 0, 1], [1, 0, 0], [math.cos(0.04), 0, math.sin(0.04)]
 
     def pairs(normals: Sequence[Sequence[float]]) -> list[list[int]]:
-        patches = Patches(means, np.array(normals, float), np.ones(4), np.ones(4, np.int32))
+        ones = np.ones(4)
+        patches = Patches(means, np.array(normals, float), ones, np.ones(4, np.int32), ones)
         return [[int(mu), int(alpha)] for mu, alpha in neighbour_pairs(patches, PARAMETERS)]
 
     all_up = [[0, 1], [1, 0], [1, 2], [1, 3], [2, 1], [3, 1]]

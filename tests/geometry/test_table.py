@@ -27,9 +27,9 @@ P = PropertyParameters(radius=3.0, angular_tolerance=math.radians(10), colineari
 
 
 def count(patches: Patches, layout: TableLayout = LAYOUT) -> Ints32:
-    counts, n_pairs = count_pairs(patches.means, patches.normals, layout, P)
-    assert counts.sum() == n_pairs
-    return counts
+    counted = count_pairs(patches.means, patches.normals, np.ones(len(patches)), layout, P)
+    assert counted.weights.sum() == counted.n_pairs == counted.total
+    return counted.weights.astype(np.int32)
 
 
 def bins_of(invariant: Floats, layout: TableLayout) -> tuple[NDArray[np.int64], ...]:
@@ -138,17 +138,31 @@ def test_bins_finer_than_the_look_up_are_refused() -> None:
     # 4096 cells of hints over the radius: 5000 bins would put two edges into one of them
     fine = TableLayout(distance_bins=5000, angle_bins=1, dihedral_bins=4, distance_exponent=1.0)
     with pytest.raises(ValueError, match="finer than the look-up allows"):
-        count_pairs(np.zeros((2, 3)), np.ones((2, 3)), fine, P)
+        count_pairs(np.zeros((2, 3)), np.ones((2, 3)), np.ones(2), fine, P)
 
 
 def test_few_patches_have_no_pairs(scenes: ModuleType) -> None:
     patches = scenes.random_patches(np.random.default_rng(0), 2)
     for n in (0, 1):
-        counts, n_pairs = count_pairs(patches.means[:n], patches.normals[:n], SMALL, P)
-        assert (n_pairs, counts.sum()) == (0, 0)
+        few = count_pairs(patches.means[:n], patches.normals[:n], np.ones(n), SMALL, P)
+        assert (few.n_pairs, few.total, few.weights.sum()) == (0, 0, 0)
     # in the same place, or out of reach
     for means in (np.zeros((2, 3)), np.array([[0, 0, 0], [3, 0, 0]], float)):
-        assert count_pairs(means, patches.normals, SMALL, P)[1] == 0
+        assert count_pairs(means, patches.normals, np.ones(2), SMALL, P).n_pairs == 0
+
+
+def test_a_pair_weighs_the_product_of_its_patches(scenes: ModuleType) -> None:
+    patches = scenes.random_patches(np.random.default_rng(4), 12)
+    weights = np.random.default_rng(5).uniform(0.1, 3, 12)
+    found = count_pairs(patches.means, patches.normals, weights, SMALL, P)
+    expected = np.zeros(SMALL.n_bins)
+    pairs = neighbour_pairs(patches, P)
+    indices = np.ravel_multi_index(bins_of(invariants(patches, pairs), SMALL), shape(SMALL))
+    for index, (mu, alpha) in zip(indices, pairs, strict=True):
+        expected[index] += weights[mu] * weights[alpha]
+    np.testing.assert_allclose(found.weights, expected, rtol=1e-5, atol=1e-6)
+    assert found.total == pytest.approx(expected.sum(), rel=1e-6)
+    assert found.n_pairs == len(pairs)
 
 
 def model(rng: np.random.Generator, g: int) -> tuple[Projection, Mixture]:

@@ -45,11 +45,13 @@ class Signatures:
 
     def exact(self, patches: Patches) -> Floats:
         f = project(pair_properties(patches, neighbour_pairs(patches, P), P), self.projection)
-        return normalised(fisher_vector(statistics_of_features(f, self.mixture), self.mixture))
+        s = statistics_of_features(f, np.ones(len(f)), self.mixture)
+        return normalised(fisher_vector(s, self.mixture))
 
     def looked_up(self, patches: Patches) -> Floats:
-        counts, n_pairs = count_pairs(patches.means, patches.normals, LAYOUT, P)
-        s = statistics_of_counts(counts, n_pairs, self.table, len(self.mixture))
+        weights = np.ones(len(patches))
+        counts = count_pairs(patches.means, patches.normals, weights, LAYOUT, P)
+        s = statistics_of_counts(counts, self.table, len(self.mixture))
         return normalised(fisher_vector(s, self.mixture))
 
 
@@ -94,6 +96,9 @@ def test_no_rigid_motion_changes_a_signature(
 
 def test_order_of_patches_does_not_matter(rooms: list[Patches], signatures: Signatures) -> None:
     room, order = rooms[0], np.random.default_rng(2).permutation(len(rooms[0]))
-    shuffled = Patches(room.means[order], room.normals[order], room.areas[order], room.sizes[order])
+    shuffled = Patches(
+        room.means[order], room.normals[order], room.areas[order],
+        room.sizes[order], room.coherences[order],
+    )  # fmt: skip
     np.testing.assert_array_equal(signatures.looked_up(shuffled), signatures.looked_up(room))
     np.testing.assert_allclose(signatures.exact(shuffled), signatures.exact(room), atol=1e-6)
