@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from sceneprint.errors import MissingDependency
+from sceneprint.geometry.counting import count_pairs
 from sceneprint.geometry.depth import inverse_depth
 from sceneprint.geometry.encoding import quantise, statistics_of_counts
 from sceneprint.geometry.hierarchy import hierarchy
 from sceneprint.geometry.normals import surface
 from sceneprint.geometry.segmentation import segment
-from sceneprint.geometry.table import count_pairs
 from sceneprint.geometry.weights import patch_weights
 from sceneprint.pipeline import Signer, float_signature, sign
 from sceneprint.types import Floats, Frame

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sceneprint.errors import ModelMismatch, UselessFrame
+from sceneprint.geometry.counting import count_pairs
 from sceneprint.geometry.depth import inverse_depth
 from sceneprint.geometry.encoding import (
     Statistics,
@@ -24,7 +25,7 @@ from sceneprint.geometry.projection import project
 from sceneprint.geometry.properties import neighbour_pairs, pair_properties
 from sceneprint.geometry.retrieval import distances
 from sceneprint.geometry.segmentation import segment
-from sceneprint.geometry.table import PairTable, count_pairs
+from sceneprint.geometry.table import PairTable
 from sceneprint.geometry.weights import patch_weights
 from sceneprint.models import Model, ModelParameters, build_table, open_table, read_model
 from sceneprint.types import Bytes, Floats, Frame, Hierarchy, Patches

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sceneprint.geometry.bins import TableLayout
 from sceneprint.geometry.hierarchy import HierarchyParameters
 from sceneprint.geometry.mixture import Mixture
 from sceneprint.geometry.projection import Projection
 from sceneprint.geometry.segmentation import SegmentationParameters
-from sceneprint.geometry.table import TableLayout
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer
 from sceneprint.synth import synthesise_room

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import TrainingError
+from sceneprint.geometry.bins import TableLayout
 from sceneprint.geometry.hierarchy import HierarchyParameters
 from sceneprint.geometry.mixture import MixtureParameters
 from sceneprint.geometry.segmentation import SegmentationParameters
-from sceneprint.geometry.table import TableLayout
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import distance, open_signer, sign
 from sceneprint.synth import synthesise_room

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from sceneprint.geometry.table import compiled_at
+from sceneprint.geometry.counting import compiled_at
 from sceneprint.pipeline import Signer, open_signer
 from sceneprint.settings import Settings
 

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneprint.geometry.counting import PairCounts
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.mixture import Mixture, moments
 from sceneprint.geometry.projection import DIMENSION
-from sceneprint.geometry.table import LEADING, PairCounts, PairTable
+from sceneprint.geometry.table import LEADING, PairTable
 from sceneprint.types import Bytes, Floats, Floats32
 
 #: Added to a quantised component: 0 is stored in the middle of the byte.
@@ -45,30 +46,28 @@ class Statistics:
 
 @kernel
 def _accumulate(
-    counts: Floats32,
-    features: Floats32,
-    components: NDArray[np.int16],
-    shares: Floats32,
-    sums: Floats,
+    counts: Floats32, table: Floats32, components: NDArray[np.int16], sums: Floats
 ) -> None:
-    """sums (G, 32): first 12, second 12, zeroth in the 25th; the rest fills a cache line."""
+    """sums (G, 32): first 12, second 12, zeroth in the 25th; the rest fills a cache line.
+
+    table, components: the packed table, and the same memory as int16.
+    """
     moments = np.empty(2 * DIMENSION)
     for b in range(len(counts)):
         if counts[b] == 0:
             continue
-        feature = features[b]
         for d in range(DIMENSION):
-            moments[d] = feature[d]
+            moments[d] = table[b, d]
             moments[DIMENSION + d] = moments[d] * moments[d]
         for k in range(LEADING):
-            share = float(shares[b, k])
+            share = float(table[b, DIMENSION + k])
             if share == 0.0:
                 break
             weight = counts[b] * share
-            row = sums[components[b, k]]
+            g = components[b, 2 * (DIMENSION + LEADING) + k]
             for d in range(2 * DIMENSION):
-                row[d] += weight * moments[d]
-            row[2 * DIMENSION] += weight
+                sums[g, d] += weight * moments[d]
+            sums[g, 2 * DIMENSION] += weight
 
 
 def statistics_of_counts(counts: PairCounts, table: PairTable, n_components: int) -> Statistics:
@@ -81,7 +80,7 @@ def statistics_of_counts(counts: PairCounts, table: PairTable, n_components: int
     n_components : G
     """
     d, sums = DIMENSION, np.zeros((n_components, 32))
-    _accumulate(counts.weights, table.features, table.components, table.posteriors, sums)
+    _accumulate(counts.weights, table.packed, table.packed.view(np.int16), sums)
     return Statistics(sums[:, 2 * d], sums[:, :d], sums[:, d : 2 * d], counts.n_pairs, counts.total)
 
 
@@ -135,7 +134,7 @@ def normalised(phi: Floats) -> Floats:
     phi : (n,); zeros, of a level without pairs, stay zeros
     """
     rooted = np.sign(phi) * np.sqrt(np.abs(phi))
-    norm = float(np.linalg.norm(rooted))
+    norm = float(np.sqrt(np.abs(phi).sum()))  # of the roots; BLAS would sum by threads
     result: Floats = rooted / norm if norm > 0 else rooted
     return result
 

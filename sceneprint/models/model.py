@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableModel
+from sceneprint.geometry.bins import TableLayout
 from sceneprint.geometry.depth import DepthParameters
 from sceneprint.geometry.hierarchy import HierarchyParameters
 from sceneprint.geometry.mixture import Mixture
@@ -20,7 +21,6 @@ from sceneprint.geometry.normals import NormalParameters
 from sceneprint.geometry.projection import Projection
 from sceneprint.geometry.properties import PropertyParameters
 from sceneprint.geometry.segmentation import SegmentationParameters
-from sceneprint.geometry.table import TableLayout
 from sceneprint.geometry.weights import WeightParameters
 
 #: Of the file and of what the numbers in it mean. Raise it when code changes signatures.

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import platformdirs
 
-from sceneprint.geometry.projection import DIMENSION
-from sceneprint.geometry.table import LEADING, PairTable, part
+from sceneprint.geometry.table import WIDTH, PairTable, part
 from sceneprint.models.model import Model
+from sceneprint.types import Floats32
 
 #: Layout of the cached file; a change makes new files beside the old.
 CACHE_VERSION = 1
@@ -54,38 +54,25 @@ def open_table(
     try:
         _publish(packed, path)
     except OSError:  # read-only or full: a cache is a convenience
-        return _unpacked(packed)
-    return _mapped(path, model) or _unpacked(packed)
-
-
-def _record() -> np.dtype[np.void]:
-    # one bin is 96 contiguous bytes, so that a look-up touches two cache lines, not three pages
-    return np.dtype(
-        [
-            ("features", "<f4", (DIMENSION,)),
-            ("posteriors", "<f4", (LEADING,)),
-            ("components", "<i2", (LEADING,)),
-        ]
-    )
-
-
-def _unpacked(packed: np.ndarray) -> PairTable:
-    return PairTable(packed["features"], packed["components"], packed["posteriors"])
+        return PairTable(packed)
+    return _mapped(path, model) or PairTable(packed)
 
 
 def _mapped(path: Path, model: Model) -> PairTable | None:
     try:
         with path.open("rb") as file:
             head = file.read(HEAD)
-        if path.stat().st_size != HEAD + model.parameters.table.n_bins * _record().itemsize:
+        shape = (model.parameters.table.n_bins, WIDTH)
+        if path.stat().st_size != HEAD + 4 * shape[0] * shape[1]:
             return None
-        packed = np.memmap(path, _record(), "r", offset=HEAD, shape=model.parameters.table.n_bins)
+        packed = np.memmap(path, np.float32, "r", offset=HEAD, shape=shape)
     except (OSError, ValueError):
         return None
-    return _unpacked(packed) if head == _head(packed) else None
+    # an ndarray of the same memory: a memmap would make every slice of it cost more
+    return PairTable(np.asarray(packed)) if head == _head(packed) else None
 
 
-def _head(packed: np.ndarray) -> bytes:
+def _head(packed: Floats32) -> bytes:
     """First bytes of the file: what it is, and a checksum of the rest (20 ms to verify)."""
     checksum = zlib.crc32(packed.view(np.uint8).data)
     return f"sceneprint table {CACHE_VERSION} {checksum:08x}".encode().ljust(HEAD)
@@ -99,24 +86,22 @@ def build_table(model: Model, progress: Progress | None = None) -> PairTable:
     model : see Model
     progress : called with bins done and their total
     """
-    return _unpacked(_build(model, progress))
+    return PairTable(_build(model, progress))
 
 
-def _build(model: Model, progress: Progress | None) -> np.ndarray:
+def _build(model: Model, progress: Progress | None) -> Floats32:
     p, n = model.parameters, model.parameters.table.n_bins
-    packed = np.zeros(n, _record())
+    packed = np.empty((n, WIDTH), np.float32)
     for first in range(0, n, CHUNK):
         last = min(first + CHUNK, n)
         done = part(first, last, p.table, p.properties, model.projection, model.mixture)
-        packed["features"][first:last] = done.features
-        packed["components"][first:last] = done.components
-        packed["posteriors"][first:last] = done.posteriors
+        packed[first:last] = done.packed
         if progress is not None:
             progress(last, n)
     return packed
 
 
-def _publish(packed: np.ndarray, path: Path) -> None:
+def _publish(packed: Floats32, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, partial = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".partial")
     try:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sceneprint.geometry import encoding as module
+from sceneprint.geometry.counting import PairCounts
 from sceneprint.geometry.encoding import (
     Statistics,
     fisher_vector,
@@ -22,7 +23,7 @@ from sceneprint.geometry.encoding import (
     statistics_of_features,
 )
 from sceneprint.geometry.mixture import Mixture, posteriors
-from sceneprint.geometry.table import LEADING, PairCounts, PairTable
+from sceneprint.geometry.table import LEADING, PairTable, pack
 from sceneprint.types import Floats, Ints32
 
 
@@ -126,7 +127,7 @@ def table_of(features: Floats, mixture: Mixture) -> PairTable:
     shares[:, : order.shape[1]] = np.take_along_axis(pi, order, axis=1)
     components = np.zeros((len(features), LEADING), np.int16)
     components[:, : order.shape[1]] = order
-    return PairTable(features.astype(np.float32), components, shares)
+    return pack(features.astype(np.float32), shares, components)
 
 
 def counted(counts: Ints32) -> PairCounts:
@@ -155,10 +156,10 @@ def test_statistics_of_counts_equal_those_of_the_pairs() -> None:
 
 
 def test_statistics_of_counts_by_hand() -> None:
-    table = PairTable(
+    table = pack(
         np.full((3, 12), 2.0, np.float32),
-        np.array([[1, 0, 2] + [0] * 5, [0, 1] + [0] * 6, [1] * 8], np.int16),
         np.array([[0.75, 0.25, 5e-3] + [0] * 5, [1, 0, 0.5] + [0] * 5, [1] + [0] * 7], np.float32),
+        np.array([[1, 0, 2] + [0] * 5, [0, 1] + [0] * 6, [1] * 8], np.int16),
     )
     s = statistics_of_counts(counted(np.array([4, 3, 0])), table, 3)
     # four pairs shared 3 : 1, with a trace of component 2; three of component 0, whose list

@@ -10,6 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from sceneprint.geometry.bins import TableLayout, bin_centres
+from sceneprint.geometry.counting import count_pairs
 from sceneprint.geometry.mixture import Mixture, posteriors
 from sceneprint.geometry.projection import Projection, project
 from sceneprint.geometry.properties import (
@@ -18,7 +20,7 @@ from sceneprint.geometry.properties import (
     neighbour_pairs,
     properties,
 )
-from sceneprint.geometry.table import LEADING, LEAST, TableLayout, bin_centres, count_pairs, part
+from sceneprint.geometry.table import LEADING, LEAST, part
 from sceneprint.types import Floats, Ints32, Patches
 
 LAYOUT = TableLayout(distance_bins=36, angle_bins=25, dihedral_bins=36, distance_exponent=1.3)

@@ -11,6 +11,8 @@ import pytest
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
+from sceneprint.geometry.bins import TableLayout
+from sceneprint.geometry.counting import count_pairs
 from sceneprint.geometry.encoding import (
     fisher_vector,
     normalised,
@@ -24,7 +26,7 @@ from sceneprint.geometry.properties import (
     neighbour_pairs,
     pair_properties,
 )
-from sceneprint.geometry.table import PairTable, TableLayout, count_pairs, part
+from sceneprint.geometry.table import PairTable, part
 from sceneprint.types import Floats, Patches
 
 LAYOUT = TableLayout(distance_bins=36, angle_bins=25, dihedral_bins=36, distance_exponent=1.3)
