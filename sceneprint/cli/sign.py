@@ -62,7 +62,8 @@ def named_frames(paths: list[Path]) -> list[tuple[str, FrameReference]]:
         prefix = f"{path.resolve().name}/" if len(paths) > 1 else ""
         for sequence in find_sequences(path):
             for reference in sequence.frames:
-                name = prefix + reference.name
+                known = reference.name.startswith(prefix)
+                name = reference.name if known else prefix + reference.name
                 if name in frames:
                     raise DatasetError(
                         f"{path}: {name} is already the name of {frames[name].path}. "

@@ -1,0 +1,134 @@
+"""The documentation is held to the code: functions exist, equations have rows, commands run."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from sceneprint.models import PRESETS, read_model
+
+ROOT = Path(__file__).resolve().parent.parent
+PAPER = (ROOT / "docs/paper.md").read_text()
+README = (ROOT / "README.md").read_text()
+MODEL = (ROOT / "docs/model.md").read_text()
+GEOMETRY = sorted((ROOT / "sceneprint/geometry").glob("*.py"))
+ROWS = re.findall(r"^\| ((?:Eq\.|Sec\.)[^|]+) \| `([^`:]+):(\w+)`", PAPER, re.MULTILINE)
+
+
+def function_of(path: str, name: str) -> object:
+    module = import_module(path.removesuffix(".py").replace("/", "."))
+    return getattr(module, name)
+
+
+def test_there_are_rows() -> None:
+    assert len(ROWS) >= 14
+    assert len(set(ROWS)) == len(ROWS)
+
+
+@pytest.mark.parametrize(("what", "path", "name"), ROWS)
+def test_every_row_names_a_function_that_names_its_source(what: str, path: str, name: str) -> None:
+    function = function_of(path, name)
+    text = (inspect.getdoc(function) or "") + (ROOT / path).read_text().split('"""')[1]
+    source = re.match(r"(Eq\. \(\d+)|(Sec\. III(?:-[A-F])?)", what)
+    assert source is not None
+    named = source[0] if source[2] else source[1]
+    assert named in text or (named == "Sec. III" and "Sec. III" in text)
+
+
+def test_every_equation_in_the_code_has_a_row() -> None:
+    marked = {
+        (mark, str(path.relative_to(ROOT)))
+        for path in GEOMETRY
+        for mark in re.findall(r"# (Eq\. \(\d+\w?\))", path.read_text())
+    }
+    assert {mark for mark, _ in marked} == {"Eq. (1)", "Eq. (2a)", "Eq. (2b)", "Eq. (2c)"}
+    assert marked <= {(what, path) for what, path, _ in ROWS}
+
+
+def test_every_reading_that_code_cites_is_explained() -> None:
+    cited = {
+        number
+        for path in GEOMETRY
+        for number in re.findall(r"\bR(\d+)\b(?=[ ,)(-])", path.read_text())
+    }
+    assert {"1", "2", "7", "11"} <= cited
+    explained = set(re.findall(r"^\| R(\d+) \|", PAPER, re.MULTILINE))
+    assert cited <= explained
+
+
+def test_docs_name_the_shipped_models_as_they_are() -> None:
+    """Ids and figures of docs/model.md are those of the files in the package."""
+    for preset in PRESETS:
+        model = read_model(preset)
+        assert f"`{model.id[:12]}`" in MODEL
+        assert f"{model.signature_bytes:,}" in MODEL
+        assert model.provenance["own_frames"] == 0
+        assert f"{model.provenance['training']['rooms']} rooms" in MODEL
+        assert f"{model.provenance['pairs_used']:,} pairs" in MODEL
+
+
+def test_every_dependency_has_a_reason() -> None:
+    import tomllib
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    reasons = (ROOT / "docs/dependencies.md").read_text()
+    wanted = project["dependencies"] + project["optional-dependencies"]["dev"]
+    names = [re.split(r"[<>=;\[ ]", requirement)[0] for requirement in wanted]
+    assert [name for name in names if name not in reasons] == []
+    locked = (ROOT / "requirements.txt").read_text()
+    assert [name for name in names if f"\n{name}==" not in f"\n{locked}"] == []
+    assert "http" not in locked
+
+
+def blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+
+
+def test_readme_commands_and_library_example_run(tmp_path: Path) -> None:
+    """Every command but `make`, which the tests themselves run under, in the README's order."""
+    commands = [line for block in blocks(README, "sh") for line in block.strip().splitlines()]
+    makes = [line for line in commands if line.startswith("make")]
+    assert makes == ["make demo"]
+    rest = [line for line in commands if line not in makes]
+    assert len(rest) == 3
+    for line in rest:
+        program, *arguments = line.split()
+        assert program == ".venv/bin/sceneprint"
+        subprocess.run([sys.executable, "-m", "sceneprint", *arguments], cwd=tmp_path, check=True)
+    index = json.loads((tmp_path / "signatures/signatures.json").read_text())
+    assert [entry["signed"] for entry in index["frames"]] == [True] * 6
+    assert (tmp_path / "frame.png").stat().st_size > 10_000
+    (example,) = blocks(README, "python")
+    assert len(example.strip().splitlines()) <= 10
+    done = subprocess.run(
+        [sys.executable, "-c", example], cwd=tmp_path, check=True, capture_output=True, text=True
+    )
+    # the first frame of room 0 looks most like another frame of room 0
+    assert re.fullmatch(r"room-000\S+ looks most like room-000\S+\n", done.stdout)
+
+
+def test_readme_camera_is_valid_json() -> None:
+    from sceneprint.datasets import Camera
+    from sceneprint.types import Intrinsics
+
+    (example,) = blocks(README, "json")
+    fields = json.loads(example)
+    scale = fields.pop("depth_scale")
+    assert Camera(Intrinsics(**fields), scale).depth_scale == 1000
+
+
+def test_make_has_the_verbs_the_docs_name() -> None:
+    targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    named = set(
+        re.findall(r"`make (\w+)", README + MODEL + (ROOT / "docs/performance.md").read_text())
+    )
+    assert {"demo", "test", "bench", "models"} <= named
+    assert named <= targets
+    assert "make test" in (ROOT / ".ci/run").read_text()
