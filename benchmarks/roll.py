@@ -81,7 +81,10 @@ def main() -> int:
             print(
                 f"{name:10} {angle:4d} deg  median {np.median(column):.3f}  max {column.max():.3f}"
             )
-        print(f"{name:10}   all     median {np.median(table):.3f}  max {table.max():.3f}")
+        print(
+            f"{name:10}   all     median {np.median(table):.3f}  max {table.max():.3f}  "
+            f"within d0 / 3: {(table <= 1 / 3).sum()} of {table.size}"
+        )
     return 0
 
 

@@ -47,7 +47,6 @@ def run(options: argparse.Namespace) -> int:
     if len(frames) < 2:
         raise DatasetError(f"{options.dataset}: the demo compares frames; give two or more.")
     signer = open_for(options, Settings())
-    sign(frames[0][1], signer)  # whatever is done once is done before the clock starts
     stored, seconds = _sign_all(frames, signer)
     _print_nearest(frames, stored, signer)
     options.out.mkdir(parents=True, exist_ok=True)
