@@ -64,11 +64,18 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _synthetic(rooms: int) -> list[tuple[str, Frame]]:
-    from sceneprint.synth import synthesise_room
+    """Six views of each room, some twenty centimetres and degrees apart on a hand-held path."""
+    from sceneprint.synth import KINECT, take, trajectory
+    from sceneprint.synth.synthesis import room_and_rng
 
-    bar = tqdm(range(rooms), desc="synthetic building", unit="room", disable=None)
-    made = [synthesise_room(11, i, 6) for i in bar]
-    return [(room.name, frame) for room in made for frame in room.frames]
+    frames = []
+    for number in tqdm(range(rooms), desc="synthetic building", unit="room", disable=None):
+        room, rng = room_and_rng(11, number)
+        for i, pose in enumerate(trajectory(room, 61, rng)[::12]):
+            depth = take(room, pose, KINECT, rng)
+            name = f"room-{number}/view-{i}"
+            frames.append((f"room {number}", Frame(depth, KINECT, name, pose)))
+    return frames
 
 
 def _given(path: Path) -> list[tuple[str, Frame]]:
