@@ -1,0 +1,137 @@
+"""Sec. III-D, diversity: a ranking to a selection whose members differ from each other.
+
+distances to the query (R,), among R (R, R)  --diversify-->  Selection (k of R)
+
+The kernel is L_XY = rho_X rho_Y exp(s(X, Y) / sigma) with rho_X = exp(s(X, Q) / (2 omega)),
+and s = -distance. The most probable set of k maximises det L_C; the greedy procedure takes,
+again and again, the candidate that multiplies the determinant most. That factor is
+rho_X^2 times the variance of X given those already taken, under exp(-D / sigma) alone: quality
+and diversity part, and their logarithms neither overflow nor underflow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.types import Floats
+
+#: Variance given the selection below which a candidate is a duplicate of one that is in it.
+DUPLICATE = 1e-9
+
+
+@dataclass(frozen=True)
+class DiversityParameters:
+    """The scales of Eq. (3), as multiples of what the ranking itself spans."""
+
+    sigma: float = 1.0  #: of the median distance within the ranking
+    omega: float = 4.0  #: of the span from its nearest to its farthest
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """C of Sec. III-D, in the order of the ranking.
+
+    Parameters
+    ----------
+    indices : (k,) positions in the ranking, rising; the first is always 0
+    gains : (k,) variance given those taken before it, in (0, 1]: 1 for the first, near 0 for one
+        much like another; what diversity each brought
+    """
+
+    indices: NDArray[np.intp]
+    gains: Floats
+
+
+def kernel_matrix(to_query: Floats, among: Floats, sigma: float, omega: float) -> Floats:
+    """The kernel L of the determinantal point process: Eq. (3), Sec. III-D.
+
+    Parameters
+    ----------
+    to_query : (R,) distances to the query
+    among : (R, R) distances within the ranking
+    sigma, omega : positive, in units of distance
+
+    Returns
+    -------
+    L : (R, R) symmetric, positive semi-definite
+
+    Notes
+    -----
+    Reading R6 (docs/paper.md): kappa scales every determinant of size k alike; it is 1.
+    """
+    rho = np.exp(-0.5 * to_query / omega)
+    kernel: Floats = rho[:, None] * rho[None, :] * np.exp(-among / sigma)  # Eq. (3)
+    return kernel
+
+
+def diversify(
+    to_query: Floats, among: Floats, k: int, p: DiversityParameters | None = None
+) -> Selection:
+    """Select up to `k` of a ranking by greedy maximisation of det L_C: Sec. III-D.
+
+    Parameters
+    ----------
+    to_query : (R,) distances to the query, rising: the ranking
+    among : (R, R) distances within the ranking
+    k : how many to select
+    p : see DiversityParameters
+
+    Returns
+    -------
+    selection : the top-ranked first, then in the order of the ranking; fewer than `k` where the
+        rest are duplicates
+
+    Raises
+    ------
+    ValueError : the shapes disagree, the ranking is not rising, or k is below 1.
+    """
+    p = p or DiversityParameters()
+    n = len(to_query)
+    if among.shape != (n, n) or k < 1 or (np.diff(to_query) < 0).any():
+        raise ValueError(f"k = {k}, distances {to_query.shape} (rising) and {among.shape}")
+    if n == 0:
+        return Selection(np.empty(0, np.intp), np.empty(0))
+    upper = among[np.triu_indices(n, 1)]
+    sigma = p.sigma * float(np.median(upper)) if upper.size else 0.0
+    omega = p.omega * float(to_query[-1] - to_query[0])
+    return _greedy(_log_quality(to_query, omega), among, sigma, min(k, n))
+
+
+def _log_quality(to_query: Floats, omega: float) -> Floats:
+    """log rho^2 up to a constant, which no choice depends on."""
+    if omega <= 0:  # all equally near, or quality left out: only diversity decides
+        return np.zeros(len(to_query))
+    quality: Floats = (to_query[0] - to_query) / omega
+    return quality
+
+
+def _greedy(log_quality: Floats, among: Floats, sigma: float, k: int) -> Selection:
+    """Incremental Cholesky factor of exp(-among / sigma), one column for each one taken."""
+    n = len(log_quality)
+    # where half of all pairs are duplicates sigma is 0: what is not a duplicate is then unlike
+    similarity = np.exp(-among / sigma) if sigma > 0 else (among <= 0).astype(float)
+    factor = np.zeros((k, n))
+    variance = np.ones(n)
+    taken: list[int] = []
+    gains: list[float] = []
+    open_ = np.ones(n, np.bool_)
+    while len(taken) < k:
+        value = np.where(
+            open_ & (variance > DUPLICATE),
+            log_quality + np.log(np.maximum(variance, 1e-300)),
+            -np.inf,
+        )
+        best = int(np.argmax(value))
+        if not np.isfinite(value[best]):
+            break
+        row = (similarity[best] - factor[:, best] @ factor) / np.sqrt(variance[best])
+        gains.append(float(variance[best]))
+        factor[len(taken)] = row
+        variance = variance - row**2
+        open_[best] = False
+        taken.append(best)
+    order = np.argsort(taken)
+    return Selection(np.array(taken, np.intp)[order], np.array(gains)[order])

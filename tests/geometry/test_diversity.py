@@ -1,0 +1,100 @@
+"""The k-DPP: Eq. (3) by hand, greedy steps against determinants, and what it is there for."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sceneprint.geometry.diversity import DiversityParameters, diversify, kernel_matrix
+from sceneprint.types import Floats
+
+
+def ranking(seed: int, n: int, dimension: int = 6) -> tuple[Floats, Floats]:
+    """L1 distances of random points, nearest to the origin first."""
+    points = np.random.default_rng(seed).exponential(size=(n, dimension)) * 100
+    points = points[np.argsort(points.sum(axis=1))]
+    return points.sum(axis=1), np.abs(points[:, None] - points[None]).sum(axis=2)
+
+
+def naive_greedy(to_query: Floats, among: Floats, k: int, p: DiversityParameters) -> list[int]:
+    """Try every candidate; keep the one with the largest determinant of L_C."""
+    n = len(to_query)
+    sigma = p.sigma * np.median(among[np.triu_indices(n, 1)])
+    omega = p.omega * (to_query[-1] - to_query[0])
+    kernel = kernel_matrix(to_query, among, sigma, omega)
+    taken: list[int] = []
+    for _ in range(k):
+        rest = [i for i in range(n) if i not in taken]
+        values = [np.linalg.det(kernel[np.ix_([*taken, i], [*taken, i])]) for i in rest]
+        taken.append(rest[int(np.argmax(values))])
+    return sorted(taken)
+
+
+def test_kernel_by_hand() -> None:
+    # rho = exp(-0.5 * (2, 4) / 4) = exp(-1/4), exp(-1/2); exp(-6 / 3) between the two
+    found = kernel_matrix(np.array([2.0, 4.0]), np.array([[0, 6.0], [6.0, 0]]), 3.0, 4.0)
+    expected = np.exp([[-0.5, -2.75], [-2.75, -1.0]])
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_kernel_is_positive_semi_definite(seed: int) -> None:
+    to_query, among = ranking(seed, 40)
+    kernel = kernel_matrix(to_query, among, 200.0, 500.0)
+    np.testing.assert_array_equal(kernel, kernel.T)
+    assert np.linalg.eigvalsh(kernel).min() > -1e-12
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("p", [DiversityParameters(), DiversityParameters(0.3, 0.5)])
+def test_greedy_equals_the_determinants(seed: int, p: DiversityParameters) -> None:
+    to_query, among = ranking(seed, 25)
+    found = diversify(to_query, among, 6, p)
+    assert found.indices.tolist() == naive_greedy(to_query, among, 6, p)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 30), k=st.integers(1, 12))
+def test_first_is_top_ranked_and_the_order_is_that_of_the_ranking(
+    seed: int, n: int, k: int
+) -> None:
+    found = diversify(*ranking(seed, n), k)
+    assert found.indices[0] == 0
+    assert found.gains[0] == 1.0
+    assert len(found.indices) == min(n, k)
+    assert all(a < b for a, b in pairwise(found.indices))
+    assert ((found.gains > 0) & (found.gains <= 1)).all()
+
+
+def test_scale_does_not_matter() -> None:
+    to_query, among = ranking(3, 30)
+    for scale in (1e-6, 1e9):
+        found = diversify(to_query * scale, among * scale, 7)
+        np.testing.assert_array_equal(found.indices, diversify(to_query, among, 7).indices)
+
+
+def test_near_duplicates_make_way() -> None:
+    """Five copies of one place, a little apart, then two others, farther from the query."""
+    position = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 50.0, 100.0])
+    to_query, among = 100 + position / 10, np.abs(position[:, None] - position[None])
+    assert diversify(to_query, among, 3).indices.tolist() == [0, 5, 6]
+
+
+def test_exact_duplicates_are_never_taken_twice() -> None:
+    position = np.array([0.0, 0.0, 0.0, 5.0, 5.0, 9.0])
+    found = diversify(np.arange(6.0), np.abs(position[:, None] - position[None]), 6)
+    assert position[found.indices].tolist() == [0.0, 5.0, 9.0]
+    same = diversify(np.full(4, 7.0), np.zeros((4, 4)), 3)
+    assert same.indices.tolist() == [0]
+
+
+def test_empty_and_wrong_input() -> None:
+    assert len(diversify(np.empty(0), np.empty((0, 0)), 3).indices) == 0
+    to_query, among = ranking(0, 5)
+    for arguments in ((to_query, among[:4], 2), (to_query, among, 0), (to_query[::-1], among, 2)):
+        with pytest.raises(ValueError, match="distances"):
+            diversify(*arguments)
