@@ -28,7 +28,7 @@ $(STAMP): requirements.txt pyproject.toml
 	@touch $(STAMP)
 
 demo: $(STAMP)
-	$(BIN)/sceneprint demo --out demo $(if $(DATASET),--dataset $(DATASET))
+	$(BIN)/sceneprint demo --out demo $(if $(DATASET),--dataset "$(DATASET)")
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

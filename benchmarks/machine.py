@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import resource
 import statistics
 import subprocess
 import sys
@@ -63,10 +62,12 @@ def seconds_to_import(runs: int = 5) -> float:
 def peak_megabytes_of_signing(folder: Path, preset: str) -> float:
     """Peak resident memory of a process that signs the frames of a folder, table mapped."""
     code = (
-        "import resource, sys\n"
+        "import sys\n"
         "from sceneprint.cli import main\n"
         f"main(['sign', sys.argv[1], '--preset', {preset!r}])\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)\n"
+        # not ru_maxrss: that survives exec, and would be the peak of whoever started us
+        "status = open('/proc/self/status').read()\n"
+        "print(status.split('VmHWM:')[1].split()[0], file=sys.stderr)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(folder)], check=True, capture_output=True, text=True
@@ -79,8 +80,3 @@ def pin_to_one_processor() -> int:
     cpu = max(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpu})
     return cpu
-
-
-def own_peak_megabytes() -> float:
-    """Peak resident memory of this process."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -5,6 +5,7 @@ Frame  --panels-->  depth, normals, patches of each level  --save_picture-->  PN
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from sceneprint.geometry.normals import surface
 from sceneprint.models import Model
 from sceneprint.pipeline import describe
 from sceneprint.types import Bytes, Floats32, Frame, Ints32
+from sceneprint.writing import write_whole
 
 #: Colour where nothing is known: dark grey, which no normal and no depth has.
 UNKNOWN = 40
@@ -106,7 +108,9 @@ def save_picture(frame: Frame, model: Model, path: Path) -> None:
     for level, (axis, of_level, labels) in enumerate(shown, 1):
         axis.imshow(patch_colours(colours, labels))
         axis.set_title(f"level {level}: {len(of_level)} patches", fontsize=10)
-    figure.savefig(path, dpi=110, format="png", metadata={"Software": None})
+    buffer = BytesIO()
+    figure.savefig(buffer, dpi=110, format="png", metadata={"Software": None})
+    write_whole(path, buffer.getvalue())
 
 
 def _draw_depth(figure: Any, axis: Any, frame: Frame, model: Model) -> None:

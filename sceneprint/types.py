@@ -19,8 +19,11 @@ Floats32 = NDArray[np.float32]
 Ints32 = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
 
-#: Most samples a depth image may have (a 16-megapixel sensor); more is refused unread.
-MAXIMUM_SAMPLES = 16_777_216
+#: Most samples a depth image may have (an 8-megapixel sensor); more is refused unread.
+MAXIMUM_SAMPLES = 8_388_608
+
+#: Longest focal length and farthest principal point that are believed, pixels.
+MAXIMUM_PIXELS = 1e7
 
 
 @dataclass(frozen=True)
@@ -66,9 +69,19 @@ class Intrinsics:
                     f"The focal length {name} = {value} is not a positive number, so pixels "
                     "have no direction. Give it in pixels, as the sensor's calibration states."
                 )
+            if not 1e-3 <= value <= MAXIMUM_PIXELS:
+                raise InvalidIntrinsics(
+                    f"The focal length {name} = {value:g} is that of no camera. "
+                    "Give it in pixels, as the sensor's calibration states."
+                )
         if not (math.isfinite(self.cx) and math.isfinite(self.cy)):
             raise InvalidIntrinsics(
                 f"The principal point ({self.cx}, {self.cy}) is not finite. "
+                "Give cx and cy in pixels, as the sensor's calibration states."
+            )
+        if max(abs(self.cx), abs(self.cy)) > MAXIMUM_PIXELS:
+            raise InvalidIntrinsics(
+                f"The principal point ({self.cx:g}, {self.cy:g}) is that of no camera. "
                 "Give cx and cy in pixels, as the sensor's calibration states."
             )
         if len(self.distortion) not in (0, 4, 5):

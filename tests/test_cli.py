@@ -6,6 +6,7 @@ import hashlib
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -130,6 +131,70 @@ def test_a_bad_frame_does_not_stop_the_others(model_file: Path, tmp_path: Path) 
     assert "8" in entries[1]["reason"]
     # the same depth as PNG and as NPY, but for the rounding of 1/1000
     assert (out / entries[0]["file"]).read_bytes() == (out / entries[4]["file"]).read_bytes()
+
+
+def test_signatures_of_two_models_do_not_mix(
+    rooms: Path, model_file: Path, small_model: Model, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run("sign", rooms / "room-000", "--model", model_file, "--out", out)
+    before = tree_hash(out)
+    other = tmp_path / "other.safetensors"
+    save_model(replace(small_model, quantiser_step=0.004), other)
+    done = run("sign", rooms / "room-000", "--model", other, "--out", out, expect=2)
+    assert "holds signatures of another model" in done.stderr
+    assert tree_hash(out) == before
+
+
+def test_an_old_signature_does_not_outlive_its_frame(model_file: Path, tmp_path: Path) -> None:
+    folder, out = tmp_path / "frames", tmp_path / "out"
+    folder.mkdir()
+    (folder / "intrinsics.json").write_text(json.dumps(CAMERA))
+    y, x = np.mgrid[:120, :160]
+    good = np.where(x < 80, 1500 + 3 * y, 2500 - 4 * y).astype(np.uint16)
+    Image.fromarray(good).save(folder / "a.png")
+    run("sign", folder, "--model", model_file, "--out", out)
+    assert [name for name in tree_hash(out) if name.endswith(".sig")] == ["frames/a.sig"]
+    (folder / "a.png").write_bytes(b"no longer a picture")
+    run("sign", folder, "--model", model_file, "--out", out, expect=2)
+    assert list(tree_hash(out)) == ["signatures.json"]
+
+
+def test_names_that_no_line_can_hold(model_file: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    (folder / "intrinsics.json").write_text(json.dumps(CAMERA))
+    y, x = np.mgrid[:120, :160]
+    good = np.where(x < 80, 1500 + 3 * y, 2500 - 4 * y).astype(np.uint16)
+    Image.fromarray(good).save(folder / "a\nb\x1b[2Jü.png")
+    done = run("sign", folder, "--model", model_file)
+    assert len(done.stdout.splitlines()) == 1
+    assert "\x1b" not in done.stdout
+
+
+def test_a_reader_that_leaves_does_not_stop_the_writing(
+    rooms: Path, model_file: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "sceneprint", "sign", rooms, "--model", model_file]
+    process = subprocess.Popen(
+        [*map(str, command), "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    error = process.stderr.read().decode()
+    process.stderr.close()
+    assert process.wait() == 0, error
+    assert len(json.loads((out / "signatures.json").read_text())["frames"]) == 4
+
+
+def test_train_for_another_range(tmp_path: Path) -> None:
+    done = run("train", "--out", tmp_path / "m", "--range", "9", "3", expect=2)
+    assert "give the smaller distance first" in done.stderr
+    done = run("train", "--out", tmp_path, "--rooms", 2, expect=2)
+    assert "is a folder" in done.stderr
+    assert "train: error" in run("train", "--out", "m", "--radius", "-1", expect=2).stderr
 
 
 def test_two_paths_keep_their_names_apart(rooms: Path, model_file: Path, tmp_path: Path) -> None:

@@ -80,6 +80,11 @@ def test_docs_name_the_shipped_models_as_they_are() -> None:
         assert f"{model.provenance['pairs_used']:,} pairs" in MODEL
 
 
+def test_no_blank_is_left_to_fill_in() -> None:
+    pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")]
+    assert [page.name for page in pages if "@@" in page.read_text()] == []
+
+
 def test_every_dependency_has_a_reason() -> None:
     import tomllib
 

@@ -6,9 +6,9 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from concurrent.futures.process import BrokenProcessPool
 
 from sceneprint import __version__
-from sceneprint.cli import demo, picture, sign, synth, train
 from sceneprint.errors import SceneprintError
 
 #: Exit code of a command that was asked for something it cannot do.
@@ -17,6 +17,8 @@ USAGE = 2
 
 def parser() -> argparse.ArgumentParser:
     """All commands with their options."""
+    from sceneprint.cli import demo, picture, sign, synth, train
+
     top = argparse.ArgumentParser(
         prog="sceneprint",
         description="Place recognition from pure geometry: depth frames in, signatures out.",
@@ -30,22 +32,34 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; errors are one line on standard error and exit code 2."""
-    options = parser().parse_args(arguments)
-    try:
+    for stream in (sys.stdout, sys.stderr):  # file names may hold what a terminal cannot show
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    command = "sceneprint"
+    try:  # from the first import on, which takes a second
+        options = parser().parse_args(arguments)
+        command = f"sceneprint {options.command}"
         return int(options.run(options))
     except SceneprintError as error:
-        print(f"sceneprint {options.command}: {error}", file=sys.stderr)
-        return USAGE
+        return _refuse(command, str(error))
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        print(
-            f"sceneprint {options.command}: {error.filename or 'input/output'}: "
-            f"{error.strerror or error}. Check the path and its permissions.",
-            file=sys.stderr,
+        place = error.filename or "input/output"
+        reason = error.strerror or error
+        return _refuse(command, f"{place}: {reason}. Check the path and its permissions.")
+    except (BrokenProcessPool, MemoryError):
+        return _refuse(
+            command,
+            "a process was killed or ran out of memory, and nothing was written. "
+            "Use fewer --jobs, or a machine with more memory.",
         )
-        return USAGE
     except KeyboardInterrupt:
-        print(f"sceneprint {options.command}: stopped", file=sys.stderr)
+        print(f"{command}: stopped", file=sys.stderr)
         return 130
+
+
+def _refuse(command: str, message: str) -> int:
+    print(f"{command}: {message}", file=sys.stderr)
+    return USAGE

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from sceneprint.cli.signer import add_model_options, open_for
 from sceneprint.datasets import find_sequences
-from sceneprint.errors import DatasetError
+from sceneprint.errors import DatasetError, FrameError
 from sceneprint.geometry.retrieval import distances
 from sceneprint.pipeline import Signer, sign
 from sceneprint.settings import Settings
@@ -43,13 +43,13 @@ def run(options: argparse.Namespace) -> int:
     """Show what signatures can do."""
     from sceneprint.pictures import save_picture
 
+    options.out.mkdir(parents=True, exist_ok=True)
     frames = _given(options.dataset) if options.dataset else _synthetic(options.rooms)
     if len(frames) < 2:
         raise DatasetError(f"{options.dataset}: the demo compares frames; give two or more.")
     signer = open_for(options, Settings())
     stored, seconds = _sign_all(frames, signer)
     _print_nearest(frames, stored, signer)
-    options.out.mkdir(parents=True, exist_ok=True)
     for number in sorted({0, len(frames) // 2, len(frames) - 1}):
         path = options.out / f"frame-{number:02d}.png"
         save_picture(frames[number][1], signer.model, path)
@@ -81,7 +81,13 @@ def _synthetic(rooms: int) -> list[tuple[str, Frame]]:
 def _given(path: Path) -> list[tuple[str, Frame]]:
     found = [(s.parent_frame, r) for s in find_sequences(path) for r in s.frames]
     step = max(-(-len(found) // MAXIMUM_FRAMES), 1)
-    return [(place, reference.read()) for place, reference in found[::step]]
+    frames = []
+    for place, reference in found[::step]:
+        try:
+            frames.append((place, reference.read()))
+        except FrameError as error:
+            print(f"left out: {error}")
+    return frames
 
 
 def _sign_all(

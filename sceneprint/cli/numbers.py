@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 
 
 def whole(text: str) -> int:
@@ -23,3 +24,14 @@ def _at_least(text: str, least: int) -> int:
     if number < least:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least} up")
     return number
+
+
+def metres(text: str) -> float:
+    """A positive distance."""
+    try:
+        distance = float(text)
+    except ValueError:
+        distance = math.nan
+    if not 0 < distance <= 1e4:  # false for NaN as well
+        raise argparse.ArgumentTypeError(f"{text!r} is not a distance of up to 10000 m")
+    return distance

@@ -33,6 +33,8 @@ def run(options: argparse.Namespace) -> int:
     """Draw one frame."""
     from sceneprint.pictures import save_picture
 
+    if options.out.suffix.lower() != ".png":
+        raise DatasetError(f"{options.out}: pictures are PNG. Name a file that ends in .png.")
     frames = [frame for sequence in find_sequences(options.path) for frame in sequence.frames]
     if not 0 <= options.frame < len(frames):
         raise DatasetError(

@@ -18,6 +18,7 @@ from sceneprint.datasets import FrameReference, find_sequences
 from sceneprint.errors import DatasetError, FrameError
 from sceneprint.pipeline import Signature, Signer, sign
 from sceneprint.settings import Settings
+from sceneprint.writing import write_whole
 
 
 def add_to(commands: Any) -> None:
@@ -58,38 +59,66 @@ def named_frames(paths: list[Path]) -> list[tuple[str, FrameReference]]:
     DatasetError : nothing is found at a path, or one path was given twice.
     """
     frames: dict[str, FrameReference] = {}
+    files: set[Path] = set()
     for path in paths:
-        prefix = f"{path.resolve().name}/" if len(paths) > 1 else ""
+        several = len(paths) > 1 and path.is_dir()  # a file is named by its folder already
+        prefix = f"{path.resolve().name}/" if several else ""
         for sequence in find_sequences(path):
             for reference in sequence.frames:
                 known = reference.name.startswith(prefix)
                 name = reference.name if known else prefix + reference.name
-                if name in frames:
+                if name in frames or reference.path.resolve() in files:
+                    first = frames[name].path if name in frames else "another of the paths"
                     raise DatasetError(
-                        f"{path}: {name} is already the name of {frames[name].path}. "
+                        f"{path}: {name} is already the name of {first}. "
                         "Sign the two in separate runs."
                     )
                 frames[name] = reference
+                files.add(reference.path.resolve())
     return list(frames.items())
 
 
 def run(options: argparse.Namespace) -> int:
     """Sign; returns 2 where a frame could not be signed."""
     frames = named_frames(options.paths)
-    if options.out is not None:
-        options.out.mkdir(parents=True, exist_ok=True)
     signer = open_for(options, Settings())
-    done: list[Signed] = []
-    with tqdm(frames, desc="sign", unit="frame", disable=None) as bar:
-        for name, reference in bar:
-            one = _sign(name, reference, signer)
-            done.append(one)
-            bar.write(_line(one, signer))
-            if options.out is not None and one.signature is not None:
-                _write_signature(options.out, one.name, one.signature)
     if options.out is not None:
-        _write_index(options.out, done, signer)
+        _claim(options.out, signer)
+    done: list[Signed] = []
+    heard = True  # whether anybody still reads the lines
+    try:
+        with tqdm(frames, desc="sign", unit="frame", disable=None) as bar:
+            for name, reference in bar:
+                one = _sign(name, reference, signer)
+                if options.out is not None:
+                    _write_signature(options.out / f"{name}.sig", one.signature)
+                done.append(one)
+                try:
+                    if heard:
+                        bar.write(_line(one, signer))
+                except BrokenPipeError:
+                    if options.out is None:
+                        raise
+                    heard = False
+    finally:  # what was written is listed, however the run ended
+        if options.out is not None:
+            _write_index(options.out, done, signer)
     return _report(done, signer)
+
+
+def _claim(folder: Path, signer: Signer) -> None:
+    """Make the folder, or see that it holds signatures of this model."""
+    folder.mkdir(parents=True, exist_ok=True)
+    index = folder / "signatures.json"
+    try:
+        known = json.loads(index.read_text())["model"]["id"] if index.exists() else None
+    except (ValueError, KeyError, TypeError):
+        known = "none that can be read"
+    if known not in (None, signer.model.id):
+        raise DatasetError(
+            f"{folder}: holds signatures of another model ({known[:12]}, not "
+            f"{signer.model.id[:12]}), which must not mix. Name a new folder, or empty this one."
+        )
 
 
 def _sign(name: str, reference: FrameReference, signer: Signer) -> Signed:
@@ -103,21 +132,26 @@ def _sign(name: str, reference: FrameReference, signer: Signer) -> Signed:
 
 
 def _line(one: Signed, signer: Signer) -> str:
+    # a name may hold line breaks and escapes; a line of ours never does
+    name = one.name if one.name.isprintable() else ascii(one.name)
     if one.signature is None:
-        return f"{one.name}  NOT SIGNED  {one.reason}"
+        return (
+            f"{name}  NOT SIGNED  {one.reason if one.reason.isprintable() else ascii(one.reason)}"
+        )
     patches = "/".join(map(str, one.signature.n_patches))
     return (
-        f"{one.name}  {patches} patches  {sum(one.signature.n_pairs)} pairs  "
+        f"{name}  {patches} patches  {sum(one.signature.n_pairs)} pairs  "
         f"{one.milliseconds:.0f} ms  {signer.model.label}"
     )
 
 
-def _write_signature(folder: Path, name: str, signature: Signature) -> None:
-    path = folder / f"{name}.sig"
+def _write_signature(path: Path, signature: Signature | None) -> None:
+    """Write it, or where there is none now, see that an earlier one does not stay."""
+    if signature is None:
+        path.unlink(missing_ok=True)
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(signature.vector.tobytes())
-    partial.replace(path)
+    write_whole(path, signature.vector.tobytes())
 
 
 def _write_index(folder: Path, done: list[Signed], signer: Signer) -> None:
@@ -131,9 +165,7 @@ def _write_index(folder: Path, done: list[Signed], signer: Signer) -> None:
         },
         "frames": [_entry(one) for one in done],
     }
-    partial = folder / "signatures.json.partial"
-    partial.write_text(json.dumps(index, indent=1) + "\n")
-    partial.replace(folder / "signatures.json")
+    write_whole(folder / "signatures.json", (json.dumps(index, indent=1) + "\n").encode())
 
 
 def _entry(one: Signed) -> dict[str, Any]:

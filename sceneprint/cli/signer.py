@@ -59,4 +59,5 @@ def open_for(options: argparse.Namespace, settings: Settings) -> Signer:
 
 def _wall() -> Frame:
     """A flat wall 2 m ahead."""
-    return Frame(np.full((96, 128), 2.0, np.float32), Intrinsics(128, 96, 110, 110, 63.5, 47.5))
+    camera = Intrinsics(256, 192, 300, 300, 127.5, 95.5)  # halved once, as most are
+    return Frame(np.full((192, 256), 2.0, np.float32), camera)

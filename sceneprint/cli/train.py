@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from sceneprint.cli.numbers import positive, whole
+from sceneprint.cli.numbers import metres, positive, whole
 from sceneprint.datasets import FrameReference, find_sequences
+from sceneprint.errors import TrainingError
 from sceneprint.models import save_model
 
 
@@ -40,6 +42,16 @@ def add_to(commands: Any) -> None:
     )
     command.add_argument("--projection", choices=("pca", "ica"), default="pca", help="default: pca")
     command.add_argument(
+        "--range",
+        type=metres,
+        nargs=2,
+        metavar=("MIN", "MAX"),
+        help="the sensor's range, metres (default: 0.3 9)",
+    )
+    command.add_argument(
+        "--radius", type=metres, metavar="R", help="reach of a patch, metres (default: 3)"
+    )
+    command.add_argument(
         "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help="processes"
     )
     command.set_defaults(run=run)
@@ -56,12 +68,21 @@ def run(options: argparse.Namespace) -> int:
         for reference in sequence.frames
     ]
     options.out.parent.mkdir(parents=True, exist_ok=True)
+    if options.out.is_dir():
+        raise TrainingError(f"{options.out}: is a folder. Name the file that the model shall be.")
     p = TrainingParameters(rooms=options.rooms, seed=options.seed, projection=options.projection)
+    model_p, mixture_p = preset_parameters(options.preset)
+    if options.range is not None:
+        least, most = options.range
+        if least >= most:
+            raise TrainingError(f"--range {least:g} {most:g}: give the smaller distance first.")
+        depth = replace(model_p.depth, minimum_depth=least, maximum_depth=most)
+        model_p = replace(model_p, depth=depth)
+    if options.radius is not None:
+        properties = replace(model_p.properties, radius=options.radius)
+        model_p = replace(model_p, properties=properties)
     with _Bars() as bars:
-        model = train(
-            options.preset, *preset_parameters(options.preset), p,
-            references, options.jobs, bars.report,
-        )  # fmt: skip
+        model = train(options.preset, model_p, mixture_p, p, references, options.jobs, bars.report)
     save_model(model, options.out)
     print(
         f"{options.out}: model {model.label}, {model.signature_bytes} bytes a signature, "

@@ -8,8 +8,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import os
-import secrets
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,7 @@ import numpy as np
 from sceneprint.datasets.intrinsics import FILE_NAME, Camera
 from sceneprint.datasets.poses import rigid_transform
 from sceneprint.types import Floats, Floats32
+from sceneprint.writing import write_whole
 
 _LARGEST = 65_534  #: stored units; 65535 reads as missing
 
@@ -38,7 +37,7 @@ def write_intrinsics(folder: Path, camera: Camera) -> Path:
     if camera.along_ray:
         fields["depth_along_ray"] = True
     path = folder / FILE_NAME
-    _replace(path, (json.dumps(fields, indent=2) + "\n").encode())
+    write_whole(path, (json.dumps(fields, indent=2) + "\n").encode())
     return path
 
 
@@ -68,7 +67,7 @@ def write_depth_png(path: Path, depth: Floats32, depth_scale: float) -> None:
         units[~((units > 0) & (units <= _LARGEST))] = 0.0
     buffer = io.BytesIO()
     Image.fromarray(units.astype(np.uint16)).save(buffer, format="PNG")
-    _replace(path, buffer.getvalue())
+    write_whole(path, buffer.getvalue())
 
 
 def write_pose(path: Path, T_parent_sensor: Floats) -> None:
@@ -80,15 +79,4 @@ def write_pose(path: Path, T_parent_sensor: Floats) -> None:
     """
     rows = rigid_transform(T_parent_sensor)
     text = "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows)
-    _replace(path, text.encode())
-
-
-def _replace(path: Path, data: bytes) -> None:
-    """Put the file there in one step: a process killed here leaves the old one or none."""
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        part.write_bytes(data)
-        os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    write_whole(path, text.encode())

@@ -136,8 +136,8 @@ def _why_useless(frame: Frame, p: DepthParameters) -> str:
     span = f"the model's range of {p.minimum_depth:g} to {p.maximum_depth:g} m"
     if within.mean() > 0.5:
         return (
-            f"{name}only {counted} {span}, too few for a surface. "
-            "Send a frame that sees more of the scene."
+            f"{name}only {counted} {span}, too few for a surface at this focal length. "
+            "Check fx and fy, or send a frame that sees more of the scene."
         )
     return (
         f"{name}{counted} {span}; their median is {np.median(given):.3g} m. "

@@ -21,9 +21,15 @@ R = TypeVar("R")
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a loop over arrays to machine code on its first call; cached on disk."""
-    return cast(Callable[P, R], numba.njit(nogil=True, cache=True, error_model="numpy")(function))
+    compiled: Any
+    try:
+        compiled = numba.njit(nogil=True, cache=True, error_model="numpy")(function)
+    except RuntimeError:  # no folder to keep the code in: compile in every process instead
+        compiled = numba.njit(nogil=True, error_model="numpy")(function)
+    return cast(Callable[P, R], compiled)
 
 
 def cached_at(function: Any) -> tuple[str, str]:
     """Folder and name pattern of a kernel's machine code, there once it has been compiled."""
-    return function.stats.cache_path, f"*.{function.__name__}-*.nbi"
+    folder = getattr(function.stats, "cache_path", None) or ""
+    return folder, f"*.{function.__name__}-*.nbi"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from sceneprint.geometry.mixture import Mixture
 from sceneprint.geometry.projection import DIMENSION, Projection
 from sceneprint.geometry.properties import DIMENSION as PROPERTY_DIMENSION
 from sceneprint.models.model import SCHEMA_VERSION, Model, ModelParameters, from_mapping
+from sceneprint.writing import write_whole
 
 #: Names of the models that ship with the package.
 PRESETS = ("paper", "compact")
@@ -39,9 +41,7 @@ def save_model(model: Model, path: Path) -> None:
     }
     data = save(model.tensors, {"sceneprint": json.dumps(header, sort_keys=True)})
     parse_model(data, str(path))  # what cannot be read back is not written
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(data)
-    partial.replace(path)
+    write_whole(path, data)
 
 
 def read_model(model: str | Path) -> Model:
@@ -92,7 +92,7 @@ def parse_model(data: bytes, name: str) -> Model:
     try:
         length = int.from_bytes(data[:8], "little")
         metadata = json.loads(data[8 : 8 + length])["__metadata__"]
-        header: dict[str, Any] = json.loads(metadata["sceneprint"])
+        header: dict[str, Any] = dict(json.loads(metadata["sceneprint"]))
         tensors = load(data)
     except Exception as error:  # safetensors raises its own, json and Python theirs
         raise UnreadableModel(
@@ -105,16 +105,18 @@ def parse_model(data: bytes, name: str) -> Model:
             "this version of sceneprint reads. Train it again, or use the version that wrote it."
         )
     try:
-        model = _assemble(header, tensors)
-    except (KeyError, TypeError, ValueError) as error:
+        model, given = _assemble(header, tensors), str(header["id"])
+    except UnreadableModel as error:
+        raise UnreadableModel(f"{name}: {error}") from error
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UnreadableModel(
             f"{name}: a part of the model is missing or misshapen ({error}). "
             "Fetch or train it again."
         ) from error
-    if model.id != header["id"]:
+    if model.id != given:
         raise UnreadableModel(
             f"{name}: its content gives the id {model.id[:12]}, its header says "
-            f"{str(header['id'])[:12]}: the file was damaged. Fetch or train it again."
+            f"{given[:12]}: the file was damaged. Fetch or train it again."
         )
     return model
 
@@ -141,6 +143,8 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
     step, d0 = float(header["quantiser_step"]), float(header["unrelated_distance"])
     if not (math.isfinite(step) and step > 0 and math.isfinite(d0) and d0 > 0):
         raise ValueError("quantiser step and unrelated distance should be positive")
+    if not re.fullmatch(r"[\w.-]{1,64}", str(header["name"]), re.ASCII):
+        raise ValueError("a name is up to 64 letters, digits, dots and dashes")
     return Model(
         name=str(header["name"]),
         parameters=from_mapping(ModelParameters, header["parameters"], "parameters"),

@@ -72,7 +72,7 @@ BAD_NPY = {
     "no samples": (npy(np.ones((0, 4), np.float32)), "no samples"),
     "bomb": (
         npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (99999, 99999), }"),
-        "more than 16777216",
+        "more than 8388608",
     ),
     "numbers without end": (
         npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (0x" + "f" * 9000 + ", 1), }"),

@@ -8,7 +8,6 @@ import pytest
 from PIL import Image
 
 from sceneprint.datasets import decode_png, write_depth_png, write_pose
-from sceneprint.datasets import writing as module
 
 
 def test_depth_by_hand(tmp_path: Path) -> None:
@@ -41,7 +40,7 @@ def test_a_killed_writer_leaves_the_old_file(tmp_path: Path, monkeypatch) -> Non
     moved = np.eye(4)
     moved[0, 3] = 1.0
     with monkeypatch.context() as patch:
-        patch.setattr(module.os, "replace", killed)
+        patch.setattr(os, "replace", killed)
         with pytest.raises(KeyboardInterrupt):
             write_pose(tmp_path / "a.txt", moved)
         with pytest.raises(KeyboardInterrupt):

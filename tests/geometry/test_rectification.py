@@ -180,8 +180,8 @@ def test_nothing_is_taken_behind_a_narrow_fold() -> None:
 coefficient = st.one_of(
     st.floats(-3, 3), st.floats(allow_nan=False, allow_infinity=False), st.just(0.0)
 )
-length = st.one_of(st.floats(1.0, 100.0), st.floats(min_value=1e-308, allow_infinity=False))
-centre = st.one_of(st.floats(-10, 20), st.floats(allow_nan=False, allow_infinity=False))
+length = st.one_of(st.floats(1.0, 100.0), st.floats(1e-3, 1e7))
+centre = st.one_of(st.floats(-10, 20), st.floats(-1e7, 1e7))
 
 
 @settings(max_examples=150, deadline=None)

@@ -119,6 +119,18 @@ def test_damage_is_noticed(data: bytes) -> None:
                 parse_model(file, "a file")
 
 
+@pytest.mark.parametrize("header", ["[1]", '"s"', "{}", '{"schema_version": 1}', "null"])
+def test_headers_that_are_no_headers(data: bytes, header: str) -> None:
+    with pytest.raises(UnreadableModel, match=r"^a file: "):
+        parse_model(save(load(data), {"sceneprint": header}), "a file")
+
+
+def test_a_name_that_would_drive_a_terminal(data: bytes) -> None:
+    escape = with_header(data, lambda header: header.update(name="a\x1b[2J"))
+    with pytest.raises(UnreadableModel, match="letters, digits, dots and dashes"):
+        parse_model(escape, "a file")
+
+
 def test_a_parameter_that_is_no_number(data: bytes) -> None:
     def break_it(header: dict[str, object]) -> None:
         parameters = header["parameters"]
