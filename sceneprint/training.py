@@ -30,7 +30,7 @@ from sceneprint.geometry.weights import patch_weights
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import describe, float_signature, open_signer, table_statistics
 from sceneprint.synth import synthesise_room
-from sceneprint.types import Bytes, Floats, Frame, Hierarchy
+from sceneprint.types import Bytes, Floats, Frame, Patches
 
 #: Called with the stage's name, steps done and their total.
 Report = Callable[[str, int, int], None]
@@ -54,7 +54,7 @@ class Lesson:
 
     place: str  #: frames of different places are unrelated
     properties: Floats  #: (n, 13) of pairs drawn from all levels
-    patches: Hierarchy
+    levels: tuple[Patches, ...]
 
 
 #: Sizes of the presets: G components, H levels.
@@ -145,7 +145,7 @@ def calibrated(model: Model, lessons: Sequence[Lesson], p: TrainingParameters) -
     signer = open_signer(model, cached=False)
     first = {lesson.place: lesson for lesson in reversed(lessons)}
     psi = [
-        float_signature([table_statistics(level, signer) for level in lesson.patches.levels], model)
+        float_signature([table_statistics(level, signer) for level in lesson.levels], model)
         for lesson in sorted(first.values(), key=lambda lesson: lesson.place)
     ]
     step = float(np.quantile(np.abs(np.stack(psi)), 1.0 - p.clipped_share)) / 127
@@ -212,4 +212,4 @@ def _lesson(
             share = patch_weights(level, model_p.weights)[pairs].prod(axis=1).cumsum()
             some = np.searchsorted(share, np.sort(rng.random(per_level)) * share[-1], "right")
             drawn.append(pair_properties(level, pairs[some], model_p.properties))
-    return [Lesson(place, np.concatenate(drawn), patches)] if drawn else []
+    return [Lesson(place, np.concatenate(drawn), patches.levels)] if drawn else []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -81,8 +82,9 @@ def run(options: argparse.Namespace) -> int:
     if options.radius is not None:
         properties = replace(model_p.properties, radius=options.radius)
         model_p = replace(model_p, properties=properties)
+    name = re.sub(r"[^A-Za-z0-9_.-]", "-", options.out.stem)[:64] or options.preset
     with _Bars() as bars:
-        model = train(options.preset, model_p, mixture_p, p, references, options.jobs, bars.report)
+        model = train(name, model_p, mixture_p, p, references, options.jobs, bars.report)
     save_model(model, options.out)
     print(
         f"{options.out}: model {model.label}, {model.signature_bytes} bytes a signature, "
