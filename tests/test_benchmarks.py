@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.__main__ import table
 from benchmarks.encode import measure
+from benchmarks.machine import peak_megabytes_of_signing
 from benchmarks.overlap import overlaps
 from benchmarks.retrieval import recall_at_10
+from sceneprint.datasets import Camera, write_depth_png, write_intrinsics
 from sceneprint.pipeline import Signer
 from sceneprint.types import Floats, Frame, Intrinsics
 
@@ -50,3 +53,13 @@ def test_without_open3d_the_row_says_so_and_the_rest_runs(
     lines = "\n".join(table("small", figures, 100.0))
     assert "FPFH | not measured: open3d cannot be imported" in lines
     assert "apt install" in lines
+
+
+@pytest.mark.parametrize("preset", ["paper", "compact"])
+def test_signing_stays_under_its_memory(
+    preset: str, room_frames: tuple[Frame, ...], tmp_path: Path
+) -> None:
+    """The budget is 700 MB; a process that has done its imports alone needs over 50."""
+    write_intrinsics(tmp_path, Camera(room_frames[0].intrinsics))
+    write_depth_png(tmp_path / "frame.png", room_frames[0].depth, 1000.0)
+    assert 50 < peak_megabytes_of_signing(tmp_path, preset) < 700
