@@ -30,9 +30,6 @@ from sceneprint.geometry.weights import patch_weights
 from sceneprint.models import Model, ModelParameters, build_table, open_table, read_model
 from sceneprint.types import Bytes, Floats, Frame, Hierarchy, Patches
 
-#: Signs the statistics of one level: table or exact.
-LevelStatistics = Callable[[Patches], Statistics]
-
 
 @dataclass(frozen=True, eq=False)
 class Signature:

@@ -20,9 +20,8 @@ class TableLayout:
 
     Angular bins are centred on right angles (and the dihedral ones on 0 and 180 degrees):
     buildings are full of these, and they must not fall on the edge between two bins. With 27
-    of them the
-    tolerance of 10 degrees in Eq. (1) is an edge, so that no bin straddles the jump of the
-    robust sign; a third of the bins then serve as well as a finer grid without that.
+    of them the tolerance of 10 degrees in Eq. (1) is an edge, so that no bin straddles the jump
+    of the robust sign; a third of the bins then serve as well as a finer grid without that.
     """
 
     distance_bins: int = 20

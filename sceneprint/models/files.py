@@ -20,8 +20,19 @@ from sceneprint.writing import write_whole
 
 #: Names of the models that ship with the package.
 PRESETS = ("paper", "compact")
-#: A model of G = 32,000 fits; a larger file is refused unread.
+#: A model of the most components fits; a larger file is refused unread.
 MAXIMUM_BYTES = 16 << 20
+#: Most components: the pair table names them in 16 bits.
+MAXIMUM_COMPONENTS = 2**15 - 1
+#: Least and most of what decides how much memory and time a frame takes.
+BOUNDS = {
+    "bins of the table": (1, 4_000_000),
+    "levels": (1, 16),
+    "patches": (1, 10_000),
+    "pixels": (64, 1 << 20),
+    "iterations": (0, 1000),
+    "window": (1, 16),
+}
 
 
 def save_model(model: Model, path: Path) -> None:
@@ -108,7 +119,7 @@ def parse_model(data: bytes, name: str) -> Model:
         model, given = _assemble(header, tensors), str(header["id"])
     except UnreadableModel as error:
         raise UnreadableModel(f"{name}: {error}") from error
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise UnreadableModel(
             f"{name}: a part of the model is missing or misshapen ({error}). "
             "Fetch or train it again."
@@ -145,9 +156,11 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
         raise ValueError("quantiser step and unrelated distance should be positive")
     if not re.fullmatch(r"[\w.-]{1,64}", str(header["name"]), re.ASCII):
         raise ValueError("a name is up to 64 letters, digits, dots and dashes")
+    parameters = from_mapping(ModelParameters, header["parameters"], "parameters")
+    _check_bounds(parameters, g)
     return Model(
         name=str(header["name"]),
-        parameters=from_mapping(ModelParameters, header["parameters"], "parameters"),
+        parameters=parameters,
         projection=Projection(tensors["projection.mean"], tensors["projection.matrix"]),
         mixture=Mixture(
             tensors["mixture.weights"], tensors["mixture.means"], tensors["mixture.variances"]
@@ -156,3 +169,23 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
         unrelated_distance=d0,
         provenance=dict(header["provenance"]),
     )
+
+
+def _check_bounds(p: ModelParameters, n_components: int) -> None:
+    """See that no frame can take unbounded memory or time with these parameters."""
+    if n_components > MAXIMUM_COMPONENTS:
+        raise ValueError(f"{n_components} components are more than {MAXIMUM_COMPONENTS}")
+    t = p.table
+    if min(t.distance_bins, t.angle_bins, t.dihedral_bins) < 1:
+        raise ValueError("every axis of the table should have bins")
+    counts = {
+        "bins of the table": t.n_bins,
+        "levels": p.hierarchy.n_levels,
+        "patches": p.segmentation.n_patches,
+        "pixels": p.depth.maximum_pixels,
+        "iterations": max(p.segmentation.iterations, p.hierarchy.iterations),
+        "window": p.normals.radius_px,
+    }
+    for what, (least, most) in BOUNDS.items():
+        if not least <= counts[what] <= most:
+            raise ValueError(f"{what}: {counts[what]} is not from {least} to {most}")

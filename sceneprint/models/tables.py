@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +12,7 @@ import platformdirs
 from sceneprint.geometry.table import WIDTH, PairTable, part
 from sceneprint.models.model import Model
 from sceneprint.types import Floats32
+from sceneprint.writing import write_whole
 
 #: Layout of the cached file; a change makes new files beside the old.
 CACHE_VERSION = 1
@@ -52,7 +51,8 @@ def open_table(
         return cached
     packed = _build(model, progress)
     try:
-        _publish(packed, path)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(path, _head(packed) + packed.tobytes())
     except OSError:  # read-only or full: a cache is a convenience
         return PairTable(packed)
     return _mapped(path, model) or PairTable(packed)
@@ -99,16 +99,3 @@ def _build(model: Model, progress: Progress | None) -> Floats32:
         if progress is not None:
             progress(last, n)
     return packed
-
-
-def _publish(packed: Floats32, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, partial = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".partial")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(_head(packed))
-            file.write(packed.data)
-        Path(partial).replace(path)
-    except BaseException:
-        Path(partial).unlink(missing_ok=True)
-        raise

@@ -131,6 +131,43 @@ def test_a_name_that_would_drive_a_terminal(data: bytes) -> None:
         parse_model(escape, "a file")
 
 
+@pytest.mark.parametrize(
+    ("stage", "field", "value"),
+    [
+        ("table", "distance_bins", 100_000),
+        ("table", "angle_bins", 0),
+        ("hierarchy", "n_levels", 0),
+        ("hierarchy", "n_levels", 1000),
+        ("segmentation", "n_patches", 1_000_000),
+        ("segmentation", "iterations", 10**9),
+        ("depth", "maximum_pixels", 10**9),
+        ("normals", "radius_px", 500),
+        ("normals", "radius_px", float("inf")),
+    ],
+)
+def test_parameters_that_would_take_all_memory(
+    data: bytes, stage: str, field: str, value: float
+) -> None:
+    def enlarge(header: dict[str, object]) -> None:
+        parameters = header["parameters"]
+        assert isinstance(parameters, dict)
+        parameters[stage][field] = value
+
+    with pytest.raises(UnreadableModel, match="missing or misshapen"):
+        parse_model(with_header(data, enlarge), "a file")
+
+
+def test_components_beyond_what_the_table_can_name(data: bytes) -> None:
+    g = 2**15
+    tensors = {
+        "mixture_weights": np.full(g, 1 / g),
+        "mixture_means": np.zeros((g, 12)),
+        "mixture_variances": np.ones((g, 12)),
+    }
+    with pytest.raises(UnreadableModel, match="32768 components are more than 32767"):
+        parse_model(with_tensors(data, **tensors), "a file")
+
+
 def test_a_parameter_that_is_no_number(data: bytes) -> None:
     def break_it(header: dict[str, object]) -> None:
         parameters = header["parameters"]
