@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 
 from sceneprint.types import Floats
 
+#: As `geometry.retrieval` gives them, or any others.
+Distances = Floats | NDArray[np.int64]
+
 #: Variance given the selection below which a candidate is a duplicate of one that is in it.
 DUPLICATE = 1e-9
 
@@ -45,7 +48,7 @@ class Selection:
     gains: Floats
 
 
-def kernel_matrix(to_query: Floats, among: Floats, sigma: float, omega: float) -> Floats:
+def kernel_matrix(to_query: Distances, among: Distances, sigma: float, omega: float) -> Floats:
     """The kernel L of the determinantal point process: Eq. (3), Sec. III-D.
 
     Parameters
@@ -68,7 +71,7 @@ def kernel_matrix(to_query: Floats, among: Floats, sigma: float, omega: float) -
 
 
 def diversify(
-    to_query: Floats, among: Floats, k: int, p: DiversityParameters | None = None
+    to_query: Distances, among: Distances, k: int, p: DiversityParameters | None = None
 ) -> Selection:
     """Select up to `k` of a ranking by greedy maximisation of det L_C: Sec. III-D.
 
@@ -86,11 +89,15 @@ def diversify(
 
     Raises
     ------
-    ValueError : the shapes disagree, the ranking is not rising, or k is below 1.
+    ValueError : the shapes disagree, the ranking is not rising, a distance is not finite, or k is
+        below 1.
     """
     p = p or DiversityParameters()
     n = len(to_query)
-    if among.shape != (n, n) or k < 1 or (np.diff(to_query) < 0).any():
+    to_query, among = np.asarray(to_query, np.float64), np.asarray(among, np.float64)
+    finite = np.isfinite(to_query).all() and np.isfinite(among).all()
+    shapes = to_query.shape == (n,) and among.shape == (n, n)
+    if not (shapes and finite and k >= 1) or (np.diff(to_query) < 0).any():
         raise ValueError(f"k = {k}, distances {to_query.shape} (rising) and {among.shape}")
     if n == 0:
         return Selection(np.empty(0, np.intp), np.empty(0))

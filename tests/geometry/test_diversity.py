@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneprint.geometry.diversity import DiversityParameters, diversify, kernel_matrix
+from sceneprint.geometry.retrieval import Metric, distances, pairwise_distances, rank
 from sceneprint.types import Floats
 
 
@@ -70,6 +71,34 @@ def test_first_is_top_ranked_and_the_order_is_that_of_the_ranking(
     assert ((found.gains > 0) & (found.gains <= 1)).all()
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_gains_multiply_to_the_determinant(seed: int) -> None:
+    """det of the similarities of C is the product of what each member brought (Schur)."""
+    to_query, among = ranking(seed, 30)
+    found = diversify(to_query, among, 8)
+    sigma = np.median(among[np.triu_indices(30, 1)])
+    chosen = np.exp(-among[np.ix_(found.indices, found.indices)] / sigma)
+    np.testing.assert_allclose(found.gains.prod(), np.linalg.det(chosen), rtol=1e-10)
+
+
+def test_gain_by_hand() -> None:
+    # sigma is the one distance there is: the second keeps 1 - exp(-1)^2 of its variance
+    found = diversify(np.array([1.0, 2.0]), np.array([[0.0, 3.0], [3.0, 0.0]]), 2)
+    np.testing.assert_allclose(found.gains, [1.0, 1 - np.exp(-2)], rtol=1e-14)
+
+
+@pytest.mark.parametrize("metric", ["l1", "l2"])
+def test_distances_of_bytes_as_retrieval_gives_them(metric: Metric) -> None:
+    database = np.random.default_rng(1).integers(0, 256, (60, 400), np.uint8)
+    ranked = rank(distances(database[7], database, metric), 40, 1.0)
+    among = pairwise_distances(database[ranked.indices], metric)
+    found = diversify(ranked.distances, among, 10)
+    assert (ranked.indices[0], found.indices[0], len(found.indices)) == (7, 0, 10)
+    same = diversify(ranked.distances.astype(float), among.astype(float), 10)
+    np.testing.assert_array_equal(found.indices, same.indices)
+    np.testing.assert_array_equal(found.gains, same.gains)
+
+
 def test_scale_does_not_matter() -> None:
     to_query, among = ranking(3, 30)
     for scale in (1e-6, 1e9):
@@ -95,6 +124,15 @@ def test_exact_duplicates_are_never_taken_twice() -> None:
 def test_empty_and_wrong_input() -> None:
     assert len(diversify(np.empty(0), np.empty((0, 0)), 3).indices) == 0
     to_query, among = ranking(0, 5)
-    for arguments in ((to_query, among[:4], 2), (to_query, among, 0), (to_query[::-1], among, 2)):
+    holed, infinite = to_query.copy(), among.copy()
+    holed[2], infinite[1, 3] = np.nan, np.inf
+    for arguments in (
+        (to_query, among[:4], 2),
+        (to_query, among, 0),
+        (to_query[::-1], among, 2),
+        (to_query[:, None], among, 2),
+        (holed, among, 2),
+        (to_query, infinite, 2),
+    ):
         with pytest.raises(ValueError, match="distances"):
             diversify(*arguments)

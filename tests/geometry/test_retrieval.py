@@ -1,4 +1,4 @@
-"""L1 distances of bytes, exact."""
+"""Distances of bytes, exact, against the obvious loop; rankings against a full sort."""
 
 from __future__ import annotations
 
@@ -7,13 +7,30 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.geometry.retrieval import distances
+from sceneprint.geometry.retrieval import (
+    Ints64,
+    Metric,
+    cross_distances,
+    distances,
+    pairwise_distances,
+    rank,
+    ranking_size,
+    similarity,
+)
 from sceneprint.types import Bytes
 
+METRICS: tuple[Metric, ...] = ("l1", "l2")
 
-def oracle(query: Bytes, database: Bytes) -> list[int]:
-    differences = database.astype(np.int64) - query.astype(np.int64)
-    return [int(d) for d in np.abs(differences).sum(axis=1)]
+
+def oracle(queries: Bytes, database: Bytes, metric: Metric = "l1") -> list[list[int]]:
+    """(Q, N), each entry summed by Python's own integers."""
+    differences = database.astype(np.int64)[None] - queries.astype(np.int64)[:, None]
+    terms = np.abs(differences) if metric == "l1" else differences**2
+    return [[sum(row.tolist()) for row in rows] for rows in terms]
+
+
+def random_bytes(seed: int, *shape: int) -> Bytes:
+    return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
 
 
 def test_by_hand() -> None:
@@ -30,19 +47,42 @@ def test_by_hand() -> None:
     found = distances(query, database)
     assert found.dtype == np.int64
     assert found.tolist() == [0, 510, 5, 255 + 245 + 55]
+    squares = distances(query, database, "l2")
+    assert squares.dtype == np.int64
+    assert squares.tolist() == [0, 2 * 255**2, 1 + 1 + 4 + 1, 255**2 + 245**2 + 55**2]
 
 
-@pytest.mark.parametrize("n", [1, 31, 32, 33, 1000, 31_250])
-def test_equals_the_oracle(n: int) -> None:
-    rng = np.random.default_rng(n)
-    query, database = rng.integers(0, 256, n, np.uint8), rng.integers(0, 256, (5, n), np.uint8)
-    assert distances(query, database).tolist() == oracle(query, database)
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("n", [0, 1, 31, 32, 33, 1000, 31_250, 32_769, 70_001])
+def test_equals_the_oracle(n: int, metric: Metric) -> None:
+    queries, database = random_bytes(n, 3, n), random_bytes(n + 1, 5, n)
+    expected = oracle(queries, database, metric)
+    assert cross_distances(queries, database, metric).tolist() == expected
+    assert distances(queries[1], database, metric).tolist() == expected[1]
 
 
-def test_sums_do_not_overflow() -> None:
-    n = 200_000
-    found = distances(np.zeros(n, np.uint8), np.full((1, n), 255, np.uint8))
-    assert found.tolist() == [n * 255]  # 51 million: no 8, 16 or 24 bits
+@pytest.mark.parametrize("metric", METRICS)
+def test_more_queries_than_fit_in_the_cache(metric: Metric) -> None:
+    queries, database = random_bytes(1, 150, 5000), random_bytes(2, 3, 5000)
+    assert cross_distances(queries, database, metric).tolist() == oracle(queries, database, metric)
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_among_each_other(metric: Metric) -> None:
+    signatures = random_bytes(3, 20, 9001)
+    found = pairwise_distances(signatures, metric)
+    assert found.tolist() == oracle(signatures, signatures, metric)
+    assert found.dtype == np.int64
+
+
+@pytest.mark.parametrize("n", [125_000, 500_000])
+def test_sums_do_not_overflow(n: int) -> None:
+    """The farthest two signatures there are; squares reach 33 billion, beyond 32 bits."""
+    black, white = np.zeros(n, np.uint8), np.full((1, n), 255, np.uint8)
+    assert distances(black, white).tolist() == [n * 255]
+    assert distances(black, white, "l2").tolist() == [n * 255**2]
+    assert distances(white[0], black[None], "l2").tolist() == [n * 255**2]
+    assert pairwise_distances(np.vstack([black, white]), "l2")[1, 0] == n * 255**2
 
 
 SIGNATURES = st.integers(1, 70).flatmap(
@@ -58,32 +98,110 @@ def test_is_a_metric(triple: tuple[bytes, bytes, bytes]) -> None:
     def d(a: Bytes, b: Bytes) -> int:
         return int(distances(a, b[None])[0])
 
-    assert d(x, y) == oracle(x, y[None])[0]
+    assert d(x, y) == oracle(x[None], y[None])[0][0]
     assert d(x, x) == 0
     assert (d(x, y) == 0) == (x.tobytes() == y.tobytes())
     assert d(x, y) == d(y, x)
     assert d(x, z) <= d(x, y) + d(y, z)
 
 
-def test_empty_database() -> None:
-    found = distances(np.zeros(8, np.uint8), np.zeros((0, 8), np.uint8))
-    assert found.shape == (0,)
-    assert found.dtype == np.int64
+@pytest.mark.parametrize("metric", METRICS)
+def test_nothing_to_compare(metric: Metric) -> None:
+    none, some = np.zeros((0, 8), np.uint8), np.zeros((3, 8), np.uint8)
+    assert distances(some[0], none, metric).shape == (0,)
+    assert distances(some[0], none, metric).dtype == np.int64
+    assert cross_distances(none, some, metric).shape == (0, 3)
+    assert cross_distances(some, none, metric).shape == (3, 0)
+    assert pairwise_distances(none, metric).shape == (0, 0)
+    assert pairwise_distances(some[:1], metric).tolist() == [[0]]
 
 
-def test_any_memory_layout() -> None:
-    rng = np.random.default_rng(0)
-    big, wide = rng.integers(0, 256, (12, 80), np.uint8), rng.integers(0, 256, 80, np.uint8)
-    query, database = wide[::2], big[::3, ::2]
-    assert distances(query, database).tolist() == oracle(query, database)
+@pytest.mark.parametrize("metric", METRICS)
+def test_any_memory_layout(metric: Metric) -> None:
+    big, wide = random_bytes(0, 12, 80), random_bytes(1, 2, 80)
+    queries, database = wide[:, ::2], big[::3, ::2]
+    expected = oracle(queries, database, metric)
+    assert cross_distances(queries, database, metric).tolist() == expected
     fortran = np.asfortranarray(database)
-    assert distances(query[::-1], fortran[:, ::-1]).tolist() == oracle(query, database)
+    assert cross_distances(queries[:, ::-1], fortran[:, ::-1], metric).tolist() == expected
+    assert distances(queries[0], fortran, metric).tolist() == expected[0]
+    assert pairwise_distances(np.asfortranarray(big)[::2], metric).tolist() == oracle(
+        big[::2], big[::2], metric
+    )
     read_only = big.copy()
     read_only.setflags(write=False)
-    assert distances(wide, read_only).tolist() == oracle(wide, big)
+    assert cross_distances(wide, read_only, metric).tolist() == oracle(wide, big, metric)
 
 
-def test_lengths_must_agree() -> None:
+def test_inputs_are_left_alone() -> None:
+    queries, database = random_bytes(4, 2, 100), random_bytes(5, 3, 100)
+    before = queries.copy(), database.copy()
+    cross_distances(queries, database)
+    pairwise_distances(database)
+    np.testing.assert_array_equal(queries, before[0])
+    np.testing.assert_array_equal(database, before[1])
+
+
+def test_shapes_types_and_metric_must_be_right() -> None:
     for query, database in (((8,), (3, 9)), ((1, 8), (3, 8)), ((8,), (8,)), ((8,), (2, 8, 1))):
         with pytest.raises(ValueError, match="signatures of"):
             distances(np.zeros(query, np.uint8), np.zeros(database, np.uint8))
+    for queries, database in (((2, 8), (3, 9)), ((8,), (3, 8)), ((2, 8), (8,)), ((8,), (8,))):
+        with pytest.raises(ValueError, match="signatures of"):
+            cross_distances(np.zeros(queries, np.uint8), np.zeros(database, np.uint8))
+    with pytest.raises(ValueError, match="signatures of"):
+        pairwise_distances(np.zeros(8, np.uint8))
+    one, many = np.zeros(8, np.uint8), np.zeros((3, 8), np.uint8)
+    for dtype in (np.int8, np.float64, np.int64, np.bool_):
+        with pytest.raises(ValueError, match="not of bytes"):
+            distances(one.astype(dtype), many)
+        with pytest.raises(ValueError, match="not of bytes"):
+            distances(one, many.astype(dtype))
+    with pytest.raises(ValueError, match="cosine"):
+        distances(one, many, "cosine")  # type: ignore[arg-type]
+
+
+def full_sort(values: Ints64, size: int) -> list[int]:
+    return sorted(range(len(values)), key=lambda i: (int(values[i]), i))[:size]
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(values=st.lists(st.integers(0, 6), max_size=40), size=st.integers(0, 45))
+def test_ranking_equals_a_full_sort(values: list[int], size: int) -> None:
+    """Few values, hence many ties, also at the cut."""
+    given_ = np.array(values, np.int64)
+    found = rank(given_, size, 4.0)
+    assert found.indices.tolist() == full_sort(given_, size)
+    assert found.distances.tolist() == given_[found.indices].tolist()
+    assert found.similarities.tolist() == [max(1 - d / 4, 0.0) for d in found.distances.tolist()]
+    assert len(found) == min(size, len(values))
+    assert (found.indices.dtype, found.distances.dtype) == (np.intp, np.int64)
+
+
+def test_ranking_of_a_large_map() -> None:
+    values = np.random.default_rng(0).integers(0, 1000, 50_000)
+    assert rank(values, 200, 500.0).indices.tolist() == full_sort(values, 200)
+
+
+def test_similarity_by_hand() -> None:
+    found = similarity(np.array([0, 50, 200, 300]), 200.0)
+    assert found.tolist() == [1.0, 0.75, 0.0, 0.0]
+
+
+def test_wrong_rankings() -> None:
+    values = np.arange(5)
+    for d0 in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="unrelated"):
+            similarity(values, d0)
+        with pytest.raises(ValueError, match="unrelated"):
+            rank(values, 3, d0)
+    for wrong, size in ((values, -1), (values[None], 3), (values.astype(float), 3)):
+        with pytest.raises(ValueError, match="distances"):
+            rank(wrong, size, 1.0)
+
+
+def test_size_of_a_ranking() -> None:
+    sizes = {0: 0, 1: 1, 49: 49, 50: 50, 120: 50, 130: 52, 300: 120, 500: 200, 100_000: 200}
+    assert {n: ranking_size(n) for n in sizes} == sizes
+    with pytest.raises(ValueError, match="-1 frames"):
+        ranking_size(-1)
