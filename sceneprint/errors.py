@@ -9,7 +9,8 @@
       x DatasetError            a folder or file that is no sequence of frames
       x ModelError
         - UnreadableModel       a model file that is none, or of another schema
-        - ModelMismatch         signatures of two models were compared
+        - ModelMismatch         signatures or artifacts of two models were compared
+      x UnreadableGeometry        a geometry artifact that is missing, damaged or of another schema
       x TrainingError           too little data, or parameters that cannot be fitted
       x MissingDependency       an optional part of the machine is absent
 
@@ -56,7 +57,11 @@ class UnreadableModel(ModelError):
 
 
 class ModelMismatch(ModelError):
-    """Signatures of two models were compared."""
+    """Signatures or artifacts of two models were compared."""
+
+
+class UnreadableGeometry(SceneprintError):
+    """The bytes are no geometry artifact, are damaged, or have another schema."""
 
 
 class TrainingError(SceneprintError):

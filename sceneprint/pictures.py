@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sceneprint.geometry.depth import inverse_depth
 from sceneprint.geometry.normals import surface
 from sceneprint.models import Model
-from sceneprint.pipeline import describe
+from sceneprint.signing import describe
 from sceneprint.types import Bytes, Floats32, Frame, Ints32
 from sceneprint.writing import write_whole
 

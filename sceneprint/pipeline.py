@@ -1,94 +1,68 @@
-"""The paper's Fig. 1 as functions, one line a stage."""
+"""The paper's Fig. 1 as functions, one line a stage.
+
+    frame --prepare--> signature, geometry
+    signature, database --retrieve--> R --diversify--> C --associate--> C_vld --locate--> pose
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from sceneprint.errors import ModelMismatch, UselessFrame
-from sceneprint.geometry.counting import count_pairs
-from sceneprint.geometry.depth import inverse_depth
-from sceneprint.geometry.encoding import (
-    Statistics,
-    fisher_vector,
-    quantise,
-    signature,
-    statistics_of_counts,
-    statistics_of_features,
+from sceneprint.errors import ModelMismatch
+from sceneprint.geometry.association import preferred
+from sceneprint.geometry.averaging import PoseAverage, average_poses
+from sceneprint.geometry.diversity import DiversityParameters, Selection
+from sceneprint.geometry.diversity import diversify as select
+from sceneprint.geometry.retrieval import (
+    Ranking,
+    distances,
+    pairwise_distances,
+    rank,
+    ranking_size,
 )
-from sceneprint.geometry.hierarchy import hierarchy
-from sceneprint.geometry.normals import surface
-from sceneprint.geometry.projection import project
-from sceneprint.geometry.properties import neighbour_pairs, pair_properties
-from sceneprint.geometry.retrieval import distances
-from sceneprint.geometry.segmentation import segment
-from sceneprint.geometry.table import PairTable
-from sceneprint.geometry.weights import patch_weights
-from sceneprint.models import Model, ModelParameters, build_table, open_table, read_model
-from sceneprint.types import Bytes, Floats, Frame, Hierarchy, Patches
+from sceneprint.geometry.segmentation import patches_of, segment
+from sceneprint.geometry.surroundings import compress, surroundings
+from sceneprint.geometry.validation import Mode, Validation, ValidationParameters
+from sceneprint.geometry.validation import validate as validate_geometry
+from sceneprint.models import Model
+from sceneprint.signing import Signature, Signer, encode, hierarchy_of, open_signer, see
+from sceneprint.types import Bytes, Floats, Frame, Geometry, Surface
+
+__all__ = [
+    "Match",
+    "Signature",
+    "Signer",
+    "associate",
+    "distance",
+    "diversify",
+    "geometry_of",
+    "locate",
+    "open_signer",
+    "prepare",
+    "retrieve",
+    "sign",
+    "validate",
+]
 
 
 @dataclass(frozen=True, eq=False)
-class Signature:
-    """psi of one frame, as it is stored and compared.
+class Match:
+    """A database frame validated against a query.
 
     Parameters
     ----------
-    vector : (25 G H,) uint8
-    model_id : of the model that made it; signatures of two models are never compared
-    n_patches : patches of each level, finest first
-    n_pairs : ordered pairs of each level
+    index : row of the database
+    distance, similarity : of the signatures
+    validation : see Validation
     """
 
-    vector: Bytes
-    model_id: str
-    n_patches: tuple[int, ...]
-    n_pairs: tuple[int, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Signer:
-    """A model made ready to sign: with its pair table opened.
-
-    Parameters
-    ----------
-    model : see Model
-    table : of this model
-    """
-
-    model: Model
-    table: PairTable
-
-
-def open_signer(
-    model: str | Path | Model = "paper",
-    cache_dir: Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    *,
-    cached: bool = True,
-) -> Signer:
-    """Open a preset, a model file or a model, and its pair table.
-
-    The first call on a machine builds the table (seconds) and caches it; later ones map it.
-
-    Parameters
-    ----------
-    model : "paper", "compact", the path of a model file, or a model
-    cache_dir : folder of derived files; default: the user's cache folder
-    progress : called with bins done and their total while the table is being built
-    cached : False for a model that will not be seen again: nothing is read or written
-
-    Raises
-    ------
-    UnreadableModel : see `read_model`.
-    """
-    read = model if isinstance(model, Model) else read_model(model)
-    if not cached:
-        return Signer(read, build_table(read, progress))
-    return Signer(read, open_table(read, cache_dir, progress))
+    index: int
+    distance: int
+    similarity: float
+    validation: Validation
 
 
 def sign(frame: Frame, signer: Signer) -> Signature:
@@ -103,101 +77,35 @@ def sign(frame: Frame, signer: Signer) -> Signature:
     ------
     UselessFrame : nothing within the sensor's range, or no two patches to relate.
     """
-    patches = describe(frame, signer.model.parameters)
-    return encode(patches, signer, frame.name)
-
-
-def describe(frame: Frame, p: ModelParameters) -> Hierarchy:
-    """The segmentation hierarchy of a frame: Sec. III-F.
-
-    Parameters
-    ----------
-    frame : depth in metres
-    p : of the model
-
-    Raises
-    ------
-    UselessFrame : nothing within the sensor's range, or no surface in it.
-    """
-    q, camera = inverse_depth(frame, p.depth)
-    seen = surface(q, camera, p.normals)
-    finest = segment(seen, p.segmentation)
-    if finest.max(initial=-1) < 0:
-        raise UselessFrame(
-            f"{_named(frame.name)}its depth samples lie on no surface: they are too scattered for "
-            "a patch. Check that the image is depth and its scale is right, or send another."
-        )
-    return hierarchy(seen, finest, p.hierarchy)
-
-
-def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
-    """Quantised signature of a hierarchy of patches: Sec. III-A and III-B.
-
-    Parameters
-    ----------
-    patches : H levels
-    signer : see `open_signer`
-    name : of the frame, for errors
-
-    Raises
-    ------
-    UselessFrame : the finest level has no pair of patches within reach.
-    """
-    model = signer.model
-    levels = [table_statistics(level, signer) for level in patches.levels]
-    psi = float_signature(levels, model, name)
-    return Signature(
-        vector=quantise(psi, model.quantiser_step),
-        model_id=model.id,
-        n_patches=tuple(len(level) for level in patches.levels),
-        n_pairs=tuple(level.n_pairs for level in levels),
-    )
-
-
-def table_statistics(level: Patches, signer: Signer) -> Statistics:
-    """Pair statistics of one level through the 4-D table."""
     p = signer.model.parameters
-    weights = patch_weights(level, p.weights)
-    counts = count_pairs(level.means, level.normals, weights, p.table, p.properties)
-    return statistics_of_counts(counts, signer.table, len(signer.model.mixture))
+    return encode(hierarchy_of(see(frame, p), p, frame.name), signer, frame.name)
 
 
-def exact_statistics(level: Patches, model: Model) -> Statistics:
-    """Pair statistics of one level, pair by pair: slow, the oracle of the table."""
-    p = model.parameters.properties
-    pairs = neighbour_pairs(level, p)
-    weights = patch_weights(level, model.parameters.weights)[pairs].prod(axis=1)
-    features = project(pair_properties(level, pairs, p), model.projection)
-    return statistics_of_features(features, weights, model.mixture)
-
-
-def float_signature(levels: list[Statistics], model: Model, name: str = "") -> Floats:
-    """psi before quantisation: Eq. (2) of every level, rooted, normalised, end to end.
-
-    A coarse level without pairs says nothing, and its part of psi is zero.
-
-    Parameters
-    ----------
-    levels : H, finest first
-    model : see Model
-    name : of the frame, for errors
+def prepare(frame: Frame, signer: Signer) -> tuple[Signature, Geometry]:
+    """Signature and geometry artifact of a frame, of one look at its surface.
 
     Raises
     ------
-    UselessFrame : the finest level has no pairs.
+    UselessFrame : see `sign`.
     """
-    if levels[0].n_pairs == 0:
-        radius = model.parameters.properties.radius
-        raise UselessFrame(
-            f"{_named(name)}no two surface patches lie within {radius:g} m of each other, so there "
-            "is no geometry between them to describe. Send a frame that sees more of the scene."
-        )
-    return signature(
-        [
-            fisher_vector(level, model.mixture) if level.n_pairs else np.zeros(model.level_length)
-            for level in levels
-        ]
-    )
+    p = signer.model.parameters
+    seen = see(frame, p)
+    signature = encode(hierarchy_of(seen, p, frame.name), signer, frame.name)
+    return signature, geometry_of(seen, signer.model)
+
+
+def geometry_of(seen: Surface, model: Model) -> Geometry:
+    """The geometry artifact of a surface: what validation needs of it, Sec. III-E.
+
+    Parameters
+    ----------
+    seen : of `sceneprint.signing.see`
+    model : whose parameters and compression are used
+    """
+    p = model.parameters
+    patches = patches_of(seen, segment(seen, p.validation_segmentation))
+    histograms = surroundings(patches, p.surroundings)
+    return Geometry(seen, patches, compress(histograms, model.compression), model.id)
 
 
 def distance(a: Signature, b: Signature) -> int:
@@ -207,13 +115,156 @@ def distance(a: Signature, b: Signature) -> int:
     ------
     ModelMismatch : they are of two models.
     """
-    if a.model_id != b.model_id:
-        raise ModelMismatch(
-            f"Signatures of two models cannot be compared: {a.model_id[:12]} and "
-            f"{b.model_id[:12]}. Sign both frames with one model."
-        )
+    _same_model(a, b)
     return int(distances(a.vector, b.vector[None])[0])
 
 
-def _named(name: str) -> str:
-    return f"{name}: " if name else ""
+def retrieve(
+    query: Signature, database: Sequence[Signature], model: Model, size: int | None = None
+) -> Ranking:
+    """R: the database frames most similar to the query, Sec. III-C.
+
+    Parameters
+    ----------
+    query : see Signature
+    database : N signatures
+    model : of all of them
+    size : how many; default: by the density of the map, see `ranking_size`
+
+    Raises
+    ------
+    ModelMismatch : signatures of several models.
+    """
+    for one in database:
+        _same_model(query, one)
+    size = ranking_size(len(database)) if size is None else size
+    return rank(distances(query.vector, _stacked(database)), size, model.unrelated_distance)
+
+
+def diversify(
+    ranking: Ranking,
+    database: Sequence[Signature],
+    k: int = 10,
+    p: DiversityParameters | None = None,
+) -> Selection:
+    """C: `k` of R that are near the query and unlike each other, Sec. III-D.
+
+    Parameters
+    ----------
+    ranking : R
+    database : that R is of
+    k : how many to select
+    p : see DiversityParameters
+
+    Returns
+    -------
+    selection : positions in R, the top-ranked first, in the order of R
+    """
+    among = pairwise_distances(_stacked([database[i] for i in ranking.indices]))
+    return select(ranking.distances.astype(float), among.astype(float), k, p)
+
+
+def validate(
+    query: Geometry,
+    match: Geometry,
+    seed: int = 0,
+    p: ValidationParameters | None = None,
+    mode: Mode = "full",
+) -> Validation:
+    """Whether two frames see one place, and the transform between them: Sec. III-E.
+
+    Parameters
+    ----------
+    query, match : geometry artifacts of one model
+    seed : of the random choices; the answer echoes it
+    p : see ValidationParameters
+    mode : "full", or "paper" for the paper's test alone
+
+    Raises
+    ------
+    ModelMismatch : the artifacts are of two models.
+    """
+    _same_model(query, match)
+    return validate_geometry(query, match, seed, p, mode)
+
+
+def associate(
+    query: Geometry,
+    ranking: Ranking,
+    among: Sequence[int],
+    open_geometry: Callable[[int], Geometry],
+    k: int = 5,
+    seed: int = 0,
+    p: ValidationParameters | None = None,
+    mode: Mode = "full",
+) -> list[Match]:
+    """Candidates validated in the order of R until `k` are accepted: Sec. III-E.
+
+    Parameters
+    ----------
+    query : geometry artifact
+    ranking : R
+    among : positions in R to try, rising: C, or the first of R
+    open_geometry : artifact of a row of the database
+    k : accepted ones after which to stop
+    seed, p, mode : see `validate`
+
+    Returns
+    -------
+    matches : all that were tried: C_vld first, strong before weak, each in the order of R; then
+        those that were not accepted
+    """
+    tried: list[Match] = []
+    accepted = 0
+    for position in among:
+        index = int(ranking.indices[position])
+        validation = validate(query, open_geometry(index), seed, p, mode)
+        tried.append(
+            Match(
+                index,
+                int(ranking.distances[position]),
+                float(ranking.similarities[position]),
+                validation,
+            )
+        )
+        accepted += validation.status == "accepted"
+        if accepted == k:
+            break
+    first = preferred([match.validation for match in tried])
+    rest = [i for i in range(len(tried)) if i not in first]
+    return [tried[i] for i in [*first, *rest]]
+
+
+def locate(matches: Sequence[Match], poses: Sequence[Floats], views: int = 5) -> PoseAverage | None:
+    """Pose of the query: robust average over up to five validated views.
+
+    Parameters
+    ----------
+    matches : of `associate`
+    poses : T_parent_sensor (4, 4) of every row of the database, all in one parent frame
+    views : most that are averaged
+
+    Returns
+    -------
+    average : T_parent_query and the spread of the votes; None where nothing was accepted
+    """
+    votes = [
+        poses[match.index] @ match.validation.T_match_query
+        for match in matches
+        if match.validation.status == "accepted" and match.validation.T_match_query is not None
+    ]
+    return average_poses(np.stack(votes[:views])) if votes else None
+
+
+def _stacked(signatures: Sequence[Signature]) -> Bytes:
+    if not signatures:
+        return np.empty((0, 0), np.uint8)
+    return np.stack([one.vector for one in signatures])
+
+
+def _same_model(a: Signature | Geometry, b: Signature | Geometry) -> None:
+    if a.model_id != b.model_id:
+        raise ModelMismatch(
+            f"Frames of two models cannot be compared: {a.model_id[:12]} and "
+            f"{b.model_id[:12]}. Sign both frames with one model."
+        )

@@ -26,11 +26,19 @@ from sceneprint.geometry.mixture import MixtureParameters, fit_mixture
 from sceneprint.geometry.projection import fit_projection, project
 from sceneprint.geometry.properties import neighbour_pairs, pair_properties
 from sceneprint.geometry.retrieval import distances
+from sceneprint.geometry.segmentation import patches_of, segment
+from sceneprint.geometry.surroundings import fit_compression, surroundings
 from sceneprint.geometry.weights import patch_weights
 from sceneprint.models import Model, ModelParameters
-from sceneprint.pipeline import describe, float_signature, open_signer, table_statistics
+from sceneprint.signing import (
+    float_signature,
+    hierarchy_of,
+    open_signer,
+    see,
+    table_statistics,
+)
 from sceneprint.synth import synthesise_room
-from sceneprint.types import Bytes, Floats, Frame, Patches
+from sceneprint.types import Bytes, Floats, Floats32, Frame, Patches
 
 #: Called with the stage's name, steps done and their total.
 Report = Callable[[str, int, int], None]
@@ -45,6 +53,8 @@ class TrainingParameters:
     seed: int = 0  #: of rooms, of the pairs drawn and of the fits
     pairs: int = 240_000  #: properties that projection and mixture are fitted to
     projection: Literal["pca", "ica"] = "pca"
+    descriptors: int = 128  #: bytes of a descriptor
+    histograms: int = 40_000  #: of surroundings, that their compression is fitted to
     clipped_share: float = 0.0005  #: of signature components, beyond the quantiser's range
 
 
@@ -54,7 +64,16 @@ class Lesson:
 
     place: str  #: frames of different places are unrelated
     properties: Floats  #: (n, 13) of pairs drawn from all levels
+    histograms: Floats32  #: (m, D) of the surroundings of patches drawn
     levels: tuple[Patches, ...]
+
+
+@dataclass(frozen=True)
+class Draw:
+    """How much is taken from each frame."""
+
+    pairs: int  #: of each level
+    histograms: int
 
 
 #: Sizes of the presets: G components, H levels.
@@ -104,15 +123,25 @@ def train(
 
     tell = report or _silent
     n_frames = p.rooms * p.views + len(references)
-    per_level = math.ceil(p.pairs / max(n_frames * model_p.hierarchy.n_levels, 1))
-    lessons = list(_lessons(model_p, p, per_level, references, jobs, tell))
+    drawn = Draw(
+        math.ceil(p.pairs / max(n_frames * model_p.hierarchy.n_levels, 1)),
+        math.ceil(p.histograms / max(n_frames, 1)),
+    )
+    lessons = list(_lessons(model_p, p, drawn, references, jobs, tell))
     if len({lesson.place for lesson in lessons}) < 2:
         raise TrainingError(
             f"{len(lessons)} usable frames of fewer than two places: d0, the distance of "
             "unrelated frames, needs two. Add --rooms, or frames of another place."
         )
     properties = np.concatenate([lesson.properties for lesson in lessons])
+    histograms = np.concatenate([lesson.histograms for lesson in lessons])
+    if len(histograms) <= model_p.surroundings.dimension:
+        raise TrainingError(
+            f"{len(histograms)} patches are too few to learn what {model_p.surroundings.dimension} "
+            "bins of their surroundings have in common. Add --rooms, or frames of your own."
+        )
     with threadpool_limits(1):  # sums in one order, whatever the number of processors
+        compression = fit_compression(histograms, p.descriptors)
         projection = fit_projection(properties, p.projection, p.seed)
         features = project(properties, projection)
         fit = fit_mixture(features, mixture_p, p.seed)
@@ -126,7 +155,8 @@ def train(
         "frames_used": len(lessons),
         "pairs_used": len(features),
     }
-    return calibrated(Model(name, model_p, projection, mixture, 1.0, 1.0, seen), lessons, p)
+    model = Model(name, model_p, projection, mixture, compression, 1.0, 1.0, seen)
+    return calibrated(model, lessons, p)
 
 
 def _silent(stage: str, done: int, total: int) -> None:
@@ -159,11 +189,11 @@ def _median_distance(stored: Bytes) -> float:
 
 
 def _lessons(
-    model_p: ModelParameters, p: TrainingParameters, per_level: int,
+    model_p: ModelParameters, p: TrainingParameters, draw: Draw,
     references: Sequence[tuple[str, FrameReference]], jobs: int, report: Report,
 ) -> Iterator[Lesson]:  # fmt: skip
-    room = partial(_room_lessons, model_p, p, per_level)
-    frame = partial(_own_lesson, model_p, p, per_level)
+    room = partial(_room_lessons, model_p, p, draw)
+    frame = partial(_own_lesson, model_p, p, draw)
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         for done, lessons in enumerate(pool.map(room, range(p.rooms)), 1):
             report("rooms", done, p.rooms)
@@ -175,33 +205,34 @@ def _lessons(
 
 
 def _room_lessons(
-    model_p: ModelParameters, p: TrainingParameters, per_level: int, index: int
+    model_p: ModelParameters, p: TrainingParameters, draw: Draw, index: int
 ) -> list[Lesson]:
     room = synthesise_room(p.seed, index, p.views)
     return [
         lesson
         for view, frame in enumerate(room.frames)
-        for lesson in _lesson(frame, room.name, (p.seed, 0, index, view), model_p, per_level)
+        for lesson in _lesson(frame, room.name, (p.seed, 0, index, view), model_p, draw)
     ]
 
 
 def _own_lesson(
-    model_p: ModelParameters, p: TrainingParameters, per_level: int,
+    model_p: ModelParameters, p: TrainingParameters, draw: Draw,
     index: int, reference: tuple[str, FrameReference],
 ) -> list[Lesson]:  # fmt: skip
     place, frame = reference
     try:
-        return _lesson(frame.read(), place, (p.seed, 1, index), model_p, per_level)
+        return _lesson(frame.read(), place, (p.seed, 1, index), model_p, draw)
     except FrameError:  # one bad frame of a recording teaches nothing; that is all
         return []
 
 
 def _lesson(
-    frame: Frame, place: str, seed: tuple[int, ...], model_p: ModelParameters, per_level: int
+    frame: Frame, place: str, seed: tuple[int, ...], model_p: ModelParameters, draw: Draw
 ) -> list[Lesson]:
     rng = np.random.default_rng(seed)
     try:
-        patches = describe(frame, model_p)
+        seen = see(frame, model_p)
+        patches = hierarchy_of(seen, model_p)
     except FrameError:
         return []
     drawn = []
@@ -210,6 +241,11 @@ def _lesson(
         if len(pairs):
             # as often as they count in the statistics; one that comes twice does no harm
             share = patch_weights(level, model_p.weights)[pairs].prod(axis=1).cumsum()
-            some = np.searchsorted(share, np.sort(rng.random(per_level)) * share[-1], "right")
+            some = np.searchsorted(share, np.sort(rng.random(draw.pairs)) * share[-1], "right")
             drawn.append(pair_properties(level, pairs[some], model_p.properties))
-    return [Lesson(place, np.concatenate(drawn), patches.levels)] if drawn else []
+    if not drawn:
+        return []
+    own = patches_of(seen, segment(seen, model_p.validation_segmentation))
+    some = rng.permutation(len(own))[: draw.histograms]
+    histograms = surroundings(own, model_p.surroundings)[some]
+    return [Lesson(place, np.concatenate(drawn), histograms, patches.levels)]

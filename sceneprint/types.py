@@ -173,3 +173,21 @@ class Hierarchy:
 
     levels: tuple[Patches, ...]
     labels: tuple[Ints32, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """What validation needs of a frame, and all it needs: the geometry artifact.
+
+    Parameters
+    ----------
+    surface : (h, w) points and normals
+    patches : P patches of one metric size, for correspondences
+    descriptors : (P, d) uint8, macro-scale surroundings of each patch; compared by distance
+    model_id : of the model that made it; artifacts of two models are never compared
+    """
+
+    surface: Surface
+    patches: Patches
+    descriptors: Bytes
+    model_id: str

@@ -14,6 +14,7 @@ from sceneprint.geometry.hierarchy import HierarchyParameters
 from sceneprint.geometry.mixture import Mixture
 from sceneprint.geometry.projection import Projection
 from sceneprint.geometry.segmentation import SegmentationParameters
+from sceneprint.geometry.surroundings import Compression, SurroundingsParameters
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer
 from sceneprint.synth import synthesise_room
@@ -35,6 +36,8 @@ def data_root() -> Path:
 def small_model() -> Model:
     """Eight components, two levels: quick to open, and signs like a real one."""
     rng = np.random.default_rng(5)
+    bins = SurroundingsParameters().dimension
+    axes = np.linalg.qr(rng.normal(size=(bins, 16)))[0].T.astype(np.float32)
     matrix = np.asfortranarray(rng.normal(size=(12, 13)) / 3)  # as scikit-learn returns them
     return Model(
         name="small",
@@ -45,6 +48,7 @@ def small_model() -> Model:
         ),
         projection=Projection(rng.normal(size=13), matrix),
         mixture=Mixture(np.full(8, 0.125), rng.normal(size=(8, 12)), np.full((8, 12), 0.7)),
+        compression=Compression(np.full(bins, 0.01, np.float32), axes),
         quantiser_step=0.002,
         unrelated_distance=1000.0,
         provenance={"made": "by a test"},

@@ -15,6 +15,7 @@ from sceneprint.errors import UnreadableModel
 from sceneprint.geometry.mixture import Mixture
 from sceneprint.geometry.projection import DIMENSION, Projection
 from sceneprint.geometry.properties import DIMENSION as PROPERTY_DIMENSION
+from sceneprint.geometry.surroundings import Compression
 from sceneprint.models.model import SCHEMA_VERSION, Model, ModelParameters, from_mapping
 from sceneprint.writing import write_whole
 
@@ -32,6 +33,10 @@ BOUNDS = {
     "pixels": (64, 1 << 20),
     "iterations": (0, 1000),
     "window": (1, 16),
+    "patches for validation": (1, 2_000),
+    "iterations for validation": (0, 1000),
+    "bins of the surroundings": (1, 10_000),
+    "bytes of a descriptor": (1, 1024),
 }
 
 
@@ -141,10 +146,15 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
         "mixture.means": (g, DIMENSION),
         "mixture.variances": (g, DIMENSION),
     }
+    parameters = from_mapping(ModelParameters, header["parameters"], "parameters")
+    _check_bounds(parameters, g, len(tensors["compression.matrix"]))
+    bins = parameters.surroundings.dimension
+    shapes["compression.mean"] = (bins,)
+    shapes["compression.matrix"] = (len(tensors["compression.matrix"]), bins)
     for name, shape in shapes.items():
-        tensor = tensors[name]
-        if tensor.shape != shape or tensor.dtype != np.float64 or not np.isfinite(tensor).all():
-            raise ValueError(f"{name} should be finite float64 {shape}")
+        tensor, kind = tensors[name], "float32" if name.startswith("compression") else "float64"
+        if tensor.shape != shape or tensor.dtype != kind or not np.isfinite(tensor).all():
+            raise ValueError(f"{name} should be finite {kind} {shape}")
     if (
         g < 1
         or (tensors["mixture.weights"] <= 0).any()
@@ -156,8 +166,6 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
         raise ValueError("quantiser step and unrelated distance should be positive")
     if not re.fullmatch(r"[\w.-]{1,64}", str(header["name"]), re.ASCII):
         raise ValueError("a name is up to 64 letters, digits, dots and dashes")
-    parameters = from_mapping(ModelParameters, header["parameters"], "parameters")
-    _check_bounds(parameters, g)
     return Model(
         name=str(header["name"]),
         parameters=parameters,
@@ -165,19 +173,22 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
         mixture=Mixture(
             tensors["mixture.weights"], tensors["mixture.means"], tensors["mixture.variances"]
         ),
+        compression=Compression(tensors["compression.mean"], tensors["compression.matrix"]),
         quantiser_step=step,
         unrelated_distance=d0,
         provenance=dict(header["provenance"]),
     )
 
 
-def _check_bounds(p: ModelParameters, n_components: int) -> None:
+def _check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> None:
     """See that no frame can take unbounded memory or time with these parameters."""
     if n_components > MAXIMUM_COMPONENTS:
         raise ValueError(f"{n_components} components are more than {MAXIMUM_COMPONENTS}")
     t = p.table
     if min(t.distance_bins, t.angle_bins, t.dihedral_bins) < 1:
         raise ValueError("every axis of the table should have bins")
+    if not (p.surroundings.scales >= 1e-3).all():
+        raise ValueError("every scale of the surroundings should have a radius and bins")
     counts = {
         "bins of the table": t.n_bins,
         "levels": p.hierarchy.n_levels,
@@ -185,6 +196,10 @@ def _check_bounds(p: ModelParameters, n_components: int) -> None:
         "pixels": p.depth.maximum_pixels,
         "iterations": max(p.segmentation.iterations, p.hierarchy.iterations),
         "window": p.normals.radius_px,
+        "patches for validation": p.validation_segmentation.n_patches,
+        "iterations for validation": p.validation_segmentation.iterations,
+        "bins of the surroundings": p.surroundings.dimension,
+        "bytes of a descriptor": n_compressed,
     }
     for what, (least, most) in BOUNDS.items():
         if not least <= counts[what] <= most:

@@ -1,4 +1,4 @@
-"""A model: everything that decides what a signature looks like, named by its content."""
+"""A model: all that decides what signatures and artifacts look like, named by its content."""
 
 from __future__ import annotations
 
@@ -21,10 +21,12 @@ from sceneprint.geometry.normals import NormalParameters
 from sceneprint.geometry.projection import Projection
 from sceneprint.geometry.properties import PropertyParameters
 from sceneprint.geometry.segmentation import SegmentationParameters
+from sceneprint.geometry.surroundings import Compression, SurroundingsParameters
 from sceneprint.geometry.weights import WeightParameters
+from sceneprint.types import Floats32
 
 #: Of the file and of what the numbers in it mean. Raise it when code changes signatures.
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 T = TypeVar("T")
 
@@ -40,17 +42,21 @@ class ModelParameters:
     weights: WeightParameters = field(default_factory=WeightParameters)
     properties: PropertyParameters = field(default_factory=PropertyParameters)
     table: TableLayout = field(default_factory=TableLayout)
+    validation_segmentation: SegmentationParameters = field(
+        default_factory=lambda: SegmentationParameters(n_patches=400)
+    )
+    surroundings: SurroundingsParameters = field(default_factory=SurroundingsParameters)
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Projection, mixture, quantiser and the parameters they were made with.
+    """Projection, mixture, quantiser, compression, and the parameters they were made with.
 
     Parameters
     ----------
     name : what people call it; not part of its identity
     parameters : see ModelParameters
-    projection, mixture : see there
+    projection, mixture, compression : see there
     quantiser_step : one unit of a stored byte
     unrelated_distance : d0, the median L1 distance of stored signatures of unrelated training
         frames, in units of a byte; similarity = 1 - d / d0
@@ -61,12 +67,13 @@ class Model:
     parameters: ModelParameters
     projection: Projection
     mixture: Mixture
+    compression: Compression
     quantiser_step: float
     unrelated_distance: float
     provenance: Mapping[str, Any]
 
     @property
-    def tensors(self) -> dict[str, NDArray[np.float64]]:
+    def tensors(self) -> dict[str, NDArray[np.float64] | Floats32]:
         """The learnt arrays by the names they have in the file."""
         arrays = {
             "projection.mean": self.projection.mean,
@@ -75,12 +82,19 @@ class Model:
             "mixture.means": self.mixture.means,
             "mixture.variances": self.mixture.variances,
         }
+        small = {
+            "compression.mean": self.compression.mean,
+            "compression.matrix": self.compression.matrix,
+        }
         # safetensors writes memory as it lies: a Fortran-ordered matrix would come back garbled
-        return {name: np.ascontiguousarray(array, "<f8") for name, array in arrays.items()}
+        return {
+            **{name: np.ascontiguousarray(array, "<f8") for name, array in arrays.items()},
+            **{name: np.ascontiguousarray(array, "<f4") for name, array in small.items()},
+        }
 
     @property
     def header(self) -> dict[str, Any]:
-        """Everything but the arrays that changes a signature or its meaning."""
+        """Everything but the arrays that changes a signature, an artifact or their meaning."""
         return {
             "schema_version": SCHEMA_VERSION,
             "parameters": asdict(self.parameters),

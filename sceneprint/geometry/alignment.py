@@ -1,0 +1,151 @@
+"""Sec. III-E, one direction: two frames to the transform that explains them best, and what else was found.
+
+Geometry, Geometry  --align-->  Alignment
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sceneprint.geometry.agreement import (
+    AgreementParameters,
+    camera_of,
+    weigh_agreement,
+    sampled,
+    tolerances,
+)
+from sceneprint.geometry.consensus import ConsensusParameters, consensus
+from sceneprint.geometry.matching import MatchingParameters, correspondences
+from sceneprint.geometry.registration import (
+    COARSE,
+    FINE,
+    RefinementParameters,
+    numbers_of,
+    refine,
+    refine_in_place,
+)
+from sceneprint.geometry.rigid import difference
+from sceneprint.types import Floats, Floats32, Geometry, Surface
+
+
+@dataclass(frozen=True)
+class AlignmentParameters:
+    """The numbers of the search for a transform."""
+
+    matching: MatchingParameters = field(default_factory=MatchingParameters)
+    consensus: ConsensusParameters = field(default_factory=ConsensusParameters)
+    n_refined: int = 8  #: hypotheses that are refined
+    violation_weight: float = 3.0  #: of a violation beside an inlier, in the score
+    same_m: float = 0.1  #: hypotheses this near are one
+    same_rad: float = math.radians(6.0)
+    coarse: RefinementParameters = COARSE
+    fine: RefinementParameters = FINE
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """One direction's outcome.
+
+    Parameters
+    ----------
+    T : (4, 4) T_target_source
+    others : (n, 4, 4) the other hypotheses that were refined, best first
+    stiffness : least over largest eigenvalue of the information, 0 where a direction is free
+    points : (N, 6) of the source that evidence is counted on
+    """
+
+    T: Floats
+    others: Floats
+    stiffness: float
+    points: Floats32
+
+
+def align(
+    source: Geometry,
+    target: Geometry,
+    rng: np.random.Generator,
+    p: AlignmentParameters,
+    agreement_p: AgreementParameters,
+) -> Alignment | None:
+    """The transform from source to target: Sec. III-E, in one direction.
+
+    Correspondences vote for some forty hypotheses; these are scored by how the source's points fit
+    the target's surface, the best distinct ones refined and scored again, and the best refined to
+    the end.
+
+    Parameters
+    ----------
+    source, target : geometry artifacts
+    rng : of the patches drawn
+    p, agreement_p : see there
+
+    Returns
+    -------
+    alignment : or None where no three correspondences agree, or no hypothesis survives refinement
+    """
+    pairs = correspondences(source.descriptors, target.descriptors, rng, p.matching)
+    hypotheses = consensus(source.patches, target.patches, pairs, p.consensus)
+    points = sampled(source.surface, agreement_p.stride)
+    if not len(hypotheses):
+        return None
+    scores = _scores(points, target.surface, hypotheses, p, agreement_p)
+    chosen = _distinct(hypotheses, scores, p)
+    refined = refined_all(source.surface, target.surface, hypotheses[chosen], p.coarse)
+    if not len(refined):
+        return None
+    scores = _scores(points, target.surface, refined, p, agreement_p)
+    order = np.argsort(-scores, kind="stable")
+    best, others = refined[order[0]], refined[order[1:]]
+    fine = refine(sampled(source.surface, p.fine.stride), target.surface, best, p.fine)
+    if fine is None:
+        return Alignment(best, others, 0.0, points)
+    eigenvalues = np.linalg.eigvalsh(fine.information)
+    stiffness = max(float(eigenvalues[0] / eigenvalues[-1]), 0.0)
+    return Alignment(fine.T, others, stiffness, points)
+
+
+def _scores(
+    points: Floats32, target: Surface, transforms: Floats,
+    p: AlignmentParameters, agreement_p: AgreementParameters,
+) -> Floats:  # fmt: skip
+    camera, limits = camera_of(target.intrinsics), tolerances(agreement_p)
+    ones = np.ones(len(points), np.float32)
+    scores = np.empty(len(transforms))
+    for k, T in enumerate(transforms):
+        inliers, violations = weigh_agreement(
+            points, ones, target.points, target.normals, camera, T, limits
+        )
+        scores[k] = inliers - p.violation_weight * violations
+    return scores
+
+
+def _distinct(hypotheses: Floats, scores: Floats, p: AlignmentParameters) -> list[int]:
+    """The best few that differ from each other."""
+    chosen: list[int] = []
+    for k in np.argsort(-scores, kind="stable"):
+        far = True
+        for c in chosen:
+            metres, radians = difference(hypotheses[k], hypotheses[c])
+            far = far and (metres > p.same_m or radians > p.same_rad)
+        if far:
+            chosen.append(int(k))
+        if len(chosen) == p.n_refined:
+            break
+    return chosen
+
+
+def refined_all(
+    source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
+) -> Floats:
+    """Each of the hypotheses (n, 4, 4) refined; those that lose the surface are left out."""
+    points, camera = sampled(source, p.stride), camera_of(target.intrinsics)
+    numbers, information = numbers_of(p), np.zeros((6, 6))
+    kept = []
+    for hypothesis in hypotheses:
+        T = hypothesis.copy()
+        if refine_in_place(points, target.points, target.normals, camera, T, numbers, information):
+            kept.append(T)
+    return np.array(kept).reshape(-1, 4, 4)

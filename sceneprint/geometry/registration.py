@@ -1,0 +1,198 @@
+"""Sec. III-E, refinement: a transform to the one near it that lays two surfaces together.
+
+    points of the source, surface of the target, T  --refine-->  T, information
+
+Projective point-to-plane alignment: every point is compared with the plane that the target saw in
+its direction. Depth errors of structured-light sensors grow with z^2, so far points weigh less.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneprint.geometry.agreement import camera_of
+from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.rigid import solve_positive, turned
+from sceneprint.types import Floats, Floats32, Surface
+
+
+@dataclass(frozen=True)
+class RefinementParameters:
+    """The numbers of one refinement."""
+
+    stride: int  #: of the source's pixels
+    iterations: int
+    first_gate: float  #: farther from the plane a point is forgotten, metres, at first
+    last_gate: float  #: and at last
+    normal_cosine: float = 0.7  #: of the angle between normals that may belong together
+    reference_depth: float = 5.0**0.5  #: gates grow by max(1, z^2 / this^2)
+    minimum_points: int = 20  #: fewer fix no transform
+
+
+#: For hypotheses: few points, wide gates.
+COARSE = RefinementParameters(5, 8, 0.25, 0.08)
+#: For the best of them.
+FINE = RefinementParameters(2, 8, 0.08, 0.03)
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """What a refinement came to.
+
+    Parameters
+    ----------
+    T : (4, 4) T_target_source
+    information : (6, 6) J^T W J per point used: turn (radians), then shift (metres), about the
+        target's origin
+    points : that took part in the last step
+    """
+
+    T: Floats
+    information: Floats
+    points: int
+
+
+@kernel
+def _nearest_pixel(
+    points: Floats32, u: int, v: int, x: float, y: float, z: float
+) -> tuple[int, int, float]:
+    """Of the 3 x 3 pixels about (u, v), the one whose point is nearest: column, row, squared."""
+    column, row, nearest = -1, -1, 1e9
+    for line in range(v - 1, v + 2):
+        for place in range(u - 1, u + 2):
+            if points[line, place, 2] > 0:
+                ex, ey, ez = (
+                    x - points[line, place, 0], y - points[line, place, 1],
+                    z - points[line, place, 2],
+                )  # fmt: skip
+                square = ex * ex + ey * ey + ez * ez
+                if square < nearest:
+                    nearest, column, row = square, place, line
+    return column, row, nearest
+
+
+@kernel
+def _accumulate(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
+    gate: float, least_cosine: float, reference: float, A: Floats, g: Floats,
+) -> int:  # fmt: skip
+    """Normal equations of one Gauss-Newton step; returns how many points took part."""
+    height, width = points.shape[0], points.shape[1]
+    row = np.zeros(6)
+    A[:] = 0.0
+    g[:] = 0.0
+    used = 0
+    for i in range(len(source)):
+        px, py, pz = source[i, 0], source[i, 1], source[i, 2]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        if not z > 0.1:
+            continue
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        column, line = x / z * camera[0] + camera[2] + 0.5, y / z * camera[1] + camera[3] + 0.5
+        if not (column >= 1 and line >= 1 and column < width - 1 and line < height - 1):
+            continue
+        u, v, square = _nearest_pixel(points, int(column), int(line), x, y, z)
+        if u < 0:
+            continue
+        mx, my, mz = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
+        residual = (
+            (x - points[v, u, 0]) * mx + (y - points[v, u, 1]) * my + (z - points[v, u, 2]) * mz
+        )
+        limit = gate * max(1.0, (z / reference) ** 2)
+        if abs(residual) > limit or square > 9.0 * limit * limit:
+            continue
+        nx, ny, nz = source[i, 3], source[i, 4], source[i, 5]
+        cosine = (
+            (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz) * mx
+            + (T[1, 0] * nx + T[1, 1] * ny + T[1, 2] * nz) * my
+            + (T[2, 0] * nx + T[2, 1] * ny + T[2, 2] * nz) * mz
+        )
+        if cosine < least_cosine:
+            continue
+        tukey = 1.0 - (residual / limit) ** 2
+        weight = tukey * tukey / (0.25 + (pz**4 + z**4) * 0.125)
+        row[0], row[1], row[2] = y * mz - z * my, z * mx - x * mz, x * my - y * mx
+        row[3], row[4], row[5] = mx, my, mz
+        for a in range(6):
+            wa = weight * row[a]
+            g[a] -= wa * residual
+            for b in range(a + 1):
+                A[a, b] += wa * row[b]
+        used += 1
+    for a in range(6):
+        for b in range(a):
+            A[b, a] = A[a, b]
+    return used
+
+
+@kernel
+def refine_in_place(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
+    numbers: Floats, information: Floats,
+) -> int:  # fmt: skip
+    """Gauss-Newton on T; the points that took part in the last step, 0 where it was lost."""
+    iterations, minimum = int(numbers[0]), int(numbers[5])
+    A, g, step = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    before, turn = np.zeros((3, 3)), np.zeros((3, 3))
+    used = 0
+    for iteration in range(iterations):
+        share = iteration / max(iterations - 1, 1)
+        gate = numbers[1] * (numbers[2] / numbers[1]) ** share
+        used = _accumulate(source, points, normals, camera, T, gate, numbers[3], numbers[4], A, g)
+        if used < minimum:
+            return 0
+        for a in range(6):
+            for b in range(6):
+                information[a, b] = A[a, b] / used
+            # a little damping: a direction that no point holds does not move
+            A[a, a] += 1e-6 * used
+        if not solve_positive(A, g, step):
+            return 0
+        for a in range(3):
+            for b in range(3):
+                before[a, b] = T[a, b]
+        turned(before, step[:3], turn)
+        for a in range(3):
+            for b in range(3):
+                T[a, b] = turn[a, b]
+        turned(np.eye(3), step[:3], turn)
+        x, y, z = T[0, 3], T[1, 3], T[2, 3]
+        for a in range(3):
+            T[a, 3] = turn[a, 0] * x + turn[a, 1] * y + turn[a, 2] * z + step[3 + a]
+    return used
+
+
+def numbers_of(p: RefinementParameters) -> Floats:
+    """The parameters as the kernel takes them."""
+    return np.array(
+        [p.iterations, p.first_gate, p.last_gate, p.normal_cosine, p.reference_depth,
+         p.minimum_points],
+        float,
+    )  # fmt: skip
+
+
+def refine(
+    source: Floats32, target: Surface, T_target_source: Floats, p: RefinementParameters
+) -> Refined | None:
+    """Lay a source's points onto the target's surface, from a transform near by: Sec. III-E.
+
+    Parameters
+    ----------
+    source : (N, 6) float32 points and normals, of `agreement.sampled` with the stride of `p`
+    target : (h, w) surface
+    T_target_source : (4, 4) where to start
+    p : see RefinementParameters
+
+    Returns
+    -------
+    refined : or None where fewer than `minimum_points` stay within the gates
+    """
+    T, information = np.array(T_target_source, float), np.zeros((6, 6))
+    used = refine_in_place(
+        source, target.points, target.normals, camera_of(target.intrinsics), T,
+        numbers_of(p), information,
+    )  # fmt: skip
+    return Refined(T, information, used) if used else None

@@ -1,0 +1,236 @@
+"""Sec. III-E, validation: two frames to a rigid transform, and whether to believe it.
+
+    Geometry, Geometry, seed  --validate-->  Validation
+
+The transform is estimated both ways, independently. That both agree is the paper's test. By
+itself it believes too much: two estimates from the same two frames may fall into the same wrong
+place, where plane lies on plane. So the transform must also explain what both sensors saw: enough
+of both surfaces agrees, and next to nothing lies where the other frame saw through.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from sceneprint.geometry.agreement import AgreementParameters, agreement, sampled
+from sceneprint.geometry.alignment import Alignment, AlignmentParameters, align, refined_all
+from sceneprint.geometry.registration import FINE, refine
+from sceneprint.geometry.rigid import inverse, nearest_rotation, rotation_angle
+from sceneprint.geometry.rivals import (
+    RivalParameters,
+    far_from,
+    patch_points,
+    plane_weights,
+    quarter_turns,
+)
+from sceneprint.types import Floats, Geometry
+
+Status = Literal["accepted", "ambiguous", "rejected"]
+Strength = Literal["strong", "weak"]
+Mode = Literal["full", "paper"]
+
+
+@dataclass(frozen=True)
+class ValidationParameters:
+    """The numbers of acceptance; how they were chosen: docs/evaluation.md."""
+
+    residual_m: float = 0.08  #: of the two directions composed: epsilon_val of Sec. III-E
+    residual_rad: float = math.radians(5.0)
+    violation_weight: float = 5.0  #: evidence = overlap - this x violations
+    evidence: float = 0.15  #: least
+    strong: float = 0.25  #: evidence below which an accepted match is weak
+    weak: float = 0.04  #: ambiguity from which on an accepted match is weak
+    ambiguous: float = 0.07  #: ambiguity from which on nothing is accepted
+    stiffness: float = 1e-5  #: least ratio of the eigenvalues of the information
+    minimum_patches: int = 10  #: of either frame
+    rivals: RivalParameters = field(default_factory=RivalParameters)
+    alignment: AlignmentParameters = field(default_factory=AlignmentParameters)
+    agreement: AgreementParameters = field(default_factory=AgreementParameters)
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """What came of aligning a query with a candidate match.
+
+    Parameters
+    ----------
+    status : accepted, ambiguous (a rival transform explains the frames as well), or rejected
+    strength : of an accepted match: strong, or weak where a rival comes near; else None
+    reason : a short sentence
+    T_match_query : (4, 4) query coordinates to the match's, x_match = T @ x_query; the best there
+        is, whatever the status; None where the frames gave no hypothesis at all
+    residual_m, residual_rad : of the two directions composed, T_match_query T_query_match;
+        infinite where there is none
+    overlap : share of both frames' points that agree under the transform, 0 to 1
+    violations : free-space violations, as a share of violations and inliers, 0 to 1
+    inliers : points of both frames that agree under the transform
+    ambiguity : share of both frames that agrees under the best rival, every plane counting the
+        same, less 5 times the rival's violations; 0 to 1. Rivals are looked for only where all
+        else speaks for accepting; elsewhere it is 0
+    T_rival : (4, 4) that rival, or None
+    seed : of the random choices
+    """
+
+    status: Status
+    strength: Strength | None
+    reason: str
+    T_match_query: Floats | None
+    residual_m: float
+    residual_rad: float
+    overlap: float
+    violations: float
+    inliers: int
+    ambiguity: float
+    T_rival: Floats | None
+    seed: int
+
+
+def middle(a: Floats, b: Floats) -> Floats:
+    """The transform halfway between two that are near each other: (4, 4)."""
+    result = np.eye(4)
+    result[:3, :3] = nearest_rotation(a[:3, :3] + b[:3, :3])
+    result[:3, 3] = (a[:3, 3] + b[:3, 3]) / 2
+    return result
+
+
+def refined_at(query: Geometry, match: Geometry, T_match_query: Floats) -> Floats | None:
+    """Both directions refined from one given transform, and their middle.
+
+    What is left of the error when the start was the truth is the sensors' and the reference
+    poses', not that of the search.
+
+    Returns
+    -------
+    (4, 4) T_match_query, or None where the frames do not overlap there
+    """
+    there = refine(sampled(query.surface, FINE.stride), match.surface, T_match_query, FINE)
+    back = refine(sampled(match.surface, FINE.stride), query.surface, inverse(T_match_query), FINE)
+    if there is None or back is None:
+        return None
+    return middle(there.T, inverse(back.T))
+
+
+def validate(
+    query: Geometry,
+    match: Geometry,
+    seed: int = 0,
+    p: ValidationParameters | None = None,
+    mode: Mode = "full",
+) -> Validation:
+    """Align a query with a candidate both ways, and decide: Sec. III-E.
+
+    Parameters
+    ----------
+    query, match : geometry artifacts made with one model
+    seed : of the random choices, the same seed giving the same answer
+    p : see ValidationParameters
+    mode : "full", or "paper": accept where the residual of the two directions is small, on no
+        other evidence
+
+    Raises
+    ------
+    ValueError : the descriptors have different lengths, or an unknown mode.
+    """
+    if mode not in ("full", "paper"):
+        raise ValueError(f"mode {mode!r} is neither 'full' nor 'paper'")
+    p = p or ValidationParameters()
+    fewest = min(len(query.patches), len(match.patches))
+    if fewest < p.minimum_patches:
+        return _nothing(
+            f"a frame has {fewest} patches, and {p.minimum_patches} are needed to tell places "
+            "apart",
+            seed,
+        )
+    there = align(query, match, np.random.default_rng((seed, 0)), p.alignment, p.agreement)
+    back = align(match, query, np.random.default_rng((seed, 1)), p.alignment, p.agreement)
+    if there is None or back is None:
+        return _nothing("no three correspondences agree on a transform", seed)
+    return _decided(query, match, there, back, seed, p, mode)
+
+
+def _nothing(reason: str, seed: int) -> Validation:
+    return Validation(
+        "rejected", None, reason, None, math.inf, math.inf, 0.0, 0.0, 0, 0.0, None, seed
+    )
+
+
+def _ambiguity(
+    query: Geometry, match: Geometry, there: Alignment, back: Alignment, T: Floats,
+    p: ValidationParameters,
+) -> tuple[float, Floats | None]:  # fmt: skip
+    """How well the best rival explains the frames, 0 to 1, and that rival."""
+    turned = np.concatenate(
+        [quarter_turns(match.patches, p.rivals) @ T, T @ quarter_turns(query.patches, p.rivals)]
+    )
+    turned = refined_all(query.surface, match.surface, turned, p.alignment.coarse)
+    backward = np.array([inverse(other) for other in back.others]).reshape(-1, 4, 4)
+    rivals = far_from(T, np.concatenate([there.others, backward, turned]), p.rivals)
+    points = patch_points(query.patches), patch_points(match.patches)
+    weights = plane_weights(query.patches, p.rivals), plane_weights(match.patches, p.rivals)
+
+    most, found = 0.0, None
+    for rival in rivals:
+        a = agreement(points[0], match.surface, rival, p.agreement, weights[0])
+        b = agreement(points[1], query.surface, inverse(rival), p.agreement, weights[1])
+        inliers, violations = a.inliers + b.inliers, a.violations + b.violations
+        violated = violations / max(inliers + violations, 1e-9)
+        explained = inliers / (a.points + b.points) - p.violation_weight * violated
+        if explained > most:
+            most, found = explained, rival
+    return most, found
+
+
+def _decided(
+    query: Geometry, match: Geometry, there: Alignment, back: Alignment, seed: int,
+    p: ValidationParameters, mode: Mode,
+) -> Validation:  # fmt: skip
+    composed = there.T @ back.T  # reading R5: the residual transform T_Q^X T_X^Q itself
+    metres = float(np.linalg.norm(composed[:3, 3]))
+    radians = rotation_angle(composed[:3, :3])
+    T = middle(there.T, inverse(back.T))
+    of_query = agreement(there.points, match.surface, T, p.agreement)
+    of_match = agreement(back.points, query.surface, inverse(T), p.agreement)
+    inliers = int(of_query.inliers + of_match.inliers)
+    overlap = inliers / max(of_query.points + of_match.points, 1.0)
+    violated = of_query.violations + of_match.violations
+    violations = violated / max(inliers + violated, 1.0)
+    ambiguity, T_rival = 0.0, None
+
+    def answer(status: Status, strength: Strength | None, reason: str) -> Validation:
+        return Validation(
+            status, strength, reason, T, metres, radians, overlap, violations, inliers,
+            ambiguity, T_rival, seed,
+        )  # fmt: skip
+
+    if metres > p.residual_m or radians > p.residual_rad:
+        degrees = math.degrees(radians)
+        return answer(
+            "rejected", None, f"the two directions disagree by {metres:.2g} m, {degrees:.2g} deg"
+        )
+    if mode == "paper":
+        return answer("accepted", "strong", "the two directions agree")
+    evidence = overlap - p.violation_weight * violations
+    if evidence < p.evidence:
+        return answer(
+            "rejected",
+            None,
+            f"only {overlap:.0%} of the surfaces agree"
+            if overlap < p.evidence
+            else f"{violations:.1%} lies where the other frame saw through",
+        )
+    if min(there.stiffness, back.stiffness) < p.stiffness:
+        return answer(
+            "ambiguous", None, "what the frames share leaves a direction free, as a plane does"
+        )
+    ambiguity, T_rival = _ambiguity(query, match, there, back, T, p)
+    if ambiguity >= p.ambiguous:
+        return answer("ambiguous", None, "another transform explains the frames as well")
+    if ambiguity >= p.weak:
+        return answer("accepted", "weak", "another transform is not ruled out")
+    if evidence < p.strong:
+        return answer("accepted", "weak", f"{overlap:.0%} of the surfaces agree")
+    return answer("accepted", "strong", "surfaces agree, and nothing speaks against it")

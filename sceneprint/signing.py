@@ -1,0 +1,210 @@
+"""Sec. III-A and III-B put together: a frame to its signature, and what of it others use.
+
+Frame  --describe-->  Hierarchy  --encode-->  Signature
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sceneprint.errors import UselessFrame
+from sceneprint.geometry.counting import count_pairs
+from sceneprint.geometry.depth import inverse_depth
+from sceneprint.geometry.encoding import (
+    Statistics,
+    fisher_vector,
+    quantise,
+    signature,
+    statistics_of_counts,
+    statistics_of_features,
+)
+from sceneprint.geometry.hierarchy import hierarchy
+from sceneprint.geometry.normals import surface
+from sceneprint.geometry.projection import project
+from sceneprint.geometry.properties import neighbour_pairs, pair_properties
+from sceneprint.geometry.segmentation import segment
+from sceneprint.geometry.table import PairTable
+from sceneprint.geometry.weights import patch_weights
+from sceneprint.models import Model, ModelParameters, build_table, open_table, read_model
+from sceneprint.types import Bytes, Floats, Frame, Hierarchy, Patches, Surface
+
+
+@dataclass(frozen=True, eq=False)
+class Signature:
+    """psi of one frame, as it is stored and compared.
+
+    Parameters
+    ----------
+    vector : (25 G H,) uint8
+    model_id : of the model that made it; signatures of two models are never compared
+    n_patches : patches of each level, finest first
+    n_pairs : ordered pairs of each level
+    """
+
+    vector: Bytes
+    model_id: str
+    n_patches: tuple[int, ...]
+    n_pairs: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Signer:
+    """A model made ready to sign: with its pair table opened.
+
+    Parameters
+    ----------
+    model : see Model
+    table : of this model
+    """
+
+    model: Model
+    table: PairTable
+
+
+def open_signer(
+    model: str | Path | Model = "paper",
+    cache_dir: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    cached: bool = True,
+) -> Signer:
+    """Open a preset, a model file or a model, and its pair table.
+
+    The first call on a machine builds the table (seconds) and caches it; later ones map it.
+
+    Parameters
+    ----------
+    model : "paper", "compact", the path of a model file, or a model
+    cache_dir : folder of derived files; default: the user's cache folder
+    progress : called with bins done and their total while the table is being built
+    cached : False for a model that will not be seen again: nothing is read or written
+
+    Raises
+    ------
+    UnreadableModel : see `read_model`.
+    """
+    read = model if isinstance(model, Model) else read_model(model)
+    if not cached:
+        return Signer(read, build_table(read, progress))
+    return Signer(read, open_table(read, cache_dir, progress))
+
+
+def see(frame: Frame, p: ModelParameters) -> Surface:
+    """Points and normals of what a frame shows: the input of Sec. III.
+
+    Parameters
+    ----------
+    frame : depth in metres
+    p : of the model
+
+    Raises
+    ------
+    UselessFrame : nothing within the sensor's range.
+    """
+    q, camera = inverse_depth(frame, p.depth)
+    return surface(q, camera, p.normals)
+
+
+def describe(frame: Frame, p: ModelParameters) -> Hierarchy:
+    """The segmentation hierarchy of a frame; see `see` and `hierarchy_of`."""
+    return hierarchy_of(see(frame, p), p, frame.name)
+
+
+def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy:
+    """The segmentation hierarchy of a surface: Sec. III-F.
+
+    Parameters
+    ----------
+    seen : of `see`
+    p : of the model
+    name : of the frame, for errors
+
+    Raises
+    ------
+    UselessFrame : the samples lie on no surface.
+    """
+    finest = segment(seen, p.segmentation)
+    if finest.max(initial=-1) < 0:
+        raise UselessFrame(
+            f"{_named(name)}its depth samples lie on no surface: they are too scattered for "
+            "a patch. Check that the image is depth and its scale is right, or send another."
+        )
+    return hierarchy(seen, finest, p.hierarchy)
+
+
+def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
+    """Quantised signature of a hierarchy of patches: Sec. III-A and III-B.
+
+    Parameters
+    ----------
+    patches : H levels
+    signer : see `open_signer`
+    name : of the frame, for errors
+
+    Raises
+    ------
+    UselessFrame : the finest level has no pair of patches within reach.
+    """
+    model = signer.model
+    levels = [table_statistics(level, signer) for level in patches.levels]
+    psi = float_signature(levels, model, name)
+    return Signature(
+        vector=quantise(psi, model.quantiser_step),
+        model_id=model.id,
+        n_patches=tuple(len(level) for level in patches.levels),
+        n_pairs=tuple(level.n_pairs for level in levels),
+    )
+
+
+def table_statistics(level: Patches, signer: Signer) -> Statistics:
+    """Pair statistics of one level through the 4-D table."""
+    p = signer.model.parameters
+    weights = patch_weights(level, p.weights)
+    counts = count_pairs(level.means, level.normals, weights, p.table, p.properties)
+    return statistics_of_counts(counts, signer.table, len(signer.model.mixture))
+
+
+def exact_statistics(level: Patches, model: Model) -> Statistics:
+    """Pair statistics of one level, pair by pair: slow, the oracle of the table."""
+    p = model.parameters.properties
+    pairs = neighbour_pairs(level, p)
+    weights = patch_weights(level, model.parameters.weights)[pairs].prod(axis=1)
+    features = project(pair_properties(level, pairs, p), model.projection)
+    return statistics_of_features(features, weights, model.mixture)
+
+
+def float_signature(levels: list[Statistics], model: Model, name: str = "") -> Floats:
+    """psi before quantisation: Eq. (2) of every level, rooted, normalised, end to end.
+
+    A coarse level without pairs says nothing, and its part of psi is zero.
+
+    Parameters
+    ----------
+    levels : H, finest first
+    model : see Model
+    name : of the frame, for errors
+
+    Raises
+    ------
+    UselessFrame : the finest level has no pairs.
+    """
+    if levels[0].n_pairs == 0:
+        radius = model.parameters.properties.radius
+        raise UselessFrame(
+            f"{_named(name)}no two surface patches lie within {radius:g} m of each other, so there "
+            "is no geometry between them to describe. Send a frame that sees more of the scene."
+        )
+    return signature(
+        [
+            fisher_vector(level, model.mixture) if level.n_pairs else np.zeros(model.level_length)
+            for level in levels
+        ]
+    )
+
+
+def _named(name: str) -> str:
+    return f"{name}: " if name else ""
