@@ -1,4 +1,4 @@
-"""`make bench`: the cost of signing, as a table, as JSON, and in docs/performance.md."""
+"""`make bench`: what every stage costs, as tables, as JSON, and in docs/performance.md."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import json
 import os
 import sys
 import tempfile
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from tqdm import tqdm
 
+from benchmarks import dpp, registration, scan
 from benchmarks.encode import EncodeFigures, measure
 from benchmarks.machine import (
     Machine,
@@ -21,6 +22,7 @@ from benchmarks.machine import (
     pin_to_one_processor,
     seconds_to_import,
 )
+from benchmarks.pairs import real_pairs, synthetic_pairs
 from sceneprint.datasets import Camera, find_sequences, write_depth_png, write_intrinsics
 from sceneprint.models import PRESETS
 from sceneprint.pipeline import open_signer
@@ -31,9 +33,14 @@ ROOT = Path(__file__).resolve().parent.parent
 BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
 
 
+def recordings() -> Path:
+    """Folder of real recordings, which need not be there."""
+    return Path(os.environ.get("SCENEPRINT_DATA", ROOT.parent / "shared" / "data"))
+
+
 def real_frames(n: int) -> list[Frame]:
     """`n` frames spread over the recordings at SCENEPRINT_DATA; none where there are none."""
-    root = Path(os.environ.get("SCENEPRINT_DATA", ROOT.parent / "shared" / "data"))
+    root = recordings()
     scenes = [root / "7scenes", root / "tum", root / "sun3d"]
     found = [
         reference
@@ -82,7 +89,17 @@ def table(preset: str, f: EncodeFigures, peak: float) -> list[str]:
     return [*lines, "", f"Peak memory of a process that signs: {peak:.0f} MB.", ""]
 
 
-def page(machine: Machine, rows: dict[str, tuple[EncodeFigures, float]], start: float) -> str:
+@dataclass(frozen=True)
+class Rows:
+    """All that one run measured; `encode`: figures and peak memory (MB) of each preset."""
+
+    encode: dict[str, tuple[EncodeFigures, float]]
+    scan: scan.ScanFigures
+    dpp: dpp.DppFigures
+    registration: registration.RegistrationFigures
+
+
+def page(machine: Machine, rows: Rows, start: float) -> str:
     """The section of docs/performance.md that `make bench` owns."""
     packages = ", ".join(f"{name} {number}" for name, number in machine.packages.items())
     lines = [
@@ -92,24 +109,36 @@ def page(machine: Machine, rows: dict[str, tuple[EncodeFigures, float]], start: 
         "compare ratios, not milliseconds.",
         "",
     ]
-    for preset, (figures, peak) in rows.items():
+    for preset, (figures, peak) in rows.encode.items():
         lines += table(preset, figures, peak)
+    lines += scan.table(rows.scan) + dpp.table(rows.dpp) + registration.table(rows.registration)
     return "\n".join([*lines, f"`import sceneprint`: {start:.2f} s.", END])
 
 
+def measure_all(n_frames: int, n_pairs: int) -> Rows:
+    """Every row, on one processor, one after the other."""
+    frames = real_frames(n_frames) or synthetic_frames(n_frames)
+    pairs = real_pairs(recordings(), n_pairs) or synthetic_pairs(n_pairs)
+    pin_to_one_processor()
+    signers = {preset: open_signer(preset) for preset in PRESETS}
+    return Rows(
+        encode={p: (measure(frames, s), peak_memory(frames, p)) for p, s in signers.items()},
+        scan=scan.measure(),
+        dpp=dpp.measure(),
+        registration=registration.measure(pairs, signers["paper"].model),
+    )
+
+
 def main() -> int:
-    """Measure both presets, print, and write what was asked for."""
+    """Measure, print, and write what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=50)
+    parser.add_argument("--pairs", type=int, default=20)
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "bench.json")
     parser.add_argument("--page", type=Path, help="Markdown file whose marked section is replaced")
     options = parser.parse_args()
     start = seconds_to_import()
-    frames = real_frames(options.frames) or synthetic_frames(options.frames)
-    pin_to_one_processor()
-    rows: dict[str, tuple[EncodeFigures, float]] = {}
-    for preset in PRESETS:
-        rows[preset] = measure(frames, open_signer(preset)), peak_memory(frames, preset)
+    rows = measure_all(options.frames, options.pairs)
     machine = describe_machine()
     section = page(machine, rows, start)
     print(section)
@@ -117,7 +146,10 @@ def main() -> int:
     result = {
         "machine": asdict(machine),
         "import_seconds": start,
-        "encode": {p: asdict(f) | {"peak_megabytes": m} for p, (f, m) in rows.items()},
+        "encode": {p: asdict(f) | {"peak_megabytes": m} for p, (f, m) in rows.encode.items()},
+        "scan": asdict(rows.scan),
+        "dpp": asdict(rows.dpp),
+        "registration": asdict(rows.registration),
     }
     options.json.write_text(json.dumps(result, indent=1) + "\n")
     if options.page is not None:

@@ -17,7 +17,8 @@ from sceneprint.geometry.hierarchy import hierarchy
 from sceneprint.geometry.normals import surface
 from sceneprint.geometry.segmentation import segment
 from sceneprint.geometry.weights import patch_weights
-from sceneprint.pipeline import Signer, float_signature, sign
+from sceneprint.pipeline import Signer, sign
+from sceneprint.signing import float_signature
 from sceneprint.types import Floats, Frame
 
 T = TypeVar("T")

@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from sceneprint.datasets import find_sequences
-from sceneprint.pipeline import (
+from sceneprint.signing import (
     describe,
     exact_statistics,
     float_signature,

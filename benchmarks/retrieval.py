@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.overlap import overlaps
 from sceneprint.datasets import find_sequences
+from sceneprint.evaluation.overlap import overlaps, view_of
 from sceneprint.geometry.encoding import quantise
 from sceneprint.geometry.retrieval import distances
-from sceneprint.pipeline import (
+from sceneprint.signing import (
     Signer,
     describe,
     float_signature,
@@ -92,7 +92,7 @@ def measure(split: str, frames: list[Frame], signer: Signer) -> Figures:
     d8: Bytes = np.stack([quantise(one, step) for one in d])
     stored = np.stack([distances(quantise(one, step), d8) for one in q]).astype(float)
     exact = np.stack([np.abs(d - one).sum(axis=1) for one in q])
-    truth = overlaps(queries, database)
+    truth = overlaps([view_of(f) for f in queries], [view_of(f) for f in database]).mean
     found = np.take_along_axis(truth, ranks(stored), axis=1)
     best = truth.max(axis=1)
     return Figures(

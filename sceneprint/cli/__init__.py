@@ -17,7 +17,7 @@ USAGE = 2
 
 def parser() -> argparse.ArgumentParser:
     """All commands with their options."""
-    from sceneprint.cli import demo, picture, sign, synth, train
+    from sceneprint.cli import demo, evaluate, picture, sign, synth, train
 
     top = argparse.ArgumentParser(
         prog="sceneprint",
@@ -25,7 +25,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"sceneprint {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (demo, sign, picture, synth, train):
+    for module in (demo, sign, picture, evaluate, synth, train):
         module.add_to(commands)
     return top
 

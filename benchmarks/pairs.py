@@ -1,0 +1,76 @@
+"""Pairs of frames that see much of each other, with the truth about how they lie.
+
+frames with poses  --pairs_among-->  FramePair, ...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sceneprint.datasets import find_sequences
+from sceneprint.evaluation.overlap import overlap, view_of
+from sceneprint.geometry.rigid import inverse
+from sceneprint.synth import synthesise_room
+from sceneprint.types import Floats, Frame
+
+#: A pair counts where the smaller share of either frame seen by the other is at least this.
+LEAST_OVERLAP = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class FramePair:
+    """Two frames of one parent frame, and how one lies to the other.
+
+    Parameters
+    ----------
+    query, match : with poses
+    overlap : the smaller direction, in [0, 1]
+    T_match_query : (4, 4), from the poses
+    """
+
+    query: Frame
+    match: Frame
+    overlap: float
+    T_match_query: Floats
+
+
+def pairs_among(frames: Sequence[Frame], apart: int = 1) -> list[FramePair]:
+    """All pairs of a list of frames that overlap enough, `apart` places or more in the list."""
+    views, found = [view_of(frame) for frame in frames], []
+    for i, query in enumerate(frames):
+        for j, match in enumerate(frames[: max(i + 1 - apart, 0)]):
+            _, least = overlap(views[i], views[j])
+            if least >= LEAST_OVERLAP:
+                assert query.pose is not None
+                assert match.pose is not None
+                truth = inverse(match.pose) @ query.pose
+                found.append(FramePair(query, match, least, truth))
+    return found
+
+
+def real_pairs(recordings: Path, n: int, step: int = 25) -> list[FramePair]:
+    """`n` pairs spread over the first 7-Scenes sequence, none closer than two steps; or none."""
+    scenes = recordings / "7scenes"
+    if not scenes.is_dir():
+        return []
+    frames = [reference.read() for reference in find_sequences(scenes)[0].frames[::step]]
+    return _spread(pairs_among(frames, apart=2), n)
+
+
+def synthetic_pairs(n: int) -> list[FramePair]:
+    """`n` pairs of views of synthetic rooms, a few of each room."""
+    found: list[FramePair] = []
+    number = 0
+    while len(found) < n:
+        found += pairs_among(synthesise_room(3, number, 5).frames)[:3]
+        number += 1
+    return found[:n]
+
+
+def _spread(pairs: list[FramePair], n: int) -> list[FramePair]:
+    chosen = np.linspace(0, len(pairs) - 1, min(n, len(pairs)))
+    return [pairs[int(i)] for i in chosen]

@@ -1,0 +1,192 @@
+"""A query validated against its candidates, and judged by the true poses.
+
+Task  --judge-->  Judged: pairs, averaged poses
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from zlib import crc32
+
+import numpy as np
+
+from sceneprint.evaluation.frames import Store
+from sceneprint.evaluation.records import VIEWS, Error, Pair, in_preferred_order, pose_error
+from sceneprint.geometry.averaging import average_poses
+from sceneprint.geometry.rigid import inverse
+from sceneprint.geometry.validation import Mode, refined_at
+from sceneprint.pipeline import validate
+from sceneprint.types import Floats, Geometry
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A database frame that a query is to be validated against.
+
+    Parameters
+    ----------
+    match : its index in the database
+    number : of its files in the store
+    name, scene, pose : as in Member
+    overlap_mean, overlap_least : with the query
+    """
+
+    match: int
+    number: int
+    name: str
+    scene: str
+    pose: Floats
+    overlap_mean: float
+    overlap_least: float
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """One query with its candidates.
+
+    Parameters
+    ----------
+    number : of the query's files in the store
+    name, scene, pose : of the query
+    ranking : database indices of the first of R, in order
+    selection : those of C, in order
+    candidates : all of both, each once
+    """
+
+    number: int
+    name: str
+    scene: str
+    pose: Floats
+    ranking: list[int]
+    selection: list[int]
+    candidates: tuple[Candidate, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What came of a task; fields as in Outcome."""
+
+    pairs: dict[int, Pair]
+    average: Error
+    average_of_ranking: Error
+    average_bound: Error
+    milliseconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """What a process needs to validate.
+
+    Parameters
+    ----------
+    geometry : gives that of a frame by its number in the store
+    mode : see `validate`
+    seed : of the whole evaluation
+    """
+
+    geometry: Callable[[int], Geometry]
+    mode: Mode
+    seed: int
+
+
+def open_judge(store: Store, mode: Mode, seed: int) -> Judge:
+    """Make ready to validate frames of a store."""
+    # neighbouring queries have many candidates in common
+    return Judge(lru_cache(128)(store.geometry), mode, seed)
+
+
+def seed_of(seed: int, query: str, match: str) -> int:
+    """Seed of a pair: that of the evaluation and the two names, so that no order matters."""
+    return crc32(f"{seed}\n{query}\n{match}".encode())
+
+
+def views_to_average(pairs: Sequence[Pair]) -> list[Pair]:
+    """The first accepted views of the scene with most accepted views, strong ones first.
+
+    Poses are comparable within one scene only. Of two scenes with as many views the one of the
+    most believed view wins.
+
+    Parameters
+    ----------
+    pairs : of a query, in the order of R
+    """
+    believed = in_preferred_order(pairs)
+    if not believed:
+        return []
+    votes = Counter(pair.scene for pair in believed)  # keeps the order of first votes
+    scene = max(votes, key=votes.__getitem__)
+    return [pair for pair in believed if pair.scene == scene][:VIEWS]
+
+
+def judge(judging: Judge, task: Task) -> Judged:
+    """Validate a query against each candidate, average its pose, and say how far off all are.
+
+    Where refinement from the true pose leads is worked out for the first answer and for the
+    averaged views of C: the bound that registration of these pairs can reach.
+    """
+    of = {c.match: c for c in task.candidates}
+    pairs = {c.match: _validated(judging, task, c) for c in task.candidates}
+    selected = [pairs[match] for match in task.selection]
+    views = views_to_average(selected)
+    start = time.perf_counter()
+    average = _average(task, of, {p.match: p.validation.T_match_query for p in views})
+    spent = 1e3 * (time.perf_counter() - start)
+    refined = {
+        pair.match: _refined(judging, task, of[pair.match])
+        for pair in (*in_preferred_order(selected)[:1], *views)
+        if pair.same_scene
+    }
+    for match, T in refined.items():
+        bound = Error() if T is None else pose_error(T, _truth(task, of[match]))
+        pairs[match] = replace(pairs[match], bound=bound)
+    ranked = views_to_average([pairs[match] for match in task.ranking])
+    return Judged(
+        pairs,
+        average,
+        _average(task, of, {p.match: p.validation.T_match_query for p in ranked}),
+        _average(task, of, {p.match: refined.get(p.match) for p in views}),
+        spent,
+    )
+
+
+def _truth(task: Task, candidate: Candidate) -> Floats:
+    """T_match_query by the true poses."""
+    truth: Floats = inverse(candidate.pose) @ task.pose
+    return truth
+
+
+def _validated(judging: Judge, task: Task, candidate: Candidate) -> Pair:
+    query, match = judging.geometry(task.number), judging.geometry(candidate.number)
+    seed = seed_of(judging.seed, task.name, candidate.name)
+    start = time.perf_counter()
+    validation = validate(query, match, seed=seed, mode=judging.mode)
+    spent = 1e3 * (time.perf_counter() - start)
+    same, T = candidate.scene == task.scene, validation.T_match_query
+    return Pair(
+        match=candidate.match,
+        scene=candidate.scene,
+        validation=validation,
+        same_scene=same,
+        error=pose_error(T, _truth(task, candidate)) if same and T is not None else Error(),
+        bound=None,
+        overlap_mean=candidate.overlap_mean,
+        overlap_least=candidate.overlap_least,
+        milliseconds=spent,
+    )
+
+
+def _refined(judging: Judge, task: Task, candidate: Candidate) -> Floats | None:
+    query, match = judging.geometry(task.number), judging.geometry(candidate.number)
+    return refined_at(query, match, _truth(task, candidate))
+
+
+def _average(task: Task, of: dict[int, Candidate], transforms: dict[int, Floats | None]) -> Error:
+    """Error of the pose averaged over views of one scene; infinite without views."""
+    poses = [of[match].pose @ T for match, T in transforms.items() if T is not None]
+    if not poses or any(of[match].scene != task.scene for match in transforms):
+        return Error()
+    return pose_error(average_poses(np.stack(poses)).T, task.pose)

@@ -1,0 +1,237 @@
+"""From a protocol to the outcome of every query.
+
+Protocol  --evaluate-->  Evaluation
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import DatasetError
+from sceneprint.evaluation.frames import Prepared, Store, prepare_all
+from sceneprint.evaluation.overlap import Overlaps, View, overlap, view_of
+from sceneprint.evaluation.pairs import Candidate, Judged, Task, judge, open_judge
+from sceneprint.evaluation.protocol import Protocol
+from sceneprint.evaluation.ranking import Ranked, rank
+from sceneprint.evaluation.records import Member, Outcome
+from sceneprint.evaluation.workers import Watch, map_over, unwatched
+from sceneprint.geometry.retrieval import Metric
+from sceneprint.geometry.validation import Mode
+from sceneprint.pipeline import Signer
+
+#: Depth images that are held in memory at once, of queries and of the database.
+BLOCK = 256
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to evaluate.
+
+    Parameters
+    ----------
+    metric : of signatures
+    levels : of the signatures to use, finest first; None for all
+    mode : of validation
+    candidates : size of C, and of the part of R that is validated
+    max_overlap : a query may find only database frames that overlap it by less (by the smaller
+        direction, within 10 cm); None for all
+    absent : a query may find only frames of other scenes
+    seed : of every random choice
+    jobs : processes; no figure depends on it
+    cache_dir : of derived files of the model; None for the user's
+    """
+
+    metric: Metric = "l1"
+    levels: int | None = None
+    mode: Mode = "full"
+    candidates: int = 10
+    max_overlap: float | None = None
+    absent: bool = False
+    seed: int = 0
+    jobs: int = 1
+    cache_dir: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What came of every query.
+
+    Parameters
+    ----------
+    prepared : the frames
+    outcomes : of all queries, against the whole database
+    alone : of a 7-Scenes table of several scenes, the outcomes of each scene with a database of
+        its own; else empty
+    """
+
+    prepared: Prepared
+    outcomes: list[Outcome]
+    alone: dict[str, list[Outcome]]
+
+
+def evaluate(
+    protocol: Protocol, signer: Signer, store: Store, settings: Settings, watch: Watch = unwatched
+) -> Evaluation:
+    """Sign all frames, ask every query, and judge the answers by the true poses.
+
+    Parameters
+    ----------
+    protocol : see `choose`
+    signer : see `open_signer`
+    store : an empty one; its frames serve the pictures afterwards
+    settings : see Settings
+    watch : told of every step of every stage
+
+    Raises
+    ------
+    DatasetError : no query or no database frame could be used.
+    """
+    prepared = prepare_all(
+        protocol.frames,
+        signer,
+        store,
+        levels=settings.levels,
+        jobs=settings.jobs,
+        cache_dir=settings.cache_dir,
+        watch=watch,
+    )
+    for use, members in (("query", prepared.queries), ("database frame", prepared.database)):
+        if not members:
+            name, reason = prepared.left_out[0]
+            raise DatasetError(
+                f"No {use} can be used. The first that was left out is {name}: {reason}. "
+                "Choose other frames."
+            )
+    truth = overlaps_of(prepared, store, watch)
+    every = np.arange(len(prepared.queries)), np.arange(len(prepared.database))
+    outcomes = _ask(prepared, truth, *every, store, settings, watch)
+    alone: dict[str, list[Outcome]] = {}
+    scenes = list(dict.fromkeys(q.scene for q in prepared.queries))
+    if protocol.split and len(scenes) > 1 and not settings.absent:
+        for scene in scenes:
+            q = np.flatnonzero([m.scene == scene for m in prepared.queries])
+            d = np.flatnonzero([m.scene == scene for m in prepared.database])
+            if len(d):
+                alone[scene] = _ask(prepared, truth, q, d, store, settings, watch)
+    return Evaluation(prepared, outcomes, alone)
+
+
+def overlaps_of(prepared: Prepared, store: Store, watch: Watch = unwatched) -> Overlaps:
+    """Overlap of every query with every database frame; 0 between scenes."""
+    shape = len(prepared.queries), len(prepared.database)
+    mean, least = np.zeros(shape), np.zeros(shape)
+    steps = _steps(prepared, store)
+    total = shape[0] * -(-shape[1] // BLOCK)
+    for i, own, begin, views in watch(steps, "overlap", total):
+        for j, view in enumerate(views, begin):
+            if prepared.database[j].scene == prepared.queries[i].scene:
+                mean[i, j], least[i, j] = overlap(own, view)
+    return Overlaps(mean, least)
+
+
+def _steps(prepared: Prepared, store: Store) -> Iterator[tuple[int, View, int, list[View]]]:
+    """Each query with each block of the database; two blocks are in memory at a time."""
+    for first in range(0, len(prepared.queries), BLOCK):
+        own = [view_of(store.frame(m)) for m in prepared.queries[first : first + BLOCK]]
+        for begin in range(0, len(prepared.database), BLOCK):
+            views = [view_of(store.frame(m)) for m in prepared.database[begin : begin + BLOCK]]
+            for i, view in enumerate(own, first):
+                yield i, view, begin, views
+
+
+def _ask(
+    prepared: Prepared,
+    truth: Overlaps,
+    of_queries: NDArray[np.intp],
+    of_database: NDArray[np.intp],
+    store: Store,
+    settings: Settings,
+    watch: Watch,
+) -> list[Outcome]:
+    """Ask some queries of some of the database."""
+    queries = [prepared.queries[i] for i in of_queries]
+    database = prepared.database
+    same = np.array([q.scene for q in queries])[:, None] == np.array([d.scene for d in database])
+    allowed = np.zeros(same.shape, np.bool_)
+    allowed[:, of_database] = True
+    if settings.absent:
+        allowed &= ~same
+    if settings.max_overlap is not None:
+        allowed &= truth.least[of_queries] < settings.max_overlap
+    ranked = rank(
+        np.stack([q.signature for q in queries]),
+        np.stack([d.signature for d in database]),
+        allowed,
+        metric=settings.metric,
+        candidates=settings.candidates,
+        watch=watch,
+    )
+    local = Overlaps(truth.mean[of_queries], truth.least[of_queries])
+    tasks = [
+        _task(query, database, one, local, i, settings.candidates)
+        for i, (query, one) in enumerate(zip(queries, ranked, strict=True))
+    ]
+    opening = partial(open_judge, store, settings.mode, settings.seed)
+    judged = watch(map_over(tasks, judge, opening, settings.jobs), "validate", len(tasks))
+    return [
+        _outcome(queries[i], ranked[i], one, allowed[i], same[i], local, i, settings.candidates)
+        for i, one in enumerate(judged)
+    ]
+
+
+def _task(
+    query: Member, database: list[Member], ranked: Ranked, truth: Overlaps, row: int, first: int
+) -> Task:
+    ranking = ranked.ranking[:first]
+    candidates = tuple(
+        Candidate(
+            j,
+            database[j].number,
+            database[j].name,
+            database[j].scene,
+            database[j].pose,
+            float(truth.mean[row, j]),
+            float(truth.least[row, j]),
+        )
+        for j in sorted({*ranking, *ranked.selection})
+    )
+    return Task(
+        query.number, query.name, query.scene, query.pose, ranking, ranked.selection, candidates
+    )
+
+
+def _outcome(
+    query: Member,
+    ranked: Ranked,
+    judged: Judged,
+    allowed: NDArray[np.bool_],
+    same: NDArray[np.bool_],
+    truth: Overlaps,
+    row: int,
+    candidates: int,
+) -> Outcome:
+    index = np.flatnonzero(allowed)
+    return Outcome(
+        name=query.name,
+        scene=query.scene,
+        pose=query.pose,
+        allowed=index,
+        present=bool((allowed & same).any()),
+        overlap_mean=truth.mean[row, index],
+        overlap_least=truth.least[row, index],
+        ranking=ranked.ranking,
+        distances=ranked.distances,
+        selection=ranked.selection,
+        pairs=judged.pairs,
+        candidates=candidates,
+        average=judged.average,
+        average_of_ranking=judged.average_of_ranking,
+        average_bound=judged.average_bound,
+        milliseconds=ranked.milliseconds | {"average": judged.milliseconds},
+    )

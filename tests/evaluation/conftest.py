@@ -1,0 +1,129 @@
+"""Outcomes as data, from which figures are worked out by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.evaluation.records import Error, Outcome, Pair
+from sceneprint.geometry.validation import Validation
+
+
+def error(cm: float, degrees: float = 0.0) -> Error:
+    return Error(cm / 100, math.radians(degrees))
+
+
+def pair(
+    match: int,
+    status: str = "accepted",
+    strength: str | None = "strong",
+    off: Error | None = None,
+    *,
+    scene: str = "here",
+    mean: float = 0.5,
+    least: float = 0.4,
+    bound: Error | None = None,
+) -> Pair:
+    T = np.eye(4)
+    known: Any = {"status": status, "strength": strength if status == "accepted" else None}
+    v = Validation(
+        **known,
+        reason="as given",
+        T_match_query=T,
+        residual_m=0.01,
+        residual_rad=0.01,
+        overlap=0.5,
+        violations=0.0,
+        inliers=100,
+        ambiguity=0.5,
+        T_rival=None,
+        seed=0,
+    )
+    same = scene == "here"
+    off = off if same and off is not None else Error()
+    return Pair(match, scene, v, same, off, bound, mean, least, 10.0)
+
+
+def outcome(
+    ranking: list[int],
+    selection: list[int],
+    pairs: list[Pair],
+    *,
+    least: list[float] | None = None,
+    present: bool = True,
+    **rest: Any,
+) -> Outcome:
+    """A query at the origin of "here" with a database of as many frames as `least`."""
+    overlap = np.array(least if least is not None else [0.4] * (max(ranking) + 1))
+    return Outcome(
+        name="here/query",
+        scene="here",
+        pose=np.eye(4),
+        allowed=np.arange(len(overlap)),
+        present=present,
+        overlap_mean=overlap,
+        overlap_least=overlap,
+        ranking=ranking,
+        distances=np.arange(len(ranking)),
+        selection=selection,
+        pairs={one.match: one for one in pairs},
+        candidates=3,
+        milliseconds={"rank": 1.0, "diversify": 1.0, "average": 1.0},
+        **rest,
+    )
+
+
+@pytest.fixture
+def make_pair() -> Callable[..., Pair]:
+    return pair
+
+
+@pytest.fixture
+def make_outcome() -> Callable[..., Outcome]:
+    return outcome
+
+
+@pytest.fixture
+def three() -> list[Outcome]:
+    """One query found, one lost, one whose scene is not in the database.
+
+    The first: rank 1 weak and 7 cm off, rank 2 strong and 2 cm off, rank 3 strong, 4 cm and 6
+    degrees off; C has ranks 1 and 3. The second: rank 1 of another scene, rank 2 weak and 15 cm
+    off, rank 3 ambiguous but right; C has ranks 1 and 3. The third: one weak, wrong match.
+    """
+    found = outcome(
+        [0, 1, 2],
+        [0, 2],
+        [
+            pair(0, strength="weak", off=error(7, 1), mean=0.6),
+            pair(1, off=error(2, 1), mean=0.4, least=0.2),
+            pair(2, off=error(4, 6), mean=0.2, bound=error(3, 1)),
+        ],
+        least=[0.6, 0.4, 0.2, 0.0],
+        average=error(1, 1),
+        average_of_ranking=error(6, 1),
+        average_bound=error(2, 1),
+    )
+    lost = outcome(
+        [3, 1, 2],
+        [3, 2],
+        [
+            pair(3, "rejected", scene="there", mean=0.0, least=0.0),
+            pair(1, strength="weak", off=error(15), mean=0.3),
+            pair(2, "ambiguous", off=error(1), mean=0.5),
+        ],
+        least=[0.1, 0.3, 0.5, 0.0],
+        average_of_ranking=error(15),
+    )
+    away = outcome(
+        [3],
+        [3],
+        [pair(3, strength="weak", scene="there", mean=0.0, least=0.0)],
+        least=[0.0] * 4,
+        present=False,
+    )
+    return [found, lost, away]

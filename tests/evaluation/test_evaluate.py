@@ -1,0 +1,212 @@
+"""The command as a user runs it, on a small synthetic building."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sceneprint.cli import main
+from sceneprint.models import Model, save_model
+
+ROW = {"within_5cm_5deg", "within_10cm_10deg", "median_translation_m", "median_rotation_deg"}
+RETRIEVAL = {"top1_overlap_50", "top5_overlap_50", "top1_overlap_30", "mean_overlap"}
+
+
+@pytest.fixture(scope="module")
+def building(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two rooms of twelve views along a path."""
+    out = tmp_path_factory.mktemp("evaluate") / "rooms"
+    arguments = ["synth", out, "--rooms", 2, "--views", 12, "--seed", 9, "--path", "--jobs", 1]
+    assert main([str(a) for a in arguments]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def model_file(small_model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("model") / "small.safetensors"
+    save_model(small_model, path)
+    return path
+
+
+def evaluated(folder: Path, *arguments: object) -> dict[str, Any]:
+    path = folder / "figures.json"
+    assert main(["evaluate", *map(str, arguments), "--json", str(path)]) == 0
+    found: dict[str, Any] = json.loads(path.read_text(), parse_constant=pytest.fail)
+    return found
+
+
+@pytest.fixture(scope="module")
+def ranges(building: Path) -> list[str]:
+    room = building / "room-000"
+    return [f"{room}@db=0:12:3,queries=1:9:3", "--distractors", str(building / "room-001")]
+
+
+@pytest.fixture(scope="module")
+def figures(ranges: list[str], model_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    folder = tmp_path_factory.mktemp("figures")
+    return evaluated(folder, *ranges, "--model", model_file, "--jobs", 1, "--plots", folder), folder
+
+
+def test_the_json_has_every_key(figures: Any) -> None:
+    found, _ = figures
+    for row in ("R", "VR", "DR", "VDR", "pose_average"):
+        more = RETRIEVAL | {"right_scene"} if row in ("R", "DR") else set()
+        assert set(found[row]) == ROW | more
+    assert {"precision", "recall", "accepted"} <= set(found["validation"])
+    assert RETRIEVAL == set(found["oracle"]) == set(found["random"])
+    assert set(found["diversity"]["translation"]) == {"R", "DR", "VR", "VDR"}
+    assert found["counts"] == {"queries": 3, "database": 4 + 12, "left_out": 0}
+    assert sum(found["lost"].values()) == 3
+    assert found["milliseconds"]["prepare"] > 0
+    assert found["settings"]["seed"] == 0
+    assert found["R"]["within_10cm_10deg"] == found["DR"]["within_10cm_10deg"]
+    assert found["oracle"]["mean_overlap"] > 0.5  # frames of a path, centimetres apart
+
+
+def test_neighbouring_frames_of_a_room_are_found(figures: Any) -> None:
+    found, _ = figures
+    assert found["VDR"]["within_10cm_10deg"] == 1.0
+    assert found["validation"]["accepted_strong_of_other_scenes"] == 0
+
+
+def test_pictures_show_something(figures: Any) -> None:
+    _, folder = figures
+    for name in ("accuracy", "acceptance", "diversity", "contact", "cloud"):
+        with Image.open(folder / f"{name}.png") as image:
+            pixels = np.asarray(image.convert("RGB"))[::3, ::3]
+        assert min(pixels.shape[:2]) > 100
+        assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 30
+    header, _, body = (folder / "cloud-vdr.ply").read_bytes().partition(b"end_header\n")
+    points = int(header.split(b"element vertex ")[1].split(b"\n")[0])
+    assert points > 10_000
+    assert len(body) == points * 27  # six floats and three bytes
+
+
+def test_the_number_of_processes_changes_nothing(
+    figures: Any, ranges: list[str], model_file: Path, tmp_path: Path
+) -> None:
+    alone, _ = figures
+    several = evaluated(tmp_path, *ranges, "--model", model_file, "--jobs", 2)
+    assert several["milliseconds"].keys() == alone["milliseconds"].keys()
+    assert several | {"milliseconds": None} == alone | {"milliseconds": None}
+
+
+def test_a_scene_that_is_absent(
+    ranges: list[str], model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--absent", "--levels", 1, "--metric", "l2", "--jobs", 1, "--plots", tmp_path)
+    found = evaluated(tmp_path, *ranges, "--model", model_file, *options)
+    assert (tmp_path / "contact.png").exists()
+    assert not (tmp_path / "cloud.png").exists()  # nothing was accepted that could be merged
+    assert found["absent"]["queries"] == 3
+    assert found["absent"]["accepted_strong"] == 0.0
+    assert found["R"]["within_10cm_10deg"] is None
+    assert "3 queries whose scene is not in the database" in capsys.readouterr().out
+
+
+def test_frames_that_cannot_be_used_are_named(
+    building: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "room"
+    (copy / "seq-01").mkdir(parents=True)
+    for file in (building / "room-000").rglob("*.*"):
+        if file.is_file():
+            (copy / file.relative_to(building / "room-000")).write_bytes(file.read_bytes())
+    (copy / "seq-01" / "frame-000001.pose.txt").unlink()
+    (copy / "seq-01" / "frame-000002.depth.png").write_bytes(b"no picture")
+    found = evaluated(
+        tmp_path, copy, "--db", "0:8:2", "--queries", "1:12:4", "--model", model_file, "--jobs", 1
+    )
+    assert found["counts"] == {"queries": 2, "database": 3, "left_out": 2}
+    reasons = {one["name"]: one["reason"] for one in found["left_out"]}
+    assert "no pose" in reasons["room/seq-01/frame-000001"]
+    assert "frame-000002" in reasons["room/seq-01/frame-000002"]
+    assert "left out" in capsys.readouterr().out
+
+
+def test_distractors_need_no_poses(building: Path, model_file: Path, tmp_path: Path) -> None:
+    plain = tmp_path / "elsewhere"
+    plain.mkdir()
+    room = building / "room-001"
+    (plain / "intrinsics.json").write_bytes((room / "intrinsics.json").read_bytes())
+    for i in range(2):
+        depth = (room / "seq-01" / f"frame-{i:06d}.depth.png").read_bytes()
+        (plain / f"{i}.png").write_bytes(depth)
+    asked = (building / "room-000", "--queries", "0:1", "--distractors", plain)
+    found = evaluated(tmp_path, *asked, "--model", model_file, "--jobs", 1)
+    assert found["counts"] == {"queries": 1, "database": 2, "left_out": 0}
+    assert found["absent"]["queries"] == 1
+
+
+def test_only_frames_that_overlap_little(building: Path, model_file: Path, tmp_path: Path) -> None:
+    asked = (building / "room-000", "--db", "0:12:3", "--queries", "1:9:3", "--max-overlap", 0.7)
+    found = evaluated(tmp_path, *asked, "--model", model_file, "--jobs", 1)
+    assert found["oracle"]["mean_overlap"] is None or found["oracle"]["mean_overlap"] < 0.9
+    assert found["settings"]["max_overlap"] == 0.7
+
+
+def test_the_table_of_several_scenes(
+    building: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for room in ("room-000", "room-001"):
+        source = building / room / "seq-01"
+        for number, frames in ((1, range(0, 12, 3)), (2, range(1, 12, 6))):
+            own = tmp_path / "scenes" / room / f"seq-{number:02d}"
+            own.mkdir(parents=True)
+            for i in frames:
+                for end in ("depth.png", "pose.txt"):
+                    name = f"frame-{i:06d}.{end}"
+                    (own / name).write_bytes((source / name).read_bytes())
+        scene = tmp_path / "scenes" / room
+        camera = (building / room / "intrinsics.json").read_bytes()
+        (scene / "intrinsics.json").write_bytes(camera)
+        (scene / "TrainSplit.txt").write_text("sequence1\n")
+        (scene / "TestSplit.txt").write_text("sequence2\n")
+    found = evaluated(tmp_path, tmp_path / "scenes", "--model", model_file, "--jobs", 1)
+    assert found["counts"] == {"queries": 4, "database": 8, "left_out": 0}
+    assert set(found["scenes"]) == set(found["by_scene"]) == {"room-000", "room-001"}
+    each = [found["scenes"][room]["R"]["mean_overlap"] for room in found["scenes"]]
+    assert found["average"]["R"]["mean_overlap"] == pytest.approx(np.mean(each))
+    out = capsys.readouterr().out
+    assert "room-001, alone" in out
+    assert "Average" in out
+    assert "Combine" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{room}"], "Give --db and --queries"),
+        (["{room}", "--db", "0:4"], "--db is given without --queries"),
+        (["{room}", "--db", "0-4", "--queries", "5:6"], "is no range of frames"),
+        (["{room}", "--db", "0:4", "--queries", "5:99"], "outside its 12 frames"),
+        (["{room}", "--db", "0:4", "--queries", "3:6"], "chosen twice"),
+        (["{room}@db=0:4,queries=5:6", "--db", "0:4", "--queries", "5:6"], "Leave them out"),
+        (["{room}", "--db", "0:4", "--queries", "5:6", "--levels", "9"], "Choose from 1 to"),
+        (["{room}", "--db", "0:4", "--queries", "5:6", "--max-overlap", "2"], "--max-overlap"),
+        (["{room}", "--db", "0:4", "--queries", "5:6", "--metric", "l3"], "--metric"),
+        (["{room}", "--db", "0:4", "--queries", "5:6", "--db-step", "0"], "--db-step"),
+        (["/nowhere", "--db", "0:4", "--queries", "5:6"], "no such file or folder"),
+    ],
+)
+def test_wrong_options_are_one_line_and_exit_code_2(
+    arguments: list[str],
+    message: str,
+    building: Path,
+    model_file: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    filled = [a.format(room=building / "room-000") for a in arguments]
+    try:
+        code = main(["evaluate", *filled, "--model", str(model_file), "--jobs", "1"])
+    except SystemExit as stop:  # argparse's own way
+        code = int(str(stop.code))
+    assert code == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert lines[-1].startswith("sceneprint evaluate: ")
+    assert message in lines[-1]

@@ -1,0 +1,258 @@
+"""Rows, acceptance, places where queries are lost, diversity: each worked by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.evaluation.diversity import diversity, voxels
+from sceneprint.evaluation.lost import PLACES, lost, place_of
+from sceneprint.evaluation.measures import (
+    absent,
+    accuracy,
+    bound,
+    oracle_and_random,
+    rows,
+    validation,
+)
+from sceneprint.evaluation.pairs import seed_of, views_to_average
+from sceneprint.evaluation.records import Error, Outcome, Pair, pose_error
+from sceneprint.evaluation.report import average, measured, per_query, to_json, without_infinities
+from sceneprint.evaluation.table import table
+from sceneprint.types import Floats, Frame, Intrinsics
+
+MakePair = Callable[..., Pair]
+MakeOutcome = Callable[..., Outcome]
+
+
+def test_rows_of_three_queries(three: list[Outcome]) -> None:
+    found = rows(three)  # the third has no scene to be found in
+    assert found["R"] == {
+        "within_5cm_5deg": 0.0,
+        "within_10cm_10deg": 0.5,  # 7 cm, and a match of another scene
+        "median_translation_m": None,
+        "median_rotation_deg": None,
+        "top1_overlap_50": 0.5,  # 0.6 and 0
+        "top5_overlap_50": 1.0,  # 0.6, and 0.5 at rank 3
+        "top1_overlap_30": 0.5,
+        "mean_overlap": pytest.approx(0.3),
+        "right_scene": 0.5,
+    }
+    assert found["DR"]["top5_overlap_50"] == 1.0
+    assert found["DR"]["within_10cm_10deg"] == 0.5
+    # strong goes before weak: 2 cm, not 7; and 15 cm
+    assert found["VR"]["within_5cm_5deg"] == 0.5
+    assert found["VR"]["median_translation_m"] == pytest.approx(0.085)
+    # 4 cm and 6 degrees; nothing accepted
+    assert found["VDR"]["within_5cm_5deg"] == 0.0
+    assert found["VDR"]["within_10cm_10deg"] == 0.5
+    assert found["pose_average"]["within_5cm_5deg"] == 0.5
+    assert found["pose_average_vr"]["within_10cm_10deg"] == 0.5
+    assert bound(three)["VDR"]["within_5cm_5deg"] == 0.5  # 3 cm; nothing accepted
+    assert bound(three)["pose_average"]["within_5cm_5deg"] == 0.5
+
+
+def test_acceptance_of_three_queries(three: list[Outcome]) -> None:
+    found = validation(three)
+    assert (found["pairs"], found["accepted"], found["accepted_strong"]) == (7, 5, 2)
+    assert found["precision"] == pytest.approx(3 / 5)  # 15 cm, and another scene
+    assert found["precision_strong"] == 1.0
+    assert found["recall"] == pytest.approx(3 / 4)  # the ambiguous one was right
+    assert found["recall_overlap_30"] == pytest.approx(2 / 3)  # one overlaps by 20 %
+    assert (found["right_but_rejected"], found["right_but_ambiguous"]) == (0, 1)
+    assert found["pairs_of_other_scenes"] == 2
+    assert found["accepted_of_other_scenes"] == 1
+    assert found["accepted_strong_of_other_scenes"] == 0
+    assert absent(three) == {
+        "queries": 1,
+        "accepted_strong": 0.0,
+        "accepted_weak": 1.0,
+        "pairs": 1,
+        "pairs_accepted": 1,
+    }
+
+
+def test_chance_of_three_queries(three: list[Outcome]) -> None:
+    found = oracle_and_random(three)
+    assert found["oracle"]["mean_overlap"] == pytest.approx(0.55)
+    assert found["oracle"]["top1_overlap_50"] == 1.0
+    assert found["random"]["mean_overlap"] == pytest.approx((0.3 + 0.225) / 2)
+    assert found["random"]["top1_overlap_50"] == 0.25
+    assert found["random"]["top5_overlap_50"] == 1.0  # four frames: five hold them all
+
+
+def test_random_five(make_outcome: MakeOutcome, make_pair: MakePair) -> None:
+    # 2 of 10 overlap by half: five miss both with 8!/(3! 5!) / (10!/(5! 5!)) = 56 / 252
+    one = make_outcome([0], [0], [make_pair(0)], least=[0.6, 0.6] + [0.0] * 8)
+    found = oracle_and_random([one])["random"]["top5_overlap_50"]
+    assert found == pytest.approx(1 - 56 / 252)
+
+
+def test_where_three_queries_are_lost(three: list[Outcome]) -> None:
+    counts = lost(three)
+    assert list(counts) == list(PLACES)
+    assert sum(counts.values()) == 3
+    assert (counts["found"], counts["ambiguous"], counts["wrongly_accepted"]) == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("place", "status", "off", "least", "ranking", "selection"),
+    [
+        ("found", "accepted", Error(0.09, 0.1), [0.4, 0.4], [0, 1], [0]),
+        ("near", "accepted", Error(0.09, 0.2), [0.4, 0.4], [0, 1], [0]),
+        ("near", "accepted", Error(0.19, 0.1), [0.0, 0.0], [0, 1], [0]),
+        ("wrongly_accepted", "accepted", Error(0.21, 0.1), [0.4, 0.4], [0, 1], [0]),
+        ("nothing_overlaps", "rejected", None, [0.29, 0.29], [0, 1], [0]),
+        ("not_in_r", "rejected", None, [0.0, 0.3], [0], [0]),
+        ("not_in_c", "rejected", None, [0.0, 0.3], [0, 1], [0]),
+        ("rejected", "rejected", None, [0.3, 0.0], [0, 1], [0]),
+        ("ambiguous", "ambiguous", None, [0.3, 0.0], [0, 1], [0]),
+        ("not_in_c", "ambiguous", None, [0.2, 0.3], [0, 1], [0]),
+    ],
+)
+def test_each_place(
+    place: str,
+    status: str,
+    off: Error | None,
+    least: list[float],
+    ranking: list[int],
+    selection: list[int],
+    make_outcome: MakeOutcome,
+    make_pair: MakePair,
+) -> None:
+    pairs = [make_pair(0, status, off=off), make_pair(1, "rejected")]
+    assert place_of(make_outcome(ranking, selection, pairs, least=least)) == place
+
+
+def test_views_to_average(make_pair: MakePair) -> None:
+    pairs = [
+        make_pair(0, strength="weak"),
+        make_pair(1, scene="there"),
+        make_pair(2, "rejected"),
+        make_pair(3),
+    ]
+    assert [p.match for p in views_to_average(pairs)] == [3, 0]
+    # as many views: the scene of the most believed one
+    assert [p.match for p in views_to_average(pairs[:2])] == [1]
+    assert len(views_to_average([make_pair(i) for i in range(9)])) == 5
+    assert views_to_average([pairs[2]]) == []
+
+
+def test_pose_error() -> None:
+    truth: Floats = np.eye(4)
+    truth[:3, 3] = (1, 2, 3)
+    off = truth.copy()
+    c, s = math.cos(0.3), math.sin(0.3)
+    off[:3, :3] = [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+    off[:3, 3] += (0.03, 0.0, 0.04)
+    found = pose_error(off, truth)
+    assert (found.metres, found.radians) == (pytest.approx(0.05), pytest.approx(0.3))
+    half_turn = np.diag([-1.0, -1, 1, 1])
+    assert pose_error(half_turn, np.eye(4)).radians == pytest.approx(math.pi)
+    assert pose_error(truth, truth) == Error(0.0, 0.0)
+
+
+def test_seeds_depend_on_the_names_alone() -> None:
+    assert seed_of(0, "a", "b") == seed_of(0, "a", "b")
+    assert len({seed_of(s, q, m) for s in range(3) for q in "ab" for m in "ab"}) == 12
+    assert 0 <= seed_of(0, "a", "b") < 2**32
+
+
+CAMERA = Intrinsics(40, 4, 100.0, 100.0, 0.0, 0.0)
+
+
+def dots(*columns: int, shift: float = 0.0, depth: float = 1.01) -> Frame:
+    """Single samples in the first row: 10 columns are five voxels at 1 m."""
+    image = np.zeros((4, 40), np.float32)
+    image[0, list(columns)] = depth
+    pose: Floats = np.eye(4)
+    pose[0, 3] = shift
+    return Frame(image, CAMERA, "dots", pose)
+
+
+def test_voxels_by_hand() -> None:
+    assert len(voxels(dots(0, 10, 20))) == 3
+    assert len(voxels(dots(0, 1, 11, 21))) == 1  # odd columns are not looked at
+    assert len(voxels(dots(0, 2, depth=0.5))) == 1  # 1 cm apart
+    assert len(voxels(dots(0, depth=4.1))) == 0
+    assert set(voxels(dots(10))) == set(voxels(dots(0, shift=0.101)))
+
+
+def test_diversity_by_hand(make_outcome: MakeOutcome, make_pair: MakePair) -> None:
+    database = [dots(0), dots(0), dots(0, 10), dots(0, 10, 20), dots(30)]
+    poses: list[Floats] = [np.eye(4) for _ in database]
+    for pose, x in zip(poses, (1.0, 2.0, 4.0, 8.0, 16.0), strict=True):
+        pose[0, 3] = x
+    one = make_outcome(
+        [0, 1, 2, 3, 4],
+        [0, 3, 4],
+        [make_pair(i) for i in range(4)] + [make_pair(4, scene="there")],
+    )
+    found = diversity([one], poses, database.__getitem__)
+    # R has three candidates at 1, 2, 4 m; C 1 and 8 m, and one of another scene
+    spread = math.sqrt(((1 - 7 / 3) ** 2 + (2 - 7 / 3) ** 2 + (4 - 7 / 3) ** 2) / 3)
+    assert found["translation"]["R"] == {
+        "mean_m": pytest.approx(7 / 3),
+        "std_m": pytest.approx(spread),
+    }
+    assert found["translation"]["DR"] == {"mean_m": 4.5, "std_m": 3.5}
+    # as many views of either: 1, 2 m and 1, 8 m
+    assert found["translation"]["VR"] == {"mean_m": 1.5, "std_m": 0.5}
+    assert found["translation"]["VDR"] == {"mean_m": 4.5, "std_m": 3.5}
+    assert found["coverage"] == {"VR": 1.0, "VDR": 3.0, "ratio_of_means": 3.0, "mean_ratio": 3.0}
+    assert (found["queries"], found["queries_validated"]) == (1, 1)
+
+
+def test_without_anything_to_count_there_is_null(
+    make_outcome: MakeOutcome, make_pair: MakePair
+) -> None:
+    away = make_outcome([0], [0], [make_pair(0, "rejected", scene="there")], present=False)
+
+    def nothing(match: int) -> Frame:
+        raise AssertionError("no depth is needed")
+
+    found = measured([away], [np.eye(4)], nothing)
+    assert found["R"]["within_5cm_5deg"] is None
+    assert found["R"]["mean_overlap"] is None
+    assert found["validation"]["precision"] is None
+    assert found["diversity"]["coverage"]["VR"] is None
+    assert found["lost"]["rejected"] == 1 or found["lost"]["nothing_overlaps"] == 1
+    assert accuracy([])["median_translation_m"] is None
+
+
+def test_json_has_null_for_what_is_infinite(three: list[Outcome]) -> None:
+    names = ["a", "b", "c", "d"]
+    found = without_infinities({"per_query": [per_query(one, names) for one in three]})
+    read = json.loads(to_json(found))
+    assert read["per_query"][1]["R"]["translation_m"] is None
+    assert read["per_query"][1]["VDR"] is None
+    assert read["per_query"][0]["VDR"]["match"] == "c"
+    assert read["per_query"][0]["pose_average"]["translation_m"] == pytest.approx(0.01)
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        to_json({"x": math.nan})
+
+
+def test_average_of_scenes(three: list[Outcome]) -> None:
+    poses = [np.eye(4)] * 4
+    first = measured(three[:1], poses, lambda match: dots(match))
+    second = measured(three[1:2], poses, lambda match: dots(match))
+    found = average([first, second])
+    assert found["VR"]["within_5cm_5deg"] == 0.5
+    assert found["VDR"]["median_translation_m"] is None  # the second scene found nothing
+    assert found["R"]["mean_overlap"] == pytest.approx(0.3)
+
+
+def test_table_reads_well(three: list[Outcome]) -> None:
+    found: dict[str, Any] = measured(three, [np.eye(4)] * 4, lambda match: dots(match))
+    found["left_out"] = [{"name": "a\nb", "reason": "dark"}, {"name": "c", "reason": "dark"}]
+    found["milliseconds"] = {"rank": 1.0, "validate": None}
+    lines = table(found)
+    assert not [line for line in lines if "nan" in line or "\n" in line]
+    assert lines[2].split() == ["VR", "0.500", "0.500", "8.5", "0.5"]
+    assert "queries       1 found, 1 wrongly accepted, 1 ambiguous" in lines
+    assert lines[-2].startswith("left out      'a\\nb': dark; and 1 more")
