@@ -9,6 +9,7 @@ a normal 2 x 16 bits on an octahedron.
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 
@@ -27,7 +28,10 @@ SCHEMA_VERSION = 1
 _HEAD, _BODY = struct.Struct("<5sHI"), struct.Struct("<HHHH5d32s")
 #: Bytes of a patch beside its descriptor: mean, normal, area, coherence as float32, and its size.
 _PATCH = np.dtype(
-    [("mean", "<f4", 3), ("normal", "<f4", 3), ("area", "<f4"), ("coherence", "<f4"), ("size", "<i4")]
+    [
+        ("mean", "<f4", 3), ("normal", "<f4", 3), ("area", "<f4"), ("coherence", "<f4"),
+        ("size", "<i4"),
+    ]
 )  # fmt: skip
 
 
@@ -47,8 +51,9 @@ def _pack(points: Floats32, normals: Floats32, scale: float, out: NDArray[np.uin
             total = abs(nx) + abs(ny) + abs(nz)
             u, v = nx / total, ny / total
             if nz > 0:  # normals face the sensor, -z: that half is the middle of the square
-                u, v = (1.0 - abs(v)) * (1.0 if u >= 0 else -1.0), (1.0 - abs(u)) * (
-                    1.0 if v >= 0 else -1.0
+                u, v = (
+                    (1.0 - abs(v)) * (1.0 if u >= 0 else -1.0),
+                    (1.0 - abs(u)) * (1.0 if v >= 0 else -1.0),
                 )
             out[y, x, 1] = np.uint16(round((u * 0.5 + 0.5) * 65535.0))
             out[y, x, 2] = np.uint16(round((v * 0.5 + 0.5) * 65535.0))
@@ -71,8 +76,9 @@ def _unpack(
             u, v = packed[y, x, 1] / 65535.0 * 2.0 - 1.0, packed[y, x, 2] / 65535.0 * 2.0 - 1.0
             nz = -(1.0 - abs(u) - abs(v))
             if nz > 0:
-                u, v = (1.0 - abs(v)) * (1.0 if u >= 0 else -1.0), (1.0 - abs(u)) * (
-                    1.0 if v >= 0 else -1.0
+                u, v = (
+                    (1.0 - abs(v)) * (1.0 if u >= 0 else -1.0),
+                    (1.0 - abs(u)) * (1.0 if v >= 0 else -1.0),
                 )
             length = np.sqrt(u * u + v * v + nz * nz)
             u, v, nz = u / length, v / length, nz / length
@@ -146,6 +152,11 @@ def read_geometry(data: bytes) -> Geometry:
         camera = Intrinsics(width, height, fx, fy, cx, cy)
     except InvalidIntrinsics as error:
         raise UnreadableGeometry(f"The geometry artifact has no camera: {error}") from error
+    if not (math.isfinite(scale) and scale > 0):
+        raise UnreadableGeometry(
+            f"The geometry artifact has {scale} for its scale of depth. "
+            "Sign the frame again from its upload."
+        )
     packed = np.frombuffer(body[ends[0] : ends[1]], "<u2").reshape(height, width, 3)
     rows = np.frombuffer(body[ends[1] : ends[2]], _PATCH)
     descriptors: Bytes = np.frombuffer(body[ends[2] :], np.uint8).reshape(count, length)

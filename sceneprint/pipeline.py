@@ -1,7 +1,7 @@
 """The paper's Fig. 1 as functions, one line a stage.
 
-    frame --prepare--> signature, geometry
-    signature, database --retrieve--> R --diversify--> C --associate--> C_vld --locate--> pose
+frame --prepare--> signature, geometry
+signature, database --retrieve--> R --diversify--> C --associate--> C_vld --locate--> pose
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.errors import ModelMismatch
-from sceneprint.geometry.association import preferred
+from sceneprint.geometry.association import preferred, voters
 from sceneprint.geometry.averaging import PoseAverage, average_poses
 from sceneprint.geometry.diversity import DiversityParameters, Selection
 from sceneprint.geometry.diversity import diversify as select
@@ -32,6 +32,7 @@ from sceneprint.signing import Signature, Signer, encode, hierarchy_of, open_sig
 from sceneprint.types import Bytes, Floats, Frame, Geometry, Surface
 
 __all__ = [
+    "Location",
     "Match",
     "Signature",
     "Signer",
@@ -63,6 +64,20 @@ class Match:
     distance: int
     similarity: float
     validation: Validation
+
+
+@dataclass(frozen=True, eq=False)
+class Location:
+    """Where a query was taken.
+
+    Parameters
+    ----------
+    parent : frame in which the pose is given
+    average : T_parent_query with the spread of the votes and how many agree
+    """
+
+    parent: str
+    average: PoseAverage
 
 
 def sign(frame: Frame, signer: Signer) -> Signature:
@@ -138,7 +153,8 @@ def retrieve(
     for one in database:
         _same_model(query, one)
     size = ranking_size(len(database)) if size is None else size
-    return rank(distances(query.vector, _stacked(database)), size, model.unrelated_distance)
+    stored = _stacked(database) if database else np.empty((0, len(query.vector)), np.uint8)
+    return rank(distances(query.vector, stored), size, model.unrelated_distance)
 
 
 def diversify(
@@ -161,7 +177,7 @@ def diversify(
     selection : positions in R, the top-ranked first, in the order of R
     """
     among = pairwise_distances(_stacked([database[i] for i in ranking.indices]))
-    return select(ranking.distances.astype(float), among.astype(float), k, p)
+    return select(ranking.distances, among, k, p)
 
 
 def validate(
@@ -206,14 +222,21 @@ def associate(
     ranking : R
     among : positions in R to try, rising: C, or the first of R
     open_geometry : artifact of a row of the database
-    k : accepted ones after which to stop
+    k : accepted ones after which to stop, at least 1
     seed, p, mode : see `validate`
 
     Returns
     -------
     matches : all that were tried: C_vld first, strong before weak, each in the order of R; then
         those that were not accepted
+
+    Raises
+    ------
+    ModelMismatch : artifacts of two models.
+    ValueError : k below 1.
     """
+    if k < 1:
+        raise ValueError(f"k = {k}: ask for 1 match or more")
     tried: list[Match] = []
     accepted = 0
     for position in among:
@@ -235,25 +258,34 @@ def associate(
     return [tried[i] for i in [*first, *rest]]
 
 
-def locate(matches: Sequence[Match], poses: Sequence[Floats], views: int = 5) -> PoseAverage | None:
+def locate(
+    matches: Sequence[Match],
+    poses: Sequence[Floats],
+    parents: Sequence[str] | None = None,
+    views: int = 5,
+) -> Location | None:
     """Pose of the query: robust average over up to five validated views.
 
     Parameters
     ----------
     matches : of `associate`
-    poses : T_parent_sensor (4, 4) of every row of the database, all in one parent frame
+    poses : T_parent_sensor (4, 4) of every row of the database
+    parents : parent frame of every row; default: one for all. Poses are combined within one
+        parent frame only, that of most of the matches
     views : most that are averaged
 
     Returns
     -------
-    average : T_parent_query and the spread of the votes; None where nothing was accepted
+    location : or None where nothing was accepted
     """
-    votes = [
-        poses[match.index] @ match.validation.T_match_query
-        for match in matches
-        if match.validation.status == "accepted" and match.validation.T_match_query is not None
-    ]
-    return average_poses(np.stack(votes[:views])) if votes else None
+    accepted = [m for m in matches if m.validation.status == "accepted"]
+    names = [parents[m.index] if parents is not None else "" for m in accepted]
+    chosen = voters(names, [m.validation.strength == "strong" for m in accepted], views)
+    transforms = [(accepted[i].index, accepted[i].validation.T_match_query) for i in chosen]
+    votes = [poses[index] @ T for index, T in transforms if T is not None]
+    if not votes:
+        return None
+    return Location(names[chosen[0]], average_poses(np.stack(votes)))
 
 
 def _stacked(signatures: Sequence[Signature]) -> Bytes:

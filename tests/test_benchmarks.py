@@ -1,4 +1,4 @@
-"""The measurements themselves: overlap by hand, and a missing open3d that stops nothing."""
+"""The measurements themselves: recall by hand, and a missing open3d that stops nothing."""
 
 from __future__ import annotations
 
@@ -11,27 +11,10 @@ import pytest
 from benchmarks.__main__ import table
 from benchmarks.encode import measure
 from benchmarks.machine import peak_megabytes_of_signing
-from benchmarks.overlap import overlaps
 from benchmarks.retrieval import recall_at_10
 from sceneprint.datasets import Camera, write_depth_png, write_intrinsics
 from sceneprint.pipeline import Signer
-from sceneprint.types import Floats, Frame, Intrinsics
-
-CAMERA = Intrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
-
-
-def wall(shift: float = 0.0, distance: float = 2.0) -> Frame:
-    """A wall across the whole image, seen from `shift` metres to the right."""
-    pose: Floats = np.eye(4)
-    pose[0, 3] = shift
-    return Frame(np.full((60, 80), distance, np.float32), CAMERA, pose=pose)
-
-
-def test_overlap_by_hand() -> None:
-    # the grid has 4 columns at 10, 30, 50, 70; 2 m away, 40 px are 40 / 70 * 2 m: two columns
-    half = 40 / 70 * 2
-    found = overlaps([wall()], [wall(), wall(half), wall(100.0), wall(0.0, 3.0)])
-    np.testing.assert_allclose(found, [[1.0, 0.5, 0.0, 0.0]], atol=1e-12)
+from sceneprint.types import Frame
 
 
 def test_recall_by_hand() -> None:

@@ -16,15 +16,14 @@ import sceneprint
 from sceneprint.errors import ModelMismatch, UselessFrame
 from sceneprint.geometry.encoding import quantise
 from sceneprint.models import Model, save_model
-from sceneprint.pipeline import (
+from sceneprint.pipeline import distance, sign
+from sceneprint.signing import (
     Signer,
     describe,
-    distance,
     encode,
     exact_statistics,
     float_signature,
     open_signer,
-    sign,
     table_statistics,
 )
 from sceneprint.types import Frame, Intrinsics

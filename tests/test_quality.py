@@ -11,7 +11,7 @@ import pytest
 from benchmarks.retrieval import measure
 from benchmarks.roll import shares_of_d0, view
 from sceneprint.datasets import FrameReference, find_sequences
-from sceneprint.pipeline import (
+from sceneprint.signing import (
     Signer,
     describe,
     exact_statistics,

@@ -11,9 +11,11 @@ from sceneprint.errors import TrainingError
 from sceneprint.geometry.bins import TableLayout
 from sceneprint.geometry.hierarchy import HierarchyParameters
 from sceneprint.geometry.mixture import MixtureParameters
-from sceneprint.geometry.segmentation import SegmentationParameters
+from sceneprint.geometry.segmentation import SegmentationParameters, patches_of, segment
+from sceneprint.geometry.surroundings import surroundings
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import distance, open_signer, sign
+from sceneprint.signing import see
 from sceneprint.synth import synthesise_room
 from sceneprint.training import TrainingParameters, preset_parameters, train
 
@@ -57,6 +59,22 @@ def test_quantiser_and_d0_fit_new_rooms(trained: tuple[Model, object]) -> None:
     assert stored.astype(int).std() > 10  # the bytes are used
 
 
+def test_descriptors_are_learnt_from_the_rooms(trained: tuple[Model, object]) -> None:
+    model = trained[0]
+    axes = model.compression.matrix.astype(float)
+    assert axes.shape == (128, model.parameters.surroundings.dimension)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(128), atol=1e-5)
+    # of rooms it never saw the axes keep most of what differs, and random ones would not
+    seen = [see(synthesise_room(99, i, 1).frames[0], model.parameters) for i in range(4)]
+    p = model.parameters
+    patches = [patches_of(one, segment(one, p.validation_segmentation)) for one in seen]
+    rows = np.concatenate([surroundings(one, p.surroundings) for one in patches])
+    left = rows - rows.mean(axis=0)
+    assert ((left @ axes.T) ** 2).sum() / (left**2).sum() > 0.5  # measured: 0.62
+    random = np.linalg.qr(np.random.default_rng(0).normal(size=axes.T.shape))[0].T
+    assert ((left @ random.T) ** 2).sum() / (left**2).sum() < 0.2
+
+
 def test_provenance_says_what_it_saw(trained: tuple[Model, object]) -> None:
     seen = trained[0].provenance
     assert (seen["frames_used"], seen["own_frames"]) == (8, 0)
@@ -70,6 +88,7 @@ def test_provenance_says_what_it_saw(trained: tuple[Model, object]) -> None:
         (replace(TRAINING, rooms=0), "0 usable frames of fewer than two places"),
         (replace(TRAINING, rooms=1), "2 usable frames of fewer than two places"),
         (replace(TRAINING, pairs=100), "too few for 16 components"),
+        (replace(TRAINING, rooms=2, views=1), r"^\d{3} patches are too few to learn what 927 bins"),
     ],
 )
 def test_too_little_data(parameters: TrainingParameters, message: str) -> None:

@@ -27,7 +27,7 @@ _SPLIT_FILES: tuple[tuple[str, Split], ...] = (
 _COLOUR_FOLDERS = ("rgb", "color", "colour")
 
 
-def find_sequences(path: Path) -> tuple[Sequence, ...]:
+def find_sequences(path: Path | str) -> tuple[Sequence, ...]:
     """Return the sequences at a path or up to 4 folders below it; no frame is read.
 
     Understood are a 7-Scenes sequence or scene (with TrainSplit.txt, TestSplit.txt), a TUM
@@ -51,6 +51,7 @@ def find_sequences(path: Path) -> tuple[Sequence, ...]:
     InvalidPose : a groundtruth.txt holds a line that is no pose.
     """
     # a name such as .. is none; a symlink's own name is what the user knows it by
+    path = Path(path)
     root = path.resolve() if ".." in path.parts else path.absolute()
     if root.is_file():
         return (_single(root),)

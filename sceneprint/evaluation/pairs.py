@@ -6,7 +6,6 @@ Task  --judge-->  Judged: pairs, averaged poses
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -16,6 +15,7 @@ import numpy as np
 
 from sceneprint.evaluation.frames import Store
 from sceneprint.evaluation.records import VIEWS, Error, Pair, in_preferred_order, pose_error
+from sceneprint.geometry.association import voters
 from sceneprint.geometry.averaging import average_poses
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation import Mode, refined_at
@@ -107,19 +107,15 @@ def seed_of(seed: int, query: str, match: str) -> int:
 def views_to_average(pairs: Sequence[Pair]) -> list[Pair]:
     """The first accepted views of the scene with most accepted views, strong ones first.
 
-    Poses are comparable within one scene only. Of two scenes with as many views the one of the
-    most believed view wins.
+    Poses are comparable within one scene only; see `voters`.
 
     Parameters
     ----------
     pairs : of a query, in the order of R
     """
     believed = in_preferred_order(pairs)
-    if not believed:
-        return []
-    votes = Counter(pair.scene for pair in believed)  # keeps the order of first votes
-    scene = max(votes, key=votes.__getitem__)
-    return [pair for pair in believed if pair.scene == scene][:VIEWS]
+    sure = [pair.validation.strength == "strong" for pair in believed]
+    return [believed[i] for i in voters([p.scene for p in believed], sure, VIEWS)]
 
 
 def judge(judging: Judge, task: Task) -> Judged:

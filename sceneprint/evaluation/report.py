@@ -15,7 +15,7 @@ import numpy as np
 from sceneprint.evaluation.diversity import diversity
 from sceneprint.evaluation.lost import lost, place_of
 from sceneprint.evaluation.measures import absent, bound, oracle_and_random, rows, validation
-from sceneprint.evaluation.records import Error, Outcome
+from sceneprint.evaluation.records import Error, Outcome, Pair
 from sceneprint.evaluation.run import Evaluation
 from sceneprint.types import Floats, Frame
 
@@ -68,6 +68,7 @@ def figures(
     found["milliseconds"] = {"prepare": prepared.milliseconds} | milliseconds(evaluation.outcomes)
     names = [member.name for member in prepared.database]
     found["per_query"] = [per_query(outcome, names) for outcome in evaluation.outcomes]
+    found["mistakes"] = mistakes(evaluation.outcomes, names)
     cleaned: dict[str, Any] = without_infinities(found)
     return cleaned
 
@@ -124,10 +125,33 @@ def per_query(outcome: Outcome, names: Sequence[str]) -> dict[str, Any]:
     }
 
 
+def mistakes(outcomes: Sequence[Outcome], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Pairs that were accepted with a wrong transform, or not accepted with a right one."""
+    return [
+        {
+            "query": outcome.name,
+            "same_scene": pair.same_scene,
+            "overlap_least": pair.overlap_least,
+            "residual_m": pair.validation.residual_m,
+            "residual_rad": pair.validation.residual_rad,
+            "agreement": pair.validation.overlap,
+            "plane_agreement": pair.validation.plane_overlap,
+            "violations": pair.validation.violations,
+            **_described(pair, names),
+        }
+        for outcome in outcomes
+        for pair in outcome.pairs.values()
+        if pair.accepted != pair.right
+    ]
+
+
 def _answer(outcome: Outcome, first: list[int], names: Sequence[str]) -> dict[str, Any] | None:
     if not first:
         return None
-    pair = outcome.pairs[first[0]]
+    return _described(outcome.pairs[first[0]], names)
+
+
+def _described(pair: Pair, names: Sequence[str]) -> dict[str, Any]:
     v = pair.validation
     return {
         "match": names[pair.match],

@@ -26,16 +26,17 @@ class AgreementParameters:
     normal_cosine: float = 0.7  #: of the angle between normals that agree
     free_space_margin: float = 0.1  #: before the surface, metres
     reference_depth: float = 5.0**0.5  #: where a depth sensor's noise starts to matter, metres
+    edge_px: int = 2  #: a violation keeps this far from any pixel that agrees, pixels
     stride: int = 5  #: of the pixels that are looked up
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Weights of the source's points; where each weighs 1, their numbers."""
+    """Counts of the source's points."""
 
-    points: float  #: all of them
-    inliers: float  #: that lie on the target's surface, normals alike
-    violations: float  #: that lie where the target saw through
+    points: int  #: all of them
+    inliers: int  #: that lie on the target's surface, normals alike
+    violations: int  #: that lie where the target saw through
 
 
 def sampled(surface: Surface, stride: int) -> Floats32:
@@ -60,7 +61,7 @@ def weigh_agreement(
     """Weight of inliers and of violations of the source (N, 6) on the target's maps under T."""
     height, width = points.shape[0], points.shape[1]
     on_surface, on_point, least_cosine = tolerances[0], tolerances[1], tolerances[2]
-    margin, reference = tolerances[3], tolerances[4]
+    margin, reference, edge = tolerances[3], tolerances[4], int(tolerances[5])
     inliers, violations = 0.0, 0.0
     for i in range(len(source)):
         px, py, pz = source[i, 0], source[i, 1], source[i, 2]
@@ -92,10 +93,10 @@ def weigh_agreement(
                 inliers += weights[i]
                 continue
         if dz < -margin * grow and plane > margin * grow:
-            # at an edge, the next pixel may show the surface that the point is on
+            # at an edge, a pixel near by may show the surface that the point is on
             nearest = tz
-            for line_ in range(max(v - 1, 0), min(v + 2, height)):
-                for column_ in range(max(u - 1, 0), min(u + 2, width)):
+            for line_ in range(max(v - edge, 0), min(v + edge + 1, height)):
+                for column_ in range(max(u - edge, 0), min(u + edge + 1, width)):
                     there = points[line_, column_, 2]
                     if there > 0:
                         nearest = min(nearest, there)
@@ -104,36 +105,62 @@ def weigh_agreement(
     return inliers, violations
 
 
+@kernel
+def _weigh_all(
+    source: Floats32, weights: Floats32, points: Floats32, normals: Floats32, camera: Floats,
+    transforms: Floats, tolerances: Floats, out: Floats,
+) -> None:  # fmt: skip
+    for k in range(len(transforms)):
+        inliers, violations = weigh_agreement(
+            source, weights, points, normals, camera, transforms[k], tolerances
+        )
+        out[k, 0] = inliers
+        out[k, 1] = violations
+
+
 def tolerances(p: AgreementParameters) -> Floats:
     """The parameters as the kernel takes them."""
     return np.array(
         [
             p.surface_tolerance, p.point_tolerance, p.normal_cosine,
-            p.free_space_margin, p.reference_depth,
+            p.free_space_margin, p.reference_depth, p.edge_px,
         ]
     )  # fmt: skip
 
 
-def agreement(
+def agreements(
     source: Floats32,
     target: Surface,
-    T_target_source: Floats,
+    transforms: Floats,
     p: AgreementParameters,
     weights: Floats32 | None = None,
-) -> Agreement:
-    """How a source's points fit what the target saw: Sec. III-E.
+) -> Floats:
+    """How a source's points fit what the target saw, under each of some transforms: Sec. III-E.
 
     Parameters
     ----------
     source : (N, 6) float32 of `sampled`
     target : (h, w) surface
-    T_target_source : (4, 4)
+    transforms : (n, 4, 4) T_target_source
     p : see AgreementParameters
     weights : (N,) of the points; default: 1 each
+
+    Returns
+    -------
+    (n, 2) weight of the inliers, and of the violations
     """
+    out = np.zeros((len(transforms), 2))
     w = np.ones(len(source), np.float32) if weights is None else weights
-    inliers, violations = weigh_agreement(
+    _weigh_all(
         source, w, target.points, target.normals, camera_of(target.intrinsics),
-        T_target_source, tolerances(p),
+        np.ascontiguousarray(transforms), tolerances(p), out,
     )  # fmt: skip
-    return Agreement(float(w.sum(dtype=float)), inliers, violations)
+    return out
+
+
+def agreement(
+    source: Floats32, target: Surface, T_target_source: Floats, p: AgreementParameters
+) -> Agreement:
+    """How a source's points fit what the target saw under one transform; see `agreements`."""
+    (inliers, violations) = agreements(source, target, T_target_source[None], p)[0].tolist()
+    return Agreement(len(source), round(inliers), round(violations))

@@ -1,4 +1,4 @@
-"""Sec. III-E, one direction: two frames to the transform that explains them best, and what else was found.
+"""Sec. III-E, one direction: two frames to the transform that explains them best, and to others.
 
 Geometry, Geometry  --align-->  Alignment
 """
@@ -10,22 +10,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sceneprint.geometry.agreement import (
-    AgreementParameters,
-    camera_of,
-    weigh_agreement,
-    sampled,
-    tolerances,
-)
+from sceneprint.geometry.agreement import AgreementParameters, agreements, sampled
 from sceneprint.geometry.consensus import ConsensusParameters, consensus
 from sceneprint.geometry.matching import MatchingParameters, correspondences
 from sceneprint.geometry.registration import (
     COARSE,
     FINE,
     RefinementParameters,
-    numbers_of,
     refine,
-    refine_in_place,
+    refined_all,
 )
 from sceneprint.geometry.rigid import difference
 from sceneprint.types import Floats, Floats32, Geometry, Surface
@@ -111,14 +104,8 @@ def _scores(
     points: Floats32, target: Surface, transforms: Floats,
     p: AlignmentParameters, agreement_p: AgreementParameters,
 ) -> Floats:  # fmt: skip
-    camera, limits = camera_of(target.intrinsics), tolerances(agreement_p)
-    ones = np.ones(len(points), np.float32)
-    scores = np.empty(len(transforms))
-    for k, T in enumerate(transforms):
-        inliers, violations = weigh_agreement(
-            points, ones, target.points, target.normals, camera, T, limits
-        )
-        scores[k] = inliers - p.violation_weight * violations
+    counts = agreements(points, target, transforms, agreement_p)
+    scores: Floats = counts[:, 0] - p.violation_weight * counts[:, 1]
     return scores
 
 
@@ -135,17 +122,3 @@ def _distinct(hypotheses: Floats, scores: Floats, p: AlignmentParameters) -> lis
         if len(chosen) == p.n_refined:
             break
     return chosen
-
-
-def refined_all(
-    source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
-) -> Floats:
-    """Each of the hypotheses (n, 4, 4) refined; those that lose the surface are left out."""
-    points, camera = sampled(source, p.stride), camera_of(target.intrinsics)
-    numbers, information = numbers_of(p), np.zeros((6, 6))
-    kept = []
-    for hypothesis in hypotheses:
-        T = hypothesis.copy()
-        if refine_in_place(points, target.points, target.normals, camera, T, numbers, information):
-            kept.append(T)
-    return np.array(kept).reshape(-1, 4, 4)

@@ -1,6 +1,6 @@
-"""Sec. III-E, association: which validated candidates to believe first.
+"""Sec. III-E, association: which validated candidates to believe first, and which vote together.
 
-validations  --preferred-->  C_vld
+validations  --preferred-->  C_vld        parent frames of C_vld  --voters-->  some of them
 """
 
 from __future__ import annotations
@@ -22,3 +22,29 @@ def preferred(validations: Sequence[Validation]) -> list[int]:
     """
     accepted = [i for i, v in enumerate(validations) if v.status == "accepted"]
     return sorted(accepted, key=lambda i: validations[i].strength != "strong")
+
+
+def voters(parents: Sequence[str], strong: Sequence[bool], most: int = 5) -> list[int]:
+    """Positions of the matches whose poses may be averaged: those of one parent frame.
+
+    The parent frame with most strong matches votes, and of equals the one with most matches; of
+    these, the one whose match comes first.
+
+    Parameters
+    ----------
+    parents : parent frames of accepted matches, in the order of `preferred`
+    strong : which of them are strong
+    most : votes that are taken, the first ones
+
+    Raises
+    ------
+    ValueError : not one for one.
+    """
+    votes: dict[str, tuple[int, int]] = {}
+    for parent, sure in zip(parents, strong, strict=True):
+        known = votes.get(parent, (0, 0))
+        votes[parent] = (known[0] + sure, known[1] + 1)
+    winner = max(
+        votes, key=votes.__getitem__, default=None
+    )  # the first of equals, as dicts keep it
+    return [i for i, parent in enumerate(parents) if parent == winner][:most]

@@ -1,6 +1,6 @@
 """Several validated views, one pose: the votes of the matches averaged robustly.
 
-    poses (n, 4, 4)  --average_poses-->  PoseAverage
+poses (n, 4, 4)  --average_poses-->  PoseAverage
 """
 
 from __future__ import annotations

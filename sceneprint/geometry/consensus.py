@@ -209,6 +209,8 @@ def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParam
     -------
     (S, 4, 4) at most `n_seeds` transforms T_target_source; none where no three agree
     """
+    if len(pairs) < 3:
+        return np.empty((0, 4, 4))
     a = np.ascontiguousarray(source.means[pairs[:, 0]])
     n = np.ascontiguousarray(source.normals[pairs[:, 0]])
     b = np.ascontiguousarray(target.means[pairs[:, 1]])

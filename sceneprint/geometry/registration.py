@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sceneprint.geometry.agreement import camera_of
+from sceneprint.geometry.agreement import camera_of, sampled
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.rigid import solve_positive, turned
 from sceneprint.types import Floats, Floats32, Surface
@@ -31,6 +31,8 @@ class RefinementParameters:
     minimum_points: int = 20  #: fewer fix no transform
 
 
+#: To see whether it leads anywhere.
+QUICK = RefinementParameters(10, 4, 0.25, 0.15)
 #: For hypotheses: few points, wide gates.
 COARSE = RefinementParameters(5, 8, 0.25, 0.08)
 #: For the best of them.
@@ -196,3 +198,17 @@ def refine(
         numbers_of(p), information,
     )  # fmt: skip
     return Refined(T, information, used) if used else None
+
+
+def refined_all(
+    source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
+) -> Floats:
+    """Each of the hypotheses (n, 4, 4) refined; those that lose the surface are left out."""
+    points, camera = sampled(source, p.stride), camera_of(target.intrinsics)
+    numbers, information = numbers_of(p), np.zeros((6, 6))
+    kept = []
+    for hypothesis in hypotheses:
+        T = hypothesis.copy()
+        if refine_in_place(points, target.points, target.normals, camera, T, numbers, information):
+            kept.append(T)
+    return np.array(kept).reshape(-1, 4, 4)

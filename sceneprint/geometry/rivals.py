@@ -6,8 +6,8 @@ A lone box looks the same from its four sides, a corridor the same at every door
 such a place agree perfectly under a wrong transform, and nothing in the residual, the overlap or
 the free space shows it. What does show is that *another* transform is not refuted either. So
 rivals are looked for: the other hypotheses that correspondences voted for, and the transform
-found, turned by quarter turns about the normals of the main planes, which is how rooms and what
-stands in them repeat.
+found, turned by quarter turns about the normals of the main planes or shifted along them, which
+is how rooms and what stands in them repeat.
 
 What a rival agrees on counts by planes, each plane as much as another however large: that a floor
 lies on a floor says little, wherever on it one stands.
@@ -20,8 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sceneprint.geometry.rigid import difference
-from sceneprint.types import Floats, Floats32, Patches
+from sceneprint.geometry.agreement import AgreementParameters, agreements
+from sceneprint.geometry.registration import COARSE, QUICK, RefinementParameters, refined_all
+from sceneprint.types import Floats, Floats32, Geometry, Patches
 
 
 @dataclass(frozen=True)
@@ -31,14 +32,25 @@ class RivalParameters:
     n_axes: int = 2  #: directions that most surface faces
     n_planes: int = 3  #: planes across each, by area
     same_direction: float = math.radians(12.0)  #: normals this near are parallel
+    shift: float = 0.5  #: steps along a corridor, metres: what refinement can bridge
+    n_shifts: int = 6  #: each way
+    least_crossing: float = 0.5  #: sine of the angle between the main families of planes
     coplanar: float = math.radians(15.0)  #: normals this near may be of one plane
     same_plane: float = 0.06  #: offsets this near are one plane, metres
+    first: RefinementParameters = QUICK  #: of all
+    hopeful_share: float = 0.04  #: after it, those that explain less are dropped
+    hopeful_violations: float = 0.15  #: and those that violate more
+    then: RefinementParameters = COARSE  #: of the rest
+    refuted: float = 0.02  #: violations from which on a rival is none
     rival_m: float = 0.25  #: a rival differs by this, metres
     rival_rad: float = math.radians(15.0)  #: or by this
 
 
-def quarter_turns(patches: Patches, p: RivalParameters) -> Floats:
-    """Turns by 90, 180 and 270 degrees that leave a main plane of the patches in itself.
+def symmetries(patches: Patches, p: RivalParameters) -> Floats:
+    """Motions that leave main planes of the patches in themselves.
+
+    Turns by 90, 180 and 270 degrees about the middle of each plane; and shifts along the direction
+    in which the two main families of planes both run, as a corridor does.
 
     Parameters
     ----------
@@ -47,10 +59,11 @@ def quarter_turns(patches: Patches, p: RivalParameters) -> Floats:
 
     Returns
     -------
-    (n, 4, 4) with n at most 3 n_axes n_planes; each turns about the middle of its plane
+    (n, 4, 4) with n at most 3 n_axes n_planes + 2 n_shifts
     """
     left = patches.areas.copy()
-    turns: list[Floats] = []
+    found: list[Floats] = []
+    axes: list[Floats] = []
     cosines = patches.normals @ patches.normals.T
     parallel = np.abs(cosines) > math.cos(p.same_direction)
     for _ in range(p.n_axes):
@@ -61,18 +74,38 @@ def quarter_turns(patches: Patches, p: RivalParameters) -> Floats:
         signed = np.sign(cosines[most]) * patches.areas * across
         axis = (patches.normals * signed[:, None]).sum(axis=0)
         axis /= np.linalg.norm(axis)
-        offsets, area = patches.means @ axis, np.where(across, left, 0.0)
-        for _ in range(p.n_planes):
-            near = np.abs(offsets[:, None] - offsets[None, :]) < p.same_plane
-            best = int(np.argmax(np.where(area > 0, near @ area, 0.0)))
-            if area[best] <= 0:
-                break
-            on_plane = near[best] & (area > 0)
-            middle = np.average(patches.means[on_plane], axis=0, weights=area[on_plane])
-            turns += [_turn(axis, middle, k) for k in (1, 2, 3)]
-            area = np.where(on_plane, 0.0, area)
+        axes.append(axis)
+        middles = _middles(patches, axis, np.where(across, left, 0.0), p)
+        found += [_turn(axis, middle, k) for middle in middles for k in (1, 2, 3)]
         left = np.where(across, 0.0, left)
-    return np.array(turns).reshape(-1, 4, 4)
+    if len(axes) > 1:
+        along = np.cross(axes[0], axes[1])
+        length = float(np.linalg.norm(along))
+        if length > p.least_crossing:
+            steps = p.shift * np.arange(1, p.n_shifts + 1)
+            found += [_shift(along / length * s) for s in np.concatenate([steps, -steps])]
+    return np.array(found).reshape(-1, 4, 4)
+
+
+def _middles(patches: Patches, axis: Floats, area: Floats, p: RivalParameters) -> list[Floats]:
+    """Middles of the largest planes across an axis, of the patches that have an area."""
+    offsets = patches.means @ axis
+    near = np.abs(offsets[:, None] - offsets[None, :]) < p.same_plane
+    middles: list[Floats] = []
+    for _ in range(p.n_planes):
+        best = int(np.argmax(np.where(area > 0, near @ area, 0.0)))
+        if area[best] <= 0:
+            break
+        on_plane = near[best] & (area > 0)
+        middles.append(np.average(patches.means[on_plane], axis=0, weights=area[on_plane]))
+        area = np.where(on_plane, 0.0, area)
+    return middles
+
+
+def _shift(by: Floats) -> Floats:
+    result = np.eye(4)
+    result[:3, 3] = by
+    return result
 
 
 def plane_weights(patches: Patches, p: RivalParameters) -> Floats32:
@@ -101,8 +134,75 @@ def _turn(axis: Floats, middle: Floats, quarters: int) -> Floats:
 
 def far_from(T: Floats, others: Floats, p: RivalParameters) -> Floats:
     """Those of the others (n, 4, 4) that differ from T enough to be another answer."""
-    far = [
-        metres > p.rival_m or radians > p.rival_rad
-        for metres, radians in (difference(T, other) for other in others)
-    ]
-    return others[np.array(far, np.bool_)] if len(others) else others
+    metres = np.linalg.norm(others[:, :3, 3] - T[:3, 3], axis=1)
+    cosines = (np.einsum("nij,ij->n", others[:, :3, :3], T[:3, :3]) - 1.0) / 2.0
+    far: Floats = others[(metres > p.rival_m) | (cosines < math.cos(p.rival_rad))]
+    return far
+
+
+def inverses(transforms: Floats) -> Floats:
+    """The inverse of each of (n, 4, 4) rigid transforms."""
+    result = np.zeros_like(transforms)
+    result[:, :3, :3] = transforms[:, :3, :3].transpose(0, 2, 1)
+    result[:, :3, 3] = -np.einsum("nij,nj->ni", result[:, :3, :3], transforms[:, :3, 3])
+    result[:, 3, 3] = 1.0
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """How far transforms explain two frames, every plane counting the same.
+
+    Parameters
+    ----------
+    share : (n,) of both frames that agrees, 0 to 1
+    violations : (n,) of free space, as a share of what agrees or violates, 0 to 1
+    """
+
+    share: Floats
+    violations: Floats
+
+
+def explained(
+    query: Geometry, match: Geometry, transforms: Floats, p: RivalParameters,
+    agreement_p: AgreementParameters,
+) -> Explained:  # fmt: skip
+    """How far each of some transforms (n, 4, 4), T_match_query, explains two frames."""
+    of_query = agreements(
+        patch_points(query.patches), match.surface, transforms, agreement_p,
+        plane_weights(query.patches, p),
+    )  # fmt: skip
+    of_match = agreements(
+        patch_points(match.patches), query.surface, inverses(transforms), agreement_p,
+        plane_weights(match.patches, p),
+    )  # fmt: skip
+    both = of_query + of_match
+    everything = plane_weights(query.patches, p).sum() + plane_weights(match.patches, p).sum()
+    return Explained(both[:, 0] / everything, both[:, 1] / np.maximum(both.sum(axis=1), 1e-9))
+
+
+def best_rival(
+    query: Geometry, match: Geometry, T: Floats, voted: Floats, p: RivalParameters,
+    agreement_p: AgreementParameters,
+) -> tuple[float, Floats | None]:  # fmt: skip
+    """How far the best rival of T explains the frames, 0 to 1, and that rival: Sec. III-E.
+
+    Parameters
+    ----------
+    query, match : geometry artifacts
+    T : (4, 4) T_match_query
+    voted : (n, 4, 4) other hypotheses, refined
+    p, agreement_p : see there
+    """
+    moved = np.concatenate([symmetries(match.patches, p) @ T, T @ symmetries(query.patches, p)])
+    near = far_from(T, refined_all(query.surface, match.surface, moved, p.first), p)
+    seen = explained(query, match, near, p, agreement_p)
+    hopeful = near[(seen.share > p.hopeful_share) & (seen.violations < p.hopeful_violations)]
+    rivals = np.concatenate([voted, refined_all(query.surface, match.surface, hopeful, p.then)])
+    rivals = far_from(T, rivals, p)
+    seen = explained(query, match, rivals, p, agreement_p)
+    share = np.where(seen.violations < p.refuted, seen.share, 0.0)
+    if not (share > 0).any():
+        return 0.0, None
+    best = int(np.argmax(share))
+    return float(share[best]), rivals[best]

@@ -72,8 +72,9 @@ class Compression:
         return result
 
 
-#: Components of a unit vector of d = 128 rarely leave [-RANGE, RANGE]; beyond, they are clipped.
-RANGE = 0.5
+#: Of 128 components of a unit vector few leave [-RANGE, RANGE]. Those are clipped, so that one
+#: large component, such as that of lying in a floor, does not outweigh all others.
+RANGE = 0.25
 
 
 @kernel

@@ -17,16 +17,10 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.geometry.agreement import AgreementParameters, agreement, sampled
-from sceneprint.geometry.alignment import Alignment, AlignmentParameters, align, refined_all
+from sceneprint.geometry.alignment import Alignment, AlignmentParameters, align
 from sceneprint.geometry.registration import FINE, refine
 from sceneprint.geometry.rigid import inverse, nearest_rotation, rotation_angle
-from sceneprint.geometry.rivals import (
-    RivalParameters,
-    far_from,
-    patch_points,
-    plane_weights,
-    quarter_turns,
-)
+from sceneprint.geometry.rivals import RivalParameters, best_rival, explained, inverses
 from sceneprint.types import Floats, Geometry
 
 Status = Literal["accepted", "ambiguous", "rejected"]
@@ -41,8 +35,9 @@ class ValidationParameters:
     residual_m: float = 0.08  #: of the two directions composed: epsilon_val of Sec. III-E
     residual_rad: float = math.radians(5.0)
     violation_weight: float = 5.0  #: evidence = overlap - this x violations
-    evidence: float = 0.15  #: least
-    strong: float = 0.25  #: evidence below which an accepted match is weak
+    evidence: float = 0.2  #: least
+    plane_overlap: float = 0.13  #: least
+    strong: float = 0.3  #: evidence below which an accepted match is weak
     weak: float = 0.04  #: ambiguity from which on an accepted match is weak
     ambiguous: float = 0.07  #: ambiguity from which on nothing is accepted
     stiffness: float = 1e-5  #: least ratio of the eigenvalues of the information
@@ -66,11 +61,13 @@ class Validation:
     residual_m, residual_rad : of the two directions composed, T_match_query T_query_match;
         infinite where there is none
     overlap : share of both frames' points that agree under the transform, 0 to 1
+    plane_overlap : the same with every plane counting as much as another, however large, 0 to 1:
+        low where only a floor or a wall agrees
     violations : free-space violations, as a share of violations and inliers, 0 to 1
     inliers : points of both frames that agree under the transform
-    ambiguity : share of both frames that agrees under the best rival, every plane counting the
-        same, less 5 times the rival's violations; 0 to 1. Rivals are looked for only where all
-        else speaks for accepting; elsewhere it is 0
+    ambiguity : share of both frames that agrees under the best rival that free space does not
+        refute, every plane counting the same; 0 to 1. Rivals are looked for only where all else
+        speaks for accepting; elsewhere it is 0
     T_rival : (4, 4) that rival, or None
     seed : of the random choices
     """
@@ -82,6 +79,7 @@ class Validation:
     residual_m: float
     residual_rad: float
     overlap: float
+    plane_overlap: float
     violations: float
     inliers: int
     ambiguity: float
@@ -154,34 +152,8 @@ def validate(
 
 def _nothing(reason: str, seed: int) -> Validation:
     return Validation(
-        "rejected", None, reason, None, math.inf, math.inf, 0.0, 0.0, 0, 0.0, None, seed
+        "rejected", None, reason, None, math.inf, math.inf, 0.0, 0.0, 0.0, 0, 0.0, None, seed
     )
-
-
-def _ambiguity(
-    query: Geometry, match: Geometry, there: Alignment, back: Alignment, T: Floats,
-    p: ValidationParameters,
-) -> tuple[float, Floats | None]:  # fmt: skip
-    """How well the best rival explains the frames, 0 to 1, and that rival."""
-    turned = np.concatenate(
-        [quarter_turns(match.patches, p.rivals) @ T, T @ quarter_turns(query.patches, p.rivals)]
-    )
-    turned = refined_all(query.surface, match.surface, turned, p.alignment.coarse)
-    backward = np.array([inverse(other) for other in back.others]).reshape(-1, 4, 4)
-    rivals = far_from(T, np.concatenate([there.others, backward, turned]), p.rivals)
-    points = patch_points(query.patches), patch_points(match.patches)
-    weights = plane_weights(query.patches, p.rivals), plane_weights(match.patches, p.rivals)
-
-    most, found = 0.0, None
-    for rival in rivals:
-        a = agreement(points[0], match.surface, rival, p.agreement, weights[0])
-        b = agreement(points[1], query.surface, inverse(rival), p.agreement, weights[1])
-        inliers, violations = a.inliers + b.inliers, a.violations + b.violations
-        violated = violations / max(inliers + violations, 1e-9)
-        explained = inliers / (a.points + b.points) - p.violation_weight * violated
-        if explained > most:
-            most, found = explained, rival
-    return most, found
 
 
 def _decided(
@@ -198,12 +170,14 @@ def _decided(
     overlap = inliers / max(of_query.points + of_match.points, 1.0)
     violated = of_query.violations + of_match.violations
     violations = violated / max(inliers + violated, 1.0)
+    by_planes = explained(query, match, T[None], p.rivals, p.agreement)
+    plane_overlap = float(by_planes.share[0])
     ambiguity, T_rival = 0.0, None
 
     def answer(status: Status, strength: Strength | None, reason: str) -> Validation:
         return Validation(
-            status, strength, reason, T, metres, radians, overlap, violations, inliers,
-            ambiguity, T_rival, seed,
+            status, strength, reason, T, metres, radians, overlap, plane_overlap, violations,
+            inliers, ambiguity, T_rival, seed,
         )  # fmt: skip
 
     if metres > p.residual_m or radians > p.residual_rad:
@@ -222,11 +196,16 @@ def _decided(
             if overlap < p.evidence
             else f"{violations:.1%} lies where the other frame saw through",
         )
+    if plane_overlap < p.plane_overlap:
+        return answer(
+            "rejected", None, f"what agrees is mostly one plane ({plane_overlap:.0%} by planes)"
+        )
     if min(there.stiffness, back.stiffness) < p.stiffness:
         return answer(
             "ambiguous", None, "what the frames share leaves a direction free, as a plane does"
         )
-    ambiguity, T_rival = _ambiguity(query, match, there, back, T, p)
+    voted = np.concatenate([there.others, inverses(back.others)])
+    ambiguity, T_rival = best_rival(query, match, T, voted, p.rivals, p.agreement)
     if ambiguity >= p.ambiguous:
         return answer("ambiguous", None, "another transform explains the frames as well")
     if ambiguity >= p.weak:

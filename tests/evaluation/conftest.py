@@ -37,6 +37,7 @@ def pair(
         residual_m=0.01,
         residual_rad=0.01,
         overlap=0.5,
+        plane_overlap=0.4,
         violations=0.0,
         inliers=100,
         ambiguity=0.5,

@@ -26,5 +26,10 @@ def goldens() -> ModuleType:
 
 
 @pytest.fixture(scope="session")
+def validation_goldens() -> ModuleType:
+    return beside("validation_goldens")
+
+
+@pytest.fixture(scope="session")
 def scenes() -> ModuleType:
     return beside("scenes")

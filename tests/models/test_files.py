@@ -13,6 +13,8 @@ from safetensors.numpy import load, save
 
 from sceneprint.errors import UnreadableModel
 from sceneprint.geometry.depth import DepthParameters
+from sceneprint.geometry.segmentation import SegmentationParameters
+from sceneprint.geometry.surroundings import SurroundingsParameters
 from sceneprint.models import PRESETS, Model, parse_model, read_model, save_model
 
 
@@ -39,13 +41,24 @@ def test_id_is_the_content_not_the_name(small_model: Model) -> None:
     assert replace(small_model, name="other", provenance={}).id == small_model.id
     depth = replace(small_model.parameters, depth=DepthParameters(maximum_depth=8.99))
     bent = replace(small_model.mixture, means=small_model.mixture.means + 1e-12)
+    reach = replace(
+        small_model.parameters, surroundings=replace(SurroundingsParameters(), far_radius=1.5)
+    )
+    own = replace(
+        small_model.parameters, validation_segmentation=SegmentationParameters(n_patches=399)
+    )
+    kept = small_model.compression
     others = [
+        replace(small_model, parameters=reach),
+        replace(small_model, parameters=own),
+        replace(small_model, compression=replace(kept, mean=kept.mean + np.float32(1e-6))),
+        replace(small_model, compression=replace(kept, matrix=-kept.matrix)),
         replace(small_model, parameters=depth),
         replace(small_model, mixture=bent),
         replace(small_model, quantiser_step=0.003),
         replace(small_model, unrelated_distance=1001.0),
     ]
-    assert len({small_model.id, *(other.id for other in others)}) == 5
+    assert len({small_model.id, *(other.id for other in others)}) == 9
 
 
 def test_sizes(small_model: Model) -> None:
@@ -60,6 +73,10 @@ def test_presets_ship(preset: str, g: int, h: int) -> None:
     assert model.signature_bytes == 25 * g * h
     assert model.mixture.weights.sum() == pytest.approx(1.0, abs=1e-12)
     assert model.parameters.properties.radius == 3.0
+    # descriptors of 128 bytes, by axes at right angles to each other
+    axes = model.compression.matrix.astype(float)
+    assert axes.shape == (128, model.parameters.surroundings.dimension)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(128), atol=1e-5)
     assert preset in PRESETS
 
 
@@ -82,6 +99,11 @@ def with_tensors(data: bytes, **changed: np.ndarray) -> bytes:
     return save(tensors, {"sceneprint": json.dumps(header_of(data))})
 
 
+def without_tensor(data: bytes, name: str) -> bytes:
+    tensors = {key: tensor for key, tensor in load(data).items() if key != name}
+    return save(tensors, {"sceneprint": json.dumps(header_of(data))})
+
+
 @pytest.fixture
 def data(small_model: Model, tmp_path: Path) -> bytes:
     save_model(small_model, tmp_path / "m")
@@ -97,7 +119,8 @@ def test_damage_is_noticed(data: bytes) -> None:
 
     cases = {
         "not a model file": [b"", b"x" * 100, data[:40], data[:-5], save({"a": np.zeros(1)})],
-        "schema 9 is not 1": [with_header(data, put("schema_version", 9))],
+        "schema 9 is not 2": [with_header(data, put("schema_version", 9))],
+        "schema 1 is not 2": [with_header(data, put("schema_version", 1))],
         "missing or misshapen": [
             with_header(data, drop("quantiser_step")),
             with_header(data, put("quantiser_step", 0.0)),
@@ -106,11 +129,20 @@ def test_damage_is_noticed(data: bytes) -> None:
             with_tensors(data, mixture_means=np.zeros((8, 11))),
             with_tensors(data, projection_mean=np.full(13, np.nan)),
             with_tensors(data, projection_mean=np.zeros(13, np.float32)),
+            with_tensors(data, compression_mean=np.zeros(927)),
+            with_tensors(data, compression_mean=np.zeros(926, np.float32)),
+            with_tensors(data, compression_matrix=np.zeros((16, 926), np.float32)),
+            with_tensors(data, compression_matrix=np.full((16, 927), np.inf, np.float32)),
+            with_tensors(data, compression_matrix=np.zeros((0, 927), np.float32)),
+            with_tensors(data, compression_matrix=np.zeros((1025, 927), np.float32)),
+            without_tensor(data, "compression.mean"),
         ],
         "should have the fields": [with_header(data, put("parameters", {"depth": {}}))],
         "was damaged": [
             with_header(data, put("quantiser_step", 0.5)),
             with_tensors(data, projection_mean=np.zeros(13)),
+            with_tensors(data, compression_mean=np.zeros(927, np.float32)),
+            with_tensors(data, compression_matrix=np.zeros((16, 927), np.float32)),
         ],
     }
     for message, files in cases.items():
@@ -143,6 +175,12 @@ def test_a_name_that_would_drive_a_terminal(data: bytes) -> None:
         ("depth", "maximum_pixels", 10**9),
         ("normals", "radius_px", 500),
         ("normals", "radius_px", float("inf")),
+        ("validation_segmentation", "n_patches", 2001),
+        ("validation_segmentation", "iterations", 10**9),
+        ("surroundings", "far_distances", 10**6),
+        ("surroundings", "near_heights", 0),
+        ("surroundings", "middle_radius", 0.0),
+        ("surroundings", "middle_radius", float("nan")),
     ],
 )
 def test_parameters_that_would_take_all_memory(

@@ -1,0 +1,208 @@
+"""Consensus: by hand, against numpy, and the motion found among wrong correspondences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sceneprint.geometry import consensus as module
+from sceneprint.geometry.consensus import ConsensusParameters, consensus
+from sceneprint.geometry.rigid import difference, inverse, moved
+from sceneprint.types import Floats, Ints32, Patches
+
+P = ConsensusParameters()
+
+
+def motion(rng: np.random.Generator) -> Floats:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.normal(0, 3, 3)
+    return T
+
+
+def carried(patches: Patches, T: Floats) -> Patches:
+    return replace(patches, means=moved(T, patches.means), normals=patches.normals @ T[:3, :3].T)
+
+
+def mirrored(patches: Patches) -> Patches:
+    mirror = np.array([-1.0, 1.0, 1.0])
+    return replace(patches, means=patches.means * mirror, normals=patches.normals * mirror)
+
+
+def with_outliers(rng: np.random.Generator, n: int, share: float) -> Ints32:
+    """Patch i of the source is patch i of the target, but for a share of them."""
+    wrong = rng.random(n) < share
+    target = np.where(wrong, rng.integers(0, n, n), np.arange(n))
+    return np.stack([np.arange(n), target], axis=1).astype(np.int32)
+
+
+def explained(a: Patches, b: Patches, pairs: Ints32, T: Floats) -> int:
+    """How many correspondences a transform explains."""
+    off = np.linalg.norm(moved(T, a.means[pairs[:, 0]]) - b.means[pairs[:, 1]], axis=1)
+    cosine = (a.normals[pairs[:, 0]] @ T[:3, :3].T * b.normals[pairs[:, 1]]).sum(axis=1)
+    return int(((off < P.inlier_distance) & (cosine > P.inlier_cosine)).sum())
+
+
+def graph(a: Patches, b: Patches, pairs: Ints32) -> tuple[NDArray[np.uint64], NDArray[np.bool_]]:
+    """The compatibility graph as bits and as a matrix."""
+    i, j = pairs.T
+    bits = np.zeros((len(pairs), (len(pairs) + 63) // 64), np.uint64)
+    module._graph(
+        a.means[i], a.normals[i], b.means[j], b.normals[j],
+        P.distance_tolerance, P.angle_tolerance, P.minimum_distance, bits,
+    )  # fmt: skip
+    unpacked = np.unpackbits(bits.view(np.uint8), axis=1, bitorder="little")
+    assert not unpacked[:, len(pairs) :].any()
+    return bits, unpacked[:, : len(pairs)].astype(bool)
+
+
+def graph_oracle(a: Patches, b: Patches, pairs: Ints32) -> NDArray[np.bool_]:
+    """The same graph from matrices of lengths, heights, angles and volumes."""
+
+    def invariants(x: Patches, index: Ints32) -> list[Floats]:
+        p, n = x.means[index], x.normals[index]
+        r = p[None] - p[:, None]
+        height = np.einsum("ijk,ik->ij", r, n)
+        volume = np.einsum("ijk,ijk->ij", r, np.cross(n[:, None], n[None]))
+        angle = np.arccos(np.clip(n @ n.T, -1, 1))
+        return [np.linalg.norm(r, axis=2), height, height.T, angle, volume]
+
+    one, other = invariants(a, pairs[:, 0]), invariants(b, pairs[:, 1])
+    length, height, back, angle, volume = (np.abs(x - y) for x, y in zip(one, other, strict=True))
+    near = np.minimum(one[0], other[0]) >= P.minimum_distance
+    fits = (length <= 0.12) & (height <= 0.12) & (back <= 0.12) & (angle <= 0.5) & (volume <= 0.24)
+    result: NDArray[np.bool_] = fits & near
+    return result
+
+
+def test_by_hand(validation_goldens: ModuleType) -> None:
+    validation_goldens.check_consensus(module)
+
+
+@pytest.mark.parametrize("n", [5, 64, 65, 130])
+def test_graph_equals_the_oracle(scenes: ModuleType, n: int) -> None:
+    rng = np.random.default_rng(n)
+    a = scenes.room(rng, n)
+    noisy = carried(a, motion(rng))
+    noisy = replace(noisy, means=noisy.means + rng.normal(0, 0.05, (n, 3)))
+    pairs = with_outliers(rng, n, 0.5)
+    _, matrix = graph(a, noisy, pairs)
+    np.testing.assert_array_equal(matrix, matrix.T)
+    assert not matrix.diagonal().any()
+    np.testing.assert_array_equal(matrix, graph_oracle(a, noisy, pairs))
+    assert n < 10 or 0.05 < matrix.mean() < 0.9
+
+
+@pytest.mark.parametrize("n", [3, 63, 64, 65, 200])
+def test_common_neighbours_equal_the_product_of_the_matrix(n: int) -> None:
+    rng = np.random.default_rng(n)
+    matrix = rng.random((n, n)) < 0.7
+    matrix = np.triu(matrix, 1) | np.triu(matrix, 1).T
+    bits = np.zeros((n, (n + 63) // 64 * 64), np.uint8)
+    bits[:, :n] = matrix
+    packed = np.packbits(bits, axis=1, bitorder="little").view(np.uint64)
+    common = np.zeros((n, n), np.int32)
+    module._second_order(packed, common)
+    np.testing.assert_array_equal(common, np.where(matrix, matrix.astype(int) @ matrix, 0))
+
+
+def test_fit_equals_scipys() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(30):
+        n = int(rng.integers(3, 40))
+        p, q = rng.normal(size=(2, n, 3))
+        normals, others = rng.normal(size=(2, n, 3))
+        weights = rng.uniform(0.1, 1.0, n)
+        T = np.zeros((4, 4))
+        assert module._fit(p, normals, q, others, weights, 0.3, T)
+        a, b = np.average(p, axis=0, weights=weights), np.average(q, axis=0, weights=weights)
+        R = Rotation.align_vectors(
+            np.concatenate([q - b, others]),
+            np.concatenate([p - a, normals]),
+            weights=np.concatenate([weights, 0.3 * weights]),
+        )[0].as_matrix()
+        np.testing.assert_allclose(T[:3, :3], R, atol=1e-6)
+        np.testing.assert_allclose(T[:3, 3], b - R @ a, atol=1e-6)
+        assert T[3].tolist() == [0, 0, 0, 1]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
+def test_the_motion_is_found_among_outliers(scenes: ModuleType, share: float) -> None:
+    rng = np.random.default_rng(int(10 * share))
+    for _ in range(3):
+        a = scenes.random_patches(rng, 150)
+        T = motion(rng)
+        b, pairs = carried(a, T), with_outliers(rng, 150, share)
+        found = consensus(a, b, pairs, P)
+        assert 1 <= len(found) <= P.n_seeds
+        np.testing.assert_allclose(found[0], T, atol=1e-6)
+
+
+def test_noise_is_averaged_out(scenes: ModuleType) -> None:
+    rng = np.random.default_rng(2)
+    a = scenes.random_patches(rng, 150)
+    T = motion(rng)
+    b = carried(a, T)
+    b = replace(b, means=b.means + rng.normal(0, 0.03, b.means.shape))
+    found = consensus(a, b, with_outliers(rng, 150, 0.7), P)
+    metres, radians = difference(found[0], T)
+    middle = moved(found[0], a.means.mean(axis=0)[None]) - moved(T, a.means.mean(axis=0)[None])
+    assert np.linalg.norm(middle) < 0.02  # 3 cm of noise in each of some 45
+    assert np.degrees(radians) < 1.0
+    assert metres < 0.05
+
+
+def test_every_hypothesis_is_a_motion(scenes: ModuleType) -> None:
+    rng = np.random.default_rng(3)
+    a, b = scenes.room(rng), scenes.room(rng)  # two rooms, and random correspondences
+    pairs = rng.integers(0, 110, (300, 2)).astype(np.int32)
+    found = consensus(a, b, pairs, P)
+    assert 5 <= len(found) <= P.n_seeds
+    assert np.isfinite(found).all()
+    for T in found:
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0, abs=1e-12)
+        assert T[3].tolist() == [0, 0, 0, 1]
+    assert consensus(a, b, pairs, replace(P, n_seeds=3)).tolist() == found[:3].tolist()
+
+
+def test_a_mirror_image_is_no_motion(scenes: ModuleType) -> None:
+    rng = np.random.default_rng(4)
+    a = scenes.random_patches(rng, 150)
+    pairs = with_outliers(rng, 150, 0.0)
+    b = carried(mirrored(a), motion(rng))
+    # without handedness every pair would be compatible: lengths, heights and angles are the same
+    assert graph(a, carried(a, motion(rng)), pairs)[1].sum() > 0.99 * 150 * 149
+    assert graph(a, b, pairs)[1].mean() < 0.35
+    most = max((explained(a, b, pairs, T) for T in consensus(a, b, pairs, P)), default=0)
+    assert most < 0.15 * 150
+    unmirrored = consensus(a, mirrored(b), pairs, P)
+    assert explained(a, mirrored(b), pairs, unmirrored[0]) == 150
+
+
+def test_moving_a_frame_moves_the_transforms(scenes: ModuleType) -> None:
+    rng = np.random.default_rng(5)
+    a = scenes.room(rng)
+    b, pairs = carried(a, motion(rng)), with_outliers(rng, 110, 0.5)
+    b = replace(b, means=b.means + rng.normal(0, 0.02, b.means.shape))
+    found = consensus(a, b, pairs, P)
+    G = motion(rng)
+    np.testing.assert_allclose(consensus(a, carried(b, G), pairs, P), G @ found, atol=1e-9)
+    np.testing.assert_allclose(consensus(carried(a, G), b, pairs, P), found @ inverse(G), atol=1e-9)
+
+
+def test_too_few_correspondences(scenes: ModuleType) -> None:
+    a = scenes.random_patches(np.random.default_rng(6), 20)
+    T = motion(np.random.default_rng(7))
+    pairs = with_outliers(np.random.default_rng(8), 20, 0.0)
+    for n in (0, 1, 2):
+        assert consensus(a, carried(a, T), pairs[:n], P).shape == (0, 4, 4)
+    found = consensus(a, carried(a, T), pairs[:3], P)
+    assert len(found) >= 1
+    np.testing.assert_allclose(found[0], T, atol=1e-9)
+    # one patch again and again: nothing is far enough from it
+    assert consensus(a, a, np.zeros((30, 2), np.int32), P).shape == (0, 4, 4)

@@ -1,0 +1,73 @@
+"""Correspondences against sorting all of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.matching import MatchingParameters, correspondences
+from sceneprint.types import Bytes, Ints32
+
+
+def oracle(source: Bytes, target: Bytes, drawn: Ints32, n_nearest: int) -> list[list[int]]:
+    """The pairs by a stable sort of all squared distances."""
+    pairs = []
+    for i in drawn.tolist():
+        squares = ((source[i].astype(int) - target.astype(int)) ** 2).sum(axis=1)
+        pairs += [[i, int(j)] for j in np.argsort(squares, kind="stable")[:n_nearest]]
+    return pairs
+
+
+@pytest.mark.parametrize("levels", [256, 2])
+def test_equals_the_oracle(levels: int) -> None:
+    # of two levels in four bytes there are 16 descriptors: nearly all distances are ties
+    rng = np.random.default_rng(levels)
+    for length in (1, 4, 128):
+        source = rng.integers(0, levels, (40, length), np.uint8) * (255 // (levels - 1))
+        target = rng.integers(0, levels, (70, length), np.uint8) * (255 // (levels - 1))
+        found = correspondences(source, target, rng, MatchingParameters(25, 4))
+        assert (found.shape, found.dtype) == ((100, 2), np.int32)
+        drawn = found[::4, 0]
+        assert (np.diff(drawn) > 0).all()
+        assert found.tolist() == oracle(source, target, drawn, 4)
+
+
+def test_distances_do_not_wrap() -> None:
+    # 1024 bytes, each 255 apart: the largest there is; 200 apart would be nearer modulo 2^16
+    source = np.zeros((1, 1024), np.uint8)
+    target = np.array([[255] * 1024, [200] * 1024, [201] * 1024, [1] * 1024], np.uint8)
+    found = correspondences(source, target, np.random.default_rng(0), MatchingParameters(1, 4))
+    assert found[:, 1].tolist() == [3, 1, 2, 0]
+
+
+def test_each_source_is_drawn_once_at_random() -> None:
+    descriptors = np.arange(50, dtype=np.uint8)[:, None]
+    p = MatchingParameters(10, 1)
+    draws = [
+        correspondences(descriptors, descriptors, np.random.default_rng(s), p) for s in (1, 1, 2)
+    ]
+    np.testing.assert_array_equal(draws[0], draws[1])
+    assert draws[0].tolist() != draws[2].tolist()
+    for pairs in draws:
+        assert len(set(pairs[:, 0].tolist())) == 10
+        np.testing.assert_array_equal(pairs[:, 0], pairs[:, 1])
+    # every patch has its turn
+    rng = np.random.default_rng(3)
+    seen = np.concatenate([correspondences(descriptors, descriptors, rng, p) for _ in range(60)])
+    assert set(seen[:, 0].tolist()) == set(range(50))
+
+
+def test_fewer_patches_than_wanted() -> None:
+    rng = np.random.default_rng(4)
+    source, target = rng.integers(0, 256, (5, 8), np.uint8), rng.integers(0, 256, (2, 8), np.uint8)
+    found = correspondences(source, target, rng, MatchingParameters(100, 3))
+    assert found.tolist() == oracle(source, target, np.arange(5, dtype=np.int32), 2)
+    none = np.empty((0, 8), np.uint8)
+    assert correspondences(none, target, rng, MatchingParameters()).shape == (0, 2)
+    assert correspondences(source, none, rng, MatchingParameters()).shape == (0, 2)
+
+
+def test_descriptors_of_two_lengths() -> None:
+    a, b = np.zeros((3, 8), np.uint8), np.zeros((3, 9), np.uint8)
+    with pytest.raises(ValueError, match="descriptors of 8 and 9 bytes"):
+        correspondences(a, b, np.random.default_rng(0), MatchingParameters())

@@ -1,0 +1,391 @@
+"""Validation of whole frames: what must hold whatever its thresholds are."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import astuple, replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sceneprint import pipeline
+from sceneprint.artifacts import read_geometry, write_geometry
+from sceneprint.errors import ModelMismatch
+from sceneprint.geometry.rigid import difference, inverse
+from sceneprint.geometry.validation import (
+    Validation,
+    ValidationParameters,
+    middle,
+    refined_at,
+    validate,
+)
+from sceneprint.models import Model, read_model
+from sceneprint.pipeline import geometry_of
+from sceneprint.signing import see
+from sceneprint.synth import KINECT, symmetric_box, take, trajectory
+from sceneprint.synth.mesh import join
+from sceneprint.synth.rooms import Room
+from sceneprint.synth.shell import Ceiling, shell, walls_of
+from sceneprint.synth.solids import box
+from sceneprint.synth.synthesis import room_and_rng
+from sceneprint.types import Floats, Floats32, Frame, Geometry, Patches, Surface
+
+#: Views of a room, each with its pose, two or three decimetres and some twenty degrees apart.
+Views = list[tuple[Floats, Geometry]]
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return read_model("paper")
+
+
+def geometry(model: Model, depth: Floats32) -> Geometry:
+    return geometry_of(see(Frame(depth, KINECT), model.parameters), model)
+
+
+@pytest.fixture(scope="module")
+def rooms(model: Model) -> list[Views]:
+    """Four views of each of three furnished rooms, as the demo takes them."""
+    made = []
+    for number in (0, 2, 3):
+        room, rng = room_and_rng(11, number)
+        poses = trajectory(room, 61, rng)[12:60:12]
+        made.append([(T, geometry(model, take(room, T, KINECT, rng))) for T in poses])
+    return made
+
+
+@pytest.fixture(scope="module")
+def pairs(rooms: list[Views]) -> list[tuple[Geometry, Geometry, Floats]]:
+    """Neighbouring views, and the transform between them."""
+    return [
+        (query, match, inverse(T_match) @ T_query)
+        for views in rooms
+        for (T_query, query), (T_match, match) in pairwise(views)
+    ]
+
+
+def sane(v: Validation) -> Validation:
+    """The answer, once everything in it is seen to be a number that makes sense."""
+    assert v.status in ("accepted", "ambiguous", "rejected")
+    assert (v.strength is None) == (v.status != "accepted")
+    assert v.strength in (None, "strong", "weak")
+    assert 0 < len(v.reason) < 100
+    for share in (v.overlap, v.violations, v.ambiguity):
+        assert 0.0 <= share <= 1.0
+    assert v.inliers >= 0
+    assert isinstance(v.inliers, int)
+    for T in (v.T_match_query, v.T_rival):
+        if T is not None:
+            np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
+            assert np.linalg.det(T[:3, :3]) > 0
+            assert np.isfinite(T).all()
+            assert T[3].tolist() == [0, 0, 0, 1]
+    if v.T_match_query is None:
+        assert (v.status, v.residual_m, v.residual_rad) == ("rejected", math.inf, math.inf)
+    else:
+        assert 0.0 <= v.residual_m < math.inf
+        assert 0.0 <= v.residual_rad <= math.pi
+    return v
+
+
+def content(v: Validation) -> tuple[object, ...]:
+    return tuple(x.tobytes() if isinstance(x, np.ndarray) else x for x in astuple(v))
+
+
+def off(v: Validation, T: Floats) -> tuple[float, float]:
+    """Metres and degrees from a transform."""
+    assert v.T_match_query is not None
+    metres, radians = difference(v.T_match_query, T)
+    return metres, math.degrees(radians)
+
+
+def flipped(g: Geometry, signs: tuple[float, float, float]) -> Geometry:
+    """Everything with x or y, or both, the other way round, as another camera would see it."""
+    s, k = g.surface, g.surface.intrinsics
+    f = np.array(signs, np.float32)
+    way = (slice(None, None, int(signs[1])), slice(None, None, int(signs[0])))
+    camera = replace(
+        k,
+        cx=k.cx if signs[0] > 0 else k.width - 1 - k.cx,
+        cy=k.cy if signs[1] > 0 else k.height - 1 - k.cy,
+    )
+    points, normals, valid, areas = (
+        np.ascontiguousarray(x)
+        for x in (s.points[way] * f, s.normals[way] * f, s.valid[way], s.areas[way])
+    )
+    patches = replace(g.patches, means=g.patches.means * f, normals=g.patches.normals * f)
+    return replace(g, surface=Surface(points, normals, valid, areas, camera), patches=patches)
+
+
+def few(g: Geometry, n: int) -> Geometry:
+    p = g.patches
+    arrays = (p.means, p.normals, p.areas, p.sizes, p.coherences)
+    return replace(g, patches=Patches(*(a[:n] for a in arrays)), descriptors=g.descriptors[:n])
+
+
+def test_the_true_transform_is_found(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
+    accepted = 0
+    for query, match, T in pairs:
+        v = sane(validate(query, match))
+        metres, degrees = off(v, T)
+        assert metres < 0.05
+        assert degrees < 5.0
+        assert v.status in ("accepted", "ambiguous")
+        assert v.overlap > 0.4
+        accepted += v.status == "accepted"
+    assert accepted >= len(pairs) - 1  # measured: all
+
+
+def test_a_frame_lies_on_itself(rooms: list[Views]) -> None:
+    for _, frame in [view for views in rooms for view in views]:
+        v = sane(validate(frame, frame))
+        metres, degrees = off(v, np.eye(4))
+        assert metres < 1e-3
+        assert degrees < 0.05
+        assert v.status in ("accepted", "ambiguous")
+        assert (round(v.overlap, 2), v.violations) == (1.0, 0.0)
+
+
+def test_the_same_seed_gives_the_same_answer(
+    pairs: list[tuple[Geometry, Geometry, Floats]],
+) -> None:
+    alone = [content(validate(q, m, seed)) for q, m, _ in pairs[:3] for seed in (0, 5)]
+    assert [answer[-1] for answer in alone] == [0, 5] * 3  # the seed is echoed
+    with ThreadPoolExecutor(4) as pool:
+        jobs = [pool.submit(validate, q, m, seed) for q, m, _ in pairs[:3] for seed in (0, 5)]
+        assert [content(job.result()) for job in jobs] == alone
+    # another seed draws other patches: the same place, not the same bits
+    for one, other in zip(alone[::2], alone[1::2], strict=True):
+        assert one[3] != other[3]
+
+
+def test_seeds_agree_with_each_other(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
+    query, match, _ = pairs[0]
+    first = sane(validate(query, match, 0))
+    assert first.T_match_query is not None
+    for seed in range(1, 6):
+        metres, degrees = off(sane(validate(query, match, seed)), first.T_match_query)
+        assert metres < 5e-3
+        assert degrees < 0.2
+
+
+def test_the_other_way_round_is_the_inverse(
+    pairs: list[tuple[Geometry, Geometry, Floats]],
+) -> None:
+    for query, match, _ in pairs:
+        there, back = sane(validate(query, match)), sane(validate(match, query))
+        assert there.T_match_query is not None
+        metres, degrees = off(back, inverse(there.T_match_query))
+        assert metres < 0.01
+        assert degrees < 0.3
+        assert back.overlap == pytest.approx(there.overlap, abs=0.02)
+
+
+def test_a_camera_held_upside_down_turns_the_transform(
+    pairs: list[tuple[Geometry, Geometry, Floats]],
+) -> None:
+    R = np.diag([-1.0, -1.0, 1.0, 1.0])
+    for query, match, _ in pairs[:4]:
+        upright = sane(validate(query, match))
+        assert upright.T_match_query is not None
+        turned = sane(validate(flipped(query, (-1, -1, 1)), match))
+        metres, degrees = off(turned, upright.T_match_query @ R)
+        assert metres < 0.01
+        assert degrees < 0.3
+        turned = sane(validate(query, flipped(match, (-1, -1, 1))))
+        metres, degrees = off(turned, R @ upright.T_match_query)
+        assert metres < 0.01
+        assert degrees < 0.3
+
+
+def looking(eye: tuple[float, float, float], at: tuple[float, float, float]) -> Floats:
+    """T_world_camera of a level camera at one point that looks at another."""
+    forward = np.subtract(at, eye)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.stack([right, np.cross(forward, right), forward], axis=1), eye
+    return T
+
+
+def askew(rng: np.random.Generator) -> Room:
+    """Boxes lying anyhow between four walls at no right angles: nothing repeats or mirrors."""
+    outline = np.array([(0, 0), (5, 0.6), (4.2, 4.5), (0.4, 3.0)])
+    top = Ceiling(2.6, np.zeros(2))
+    boxes = []
+    for _ in range(14):
+        solid = box(*rng.uniform(0.2, 0.9, 3).tolist())
+        place = rng.uniform((1.2, 1.0, 0.1), (3.8, 3.2, 1.4))
+        boxes.append(solid.turned(Rotation.random(rng=rng).as_matrix(), place))
+    return Room(join([shell(outline, walls_of(outline), top), *boxes]), outline, top)
+
+
+def test_a_mirror_image_is_not_believed(model: Model) -> None:
+    # the descriptors are the same, so that only the consensus can tell. Not so in furnished rooms
+    # at right angles: of those, a part is its own mirror image, walls and cupboards alike
+    rng, middle_of_it = np.random.default_rng(1), (2.5, 2.1, 0.7)
+    room = askew(rng)
+    for x, y, z in ((0.5, 0.5, 1.5), (4.0, 4.0, 1.2), (0.7, 2.8, 1.9)):
+        depths = [
+            take(room, looking((x + step, y, z), middle_of_it), KINECT, rng) for step in (0.0, 0.2)
+        ]
+        here, beside = (geometry(model, depth) for depth in depths)
+        assert sane(validate(here, beside)).strength == "strong"
+        assert sane(validate(here, flipped(beside, (-1, 1, 1)))).status != "accepted"
+        assert sane(validate(here, flipped(here, (-1, 1, 1)))).status != "accepted"
+
+
+def test_two_rooms_are_two_places(rooms: list[Views]) -> None:
+    for i, views in enumerate(rooms):
+        for others in rooms[i + 1 :]:
+            for (_, query), (_, match) in zip(views, others, strict=True):
+                assert sane(validate(query, match)).status != "accepted"
+
+
+def test_flat_walls_leave_directions_free(model: Model) -> None:
+    y, x = np.mgrid[:480, :640]
+    at_2, at_3 = (np.full((480, 640), z, np.float32) for z in (2.0, 3.0))
+    leaning = (2.0 + x / 1000 + y / 2000).astype(np.float32)
+    walls = [geometry(model, depth) for depth in (at_2, at_3, leaning)]
+    for query in walls:
+        for match in walls:
+            assert sane(validate(query, match)).status in ("ambiguous", "rejected")
+
+
+def test_sides_of_a_cube_are_not_told_apart(model: Model) -> None:
+    # a quarter turn about the cube: nothing in two views tells it from no turn at all
+    scene, rng = symmetric_box(), np.random.default_rng(0)
+    seen = []
+    for turn in (0.4, 0.4 + math.pi / 2):
+        T = looking((2.2 * math.sin(turn), -2.2 * math.cos(turn), 1.3), (0.0, 0.0, 0.3))
+        seen.append(geometry(model, take(scene, T, KINECT, rng)))
+    assert sane(validate(seen[0], seen[1])).status == "ambiguous"
+
+
+def test_too_few_patches(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
+    query, match, _ = pairs[0]
+    for n in (0, 1, 9):
+        for a, b in ((few(query, n), match), (query, few(match, n))):
+            v = sane(validate(a, b, 3))
+            assert (v.status, v.T_match_query, v.seed) == ("rejected", None, 3)
+            assert f"{n} patches" in v.reason
+    for n in (10, 11):
+        assert "patches, and" not in sane(validate(few(query, n), match)).reason
+
+
+def test_patches_that_agree_on_nothing(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
+    query, match, _ = pairs[0]
+    one_place = replace(query.patches, means=np.zeros_like(query.patches.means))
+    v = sane(validate(replace(query, patches=one_place), match))
+    assert (v.status, v.T_match_query, v.inliers, v.overlap) == ("rejected", None, 0, 0.0)
+
+
+def test_what_was_not_seen_supports_nothing(
+    pairs: list[tuple[Geometry, Geometry, Floats]],
+) -> None:
+    query, match, _ = pairs[0]
+    s = match.surface
+    blank = Surface(
+        np.zeros_like(s.points),
+        np.zeros_like(s.normals),
+        np.zeros_like(s.valid),
+        np.zeros_like(s.areas),
+        s.intrinsics,
+    )
+    for a, b in ((query, replace(match, surface=blank)), (replace(match, surface=blank), query)):
+        v = sane(validate(a, b))
+        assert (v.status, v.inliers) == ("rejected", 0)
+
+
+def test_the_papers_test_is_the_residual_alone(
+    pairs: list[tuple[Geometry, Geometry, Floats]], model: Model
+) -> None:
+    query, match, _ = pairs[0]
+    hard = ValidationParameters(evidence=2.0)
+    full, paper = (sane(validate(query, match, 0, hard, mode)) for mode in ("full", "paper"))
+    assert (full.status, full.strength) == ("rejected", None)
+    assert paper.status == "accepted"
+    np.testing.assert_array_equal(full.T_match_query, paper.T_match_query)
+    assert (full.residual_m, full.residual_rad) == (paper.residual_m, paper.residual_rad)
+    exact = replace(hard, residual_m=paper.residual_m * 0.99)
+    assert sane(validate(query, match, 0, exact, "paper")).status == "rejected"
+    exact = replace(hard, residual_rad=paper.residual_rad * 0.99)
+    assert sane(validate(query, match, 0, exact, "paper")).status == "rejected"
+    exact = replace(hard, residual_m=paper.residual_m, residual_rad=paper.residual_rad)
+    assert sane(validate(query, match, 0, exact, "paper")).status == "accepted"
+    # a wall on a wall, which evidence does not accept
+    wall = geometry(model, np.full((480, 640), 2.0, np.float32))
+    assert sane(validate(wall, wall, mode="paper")).status == "accepted"
+    assert sane(validate(wall, wall)).status == "ambiguous"
+
+
+def test_wrong_calls(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
+    query, match, _ = pairs[0]
+    with pytest.raises(ValueError, match="mode 'other' is neither 'full' nor 'paper'"):
+        validate(query, match, mode="other")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="descriptors of 128 and 127 bytes"):
+        validate(query, replace(match, descriptors=match.descriptors[:, :127]))
+    with pytest.raises(ModelMismatch, match="Frames of two models cannot be compared"):
+        pipeline.validate(query, replace(match, model_id="0" * 64))
+
+
+def test_frames_are_left_as_they_were(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
+    query, match, _ = pairs[0]
+
+    def digest() -> list[str]:
+        arrays = [
+            array
+            for g in (query, match)
+            for array in (
+                g.surface.points, g.surface.normals, g.surface.valid, g.patches.means,
+                g.patches.normals, g.patches.areas, g.descriptors,
+            )
+        ]  # fmt: skip
+        return [hashlib.sha256(array.tobytes()).hexdigest() for array in arrays]
+
+    before = digest()
+    sane(validate(query, match))
+    assert digest() == before
+
+
+def test_artifacts_from_disk_validate_alike(
+    pairs: list[tuple[Geometry, Geometry, Floats]],
+) -> None:
+    for query, match, _ in pairs[:4]:
+        fresh = sane(validate(query, match))
+        assert fresh.T_match_query is not None
+        stored = [read_geometry(write_geometry(g)) for g in (query, match)]
+        v = sane(validate(stored[0], stored[1]))
+        metres, degrees = off(v, fresh.T_match_query)
+        assert metres < 1e-3
+        assert degrees < 0.05
+        assert v.overlap == pytest.approx(fresh.overlap, abs=5e-3)
+
+
+def test_refined_at_the_truth_stays_there(
+    pairs: list[tuple[Geometry, Geometry, Floats]],
+) -> None:
+    for query, match, T in pairs:
+        found = refined_at(query, match, T)
+        assert found is not None
+        metres, radians = difference(found, T)
+        assert metres < 0.03
+        assert math.degrees(radians) < 1.0
+    far = np.eye(4)
+    far[2, 3] = -50.0
+    assert refined_at(pairs[0][0], pairs[0][1], far) is None
+
+
+def test_middle_by_hand() -> None:
+    a, b = np.eye(4), np.eye(4)
+    b[:3, :3] = Rotation.from_rotvec([0, 0, 0.2]).as_matrix()
+    b[:3, 3] = 2, 4, 6
+    half = middle(a, b)
+    np.testing.assert_allclose(half[:3, :3], Rotation.from_rotvec([0, 0, 0.1]).as_matrix())
+    assert half[:3, 3].tolist() == [1, 2, 3]
+    np.testing.assert_allclose(middle(b, b), b, atol=1e-12)

@@ -1,0 +1,184 @@
+"""The checks of validation by hand catch a wrong line: one mutation at a time, uncompiled."""
+
+from __future__ import annotations
+
+import inspect
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry import agreement, averaging, consensus, registration, rigid
+
+RIGID = [
+    ("-T[:3, :3].T @ T[:3, 3]", "T[:3, :3].T @ T[:3, 3]"),
+    ("result[:3, :3] = T[:3, :3].T\n", "result[:3, :3] = T[:3, :3]\n"),
+    ("points @ T[:3, :3].T + T[:3, 3]", "points @ T[:3, :3] + T[:3, 3]"),
+    ("R[2, 2] - 1.0)", "R[2, 2] - 3.0)"),
+    ("(R[0, 2] - R[2, 0]) ** 2", "(R[0, 2] + R[2, 0]) ** 2"),
+    ("a[:3, 3] - b[:3, 3]", "a[:3, 3] + b[:3, 3]"),
+    ("result: Floats = u @ fix @ vt", "result: Floats = u @ vt"),
+    ("N[0, 2] = H[0, 2] - H[2, 0]", "N[0, 2] = H[2, 0] - H[0, 2]"),
+    ("N[2, 3] = H[2, 1] + H[1, 2]", "N[2, 3] = H[2, 1] - H[1, 2]"),
+    ("if N[i, i] > N[best, best]:", "if N[i, i] < N[best, best]:"),
+    ("R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + w * z)", "R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y)"),
+    ("K[0, 1], K[0, 2], K[1, 2] = -omega[2], omega[1]", "K[0, 1], K[0, 2], K[1, 2] = -omega[2], 0"),
+    ("(1.0 - np.cos(angle)) / (angle * angle)", "(1.0 - np.cos(angle)) / angle"),
+    ("total += E[i, k] * R[k, j]", "total += R[i, k] * E[k, j]"),
+    ("if not diagonal > 1e-12:", "if not diagonal > -1e-12:"),
+    ("diagonal -= A[j, k] * A[j, k]", "diagonal -= A[j, k]"),
+    ("total -= A[k, i] * x[k]", "total -= A[i, k] * x[k]"),
+]
+
+AGREEMENT = [
+    ("if not z > 0.1:", "if not z > -9.0:"),
+    ("camera[2] + 0.5,", "camera[2],"),
+    ("camera[3] + 0.5\n", "camera[3]\n"),
+    ("column < width and line < height", "column < width + 1 and line < height"),
+    ("column >= 0 and line >= 0", "column > 0 and line > 1"),
+    ("plane = abs(dx * mx + dy * my + dz * mz)", "plane = abs(dz)"),
+    ("grow = max(1.0, (z / reference) ** 2)", "grow = 1.0"),
+    ("grow = max(1.0, (z / reference) ** 2)", "grow = max(1.0, z / reference)"),
+    ("grow = max(1.0, (z / reference) ** 2)", "grow = (z / reference) ** 2"),
+    ("plane < on_surface * grow", "plane < on_surface"),
+    ("gate = on_point * grow", "gate = 9 * on_point * grow"),
+    ("if cosine > least_cosine and", "if abs(cosine) > least_cosine and"),
+    ("dx * dx + dy * dy + dz * dz < gate * gate", "dx * dx + dy * dy < gate * gate"),
+    ("inliers += weights[i]", "inliers += 1.0"),
+    ("violations += weights[i]", "violations += 1.0"),
+    ("if dz < -margin * grow and", "if dz > margin * grow and"),
+    ("and plane > margin * grow:", "and plane > 0:"),
+    ("nearest = min(nearest, there)", "nearest = there"),
+    ("if there > 0:", "if there > 1.5:"),
+    ("if z < nearest - margin * grow:", "if z < nearest:"),
+    ("if z < nearest - margin * grow:", "if z < tz - margin * grow:"),
+    ("(T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz) * mx", "nx * mx"),
+    ("half = stride // 2", "half = 0"),
+    ("[half::stride, half::stride]\n", "[::stride, ::stride]\n"),
+    ("out[k, 0] = inliers", "out[k, 1] = inliers"),
+    ("camera, transforms[k], tolerances", "camera, transforms[0], tolerances"),
+    ("Agreement(len(source), round(inliers)", "Agreement(round(inliers), round(inliers)"),
+]
+
+REGISTRATION = [
+    ("if square < nearest:", "if square > nearest or column < 0:"),
+    ("range(u - 1, u + 2)", "range(u, u + 1)"),
+    ("column >= 1 and line >= 1", "column >= 0 and line >= 0"),
+    ("column < width - 1 and line < height - 1", "column < width and line < height"),
+    ("limit = gate * max(1.0, (z / reference) ** 2)", "limit = gate"),
+    ("limit = gate * max(1.0, (z / reference) ** 2)", "limit = gate * (z / reference) ** 2"),
+    ("if abs(residual) > limit or", "if residual > limit or"),
+    ("square > 9.0 * limit * limit", "square > 1e9"),
+    ("if cosine < least_cosine:", "if abs(cosine) < least_cosine:"),
+    ("1.0 - (residual / limit) ** 2", "1.0 - abs(residual / limit)"),
+    ("weight = tukey * tukey /", "weight = tukey /"),
+    ("(0.25 + (pz**4 + z**4) * 0.125)", "(0.25 + (z**4 + z**4) * 0.125)"),
+    ("(0.25 + (pz**4 + z**4) * 0.125)", "(0.25 + (pz**2 + z**2) * 0.125)"),
+    ("y * mz - z * my, z * mx - x * mz", "z * my - y * mz, z * mx - x * mz"),
+    ("y * mz - z * my, z * mx - x * mz", "y * mz - z * my, x * mz - z * mx"),
+    ("g[a] -= wa * residual", "g[a] += wa * residual"),
+    ("A[b, a] = A[a, b]", "A[b, a] = 0.0"),
+    ("share = iteration / max(iterations - 1, 1)", "share = 0.0"),
+    ("share = iteration / max(iterations - 1, 1)", "share = 1.0"),
+    ("if used < minimum:", "if used < 1:"),
+    ("information[a, b] = A[a, b] / used", "information[a, b] = A[b, a]  / 2 * used"),
+    ("+ step[3 + a]", "- step[3 + a]"),
+    ("turned(before, step[:3], turn)", "turned(before, -step[:3], turn)"),
+    ("if used else None", "if used > 1 else None"),
+]
+
+CONSENSUS = [
+    ("abs(da - db) > tolerance", "da - db > tolerance"),
+    ("or da < minimum or", "or"),
+    ("or db < minimum:", ":"),
+    ("if abs(ha - hb) > tolerance:", "if abs(ha - hb) > 9:"),
+    ("if abs(ga - gb) > tolerance:", "if abs(ga - gb) > 9:"),
+    ("if abs(np.arccos(ca) - np.arccos(cb)) > angle:", "if False:"),
+    ("if abs(ta - tb) > 2 * tolerance:", "if abs(abs(ta) - abs(tb)) > 2 * tolerance:"),
+    ("bits[j, i >> 6] |= np.uint64(1) << np.uint64(i & 63)", "pass"),
+    ("if used < 3:", "if used < 1:"),
+    ("a[d] /= total", "a[d] /= used"),
+    ("b[r] - (R[r, 0] * a[0]", "b[r] + (R[r, 0] * a[0]"),
+    ("weights[i] = u * u if u > 0 and agree", "weights[i] = u if u > 0 and agree"),
+    ("weights[i] = u * u if u > 0 and agree", "weights[i] = u * u if agree"),
+    ("weights[i] = u * u if u > 0 and agree", "weights[i] = u * u if u > 0"),
+]
+
+AVERAGING = [
+    ("agree_m: float = 0.15", "agree_m: float = 0.2"),
+    ("math.radians(10.0)", "math.radians(15.0)"),
+    ("(apart[..., 0] <= p.agree_m) & (", "(apart[..., 0] <= p.agree_m) | ("),
+    ("-int(near[i].sum())", "int(near[i].sum())"),
+    ("float(cost[i]), i)", "-float(cost[i]), i)"),
+    ("float(cost[i]), i)", "float(cost[i]), -i)"),
+    ("members = poses[near[medoid]]", "members = poses"),
+    ("members = poses[near[medoid]]", "members = poses[[medoid]]"),
+    ("nearest_rotation(members[:, :3, :3].sum(axis=0))", "members[0, :3, :3]"),
+    ("members[:, :3, 3].mean(axis=0)", "members[0, :3, 3]"),
+    ("members[:, :3, 3].mean(axis=0)", "np.median(members[:, :3, 3], axis=0)"),
+    ("np.sqrt((left**2).mean(axis=0))", "left.mean(axis=0)"),
+    ("metres, radians, len(members), len(poses)", "metres, radians, len(poses), len(poses)"),
+]
+
+CHECKS = {
+    rigid: ("check_rigid",),
+    agreement: ("check_agreement", "check_sampling"),
+    registration: ("check_registration",),
+    consensus: ("check_consensus",),
+    averaging: ("check_averaging",),
+}
+CASES = [
+    (module, line, wrong)
+    for module, mutations in (
+        (rigid, RIGID),
+        (agreement, AGREEMENT),
+        (registration, REGISTRATION),
+        (consensus, CONSENSUS),
+        (averaging, AVERAGING),
+    )
+    for line, wrong in mutations
+]
+#: Uncompiled, a pixel beyond the image is an IndexError; no answer where one is due, the other.
+CAUGHT = (AssertionError, IndexError, AttributeError)
+COMPILE = "from sceneprint.geometry.kernel import kernel\n"
+
+
+def uncompiled(module: ModuleType, line: str = "", wrong: str = "") -> ModuleType:
+    """A fresh copy of a module with one expression replaced, its kernels plain Python."""
+    source = inspect.getsource(module)
+    if line:
+        assert source.count(line) == 1, f"{line!r}: {source.count(line)} in {module.__name__}"
+    source = source.replace(COMPILE, "kernel = lambda function: function\n").replace(line, wrong)
+    copy = ModuleType(module.__name__)  # dataclasses look their module up by this name
+    exec(compile(source, str(module.__file__), "exec"), copy.__dict__)
+    return copy
+
+
+def check(goldens: ModuleType, module: ModuleType, copy: ModuleType) -> None:
+    with np.errstate(all="ignore"):  # a wrong line may divide by nought; that is not the catch
+        for name in CHECKS[module]:
+            getattr(goldens, name)(copy)
+
+
+@pytest.mark.parametrize(
+    ("module", "line", "wrong"),
+    CASES,
+    ids=[f"{m.__name__.rpartition('.')[2]}-{i}" for i, (m, _, _) in enumerate(CASES)],
+)
+def test_goldens_catch_a_wrong_line(
+    validation_goldens: ModuleType, module: ModuleType, line: str, wrong: str
+) -> None:
+    copy = uncompiled(module, line, wrong)
+    with pytest.raises(CAUGHT):
+        check(validation_goldens, module, copy)
+
+
+@pytest.mark.parametrize("module", CHECKS)
+def test_unchanged_copies_pass(validation_goldens: ModuleType, module: ModuleType) -> None:
+    # so that the cases above fail for their mutation, not for being copies
+    copy = uncompiled(module)
+    check(validation_goldens, module, copy)
+    # and so that they are: of its own kernels none is compiled
+    own = [v for v in vars(copy).values() if getattr(v, "__module__", "") == module.__name__]
+    assert len(own) >= 2
+    assert not any(hasattr(value, "py_func") for value in own)

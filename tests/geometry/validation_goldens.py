@@ -1,0 +1,386 @@
+"""Validation worked by hand; `test_validation_mutations.py` shows that these checks can fail.
+
+Each check takes the module under test, so that it can be run on a mutated copy. All scenes are a
+few points, so that kernels run uncompiled as well.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import product
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from sceneprint.types import Floats, Floats32, Intrinsics, Patches, Surface
+
+#: Pixels are a degree wide; the ray of pixel (20, 15) is the optical axis.
+CAMERA = Intrinsics(41, 31, 57.0, 57.0, 20.0, 15.0)
+CENTRE = (20, 15)
+TOWARDS = np.array([0.0, 0.0, -1.0])
+
+
+def wall(depth: float | Floats, normal: Floats = TOWARDS) -> Surface:
+    """A surface of this depth, 0 where missing, whose normals are all the same."""
+    z = np.broadcast_to(depth, (CAMERA.height, CAMERA.width))
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rays = np.dstack([(x - CAMERA.cx) / CAMERA.fx, (y - CAMERA.cy) / CAMERA.fy, np.ones(z.shape)])
+    valid = z > 0
+    normals = np.where(valid[..., None], normal, 0.0).astype(np.float32)
+    points = (rays * z[..., None]).astype(np.float32)
+    return Surface(points, normals, valid, np.ones(z.shape, np.float32), CAMERA)
+
+
+def seen_at(pixel: tuple[float, float], z: float, normal: Floats = TOWARDS) -> Floats32:
+    """One point of `sampled`, at that depth in that pixel."""
+    x, y = (pixel[0] - CAMERA.cx) / CAMERA.fx * z, (pixel[1] - CAMERA.cy) / CAMERA.fy * z
+    return np.array([[x, y, z, *normal]], np.float32)
+
+
+def quarter(axis: int, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Floats:
+    """A turn by 90 degrees about an axis, then a shift."""
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    T = np.eye(4)
+    T[a, a] = T[b, b] = 0.0
+    T[b, a], T[a, b] = 1.0, -1.0
+    T[:3, 3] = shift
+    return T
+
+
+def check_rigid(module: ModuleType) -> None:
+    about_z = quarter(2, (1.0, 2.0, 3.0))  # x goes to y
+    assert module.moved(about_z, np.array([[1.0, 0, 0], [0, 0, 5]])).tolist() == [
+        [1, 3, 3],
+        [1, 2, 8],
+    ]
+    assert module.inverse(about_z)[:3].tolist() == [[0, 1, 0, -2], [-1, 0, 0, 1], [0, 0, 1, -3]]
+    for axis in range(3):
+        assert module.rotation_angle(quarter(axis)[:3, :3]) == math.pi / 2
+    half = np.diag([1.0, -1.0, -1.0])
+    assert module.rotation_angle(half) == math.pi
+    assert module.rotation_angle(np.eye(3)) == 0.0
+    metres, radians = module.difference(about_z, quarter(2, (1.0, 5.0, 7.0)))
+    assert (metres, radians) == (5.0, 0.0)
+    metres, radians = module.difference(about_z, quarter(0, (1.0, 5.0, 7.0)) @ about_z)
+    assert (round(metres**2, 9), radians) == (1 + 0 + 36, math.pi / 2)
+    # the nearest rotation of a mirror image is none
+    found = module.nearest_rotation(np.diag([3.0, 2.0, -1.0]))
+    np.testing.assert_allclose(found, np.eye(3), atol=1e-12)
+    result = np.empty((3, 3))
+    for axis, omega in enumerate(np.eye(3) * (math.pi / 2)):
+        module.turned(np.eye(3), omega, result)
+        np.testing.assert_allclose(result, quarter(axis)[:3, :3], atol=1e-12)
+    module.turned(quarter(0)[:3, :3], np.array([0.0, 0.0, math.pi / 2]), result)
+    np.testing.assert_allclose(result, [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-12)
+    a = np.array([[1.0, 0, 0], [0, 2, 0], [0, 0, 3], [1, 1, 0]])
+    for axis, second in product(range(3), range(3)):
+        R = quarter(axis)[:3, :3] @ quarter(second)[:3, :3]
+        module.rotation_of_covariance((a @ R.T).T @ a, result)
+        np.testing.assert_allclose(result, R, atol=1e-12)
+    x = np.empty(2)
+    # 4 x + 2 y = 10, 2 x + 10 y = 14: (2, 1)
+    assert module.solve_positive(np.array([[4.0, 2], [2, 10]]), np.array([10.0, 14]), x)
+    np.testing.assert_allclose(x, [2, 1], atol=1e-12)
+    assert not module.solve_positive(np.array([[1.0, 2], [2, 4]]), np.ones(2), x)
+
+
+def check_agreement(module: ModuleType) -> None:
+    p = module.AgreementParameters(
+        surface_tolerance=0.05,
+        point_tolerance=0.15,
+        normal_cosine=0.7,
+        free_space_margin=0.1,
+        reference_depth=2.0,
+    )
+
+    def found(source: Floats32, target: Surface, T: Floats | None = None) -> tuple[float, float]:
+        result = module.agreement(source, target, np.eye(4) if T is None else T, p)
+        assert result.points == len(source)
+        return result.inliers, result.violations
+
+    on, through, nothing = (1.0, 0.0), (0.0, 1.0), (0.0, 0.0)
+    # a wall at 2 m, where tolerances have not begun to grow
+    flat = wall(2.0)
+    for z, expected in (
+        (2.0, on), (1.96, on), (1.94, nothing), (1.91, nothing), (1.89, through), (0.5, through),
+        (0.11, through), (0.09, nothing), (-2.0, nothing),
+    ):  # fmt: skip
+        assert found(seen_at(CENTRE, z), flat) == expected, z
+    # behind the wall tolerances grow with z^2, and nothing is violated: 4.41 / 4 of 5 cm is 5.5 cm
+    for z, expected in ((2.05, on), (2.10, nothing), (9.0, nothing)):
+        assert found(seen_at(CENTRE, z), flat) == expected, z
+    # normals 45 degrees apart agree, 46 do not: 0.7 is the cosine of 45.6; neither violates
+    for degrees, expected in ((45, on), (46, nothing), (180, nothing)):
+        a = math.radians(degrees)
+        leaning = np.array([math.sin(a), 0.0, -math.cos(a)])
+        assert found(seen_at(CENTRE, 2.0, leaning), flat) == expected
+        assert found(seen_at(CENTRE, 1.0, leaning), flat) == through
+    # the edge of the image is half a pixel past the last pixel's centre
+    for pixel, expected in (
+        ((-0.4, 15.0), on), ((-0.6, 15.0), nothing), ((40.4, 15.0), on), ((40.6, 15.0), nothing),
+        ((20.0, -0.4), on), ((20.0, -0.6), nothing), ((20.0, 30.4), on), ((20.0, 30.6), nothing),
+    ):  # fmt: skip
+        assert found(seen_at(pixel, 2.0), flat) == expected, pixel
+    # what the target did not see says nothing
+    hole = np.full((31, 41), 2.0)
+    hole[15, 20] = 0.0
+    for z in (1.0, 2.0, 3.0):
+        assert found(seen_at(CENTRE, z), wall(hole)) == nothing
+        assert found(seen_at((22.0, 15.0), z), wall(hole)) == found(seen_at(CENTRE, z), flat)
+    # at twice the reference depth everything is four times as wide
+    for depth, expected in (
+        (4.0, on), (4.19, on), (4.21, nothing), (4.39, nothing), (4.41, through), (3.61, nothing),
+        (3.81, on), (3.79, nothing), (2.0, nothing),
+    ):  # fmt: skip
+        assert found(seen_at(CENTRE, 4.0), wall(depth)) == expected, depth
+    # a floor seen at 6 degrees: 1 cm off its plane is 10 cm along the ray, 2 cm are 20 cm
+    grazing = np.array([math.sqrt(1 - 0.1**2), 0.0, -0.1])
+    for z, expected in ((1.9, on), (1.8, nothing)):
+        assert found(seen_at(CENTRE, z, grazing), wall(2.0, grazing)) == expected
+    # and 20 cm off its plane are 2 m along the ray
+    assert found(seen_at(CENTRE, 1.1, grazing), wall(2.0, grazing)) == nothing
+    assert found(seen_at(CENTRE, 0.9, grazing), wall(2.0, grazing)) == through
+    # near an edge a pixel near by may be the one: left of column 20, above row 15 it is 1 m
+    left, above = np.full((31, 41), 2.0), np.full((31, 41), 2.0)
+    left[:, :20], above[:15] = 1.0, 1.0
+    for edge in (1, 2):
+        p = replace(p, edge_px=edge)
+        for off, z, expected in (
+            (edge - 1, 1.0, nothing), (edge, 1.0, through), (edge - 1, 0.91, nothing),
+            (edge - 1, 0.89, through), (-1, 1.0, on), (0, 2.0, on),
+        ):  # fmt: skip
+            assert found(seen_at((20 + off, 15), z), wall(left)) == expected
+            assert found(seen_at((20, 15 + off), z), wall(above)) == expected
+    # at the border of the image there are fewer neighbours
+    assert found(seen_at((40, 30), 1.0), wall(left)) == through
+    assert found(seen_at((0, 0), 0.5), wall(left)) == through
+    # transforms act on points and on normals: the source looks along x, and 1 m lower
+    T = quarter(1, (0.0, 1.0, 0.0))  # about y: z goes to x, x to -z
+    point = np.array([[-2.0, -1.0, 0.0, 1.0, 0.0, 0.0]], np.float32)
+    assert found(point, flat, T) == on
+    assert found(point, flat) == nothing
+    # and a leaning wall's normal, from a source that lies on its side
+    leaning = np.array([0.6, 0.0, -0.8])
+    point = seen_at(CENTRE, 2.0, np.array([0.0, -0.6, -0.8]))
+    assert found(point, wall(2.0, leaning), quarter(2)) == on
+    # several transforms at once, weights in the place of numbers: 0.5 on, 0.25 through, 4 behind
+    both = np.concatenate([seen_at(CENTRE, 2.0), seen_at(CENTRE, 1.0), seen_at(CENTRE, 3.0)])
+    weights = np.array([0.5, 0.25, 4.0], np.float32)
+    nearer, away = np.eye(4), np.eye(4)
+    nearer[2, 3], away[0, 3] = -1.0, 50.0
+    transforms = np.array([np.eye(4), nearer, away])
+    result = module.agreements(both, flat, transforms, p, weights)
+    assert result.tolist() == [[0.5, 0.25], [4.0, 0.5], [0.0, 0.0]]
+    assert module.agreements(both, flat, transforms, p).tolist() == [[1, 1], [1, 1], [0, 0]]
+    assert module.agreements(both, flat, transforms[:0], p).shape == (0, 2)
+
+
+def check_sampling(module: ModuleType) -> None:
+    seen = wall(np.arange(31 * 41).reshape(31, 41) + 1.0)
+    seen.valid[7, 12] = False
+    rows = module.sampled(seen, 5)  # the middle of every full five
+    assert (rows.shape, rows.dtype) == ((6 * 8 - 1, 6), np.float32)
+    z = [y * 41 + x + 1 for y in range(2, 31, 5) for x in range(2, 41, 5) if (y, x) != (7, 12)]
+    assert rows[:, 2].tolist() == z
+    np.testing.assert_array_equal(rows[:, 3:], np.broadcast_to(TOWARDS, (47, 3)))
+    assert len(module.sampled(seen, 1)) == 31 * 41 - 1
+    assert module.camera_of(CAMERA).tolist() == [57.0, 57.0, 20.0, 15.0]
+
+
+def check_registration(module: ModuleType) -> None:
+    def once(source: Floats32, target: Surface, gate: float = 0.1, T: Floats | None = None) -> Any:
+        p = module.RefinementParameters(
+            1, 1, gate, gate, normal_cosine=0.7, reference_depth=2.0, minimum_points=1
+        )
+        return module.refine(source, target, np.eye(4) if T is None else T, p)
+
+    # one point, 3 cm behind a wall: n = -z and p = (.2, .1, 2), so p x n = (-.1, .2, 0)
+    at = (CAMERA.cx + 0.1 * 57, CAMERA.cy + 0.05 * 57)
+    point = seen_at(at, 2.0)
+    np.testing.assert_allclose(point[0, :3], [0.2, 0.1, 2.0], atol=1e-6)
+    found = once(point, wall(1.97))
+    # Tukey's weight (1 - .3^2)^2; both depths are 2: over .25 + (16 + 16) / 8
+    row = np.array([-0.1, 0.2, 0.0, 0.0, 0.0, -1.0])
+    weight = (1 - 0.3**2) ** 2 / 4.25
+    np.testing.assert_allclose(found.information, weight * np.outer(row, row), atol=1e-6)
+    assert found.points == 1
+    # the shortest step that brings it onto the wall: residual -3 cm, |row|^2 = 1.05
+    step = 0.03 / 1.05 * row
+    np.testing.assert_allclose(found.T[:3, 3], step[3:], atol=1e-5)
+    np.testing.assert_allclose(
+        [found.T[2, 1], found.T[0, 2], found.T[1, 0]], [step[0], step[1], 0.0], atol=1e-5
+    )
+    # a point counts by its depth in both frames: 1 m before the source, 2 m before the target
+    forward = np.eye(4)
+    forward[2, 3] = 1.0
+    found = once(seen_at(CENTRE, 1.0), wall(2.0), T=forward)
+    np.testing.assert_allclose(found.information[5, 5], 1 / (0.25 + 17 / 8), rtol=1e-6)
+    # beyond the gate, which grows with z^2, a point is forgotten
+    for z, gap, takes_part in (
+        (2.0, 0.09, True), (2.0, 0.11, False), (2.0, -0.11, False), (4.0, 0.39, True),
+        (4.0, 0.41, False), (1.0, 0.09, True), (1.0, 0.11, False),
+    ):  # fmt: skip
+        assert (once(seen_at(CENTRE, z), wall(z + gap)) is not None) == takes_part, (z, gap)
+    # and one whose normal is more than 45.6 degrees off
+    for degrees, takes_part in ((45, True), (46, False), (180, False)):
+        a = math.radians(degrees)
+        leaning = np.array([math.sin(a), 0.0, -math.cos(a)])
+        assert (once(seen_at(CENTRE, 2.0, leaning), wall(2.0)) is not None) == takes_part
+    # on a plane seen at 6 degrees: 2 cm off the plane are 20 cm along the ray, 4 cm are 40 cm,
+    # more than three gates
+    grazing = np.array([math.sqrt(1 - 0.1**2), 0.0, -0.1])
+    for z, takes_part in ((1.8, True), (1.6, False)):
+        assert (once(seen_at(CENTRE, z, grazing), wall(2.0, grazing)) is not None) == takes_part
+    # of the nine pixels the nearest point: in column 20 alone it is 1 m to the wall
+    step_ = np.full((31, 41), 2.0)
+    step_[:, 20] = 1.0
+    for column, z, takes_part in (
+        (20, 1.0, True), (21, 1.0, True), (19, 1.0, True), (22, 1.0, False),
+        (21, 2.0, True), (20, 2.0, True), (20, 1.5, False),
+    ):  # fmt: skip
+        assert (once(seen_at((column, 15), z), wall(step_)) is not None) == takes_part
+    # the outermost pixels have no nine
+    for pixel, takes_part in (
+        ((1.0, 15.0), True), ((0.0, 15.0), False), ((39.0, 15.0), True), ((40.0, 15.0), False),
+        ((20.0, 1.0), True), ((20.0, 0.0), False), ((20.0, 29.0), True), ((20.0, 30.0), False),
+    ):  # fmt: skip
+        assert (once(seen_at(pixel, 2.0), wall(2.0)) is not None) == takes_part, pixel
+    assert once(seen_at(CENTRE, 2.0), wall(0.0)) is None
+    assert once(seen_at(CENTRE, -2.0), wall(2.0)) is None
+    assert once(np.empty((0, 6), np.float32), wall(2.0)) is None
+    # gates narrow from the first to the last: at 9 cm a point takes part at first only, and
+    # weighs little
+    ring = [(10, 10), (20, 10), (30, 10), (10, 20), (20, 20), (30, 20)]
+    some = np.concatenate([seen_at(pixel, 2.0) for pixel in ring] + [seen_at(CENTRE, 1.91)])
+    for iterations, least, points in ((1, 7, 7), (2, 6, 6), (2, 7, None), (4, 6, 6)):
+        p = module.RefinementParameters(
+            1, iterations, 0.1, 0.02, reference_depth=2.0, minimum_points=least
+        )
+        found = module.refine(some, wall(2.0), np.eye(4), p)
+        assert (found and found.points) == points
+        assert found is None or np.abs(found.T - np.eye(4)).max() < 2e-3
+
+
+def patches(means: Floats, normals: Floats) -> Patches:
+    n = len(means)
+    return Patches(means, normals, np.ones(n), np.ones(n, np.int32), np.ones(n))
+
+
+def compatible(module: ModuleType, a: Patches, b: Patches) -> bool:
+    """Whether two correspondences, of patch 0 and of patch 1, are compatible."""
+    bits = np.zeros((2, 1), np.uint64)
+    module._graph(a.means, a.normals, b.means, b.normals, 0.12, 0.5, 0.15, bits)
+    assert bits[0, 0] in (0, 2)
+    assert bits[1, 0] == bits[0, 0] // 2
+    return bool(bits[0, 0])
+
+
+def check_consensus(module: ModuleType) -> None:
+    x, y, z = np.eye(3)
+    origin = np.zeros(3)
+
+    def two(place: Floats, first: Floats, second: Floats) -> Patches:
+        return patches(np.array([origin, place]), np.array([first, second]))
+
+    # patches a metre apart, the first facing up, the second facing y
+    a = two(x, z, y)
+    R = quarter(0)[:3, :3] @ quarter(1)[:3, :3]
+    moved = patches(a.means @ R.T + [1, 2, 3], a.normals @ R.T)
+    assert compatible(module, a, moved)
+    for length, same in ((1.11, True), (0.89, True), (1.13, False), (0.87, False)):
+        assert compatible(module, a, two(length * x, z, y)) == same
+    # nearer than 15 cm nothing is compared, in either frame
+    assert compatible(module, two(0.16 * x, z, y), two(0.16 * x, z, y))
+    assert not compatible(module, two(0.16 * x, z, y), two(0.14 * x, z, y))
+    assert not compatible(module, two(0.14 * x, z, y), two(0.16 * x, z, y))
+    # heights over the first patch's plane, and over the second's, at the same distance
+    for height, same in ((0.11, True), (-0.11, True), (0.13, False), (-0.13, False)):
+        level = math.sqrt(1 - height**2)
+        assert compatible(module, two(x, z, z), two(level * x + height * z, z, z)) == same
+        assert compatible(module, a, two(level * x + height * z, z, y)) == same
+        assert compatible(module, a, two(level * x + height * y, z, y)) == same
+    # the angle between the normals: 90 degrees, and 28 or 29 more; 0.5 rad are 28.6
+    for degrees, same in ((118, True), (119, False), (62, True), (61, False)):
+        turn = math.radians(degrees)
+        # 20 cm apart, where the triple product, which shrinks as well, is within tolerance
+        away = two(0.2 * x, z, math.cos(turn) * z + math.sin(turn) * y)
+        assert compatible(module, two(0.2 * x, z, y), away) == same
+    # mirrored, all lengths and angles stay, and the triple product x . (z x y) turns round
+    assert not compatible(module, a, two(x, z, -y))
+    assert not compatible(module, a, patches(a.means * [-1, 1, 1], a.normals * [-1, 1, 1]))
+    # of a mirror image of what lies in one plane there is a motion
+    flat = two(x, x, (x + z) / math.sqrt(2))
+    assert compatible(module, flat, patches(flat.means * [1, -1, 1], flat.normals * [1, -1, 1]))
+
+    # a fit to positions and normals: a quarter turn about z and a shift
+    source = patches(
+        np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [5, 5, 5]]), np.eye(3)[[0, 1, 2, 0]]
+    )
+    T = quarter(2, (1.0, 2.0, 3.0))
+    q, m = source.means @ T[:3, :3].T + T[:3, 3], source.normals @ T[:3, :3].T
+    q[3] = 0.0  # counts for nothing
+    found = np.zeros((4, 4))
+    weights = np.array([1.0, 2.0, 3.0, 0.0])
+    assert module._fit(source.means, source.normals, q, m, weights, 0.05, found)
+    np.testing.assert_allclose(found, T, atol=1e-12)
+    assert not module._fit(
+        source.means, source.normals, q, m, np.array([1.0, 0, 0, 1]), 0.05, found
+    )
+    # what it explains: off by 0, 6 cm, 16 cm, and by 0 but facing elsewhere; (1 - .16)^2
+    off = q.copy()
+    off[1, 0] += 0.06
+    off[2, 2] += 0.16
+    off[3] = source.means[3] @ T[:3, :3].T + T[:3, 3]
+    m[3] = z
+    total = module._explained(source.means, source.normals, off, m, T, 0.15, 0.85, weights)
+    np.testing.assert_allclose(weights, [1, 0.84**2, 0, 0], atol=1e-9)
+    assert abs(total - 1 - 0.84**2) < 1e-9
+
+
+def check_averaging(module: ModuleType) -> None:
+    def at(x: float, y: float = 0.0, degrees: float = 0.0) -> Floats:
+        T = np.eye(4)
+        a = math.radians(degrees)
+        T[0, 0] = T[1, 1] = math.cos(a)
+        T[1, 0], T[0, 1] = math.sin(a), -math.sin(a)
+        T[0, 3], T[1, 3] = x, y
+        return T
+
+    # four votes around a square of 8 cm and 4 degrees, and two far off
+    votes = [
+        at(9.0),
+        at(0, 0, -2),
+        at(0.08, 0, 2),
+        at(0, 0.08, -2),
+        at(0.08, 0.08, 2),
+        at(0, 0, 40),
+    ]
+    found = module.average_poses(np.array(votes))
+    np.testing.assert_allclose(found.T, at(0.04, 0.04), atol=1e-12)
+    assert (found.support, found.votes) == (4, 6)
+    # each of the four is 4 cm off in x and in y, and 2 degrees
+    np.testing.assert_allclose(found.spread_m, 0.04 * math.sqrt(2), atol=1e-12)
+    np.testing.assert_allclose(found.spread_rad, math.radians(2), atol=1e-12)
+    # the default tolerances: 15 cm and 10 degrees, either is enough to disagree
+    for other, support in (
+        (at(0.149), 2), (at(0.151), 1), (at(0, 0, 9.9), 2), (at(0, 0, 10.1), 1),
+        (at(0.14, 0, 9), 2),
+    ):  # fmt: skip
+        assert module.average_poses(np.array([at(0), other])).support == support
+    # nobody agrees: the earlier
+    found = module.average_poses(np.array([at(1), at(2), at(3)]))
+    np.testing.assert_array_equal(found.T, at(1))
+    assert (found.spread_m, found.support, found.votes) == (0.0, 1, 3)
+    # two against two: the two that are nearer to each other, though they come later
+    found = module.average_poses(np.array([at(1), at(1.1), at(2), at(2.04)]))
+    np.testing.assert_allclose(found.T, at(2.02), atol=1e-12)
+    # more against fewer, though these are nearer; the mean is not the medoid
+    found = module.average_poses(np.array([at(5), at(5.01), at(0), at(0.12), at(0.06), at(0.06)]))
+    np.testing.assert_allclose(found.T, at(0.06), atol=1e-12)
+    np.testing.assert_allclose(found.spread_m, math.sqrt(0.0072 / 4), atol=1e-12)
+    # the medoid has two beside it, which do not agree with each other
+    found = module.average_poses(np.array([at(-0.1), at(0.0), at(0.13)]))
+    np.testing.assert_allclose(found.T, at(0.01), atol=1e-12)
+    assert found.support == 3

@@ -1,0 +1,172 @@
+"""Rows of `make bench`: what they compare is the same work, and pages hold what was measured."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import dpp, registration, scan
+from benchmarks.__main__ import BEGIN, END, Rows, page
+from benchmarks.encode import Clock, EncodeFigures, open3d, points_of
+from benchmarks.machine import Machine
+from benchmarks.pairs import FramePair, pairs_among, real_pairs, synthetic_pairs
+from sceneprint.errors import MissingDependency
+from sceneprint.geometry.diversity import diversify
+from sceneprint.geometry.retrieval import distances, pairwise_distances, rank
+from sceneprint.models import Model
+from sceneprint.types import Floats, Frame, Intrinsics
+
+CAMERA = Intrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
+
+
+def wall(shift: float = 0.0) -> Frame:
+    """A wall 2 m away, seen by a camera `shift` metres to the right, and turned upside down."""
+    pose: Floats = np.diag([-1.0, -1.0, 1.0, 1.0])
+    pose[0, 3] = shift
+    return Frame(np.full((60, 80), 2.0, np.float32), CAMERA, f"{shift:g} m", pose)
+
+
+def pair_of(frames: tuple[Frame, ...]) -> FramePair:
+    """A frame with itself."""
+    return FramePair(frames[0], frames[0], 1.0, np.eye(4))
+
+
+def test_scan_compares_a_read_and_four_scans() -> None:
+    found = scan.measure(signatures=5, length=64, runs=3)
+    assert list(found.milliseconds) == list(found.shares)
+    assert len(found.milliseconds) == 4
+    assert found.read > 0
+    assert all(value > 0 for value in (*found.milliseconds.values(), *found.shares.values()))
+    text = "\n".join(scan.table(found))
+    assert "5 signatures of 64 bytes" in text
+    assert all(f"| {name} | " in text for name in found.milliseconds)
+
+
+def test_views_of_a_walk_are_farther_apart_the_longer_it_is() -> None:
+    walk = dpp.views(25, 4096)
+    to_first = distances(walk[0], walk)
+    assert to_first[0] == 0
+    assert (np.diff(to_first[:3]) > 0).all()
+    assert to_first[1] < 0.7 * to_first[12]
+
+
+@pytest.mark.parametrize("size", [20, 60])
+def test_both_selections_are_the_same(size: int) -> None:
+    found = dpp.measure(size=size, k=6, length=2048, runs=1)
+    assert found.agrees
+    assert (found.ranking, found.selected) == (size, 6)
+    assert min(found.pairwise, found.greedy, found.naive, found.share) > 0
+    text = "\n".join(dpp.table(found))
+    assert f"6 of a ranking of {size}" in text
+    assert "differ" not in text
+    assert "differ" in "\n".join(dpp.table(replace(found, agrees=False)))
+
+
+def test_naive_selection_finds_the_largest_determinant() -> None:
+    database = dpp.views(12, 512)
+    ranking = rank(distances(database[6], database), 12, 1.0)
+    among = pairwise_distances(database[ranking.indices])
+    found = dpp.naive_selection(ranking, among, 4)
+    assert found == diversify(ranking.distances, among, 4).indices.tolist()
+    assert found[0] == 0
+
+
+def test_pairs_by_hand() -> None:
+    half = 40 / 70 * 2  # half of the width that is seen
+    pairs = pairs_among([wall(), wall(half), wall(2 * half), wall(2.5 * half)])
+    names = [(pair.query.name, pair.match.name) for pair in pairs]
+    assert names == [
+        (wall(half).name, wall().name),
+        (wall(2 * half).name, wall(half).name),
+        (wall(2.5 * half).name, wall(2 * half).name),
+    ]
+    assert pairs[0].overlap == 0.5
+    # both cameras stand on their heads: what is to the right in the room is to their left
+    np.testing.assert_allclose(pairs[0].T_match_query[:3, 3], [-half, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(pairs[0].T_match_query[:3, :3], np.eye(3), atol=1e-12)
+    assert pairs_among([wall(), wall(), wall()], apart=2)[0].match.name == "0 m"
+    assert len(pairs_among([wall(), wall(), wall()], apart=2)) == 1
+
+
+def test_pairs_of_rooms_and_of_no_recordings(tmp_path: Path) -> None:
+    assert real_pairs(tmp_path, 5) == []
+    (pair,) = synthetic_pairs(1)
+    assert pair.overlap >= 0.3
+
+
+def test_pairs_of_recordings(data_root: Path) -> None:
+    pairs = real_pairs(data_root, 4, step=100)
+    assert len(pairs) == 4
+    assert min(pair.overlap for pair in pairs) >= 0.3
+
+
+@pytest.mark.parametrize(
+    ("metres", "degrees", "right"),
+    [(0.0, 0.0, True), (0.099, 9.9, True), (0.101, 0.0, False), (0.0, 10.1, False)],
+)
+def test_right_within_ten_centimetres_and_degrees(
+    metres: float, degrees: float, right: bool
+) -> None:
+    truth, found = np.eye(4), np.eye(4)
+    truth[:3, 3] = 1.0, 2.0, 3.0
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    found[:2, :2] = [[c, -s], [s, c]]
+    found[:3, 3] = 1.0, 2.0 + metres, 3.0
+    assert registration.is_right(found, truth) is right
+    assert not registration.is_right(None, truth)
+
+
+def test_without_open3d_the_row_says_so(
+    small_model: Model, room_frames: tuple[Frame, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    figures = registration.measure([pair_of(room_frames)], small_model, warm_up=0)
+    assert (figures.open3d, figures.open3d_right, figures.share) == (None, None, None)
+    assert list(figures.stages) == ["geometry of both frames", "validation"]
+    assert figures.ours == pytest.approx(sum(figures.stages.values()))
+    text = "\n".join(registration.table(figures))
+    assert "Open3D | not measured: open3d cannot be imported" in text
+
+
+def test_open3d_finds_a_frame_in_itself(room_frames: tuple[Frame, ...]) -> None:
+    try:
+        o3d = open3d()
+    except MissingDependency as error:
+        pytest.skip(str(error))
+    clock, points = Clock(), points_of(room_frames[0], 0.3, 9.0)
+    found = registration.register_by_open3d(points, points, o3d, clock)
+    np.testing.assert_allclose(found, np.eye(4), atol=1e-3)
+    assert list(clock.stages) == ["voxel grid", "normals", "features", "RANSAC", "ICP"]
+
+
+def test_page_and_json_hold_every_row() -> None:
+    encode = EncodeFigures(3, {"pairs": 2.0}, 2.0, {}, None, None, "no open3d")
+    rows = Rows(
+        {"paper": (encode, 100.0)},
+        scan.ScanFigures(500, 125_000, 2.0, {"L1, one query": 4.0}, {"L1, one query": 0.5}),
+        dpp.DppFigures(125, 10, 125_000, 20.0, 0.5, 10.0, 0.05, agrees=True),
+        registration.RegistrationFigures(
+            20, 0.5, {"validation": 20.0}, 20.0, 1.0, {"RANSAC": 200.0}, 200.0, 0.9, 0.1, 0.1, ""
+        ),
+    )
+    section = page(Machine("a processor", 2, 8.0, "3.11", {"numpy": "2"}), rows, 0.1)
+    assert section.startswith(BEGIN)
+    assert section.endswith(END)
+    for wanted in (
+        "### Signing, `paper`",
+        "### Exact scan of 500 signatures of 125,000 bytes (62.5 MB)",
+        "| L1, one query | 4.00 | 0.50 |",
+        "| **greedy selection / by determinants** | **0.050** |",
+        "| Open3D RANSAC | 200.0 |",
+        "| **ours / Open3D** | **0.100** |",
+        "truth: 1.00 of the pairs; Open3D's within it: 0.90.",
+    ):
+        assert wanted in section
+    for one in (rows.scan, rows.dpp, rows.registration):
+        assert json.loads(json.dumps(asdict(one))) == asdict(one)
