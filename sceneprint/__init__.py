@@ -1,7 +1,11 @@
 """sceneprint: place recognition from pure geometry.
 
     signer = sceneprint.open_signer("paper")
-    signature = sceneprint.sign(frame, signer)
+    signature, geometry = sceneprint.prepare(frame, signer)
+    ranking = sceneprint.retrieve(signature, signatures, signer.model)  # R
+    selection = sceneprint.diversify(ranking, signatures)  # C
+    matches = sceneprint.associate(geometry, ranking, selection.indices, open_geometry)  # C_vld
+    location = sceneprint.locate(matches, poses)
 
 Names are loaded when first used, so that importing the package costs nothing.
 """
@@ -13,41 +17,81 @@ from importlib.metadata import version as _version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sceneprint.artifacts import read_geometry, write_geometry
     from sceneprint.datasets import find_sequences, make_frame, read_frame
+    from sceneprint.geometry.validation import Validation
     from sceneprint.models import Model, read_model
-    from sceneprint.pipeline import Signature, Signer, distance, open_signer, sign
-    from sceneprint.types import Frame, Intrinsics
+    from sceneprint.pipeline import (
+        Location,
+        Match,
+        Signature,
+        Signer,
+        associate,
+        distance,
+        diversify,
+        locate,
+        open_signer,
+        prepare,
+        retrieve,
+        sign,
+        validate,
+    )
+    from sceneprint.types import Frame, Geometry, Intrinsics
 
 __all__ = [
     "Frame",
+    "Geometry",
     "Intrinsics",
+    "Location",
+    "Match",
     "Model",
     "Signature",
     "Signer",
+    "Validation",
+    "associate",
     "distance",
+    "diversify",
     "find_sequences",
+    "locate",
     "make_frame",
     "open_signer",
+    "prepare",
     "read_frame",
+    "read_geometry",
     "read_model",
+    "retrieve",
     "sign",
+    "validate",
+    "write_geometry",
 ]
 
 __version__ = _version("sceneprint")
 
 _HOME = {
     "Frame": "types",
+    "Geometry": "types",
     "Intrinsics": "types",
+    "Location": "pipeline",
+    "Match": "pipeline",
     "Model": "models",
     "Signature": "pipeline",
     "Signer": "pipeline",
+    "Validation": "geometry.validation",
+    "associate": "pipeline",
     "distance": "pipeline",
+    "diversify": "pipeline",
     "find_sequences": "datasets",
+    "locate": "pipeline",
     "make_frame": "datasets",
     "open_signer": "pipeline",
+    "prepare": "pipeline",
     "read_frame": "datasets",
+    "read_geometry": "artifacts",
     "read_model": "models",
+    "retrieve": "pipeline",
     "sign": "pipeline",
+    "validate": "pipeline",
+    "write_geometry": "artifacts",
 }
 
 

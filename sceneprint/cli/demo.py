@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import math
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +15,30 @@ from tqdm import tqdm
 from sceneprint.cli.signer import add_model_options, open_for
 from sceneprint.datasets import find_sequences
 from sceneprint.errors import DatasetError, FrameError
-from sceneprint.geometry.retrieval import distances
-from sceneprint.pipeline import Signer, sign
+from sceneprint.geometry.rigid import difference
+from sceneprint.pipeline import (
+    Match,
+    Signature,
+    Signer,
+    associate,
+    diversify,
+    locate,
+    prepare,
+    retrieve,
+)
 from sceneprint.settings import Settings
-from sceneprint.types import Frame
+from sceneprint.types import Frame, Geometry
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A frame of the demo with all that is made of it."""
+
+    place: str  #: frames of one place share a parent frame
+    frame: Frame
+    signature: Signature
+    geometry: Geometry
+
 
 #: Of a data set, no more frames than this are taken, evenly spread.
 MAXIMUM_FRAMES = 48
@@ -26,9 +48,9 @@ def add_to(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "demo",
-        help="sign frames, find each one's nearest, draw three of them",
-        description="Sign the frames of a small synthetic building (or of --dataset), tell for "
-        "each which other frame is nearest, and draw three of them.",
+        help="sign frames, find each one among the others with its pose, draw three of them",
+        description="Sign the frames of a small synthetic building (or of --dataset), find each "
+        "among the others, validated and with a pose, and draw three of them.",
     )
     command.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR")
     command.add_argument(
@@ -40,7 +62,7 @@ def add_to(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Show what signatures can do."""
+    """Show retrieval, diversification, validation and the pose."""
     from sceneprint.pictures import save_picture
 
     options.out.mkdir(parents=True, exist_ok=True)
@@ -48,18 +70,24 @@ def run(options: argparse.Namespace) -> int:
     if len(frames) < 2:
         raise DatasetError(f"{options.dataset}: the demo compares frames; give two or more.")
     signer = open_for(options, Settings())
-    stored, seconds = _sign_all(frames, signer)
-    _print_nearest(frames, stored, signer)
+    start = time.perf_counter()
+    known = _prepare_all(frames, signer)
+    seconds = time.perf_counter() - start
+    last = _ask_all(known, signer)
     for number in sorted({0, len(frames) // 2, len(frames) - 1}):
         path = options.out / f"frame-{number:02d}.png"
         save_picture(frames[number][1], signer.model, path)
         print(f"picture: {path}")
+    for line in last:
+        print(line)
     print(
         f"{len(frames)} frames signed in {seconds:.1f} s "
         f"({1e3 * seconds / len(frames):.0f} ms each, {signer.model.signature_bytes} bytes each) "
         f"with model {signer.model.label}"
     )
-    print("next: sceneprint sign PATH, with an intrinsics.json beside your frames (README.md)")
+    print(
+        "next: sceneprint sign PATH, or sceneprint evaluate PATH, on frames of your own (README.md)"
+    )
     return 0
 
 
@@ -90,32 +118,62 @@ def _given(path: Path) -> list[tuple[str, Frame]]:
     return frames
 
 
-def _sign_all(
-    frames: list[tuple[str, Frame]], signer: Signer
-) -> tuple[np.ndarray[Any, np.dtype[np.uint8]], float]:
-    start = time.perf_counter()
+def _prepare_all(frames: list[tuple[str, Frame]], signer: Signer) -> list[Known]:
     bar = tqdm(frames, desc="sign", unit="frame", disable=None)
-    stored = np.stack([sign(frame, signer).vector for _, frame in bar])
-    return stored, time.perf_counter() - start
+    return [Known(place, frame, *prepare(frame, signer)) for place, frame in bar]
 
 
-def _print_nearest(
-    frames: list[tuple[str, Frame]], stored: np.ndarray[Any, np.dtype[np.uint8]], signer: Signer
-) -> None:
-    d0 = signer.model.unrelated_distance
-    table = np.stack([distances(one, stored) for one in stored]).astype(float)
-    np.fill_diagonal(table, np.inf)
-    nearest = table.argmin(axis=1)
-    width = max(len(frame.name) for _, frame in frames)
-    print(f"{'frame':{width}}  {'nearest other frame':{width}}  similarity  same place")
-    hits = 0
-    for i, (place, frame) in enumerate(frames):
-        j = int(nearest[i])
-        same = frames[j][0] == place
-        hits += same
-        similarity = float(np.clip(1.0 - table[i, j] / d0, 0.0, 1.0))
-        print(
-            f"{frame.name:{width}}  {frames[j][1].name:{width}}  {similarity:10.2f}  "
-            f"{'yes' if same else 'no'}"
+def _ask_all(known: list[Known], signer: Signer) -> list[str]:
+    """Ask for each frame among all others, and print what came back; returns the last lines."""
+    width = max(len(one.frame.name) for one in known)
+    print(
+        f"{'query':{width}}  {'nearest frame':{width}}  similarity  "
+        f"{'validated match':{width}}  strength  pose off by"
+    )
+    nearest, found, right, milliseconds = 0, 0, 0, []
+    for i, query in enumerate(tqdm(known, desc="ask", unit="query", disable=None)):
+        database = known[:i] + known[i + 1 :]
+        start = time.perf_counter()
+        signatures = [one.signature for one in database]
+        ranking = retrieve(query.signature, signatures, signer.model)
+        selection = diversify(ranking, signatures)
+        matches = associate(
+            query.geometry,
+            ranking,
+            selection.indices.tolist(),
+            [one.geometry for one in database].__getitem__,
+            k=3,
         )
-    print(f"the nearest frame is of the same place for {hits} of {len(frames)} frames")
+        milliseconds.append(1e3 * (time.perf_counter() - start))
+        first = database[int(ranking.indices[0])]
+        nearest += first.place == query.place
+        line = f"{query.frame.name:{width}}  {first.frame.name:{width}}  "
+        line += f"{ranking.similarities[0]:10.2f}  "
+        accepted = [match for match in matches if match.validation.status == "accepted"]
+        if accepted:
+            best = database[accepted[0].index]
+            found += 1
+            right += best.place == query.place
+            line += f"{best.frame.name:{width}}  {accepted[0].validation.strength:8}  "
+            line += _pose_error(query, matches, database)
+        else:
+            line += f"{'not found':{width}}"
+        tqdm.write(line.rstrip())
+    return [
+        f"the nearest frame is of the same place for {nearest} of {len(known)} queries; a match "
+        f"was validated for {found}, and {right} of these are of the same place",
+        f"{np.median(milliseconds):.0f} ms a query among {len(known) - 1} frames, validation "
+        "included (median)",
+    ]
+
+
+def _pose_error(query: Known, matches: list[Match], database: list[Known]) -> str:
+    """How far the pose averaged over the matches is from the known one, where it is known."""
+    if query.frame.pose is None or any(one.frame.pose is None for one in database):
+        return ""
+    poses = [one.frame.pose for one in database if one.frame.pose is not None]
+    location = locate(matches, poses, [one.place for one in database])
+    if location is None or location.parent != query.place:
+        return "another place"
+    metres, radians = difference(location.average.T, query.frame.pose)
+    return f"{100 * metres:.1f} cm, {math.degrees(radians):.1f} deg"
