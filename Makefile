@@ -11,10 +11,10 @@ export OPENBLAS_NUM_THREADS ?= 1
 .PHONY: help demo test lint format bench models lock clean
 
 help:
-	@echo "make demo    sign frames, find each one's nearest, and draw them [DATASET=folder]"
+	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
 	@echo "make test    lint, types, import contracts and all tests"
 	@echo "make lint    lint, types and import contracts only"
-	@echo "make bench   what signing costs, beside FPFH; rewrites its part of docs/performance.md"
+	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
 	@echo "make models  train the presets that ship with the package (minutes)"
 	@echo "make lock    resolve the dependencies anew into requirements.txt"
 

@@ -108,7 +108,7 @@ def test_readme_commands_and_library_example_run(tmp_path: Path) -> None:
     makes = [line for line in commands if line.startswith("make")]
     assert makes == ["make demo"]
     rest = [line for line in commands if line not in makes]
-    assert len(rest) == 3
+    assert len(rest) == 4
     for line in rest:
         program, *arguments = line.split()
         assert program == ".venv/bin/sceneprint"
@@ -121,8 +121,13 @@ def test_readme_commands_and_library_example_run(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", example], cwd=tmp_path, check=True, capture_output=True, text=True
     )
-    # the first frame of room 0 looks most like another frame of room 0
-    assert re.fullmatch(r"room-000\S+ looks most like room-000\S+\n", done.stdout)
+    # the first frame of room 0 is found in another frame of room 0, and in none of room 1
+    lines = done.stdout.splitlines()
+    assert re.match(r"room-000\S+ 0\.\d\d accepted ", lines[0])
+    assert [line.split()[2] for line in lines if line.startswith("room-001")] == ["rejected"] * 3
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert figures["counts"]["queries"] == 3
+    assert (tmp_path / "plots/contact.png").stat().st_size > 10_000
 
 
 def test_readme_camera_is_valid_json() -> None:
