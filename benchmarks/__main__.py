@@ -80,13 +80,16 @@ def table(preset: str, f: EncodeFigures, peak: float) -> list[str]:
     ]
     lines += [f"| {stage} | {ms:.1f} |" for stage, ms in f.stages.items()]
     lines += [f"| **signing, sum** | **{f.signing:.1f}** |"]
+    lines += [f"| {stage} | {ms:.1f} |" for stage, ms in f.artifact_stages.items()]
     lines += [f"| {stage} | {ms:.1f} |" for stage, ms in f.fpfh_stages.items()]
-    if f.fpfh is not None and f.ratio is not None:
+    if f.fpfh is not None and f.ratio is not None and f.ratio_with_artifact is not None:
         lines += [f"| **FPFH, sum** | **{f.fpfh:.1f}** |"]
         lines += [f"| **signing / FPFH** | **{f.ratio:.2f}** |"]
+        lines += [f"| **signing and geometry artifact / FPFH** | **{f.ratio_with_artifact:.2f}** |"]
     else:
         lines += [f"| FPFH | not measured: {f.note} |"]
-    return [*lines, "", f"Peak memory of a process that signs: {peak:.0f} MB.", ""]
+    sizes = f"Geometry artifact: {f.artifact_bytes:,} bytes. Peak memory of a process that signs: "
+    return [*lines, "", f"{sizes}{peak:.0f} MB.", ""]
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.errors import MissingDependency
 from sceneprint.geometry.counting import count_pairs
 from sceneprint.geometry.depth import inverse_depth
@@ -17,8 +18,8 @@ from sceneprint.geometry.hierarchy import hierarchy
 from sceneprint.geometry.normals import surface
 from sceneprint.geometry.segmentation import segment
 from sceneprint.geometry.weights import patch_weights
-from sceneprint.pipeline import Signer, sign
-from sceneprint.signing import float_signature
+from sceneprint.pipeline import Signer, geometry_of, sign
+from sceneprint.signing import float_signature, see
 from sceneprint.types import Floats, Frame
 
 T = TypeVar("T")
@@ -66,6 +67,16 @@ def signing_stages(frame: Frame, signer: Signer) -> dict[str, float]:
     return clock.stages
 
 
+def artifact_stages(frame: Frame, signer: Signer) -> tuple[dict[str, float], int]:
+    """Milliseconds of each stage of the geometry artifact beside `sign`, and its bytes."""
+    clock, model = Clock(), signer.model
+    seen = see(frame, model.parameters)
+    geometry = clock.run("patches and descriptors", lambda: geometry_of(seen, model))
+    data = clock.run("artifact to bytes", lambda: write_geometry(geometry))
+    clock.run("artifact from bytes", lambda: read_geometry(data))
+    return clock.stages, len(data)
+
+
 def open3d() -> Any:
     """The open3d module.
 
@@ -106,14 +117,20 @@ def fpfh_stages(points: Floats, o3d: Any) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class EncodeFigures:
-    """Medians over all frames, milliseconds; `ratio` is the median of each frame's own."""
+    """Medians over all frames, milliseconds; `ratio` is the median of each frame's own.
+
+    `ratio_with_artifact` has the geometry artifact made and written beside the signature.
+    """
 
     frames: int
     stages: dict[str, float]
     signing: float
+    artifact_stages: dict[str, float]
+    artifact_bytes: int
     fpfh_stages: dict[str, float]
     fpfh: float | None
     ratio: float | None
+    ratio_with_artifact: float | None
     note: str
 
 
@@ -126,20 +143,27 @@ def measure(frames: list[Frame], signer: Signer, warm_up: int = 3) -> EncodeFigu
         note = str(error)
     for frame in frames[:warm_up]:
         sign(frame, signer)
-    ours, theirs = [], []
+        artifact_stages(frame, signer)
+    ours, theirs, artifacts = [], [], []
     for frame in frames:
         ours.append(signing_stages(frame, signer))
+        artifacts.append(artifact_stages(frame, signer))
         if o3d is not None:
             theirs.append(fpfh_stages(points_of(frame, p.minimum_depth, p.maximum_depth), o3d))
     sums, other = [sum(s.values()) for s in ours], [sum(s.values()) for s in theirs]
+    made = [sum(s.values()) - s["artifact from bytes"] for s, _ in artifacts]
     ratios = [a / b for a, b in zip(sums, other, strict=False)]
+    with_artifact = [(a + m) / b for a, m, b in zip(sums, made, other, strict=False)]
     return EncodeFigures(
         frames=len(frames),
         stages=_medians(ours),
         signing=float(np.median(sums)),
+        artifact_stages=_medians([stages for stages, _ in artifacts]),
+        artifact_bytes=int(np.median([size for _, size in artifacts])),
         fpfh_stages=_medians(theirs),
         fpfh=float(np.median(other)) if other else None,
         ratio=float(np.median(ratios)) if ratios else None,
+        ratio_with_artifact=float(np.median(with_artifact)) if with_artifact else None,
         note=note,
     )
 

@@ -146,7 +146,10 @@ def test_open3d_finds_a_frame_in_itself(room_frames: tuple[Frame, ...]) -> None:
 
 
 def test_page_and_json_hold_every_row() -> None:
-    encode = EncodeFigures(3, {"pairs": 2.0}, 2.0, {}, None, None, "no open3d")
+    encode = EncodeFigures(
+        3, {"pairs": 2.0}, 2.0, {"patches and descriptors": 9.0}, 170_000, {}, None, None, None,
+        "no open3d",
+    )  # fmt: skip
     rows = Rows(
         {"paper": (encode, 100.0)},
         scan.ScanFigures(500, 125_000, 2.0, {"L1, one query": 4.0}, {"L1, one query": 0.5}),

@@ -96,7 +96,7 @@ def acceptance_figure(outcomes: Sequence[Outcome]) -> Figure:
     _sweep(axes[1], found, degrees, 10, "residual, degrees")
     _sweep(axes[2], found, [p.validation.violations for p in found], 0.2, "free-space violations")
     _sweep(axes[3], found, [p.validation.overlap for p in found], 1, "overlap", least=True)
-    _sweep(axes[4], found, [p.validation.ambiguity for p in found], 1, "ambiguity")
+    _sweep(axes[4], found, [p.validation.ambiguity for p in found], 0.2, "ambiguity")
     _bins(axes[5], pairs)
     axes[0].legend(frameon=False, loc="lower right")
     figure.suptitle(

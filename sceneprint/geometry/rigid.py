@@ -21,6 +21,15 @@ def inverse(T: Floats) -> Floats:
     return result
 
 
+def inverses(transforms: Floats) -> Floats:
+    """The inverse of each of (n, 4, 4) rigid transforms."""
+    result = np.zeros_like(transforms)
+    result[:, :3, :3] = transforms[:, :3, :3].transpose(0, 2, 1)
+    result[:, :3, 3] = -np.einsum("nij,nj->ni", result[:, :3, :3], transforms[:, :3, 3])
+    result[:, 3, 3] = 1.0
+    return result
+
+
 def moved(T: Floats, points: Floats) -> Floats:
     """Points (n, 3) of frame a, in frame b, by T_b_a."""
     result: Floats = points @ T[:3, :3].T + T[:3, 3]

@@ -9,20 +9,21 @@ rivals are looked for: the other hypotheses that correspondences voted for, and 
 found, turned by quarter turns about the normals of the main planes or shifted along them, which
 is how rooms and what stands in them repeat.
 
-What a rival agrees on counts by planes, each plane as much as another however large: that a floor
-lies on a floor says little, wherever on it one stands.
+What a rival agrees on counts by planes (`planes.py`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from sceneprint.geometry.agreement import AgreementParameters, agreements
+from sceneprint.geometry.agreement import AgreementParameters
+from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.planes import PlaneParameters, PlaneView, explained
 from sceneprint.geometry.registration import COARSE, QUICK, RefinementParameters, refined_all
-from sceneprint.types import Floats, Floats32, Geometry, Patches
+from sceneprint.types import Floats, Patches
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,7 @@ class RivalParameters:
     shift: float = 0.5  #: steps along a corridor, metres: what refinement can bridge
     n_shifts: int = 6  #: each way
     least_crossing: float = 0.5  #: sine of the angle between the main families of planes
-    coplanar: float = math.radians(15.0)  #: normals this near may be of one plane
-    same_plane: float = 0.06  #: offsets this near are one plane, metres
+    planes: PlaneParameters = field(default_factory=PlaneParameters)
     first: RefinementParameters = QUICK  #: of all
     hopeful_share: float = 0.04  #: after it, those that explain less are dropped
     hopeful_violations: float = 0.15  #: and those that violate more
@@ -62,16 +62,17 @@ def symmetries(patches: Patches, p: RivalParameters) -> Floats:
     (n, 4, 4) with n at most 3 n_axes n_planes + 2 n_shifts
     """
     left = patches.areas.copy()
+    mass = np.empty(len(patches))
     found: list[Floats] = []
     axes: list[Floats] = []
-    cosines = patches.normals @ patches.normals.T
-    parallel = np.abs(cosines) > math.cos(p.same_direction)
     for _ in range(p.n_axes):
-        most = int(np.argmax(parallel @ left))
+        _facing(patches.normals, left, math.cos(p.same_direction), mass)
+        most = int(np.argmax(mass))
         if left[most] <= 0:
             break
-        across = parallel[most]
-        signed = np.sign(cosines[most]) * patches.areas * across
+        cosines = (patches.normals * patches.normals[most]).sum(axis=1)
+        across = np.abs(cosines) > math.cos(p.same_direction)
+        signed = np.sign(cosines) * patches.areas * across
         axis = (patches.normals * signed[:, None]).sum(axis=0)
         axis /= np.linalg.norm(axis)
         axes.append(axis)
@@ -89,37 +90,46 @@ def symmetries(patches: Patches, p: RivalParameters) -> Floats:
 
 def _middles(patches: Patches, axis: Floats, area: Floats, p: RivalParameters) -> list[Floats]:
     """Middles of the largest planes across an axis, of the patches that have an area."""
-    offsets = patches.means @ axis
-    near = np.abs(offsets[:, None] - offsets[None, :]) < p.same_plane
+    offsets, mass = (patches.means * axis).sum(axis=1), np.empty(len(patches))
     middles: list[Floats] = []
     for _ in range(p.n_planes):
-        best = int(np.argmax(np.where(area > 0, near @ area, 0.0)))
+        _level(offsets, area, p.planes.same_plane, mass)
+        best = int(np.argmax(np.where(area > 0, mass, 0.0)))
         if area[best] <= 0:
             break
-        on_plane = near[best] & (area > 0)
+        on_plane = (np.abs(offsets - offsets[best]) < p.planes.same_plane) & (area > 0)
         middles.append(np.average(patches.means[on_plane], axis=0, weights=area[on_plane]))
         area = np.where(on_plane, 0.0, area)
     return middles
+
+
+@kernel
+def _facing(normals: Floats, areas: Floats, cosine: float, mass: Floats) -> None:
+    """Area of the patches that face the way of each, or away from it."""
+    for i in range(len(normals)):
+        a, b, c = normals[i, 0], normals[i, 1], normals[i, 2]
+        total = 0.0
+        for j in range(len(normals)):
+            if abs(normals[j, 0] * a + normals[j, 1] * b + normals[j, 2] * c) > cosine:
+                total += areas[j]
+        mass[i] = total
+
+
+@kernel
+def _level(offsets: Floats, areas: Floats, apart: float, mass: Floats) -> None:
+    """Area of the patches whose offset is near that of each."""
+    for i in range(len(offsets)):
+        total = 0.0
+        for j in range(len(offsets)):
+            if abs(offsets[j] - offsets[i]) < apart:
+                total += areas[j]
+        mass[i] = total
 
 
 def _shift(by: Floats) -> Floats:
     result = np.eye(4)
     result[:3, 3] = by
     return result
-
-
-def plane_weights(patches: Patches, p: RivalParameters) -> Floats32:
-    """Weights of patches by which every plane weighs 1, over all patches that lie in it: (P,)."""
-    offsets = patches.normals @ patches.means.T
-    apart = np.abs(offsets - np.diag(offsets)[:, None])
-    together = (patches.normals @ patches.normals.T > math.cos(p.coplanar)) & (apart < p.same_plane)
-    weights: Floats32 = (1.0 / together.sum(axis=1)).astype(np.float32)
-    return weights
-
-
-def patch_points(patches: Patches) -> Floats32:
-    """Patches as points to be looked up: (P, 6) float32, means and normals."""
-    return np.concatenate([patches.means, patches.normals], axis=1).astype(np.float32)
 
 
 def _turn(axis: Floats, middle: Floats, quarters: int) -> Floats:
@@ -140,67 +150,26 @@ def far_from(T: Floats, others: Floats, p: RivalParameters) -> Floats:
     return far
 
 
-def inverses(transforms: Floats) -> Floats:
-    """The inverse of each of (n, 4, 4) rigid transforms."""
-    result = np.zeros_like(transforms)
-    result[:, :3, :3] = transforms[:, :3, :3].transpose(0, 2, 1)
-    result[:, :3, 3] = -np.einsum("nij,nj->ni", result[:, :3, :3], transforms[:, :3, 3])
-    result[:, 3, 3] = 1.0
-    return result
-
-
-@dataclass(frozen=True, eq=False)
-class Explained:
-    """How far transforms explain two frames, every plane counting the same.
-
-    Parameters
-    ----------
-    share : (n,) of both frames that agrees, 0 to 1
-    violations : (n,) of free space, as a share of what agrees or violates, 0 to 1
-    """
-
-    share: Floats
-    violations: Floats
-
-
-def explained(
-    query: Geometry, match: Geometry, transforms: Floats, p: RivalParameters,
-    agreement_p: AgreementParameters,
-) -> Explained:  # fmt: skip
-    """How far each of some transforms (n, 4, 4), T_match_query, explains two frames."""
-    of_query = agreements(
-        patch_points(query.patches), match.surface, transforms, agreement_p,
-        plane_weights(query.patches, p),
-    )  # fmt: skip
-    of_match = agreements(
-        patch_points(match.patches), query.surface, inverses(transforms), agreement_p,
-        plane_weights(match.patches, p),
-    )  # fmt: skip
-    both = of_query + of_match
-    everything = plane_weights(query.patches, p).sum() + plane_weights(match.patches, p).sum()
-    return Explained(both[:, 0] / everything, both[:, 1] / np.maximum(both.sum(axis=1), 1e-9))
-
-
 def best_rival(
-    query: Geometry, match: Geometry, T: Floats, voted: Floats, p: RivalParameters,
+    query: PlaneView, match: PlaneView, T: Floats, voted: Floats, p: RivalParameters,
     agreement_p: AgreementParameters,
 ) -> tuple[float, Floats | None]:  # fmt: skip
     """How far the best rival of T explains the frames, 0 to 1, and that rival: Sec. III-E.
 
     Parameters
     ----------
-    query, match : geometry artifacts
+    query, match : of `plane_view`
     T : (4, 4) T_match_query
     voted : (n, 4, 4) other hypotheses, refined
     p, agreement_p : see there
     """
     moved = np.concatenate([symmetries(match.patches, p) @ T, T @ symmetries(query.patches, p)])
     near = far_from(T, refined_all(query.surface, match.surface, moved, p.first), p)
-    seen = explained(query, match, near, p, agreement_p)
+    seen = explained(query, match, near, agreement_p)
     hopeful = near[(seen.share > p.hopeful_share) & (seen.violations < p.hopeful_violations)]
     rivals = np.concatenate([voted, refined_all(query.surface, match.surface, hopeful, p.then)])
     rivals = far_from(T, rivals, p)
-    seen = explained(query, match, rivals, p, agreement_p)
+    seen = explained(query, match, rivals, agreement_p)
     share = np.where(seen.violations < p.refuted, seen.share, 0.0)
     if not (share > 0).any():
         return 0.0, None

@@ -18,9 +18,10 @@ import numpy as np
 
 from sceneprint.geometry.agreement import AgreementParameters, agreement, sampled
 from sceneprint.geometry.alignment import Alignment, AlignmentParameters, align
+from sceneprint.geometry.planes import explained, plane_view
 from sceneprint.geometry.registration import FINE, refine
-from sceneprint.geometry.rigid import inverse, nearest_rotation, rotation_angle
-from sceneprint.geometry.rivals import RivalParameters, best_rival, explained, inverses
+from sceneprint.geometry.rigid import inverse, inverses, nearest_rotation, rotation_angle
+from sceneprint.geometry.rivals import RivalParameters, best_rival
 from sceneprint.types import Floats, Geometry
 
 Status = Literal["accepted", "ambiguous", "rejected"]
@@ -170,8 +171,8 @@ def _decided(
     overlap = inliers / max(of_query.points + of_match.points, 1.0)
     violated = of_query.violations + of_match.violations
     violations = violated / max(inliers + violated, 1.0)
-    by_planes = explained(query, match, T[None], p.rivals, p.agreement)
-    plane_overlap = float(by_planes.share[0])
+    views = plane_view(query, p.rivals.planes), plane_view(match, p.rivals.planes)
+    plane_overlap = float(explained(*views, T[None], p.agreement).share[0])
     ambiguity, T_rival = 0.0, None
 
     def answer(status: Status, strength: Strength | None, reason: str) -> Validation:
@@ -205,7 +206,7 @@ def _decided(
             "ambiguous", None, "what the frames share leaves a direction free, as a plane does"
         )
     voted = np.concatenate([there.others, inverses(back.others)])
-    ambiguity, T_rival = best_rival(query, match, T, voted, p.rivals, p.agreement)
+    ambiguity, T_rival = best_rival(*views, T, voted, p.rivals, p.agreement)
     if ambiguity >= p.ambiguous:
         return answer("ambiguous", None, "another transform explains the frames as well")
     if ambiguity >= p.weak:

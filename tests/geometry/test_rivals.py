@@ -9,16 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.rigid import difference, inverse, moved
-from sceneprint.geometry.rivals import (
-    RivalParameters,
-    far_from,
-    inverses,
-    patch_points,
-    plane_weights,
-    symmetries,
-)
-from sceneprint.types import Floats, Patches
+from sceneprint.geometry.planes import plane_view, plane_weights
+from sceneprint.geometry.rigid import difference, inverse, inverses, moved
+from sceneprint.geometry.rivals import RivalParameters, far_from, symmetries
+from sceneprint.types import Floats, Geometry, Intrinsics, Patches, Surface
 
 P = RivalParameters()
 
@@ -98,21 +92,26 @@ def test_plane_weights_by_hand() -> None:
     patches = on_planes(
         ([0, -1, 0], -1.4, 8, 1.0), ([0, 0, -1], -3.0, 2, 5.0), ([0, -1, 0], -0.7, 1, 1.0)
     )
-    weights = plane_weights(patches, P)
+    weights = plane_weights(patches, P.planes)
     assert weights.dtype == np.float32
     # a floor of eight, a wall of two, a table top of one, whatever their areas: 1 each
     np.testing.assert_allclose(weights, [1 / 8] * 8 + [1 / 2] * 2 + [1.0])
     # two sides of a thin board face apart, and are two planes
     board = on_planes(([0, 0, -1], -2.0, 4, 1.0), ([0, 0, 1], 2.02, 4, 1.0))
-    np.testing.assert_allclose(plane_weights(board, P), 1 / 4)
+    np.testing.assert_allclose(plane_weights(board, P.planes), 1 / 4)
     # 5 cm apart is one plane, 7 cm are two
     for gap, weight in ((0.05, 0.5), (0.07, 1.0)):
         two = on_planes(([0, 0, -1], -2.0, 1, 1.0), ([0, 0, -1], -2.0 - gap, 1, 1.0))
-        np.testing.assert_allclose(plane_weights(two, P), weight)
+        np.testing.assert_allclose(plane_weights(two, P.planes), weight)
 
 
-def test_patch_points() -> None:
-    points = patch_points(ROOM)
+def test_plane_view() -> None:
+    nothing = np.zeros((2, 2, 3), np.float32)
+    camera = Intrinsics(2, 2, 1.0, 1.0, 0.5, 0.5)
+    seen = Surface(nothing, nothing, nothing[..., 0] > 0, nothing[..., 0], camera)
+    view = plane_view(Geometry(seen, ROOM, np.zeros((68, 4), np.uint8), "ab" * 32), P.planes)
+    points = view.points
+    np.testing.assert_array_equal(view.weights, plane_weights(ROOM, P.planes))
     assert (points.shape, points.dtype) == ((68, 6), np.float32)
     np.testing.assert_array_equal(points[:, :3], ROOM.means.astype(np.float32))
     np.testing.assert_array_equal(points[:, 3:], ROOM.normals.astype(np.float32))
