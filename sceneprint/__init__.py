@@ -20,16 +20,13 @@ if TYPE_CHECKING:
     from sceneprint.artifacts import read_geometry, write_geometry
     from sceneprint.datasets import find_sequences, make_frame, read_frame
     from sceneprint.geometry.validation import Validation
+    from sceneprint.matches import Location, Match, associate, locate
     from sceneprint.models import Model, read_model
     from sceneprint.pipeline import (
-        Location,
-        Match,
         Signature,
         Signer,
-        associate,
         distance,
         diversify,
-        locate,
         open_signer,
         prepare,
         retrieve,
@@ -71,17 +68,17 @@ _HOME = {
     "Frame": "types",
     "Geometry": "types",
     "Intrinsics": "types",
-    "Location": "pipeline",
-    "Match": "pipeline",
+    "Location": "matches",
+    "Match": "matches",
     "Model": "models",
     "Signature": "pipeline",
     "Signer": "pipeline",
     "Validation": "geometry.validation",
-    "associate": "pipeline",
+    "associate": "matches",
     "distance": "pipeline",
     "diversify": "pipeline",
     "find_sequences": "datasets",
-    "locate": "pipeline",
+    "locate": "matches",
     "make_frame": "datasets",
     "open_signer": "pipeline",
     "prepare": "pipeline",

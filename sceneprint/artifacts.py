@@ -9,7 +9,6 @@ a normal 2 x 16 bits on an octahedron.
 
 from __future__ import annotations
 
-import math
 import struct
 import zlib
 
@@ -26,6 +25,13 @@ SCHEMA_VERSION = 1
 #: magic, schema, checksum | width, height, patches, bytes of a descriptor, fx, fy, cx, cy,
 #: inverse depth of 65535, model
 _HEAD, _BODY = struct.Struct("<5sHI"), struct.Struct("<HHHH5d32s")
+#: Most patches and longest descriptor that are believed: validation compares all patches with all,
+#: and no model makes more of either.
+MAXIMUM_PATCHES, MAXIMUM_DESCRIPTOR = 4096, 1024
+#: Least and most of the nearest depth, metres: points and areas stay finite in 32 bits.
+NEAREST = (1e-6, 1e6)
+#: Farthest patch, metres, and largest, square metres, that are believed.
+FARTHEST, LARGEST = 1e9, 1e18
 #: Bytes of a patch beside its descriptor: mean, normal, area, coherence as float32, and its size.
 _PATCH = np.dtype(
     [
@@ -128,7 +134,8 @@ def read_geometry(data: bytes) -> Geometry:
 
     Raises
     ------
-    UnreadableGeometry : not an artifact, cut short, damaged, or of another schema.
+    UnreadableGeometry : not an artifact, cut short, damaged, of another schema, or with numbers
+        that are no camera, no depth or no patches.
     """
     if len(data) < _HEAD.size + _BODY.size or data[: len(MAGIC)] != MAGIC:
         raise UnreadableGeometry(
@@ -152,15 +159,21 @@ def read_geometry(data: bytes) -> Geometry:
         camera = Intrinsics(width, height, fx, fy, cx, cy)
     except InvalidIntrinsics as error:
         raise UnreadableGeometry(f"The geometry artifact has no camera: {error}") from error
-    if not (math.isfinite(scale) and scale > 0):
+    # false for NaN as well
+    if not (scale > 0 and NEAREST[0] <= 1.0 / (scale * 65535.0) <= NEAREST[1]):
         raise UnreadableGeometry(
             f"The geometry artifact has {scale} for its scale of depth. "
             "Sign the frame again from its upload."
         )
+    patches = _patches(np.frombuffer(body[ends[1] : ends[2]], _PATCH))
+    if count > MAXIMUM_PATCHES or length > MAXIMUM_DESCRIPTOR or not _sound(patches):
+        raise UnreadableGeometry(
+            f"The geometry artifact's {count} patches with descriptors of {length} bytes are none "
+            "that a model makes. Sign the frame again from its upload."
+        )
     packed = np.frombuffer(body[ends[0] : ends[1]], "<u2").reshape(height, width, 3)
-    rows = np.frombuffer(body[ends[1] : ends[2]], _PATCH)
     descriptors: Bytes = np.frombuffer(body[ends[2] :], np.uint8).reshape(count, length)
-    return Geometry(_surface(packed, scale, camera), _patches(rows), descriptors, model.hex())
+    return Geometry(_surface(packed, scale, camera), patches, descriptors, model.hex())
 
 
 def _surface(packed: NDArray[np.uint16], scale: float, k: Intrinsics) -> Surface:
@@ -173,10 +186,23 @@ def _surface(packed: NDArray[np.uint16], scale: float, k: Intrinsics) -> Surface
 
 
 def _patches(rows: NDArray[np.void]) -> Patches:
-    return Patches(
-        means=rows["mean"].astype(float),
-        normals=rows["normal"].astype(float),
-        areas=rows["area"].astype(float),
-        sizes=rows["size"].astype(np.int32),
-        coherences=rows["coherence"].astype(float),
+    with np.errstate(invalid="ignore"):  # a signalling NaN; `_sound` refuses it
+        return Patches(
+            means=rows["mean"].astype(float),
+            normals=rows["normal"].astype(float),
+            areas=rows["area"].astype(float),
+            sizes=rows["size"].astype(np.int32),
+            coherences=rows["coherence"].astype(float),
+        )
+
+
+def _sound(patches: Patches) -> bool:
+    """Whether the numbers are those of patches: comparisons with NaN are false."""
+    length = np.sqrt((patches.normals**2).sum(axis=1))
+    return bool(
+        (np.abs(patches.means) <= FARTHEST).all()
+        and (np.abs(length - 1.0) < 1e-3).all()
+        and ((patches.areas >= 0) & (patches.areas <= LARGEST)).all()
+        and ((patches.coherences >= 0) & (patches.coherences <= 1)).all()
+        and (patches.sizes >= 0).all()
     )

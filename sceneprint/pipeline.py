@@ -6,14 +6,11 @@ signature, database --retrieve--> R --diversify--> C --associate--> C_vld --loca
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
 from sceneprint.errors import ModelMismatch
-from sceneprint.geometry.association import preferred, voters
-from sceneprint.geometry.averaging import PoseAverage, average_poses
 from sceneprint.geometry.diversity import DiversityParameters, Selection
 from sceneprint.geometry.diversity import diversify as select
 from sceneprint.geometry.retrieval import (
@@ -29,55 +26,20 @@ from sceneprint.geometry.validation import Mode, Validation, ValidationParameter
 from sceneprint.geometry.validation import validate as validate_geometry
 from sceneprint.models import Model
 from sceneprint.signing import Signature, Signer, encode, hierarchy_of, open_signer, see
-from sceneprint.types import Bytes, Floats, Frame, Geometry, Surface
+from sceneprint.types import Bytes, Frame, Geometry, Surface
 
 __all__ = [
-    "Location",
-    "Match",
     "Signature",
     "Signer",
-    "associate",
     "distance",
     "diversify",
     "geometry_of",
-    "locate",
     "open_signer",
     "prepare",
     "retrieve",
     "sign",
     "validate",
 ]
-
-
-@dataclass(frozen=True, eq=False)
-class Match:
-    """A database frame validated against a query.
-
-    Parameters
-    ----------
-    index : row of the database
-    distance, similarity : of the signatures
-    validation : see Validation
-    """
-
-    index: int
-    distance: int
-    similarity: float
-    validation: Validation
-
-
-@dataclass(frozen=True, eq=False)
-class Location:
-    """Where a query was taken.
-
-    Parameters
-    ----------
-    parent : frame in which the pose is given
-    average : T_parent_query with the spread of the votes and how many agree
-    """
-
-    parent: str
-    average: PoseAverage
 
 
 def sign(frame: Frame, signer: Signer) -> Signature:
@@ -148,12 +110,13 @@ def retrieve(
 
     Raises
     ------
-    ModelMismatch : signatures of several models.
+    ModelMismatch : signatures of several models, or of another than `model`.
     """
+    _same_model(query, model)
     for one in database:
         _same_model(query, one)
     size = ranking_size(len(database)) if size is None else size
-    stored = _stacked(database) if database else np.empty((0, len(query.vector)), np.uint8)
+    stored = _stacked(database) if len(database) else np.empty((0, len(query.vector)), np.uint8)
     return rank(distances(query.vector, stored), size, model.unrelated_distance)
 
 
@@ -204,99 +167,16 @@ def validate(
     return validate_geometry(query, match, seed, p, mode)
 
 
-def associate(
-    query: Geometry,
-    ranking: Ranking,
-    among: Sequence[int],
-    open_geometry: Callable[[int], Geometry],
-    k: int = 5,
-    seed: int = 0,
-    p: ValidationParameters | None = None,
-    mode: Mode = "full",
-) -> list[Match]:
-    """Candidates validated in the order of R until `k` are accepted: Sec. III-E.
-
-    Parameters
-    ----------
-    query : geometry artifact
-    ranking : R
-    among : positions in R to try, rising: C, or the first of R
-    open_geometry : artifact of a row of the database
-    k : accepted ones after which to stop, at least 1
-    seed, p, mode : see `validate`
-
-    Returns
-    -------
-    matches : all that were tried: C_vld first, strong before weak, each in the order of R; then
-        those that were not accepted
-
-    Raises
-    ------
-    ModelMismatch : artifacts of two models.
-    ValueError : k below 1.
-    """
-    if k < 1:
-        raise ValueError(f"k = {k}: ask for 1 match or more")
-    tried: list[Match] = []
-    accepted = 0
-    for position in among:
-        index = int(ranking.indices[position])
-        validation = validate(query, open_geometry(index), seed, p, mode)
-        tried.append(
-            Match(
-                index,
-                int(ranking.distances[position]),
-                float(ranking.similarities[position]),
-                validation,
-            )
-        )
-        accepted += validation.status == "accepted"
-        if accepted == k:
-            break
-    first = preferred([match.validation for match in tried])
-    rest = [i for i in range(len(tried)) if i not in first]
-    return [tried[i] for i in [*first, *rest]]
-
-
-def locate(
-    matches: Sequence[Match],
-    poses: Sequence[Floats],
-    parents: Sequence[str] | None = None,
-    views: int = 5,
-) -> Location | None:
-    """Pose of the query: robust average over up to five validated views.
-
-    Parameters
-    ----------
-    matches : of `associate`
-    poses : T_parent_sensor (4, 4) of every row of the database
-    parents : parent frame of every row; default: one for all. Poses are combined within one
-        parent frame only, that of most of the matches
-    views : most that are averaged
-
-    Returns
-    -------
-    location : or None where nothing was accepted
-    """
-    accepted = [m for m in matches if m.validation.status == "accepted"]
-    names = [parents[m.index] if parents is not None else "" for m in accepted]
-    chosen = voters(names, [m.validation.strength == "strong" for m in accepted], views)
-    transforms = [(accepted[i].index, accepted[i].validation.T_match_query) for i in chosen]
-    votes = [poses[index] @ T for index, T in transforms if T is not None]
-    if not votes:
-        return None
-    return Location(names[chosen[0]], average_poses(np.stack(votes)))
-
-
 def _stacked(signatures: Sequence[Signature]) -> Bytes:
-    if not signatures:
+    if not len(signatures):
         return np.empty((0, 0), np.uint8)
     return np.stack([one.vector for one in signatures])
 
 
-def _same_model(a: Signature | Geometry, b: Signature | Geometry) -> None:
-    if a.model_id != b.model_id:
+def _same_model(a: Signature | Geometry, b: Signature | Geometry | Model) -> None:
+    other = b.id if isinstance(b, Model) else b.model_id
+    if a.model_id != other:
         raise ModelMismatch(
-            f"Frames of two models cannot be compared: {a.model_id[:12]} and "
-            f"{b.model_id[:12]}. Sign both frames with one model."
+            f"Frames of two models cannot be compared: {a.model_id[:12]} and {other[:12]}. "
+            "Sign both frames with one model."
         )

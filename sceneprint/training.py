@@ -30,13 +30,7 @@ from sceneprint.geometry.segmentation import patches_of, segment
 from sceneprint.geometry.surroundings import fit_compression, surroundings
 from sceneprint.geometry.weights import patch_weights
 from sceneprint.models import Model, ModelParameters
-from sceneprint.signing import (
-    float_signature,
-    hierarchy_of,
-    open_signer,
-    see,
-    table_statistics,
-)
+from sceneprint.signing import float_signature, hierarchy_of, open_signer, see, table_statistics
 from sceneprint.synth import synthesise_room
 from sceneprint.types import Bytes, Floats, Floats32, Frame, Patches
 
@@ -155,8 +149,8 @@ def train(
         "frames_used": len(lessons),
         "pairs_used": len(features),
     }
-    model = Model(name, model_p, projection, mixture, compression, 1.0, 1.0, seen)
-    return calibrated(model, lessons, p)
+    fitted = Model(name, model_p, projection, mixture, compression, 1.0, 1.0, seen)
+    return calibrated(fitted, lessons, p)
 
 
 def _silent(stage: str, done: int, total: int) -> None:

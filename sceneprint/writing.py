@@ -2,9 +2,27 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from pathlib import Path
+
+
+def check_writable(path: Path) -> None:
+    """See before long work that `write_whole` will be able to write there.
+
+    Raises
+    ------
+    OSError : it is a folder, or its folder takes no files.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    part = _beside(path)
+    try:
+        part.touch()
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(path)) from error
+    part.unlink()
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -19,7 +37,7 @@ def write_whole(path: Path, data: bytes) -> None:
     ------
     OSError : it cannot be written; nothing is left behind.
     """
-    part = path.with_name(f".{secrets.token_hex(6)}.part")  # short: the name may be long already
+    part = _beside(path)
     try:
         part.write_bytes(data)
         os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
@@ -29,3 +47,7 @@ def write_whole(path: Path, data: bytes) -> None:
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f".{secrets.token_hex(6)}.part")  # short: the name may be long already

@@ -48,9 +48,10 @@ def made(height: int, width: int, patches: int, depth: float = 2.0, length: int 
     areas = np.full((height, width), depth**2 / 3600, np.float32)
     surface = Surface((rays * depth).astype(np.float32), normals, valid, areas, k)
     rng = np.random.default_rng(0)
+    directions = rng.normal(size=(patches, 3))
     rows = Patches(
         rng.normal(size=(patches, 3)),
-        rng.normal(size=(patches, 3)),
+        directions / np.linalg.norm(directions, axis=1, keepdims=True),
         rng.random(patches),
         np.arange(patches, dtype=np.int32),
         rng.random(patches),
@@ -239,11 +240,47 @@ def test_a_camera_that_is_none() -> None:
         read_geometry(sealed(empty, 0, struct.pack("<HH", 0, 0)))
 
 
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf"), 1e-300, 1e-12, 1e3])
 def test_a_scale_that_is_none(scale: float) -> None:
     data = write_geometry(made(2, 3, 0, length=0))
     with pytest.raises(UnreadableGeometry, match="scale of depth"):
         read_geometry(sealed(data, 40, struct.pack("<d", scale)))
+
+
+@pytest.mark.parametrize("at", [0, 3, 6, 7])  # mean, normal, area, coherence
+def test_patches_that_are_none(at: int, data: bytes) -> None:
+    """A checksum can be made by anybody; what validation would make NaN of is refused."""
+    first = BODY + 6 * 160 * 120
+    allowed = {3: [], 6: [0.0, 1.0], 7: [0.0, 1.0]}.get(at, [0.0, 1.0, -1.0])
+    for value in (0.0, 1.0, -1.0, float("nan"), float("inf"), -float("inf"), 3e38, 1e-30):
+        hostile = sealed(data, first + 36 * 5 + 4 * at, struct.pack("<f", value))
+        if value in allowed or (value == 1e-30 and at != 3):
+            assert len(read_geometry(hostile).patches) > 300
+        else:
+            with pytest.raises(UnreadableGeometry, match="none that a model makes"):
+                read_geometry(hostile)
+    signalling = sealed(data, first + 4 * at, struct.pack("<I", 0x7FA00000))
+    with pytest.raises(UnreadableGeometry, match="none that a model makes"):
+        read_geometry(signalling)
+
+
+def test_more_than_a_model_makes() -> None:
+    most = write_geometry(made(2, 3, 4096, length=1))
+    assert len(read_geometry(most).patches) == 4096
+    for patches, length in ((4097, 1), (1, 1025)):
+        with pytest.raises(UnreadableGeometry, match="none that a model makes"):
+            read_geometry(write_geometry(made(2, 3, patches, length=length)))
+
+
+def test_points_stay_finite_whatever_the_bytes() -> None:
+    data = bytearray(write_geometry(made(4, 5, 0, length=0)))
+    for number, value in enumerate((1e-3, 1e-3, 1e7, -1e7, 1 / (1e6 * 65535))):
+        data[HEAD + 8 + 8 * number : HEAD + 16 + 8 * number] = struct.pack("<d", value)
+    data[HEAD + BODY :] = b"\1\0" * (3 * 4 * 5)  # as far as can be, at every pixel
+    read = read_geometry(sealed(bytes(data), 0, b"")).surface
+    assert read.valid.all()
+    for array in (read.points, read.normals, read.areas):
+        assert np.isfinite(array).all()
 
 
 def test_artifacts_read_from_a_file(geometries: list[Geometry], tmp_path: Path) -> None:

@@ -255,5 +255,7 @@ def test_wrong_usage(arguments: list[str]) -> None:
 
 def test_demo_ends_well(tmp_path: Path, model_file: Path, rooms: Path) -> None:
     done = run("demo", "--out", tmp_path / "demo", "--dataset", rooms, "--model", model_file)
-    assert "of 4 frames" in done.stdout
+    assert "of the same place for" in done.stdout
+    assert "of 4 queries" in done.stdout
+    assert "4 frames signed" in done.stdout
     assert len(list((tmp_path / "demo").glob("*.png"))) == 3

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint import pipeline
 from sceneprint.errors import ModelMismatch, UselessFrame
 from sceneprint.geometry.association import preferred, voters
 from sceneprint.geometry.averaging import average_poses
@@ -16,21 +15,21 @@ from sceneprint.geometry.retrieval import Ranking
 from sceneprint.geometry.segmentation import patches_of, segment
 from sceneprint.geometry.surroundings import compress, surroundings
 from sceneprint.geometry.validation import Validation
-from sceneprint.models import Model
+from sceneprint.matches import Match, associate, locate
+from sceneprint.models import Model, read_model
 from sceneprint.pipeline import (
-    Match,
     Signature,
     Signer,
-    associate,
     diversify,
     geometry_of,
-    locate,
     prepare,
     retrieve,
     sign,
     validate,
 )
 from sceneprint.signing import see
+from sceneprint.synth import KINECT, take, trajectory
+from sceneprint.synth.synthesis import room_and_rng
 from sceneprint.types import Floats, Frame, Geometry, Intrinsics
 
 
@@ -66,10 +65,18 @@ def ranked(model: Model, *indices: int) -> Ranking:
     return Ranking(np.array(indices, np.intp), far, 1 - far / model.unrelated_distance)
 
 
+@pytest.fixture
+def model_a(small_model: Model) -> Model:
+    """The small model by the id that signatures have here."""
+    named = replace(small_model)
+    vars(named)["id"] = "a" * 64
+    return named
+
+
 # retrieve
 
 
-def test_retrieve_by_hand(small_model: Model) -> None:
+def test_retrieve_by_hand(model_a: Model) -> None:
     query = signature(10, 10, 10)
     database = [
         signature(10, 10, 13),
@@ -77,25 +84,25 @@ def test_retrieve_by_hand(small_model: Model) -> None:
         signature(10, 9, 10),
         signature(7, 10, 10),
     ]
-    found = retrieve(query, database, small_model)
+    found = retrieve(query, database, model_a)
     assert found.indices.tolist() == [2, 0, 3, 1]
     assert found.distances.tolist() == [1, 3, 3, 265]
     # d0 of the model is 1000
     np.testing.assert_allclose(found.similarities, [0.999, 0.997, 0.997, 0.735])
-    assert retrieve(query, database, small_model, 2).indices.tolist() == [2, 0]
-    assert retrieve(query, database, small_model, 0).indices.tolist() == []
+    assert retrieve(query, database, model_a, 2).indices.tolist() == [2, 0]
+    assert retrieve(query, database, model_a, 0).indices.tolist() == []
 
 
-def test_how_many_are_retrieved(small_model: Model) -> None:
+def test_how_many_are_retrieved(model_a: Model) -> None:
     rng = np.random.default_rng(0)
     database = [signature(*rng.integers(0, 256, 4).tolist()) for _ in range(600)]
     for n, size in ((49, 49), (51, 50), (200, 80), (600, 200)):
-        assert len(retrieve(database[0], database[:n], small_model)) == size
+        assert len(retrieve(database[0], database[:n], model_a)) == size
 
 
-def test_an_empty_database(small_model: Model) -> None:
+def test_an_empty_database(model_a: Model) -> None:
     for size in (None, 0, 5):
-        found = retrieve(signature(1, 2, 3), [], small_model, size)
+        found = retrieve(signature(1, 2, 3), [], model_a, size)
         assert len(found) == 0
         assert (found.distances.dtype, found.similarities.shape) == (np.int64, (0,))
         chosen = diversify(found, [], 10)
@@ -103,20 +110,25 @@ def test_an_empty_database(small_model: Model) -> None:
         assert associate(never(), found, [], unopened) == []
 
 
-def test_a_database_of_one_frame(small_model: Model) -> None:
+def test_a_database_of_one_frame(model_a: Model) -> None:
     database = [signature(1, 2, 3)]
-    found = retrieve(signature(1, 2, 5), database, small_model)
+    found = retrieve(signature(1, 2, 5), database, model_a)
     assert (found.indices.tolist(), found.distances.tolist()) == ([0], [2])
     chosen = diversify(found, database, 10)
     assert (chosen.indices.tolist(), chosen.gains.tolist()) == ([0], [1.0])
 
 
-def test_signatures_of_two_models_are_not_compared(small_model: Model) -> None:
+def test_signatures_of_two_models_are_not_compared(model_a: Model) -> None:
     mixed = [signature(1, 2), signature(1, 2, model_id="b" * 64)]
+    other = replace(model_a)
+    vars(other)["id"] = "b" * 64
     with pytest.raises(ModelMismatch, match="aaaaaaaaaaaa and bbbbbbbbbbbb"):
-        retrieve(signature(1, 2), mixed, small_model)
+        retrieve(signature(1, 2), mixed, model_a)
     with pytest.raises(ModelMismatch, match="bbbbbbbbbbbb and aaaaaaaaaaaa"):
-        retrieve(mixed[1], mixed[:1], small_model)
+        retrieve(mixed[1], mixed[:1], other)
+    # d0 of another model would make similarities that mean nothing
+    with pytest.raises(ModelMismatch, match="bbbbbbbbbbbb and aaaaaaaaaaaa"):
+        retrieve(mixed[1], mixed[1:], model_a)
 
 
 def test_a_frame_of_the_database_finds_itself(
@@ -132,12 +144,12 @@ def test_a_frame_of_the_database_finds_itself(
 # diversify
 
 
-def test_diversify_is_the_selection_from_distances_among_the_ranking(small_model: Model) -> None:
+def test_diversify_is_the_selection_from_distances_among_the_ranking(model_a: Model) -> None:
     rng = np.random.default_rng(1)
     database = [signature(*rng.integers(0, 256, 30).tolist()) for _ in range(25)]
     database += database[:5]  # and duplicates, which add nothing
     query = signature(*rng.integers(0, 256, 30).tolist())
-    found = retrieve(query, database, small_model, 20)
+    found = retrieve(query, database, model_a, 20)
     rows = np.array([database[i].vector for i in found.indices], int)
     among = np.abs(rows[:, None] - rows[None]).sum(axis=2)
     chosen = diversify(found, database, 6)
@@ -202,52 +214,48 @@ def test_artifacts_of_two_models_are_not_compared(small_model: Model) -> None:
         associate(other, ranked(small_model, 4), [0], lambda _: never())
 
 
-@pytest.fixture
-def judge(monkeypatch: pytest.MonkeyPatch) -> dict[int, Validation]:
-    """Verdicts by row of the database, in place of validation; artifacts are rows."""
-    verdicts: dict[int, Validation] = {}
+@pytest.fixture(scope="module")
+def walk() -> list[Geometry]:
+    """Three views along a path in one room, and a view of another room."""
+    model = read_model("paper")
+    frames = []
+    for number, views in ((3, (24, 36, 48)), (1, (0,))):
+        room, rng = room_and_rng(11, number)
+        poses = trajectory(room, 61, rng)
+        frames += [Frame(take(room, poses[i], KINECT, rng), KINECT) for i in views]
+    return [geometry_of(see(frame, model.parameters), model) for frame in frames]
 
-    def judged(query: Geometry, row: int, seed: int, p: object, mode: str) -> Validation:
-        assert (seed, p, mode) == (7, None, "paper")
-        return verdicts[row]
 
-    monkeypatch.setattr(pipeline, "validate", judged)
-    return verdicts
-
-
-def tried(
-    judge: dict[int, Validation], ranking: Ranking, among: list[int], k: int = 5
-) -> tuple[list[int], list[Match]]:
+def test_candidates_are_tried_in_order_until_enough(
+    small_model: Model, walk: list[Geometry]
+) -> None:
+    query, near, far, elsewhere = walk
+    rows = {40: elsewhere, 10: far, 30: near, 20: query}
+    ranking = ranked(small_model, 40, 10, 30, 20)
     opened: list[int] = []
 
     def row(index: int) -> Geometry:
         opened.append(index)
-        return index  # type: ignore[return-value]
+        return rows[index]
 
-    matches = associate(never(), ranking, among, row, k, 7, None, "paper")
-    return opened, matches
-
-
-def test_candidates_are_tried_in_order_until_enough(
-    small_model: Model, judge: dict[int, Validation]
-) -> None:
-    ranking = ranked(small_model, 40, 10, 30, 20, 50)
-    judge |= {40: outcome("rejected"), 10: outcome(strength="weak"), 30: outcome(), 20: outcome(),
-              50: outcome("ambiguous")}  # fmt: skip
-    opened, matches = tried(judge, ranking, [0, 1, 2, 3, 4], 2)
-    assert opened == [40, 10, 30]
-    # strong before weak, then what was not accepted
-    assert [m.index for m in matches] == [30, 10, 40]
-    assert [m.distance for m in matches] == [30, 20, 10]
-    assert [m.similarity for m in matches] == pytest.approx([0.97, 0.98, 0.99])
-    assert [m.validation for m in matches] == [judge[30], judge[10], judge[40]]
-    opened, matches = tried(judge, ranking, [0, 1, 2, 3, 4])
-    assert opened == [40, 10, 30, 20, 50]
-    assert [m.index for m in matches] == [30, 20, 10, 40, 50]
-    opened, matches = tried(judge, ranking, [1, 4], 1)
-    assert (opened, [m.index for m in matches]) == ([10], [10])
-    opened, matches = tried(judge, ranking, [0, 4], 1)
-    assert (opened, [m.index for m in matches]) == ([40, 50], [40, 50])
+    found = associate(query, ranking, [0, 1, 2, 3], row, 2, 7)
+    assert opened == [40, 10, 30]  # enough: the last is not looked at
+    # those accepted in the order of the ranking, then what was not
+    assert [m.index for m in found] == [10, 30, 40]
+    assert [m.validation.status for m in found] == ["accepted", "accepted", "rejected"]
+    assert [m.distance for m in found] == [20, 30, 10]
+    assert [m.similarity for m in found] == pytest.approx([0.98, 0.97, 0.99])
+    assert [m.validation.seed for m in found] == [7, 7, 7]
+    alone = validate(query, far, 7)
+    assert alone.T_match_query is not None
+    assert found[0].validation.T_match_query is not None
+    np.testing.assert_array_equal(found[0].validation.T_match_query, alone.T_match_query)
+    opened.clear()
+    found = associate(query, ranking, np.array([0, 2]), row, 5, 7)
+    assert (opened, [m.index for m in found]) == ([40, 30], [30, 40])
+    # the paper's test tells nothing of strength
+    (only,) = associate(query, ranking, [2], row, 1, 7, mode="paper")
+    assert (only.validation.status, only.validation.strength) == ("accepted", "strong")
 
 
 def test_preferred() -> None:
@@ -319,6 +327,12 @@ def test_locate_combines_poses_of_one_parent_frame() -> None:
     found = locate(matches[:4], [np.eye(4)] * 6, parents)
     assert found is not None
     assert (found.parent, found.average.T[0, 3]) == ("flat", pytest.approx(0.01))
+
+
+def test_locate_averages_one_view_at_least() -> None:
+    for views in (0, -1):
+        with pytest.raises(ValueError, match="1 view or more"):
+            locate([match(0, outcome())], [np.eye(4)], views=views)
 
 
 def test_locate_takes_the_first_few() -> None:

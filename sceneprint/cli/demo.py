@@ -16,16 +16,8 @@ from sceneprint.cli.signer import add_model_options, open_for
 from sceneprint.datasets import find_sequences
 from sceneprint.errors import DatasetError, FrameError
 from sceneprint.geometry.rigid import difference
-from sceneprint.pipeline import (
-    Match,
-    Signature,
-    Signer,
-    associate,
-    diversify,
-    locate,
-    prepare,
-    retrieve,
-)
+from sceneprint.matches import Match, associate, locate
+from sceneprint.pipeline import Signature, Signer, diversify, prepare, retrieve
 from sceneprint.settings import Settings
 from sceneprint.types import Frame, Geometry
 

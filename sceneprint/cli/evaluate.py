@@ -15,7 +15,7 @@ from sceneprint.cli.numbers import positive, whole
 from sceneprint.cli.signer import add_model_options, open_for
 from sceneprint.errors import DatasetError
 from sceneprint.settings import Settings
-from sceneprint.writing import write_whole
+from sceneprint.writing import check_writable, write_whole
 
 if TYPE_CHECKING:
     from sceneprint.evaluation.protocol import Protocol
@@ -137,9 +137,6 @@ def run(options: argparse.Namespace) -> int:
     from sceneprint.evaluation.table import table
 
     protocol = _protocol(options)
-    for folder in (options.plots, options.json.parent if options.json else None):
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
     own = Settings()
     signer = open_for(options, own)
     if (options.levels or 1) > (most := signer.model.parameters.hierarchy.n_levels):
@@ -147,6 +144,7 @@ def run(options: argparse.Namespace) -> int:
             f"--levels {options.levels}: model {signer.model.label} has {most} levels. "
             f"Choose from 1 to {most}."
         )
+    _make_room(options)
     settings = EvaluationSettings(
         metric=options.metric,
         levels=options.levels,
@@ -176,6 +174,14 @@ def run(options: argparse.Namespace) -> int:
             for path in save_pictures(options.plots, evaluation, found, store, signer.model):
                 print(f"picture: {path}")
     return 0
+
+
+def _make_room(options: argparse.Namespace) -> None:
+    """Folders for what is to be written; what cannot be written must not cost an hour's work."""
+    for file in (options.json, options.plots / "accuracy.png" if options.plots else None):
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            check_writable(file)
 
 
 def _protocol(options: argparse.Namespace) -> Protocol:

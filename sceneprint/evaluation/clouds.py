@@ -129,7 +129,7 @@ def cloud_figure(name: str, ranked: Cloud, diverse: Cloud, ratio: float | None) 
     figure.suptitle(
         f"{name}{covers}\nvalidated views by their estimated transforms, one colour each, the "
         "query grey",
-        x=0.01, ha="left", fontsize=12,
+        x=0.01, ha="left", fontsize=12, parse_math=False,
     )  # fmt: skip
     return figure
 

@@ -47,7 +47,10 @@ def contact_sheet(
     blocks = np.array(figure.subfigures(lines, columns, squeeze=False)).ravel()
     for block, number in zip(blocks, chosen, strict=False):
         outcome = outcomes[number]
-        block.suptitle(outcome.name, x=0.01, ha="left", fontsize=11, fontweight="bold")
+        block.suptitle(
+            outcome.name, x=0.01, ha="left", fontsize=11, fontweight="bold",
+            parse_math=False,  # a name may hold a $
+        )  # fmt: skip
         axes = block.subplots(len(ROWS), VIEWS + 1, squeeze=False)
         frame = query(number)
         for row, line in zip(ROWS, axes, strict=True):

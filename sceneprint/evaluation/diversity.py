@@ -31,7 +31,7 @@ def diversity(
     the five) of the distance between the query and the match, metres, by true poses, averaged
     over queries. `coverage` has the 2 cm voxels that the first validated views see (true
     poses, depth below 4 m), for VR and VDR, in the mean over queries. VR and VDR are compared
-    at equal numbers of views, on queries for which both have two or more.
+    at equal numbers of views, on queries for which both have two or more; without any, null.
 
     Parameters
     ----------
@@ -50,7 +50,8 @@ def diversity(
         "VDR": _translation([(o, d) for o, _, d in compared], poses),
     }
     covered = coverage(outcomes, database)
-    both = [pair for pair in covered if pair is not None]
+    # where all that a query's views see lies beyond FARTHEST there is nothing to compare
+    both = [pair for pair in covered if pair is not None and pair[0] > 0]
     ranked_mean, diverse_mean = np.mean(both, axis=0).tolist() if both else (0.0, 0.0)
     return {
         "queries": len(ranked),

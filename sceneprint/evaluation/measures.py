@@ -29,10 +29,10 @@ def rows(outcomes: Sequence[Outcome]) -> dict[str, Figures]:
     """
     here = [o for o in outcomes if o.present]
     return {
-        "R": accuracy([_first(o, "R") for o in here]) | retrieval(here, "R"),
-        "VR": accuracy([_first(o, "VR") for o in here]),
-        "DR": accuracy([_first(o, "DR") for o in here]) | retrieval(here, "DR"),
-        "VDR": accuracy([_first(o, "VDR") for o in here]),
+        "R": accuracy([first_error(o, "R") for o in here]) | retrieval(here, "R"),
+        "VR": accuracy([first_error(o, "VR") for o in here]),
+        "DR": accuracy([first_error(o, "DR") for o in here]) | retrieval(here, "DR"),
+        "VDR": accuracy([first_error(o, "VDR") for o in here]),
         "pose_average": accuracy([o.average for o in here]),
         "pose_average_vr": accuracy([o.average_of_ranking for o in here]),
     }
@@ -168,7 +168,8 @@ def absent(outcomes: Sequence[Outcome]) -> dict[str, float | int | None]:
     }
 
 
-def _first(outcome: Outcome, of: str) -> Error:
+def first_error(outcome: Outcome, of: str) -> Error:
+    """How far off a row's first answer is; infinite where it has none."""
     views = outcome.views(of)
     return views[0].error if views else Error()
 

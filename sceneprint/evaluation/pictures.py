@@ -42,7 +42,8 @@ def save_pictures(
 
     Returns
     -------
-    paths : of the files written; the clouds are missing where no query has two validated views
+    paths : of the files written; the clouds are missing where no query has two validated views,
+        or those see nothing nearer than `FARTHEST`
     """
     outcomes, prepared = evaluation.outcomes, evaluation.prepared
     used = figures["settings"]
@@ -70,10 +71,11 @@ def save_pictures(
             merged(query(number), pairs[:VIEWS], database)
             for pairs in equal_views(outcomes[number])
         )
-        drawn["cloud.png"] = cloud_figure(outcomes[number].name, ranked, diverse, ratio)
-        for name, cloud in (("cloud-vr.ply", ranked), ("cloud-vdr.ply", diverse)):
-            write_whole(folder / name, to_ply(cloud))
-            paths.append(folder / name)
+        if len(ranked.points) + len(diverse.points):
+            drawn["cloud.png"] = cloud_figure(outcomes[number].name, ranked, diverse, ratio)
+            for name, cloud in (("cloud-vr.ply", ranked), ("cloud-vdr.ply", diverse)):
+                write_whole(folder / name, to_ply(cloud))
+                paths.append(folder / name)
     for name, figure in drawn.items():
         save_figure(figure, folder / name)
     return [folder / name for name in drawn] + paths
@@ -88,6 +90,6 @@ def _typical(evaluation: Evaluation, database: Any) -> tuple[int, float] | None:
         return None
     numbers = [i for i, n in enumerate(views) if n == most]
     covered = coverage([outcomes[i] for i in numbers], database)
-    ratios = [pair[1] / pair[0] if pair else 0.0 for pair in covered]
+    ratios = [pair[1] / pair[0] if pair and pair[0] else 0.0 for pair in covered]
     middle = int(np.argsort(ratios, kind="stable")[len(ratios) // 2])
     return numbers[middle], ratios[middle]

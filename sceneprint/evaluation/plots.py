@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.evaluation.measures import bound_of
+from sceneprint.evaluation.measures import bound_of, first_error
 from sceneprint.evaluation.records import Error, Outcome, Pair
 from sceneprint.types import Floats
 from sceneprint.writing import write_whole
@@ -57,9 +57,9 @@ def accuracy_figure(outcomes: Sequence[Outcome]) -> Figure:
     """Share of queries whose pose is right to x cm and 10 degrees, for every row."""
     here = [o for o in outcomes if o.present]
     of: dict[str, Callable[[Outcome], Error]] = {
-        "R": lambda o: _first(o, "R"),
-        "VR": lambda o: _first(o, "VR"),
-        "VDR": lambda o: _first(o, "VDR"),
+        "R": lambda o: first_error(o, "R"),
+        "VR": lambda o: first_error(o, "VR"),
+        "VDR": lambda o: first_error(o, "VDR"),
         "pose average": lambda o: o.average,
         "bound of VDR": bound_of,
     }
@@ -178,8 +178,3 @@ def _plain(axes: Any) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", color="#e8eaee", lw=0.8)
     axes.set_axisbelow(True)
-
-
-def _first(outcome: Outcome, of: str) -> Error:
-    views = outcome.views(of)
-    return views[0].error if views else Error()

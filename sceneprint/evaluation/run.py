@@ -101,12 +101,13 @@ def evaluate(
         cache_dir=settings.cache_dir,
         watch=watch,
     )
-    for use, members in (("query", prepared.queries), ("database frame", prepared.database)):
+    for use, members in (("query", prepared.queries), ("database", prepared.database)):
         if not members:
-            name, reason = prepared.left_out[0]
+            own = {one.name for one in protocol.frames if one.use == use}
+            name, reason = next(left for left in prepared.left_out if left[0] in own)
             raise DatasetError(
-                f"No {use} can be used. The first that was left out is {name}: {reason}. "
-                "Choose other frames."
+                f"No {use} frame can be used. The first that was left out is {name}: "
+                f"{reason.rstrip('.')}. Choose other frames."
             )
     truth = overlaps_of(prepared, store, watch)
     every = np.arange(len(prepared.queries)), np.arange(len(prepared.database))

@@ -44,7 +44,6 @@ def voters(parents: Sequence[str], strong: Sequence[bool], most: int = 5) -> lis
     for parent, sure in zip(parents, strong, strict=True):
         known = votes.get(parent, (0, 0))
         votes[parent] = (known[0] + sure, known[1] + 1)
-    winner = max(
-        votes, key=votes.__getitem__, default=None
-    )  # the first of equals, as dicts keep it
+    # the first of equals: dicts keep the order in which parents came
+    winner = max(votes, key=votes.__getitem__, default=None)
     return [i for i, parent in enumerate(parents) if parent == winner][:most]

@@ -190,7 +190,7 @@ def refine(
 
     Returns
     -------
-    refined : or None where fewer than `minimum_points` stay within the gates
+    refined : or None where fewer than `minimum_points` stay within the gates, or they fix no step
     """
     T, information = np.array(T_target_source, float), np.zeros((6, 6))
     used = refine_in_place(

@@ -22,7 +22,7 @@ Ints64 = NDArray[np.int64]
 #: "l1": the paper's, sum |x - y|; "l2": squared Euclidean, sum (x - y)^2, an integer as well.
 Metric = Literal["l1", "l2"]
 
-#: Bytes summed in 32 bits before they move to 64; 32768 x 255^2 is the last that fits.
+#: Bytes summed in 32 bits before they move to 64: the last power of 2 of which 255^2 each fit.
 BLOCK = 32768
 
 #: Bytes of queries that stay in a core's cache while the database streams past them, and bytes

@@ -1,6 +1,6 @@
 """Sec. III-E, ambiguity: other transforms that would explain the same two frames.
 
-    T, hypotheses, patches  --candidates-->  transforms far from T
+    T, hypotheses, planes  --best_rival-->  ambiguity, T_rival
 
 A lone box looks the same from its four sides, a corridor the same at every door. Two frames of
 such a place agree perfectly under a wrong transform, and nothing in the residual, the overlap or

@@ -39,8 +39,8 @@ class ValidationParameters:
     evidence: float = 0.2  #: least
     plane_overlap: float = 0.13  #: least
     strong: float = 0.3  #: evidence below which an accepted match is weak
-    weak: float = 0.04  #: ambiguity from which on an accepted match is weak
-    ambiguous: float = 0.07  #: ambiguity from which on nothing is accepted
+    weak: float = 0.05  #: ambiguity from which on an accepted match is weak
+    ambiguous: float = 0.14  #: ambiguity from which on nothing is accepted
     stiffness: float = 1e-5  #: least ratio of the eigenvalues of the information
     minimum_patches: int = 10  #: of either frame
     rivals: RivalParameters = field(default_factory=RivalParameters)
@@ -54,8 +54,10 @@ class Validation:
 
     Parameters
     ----------
-    status : accepted, ambiguous (a rival transform explains the frames as well), or rejected
-    strength : of an accepted match: strong, or weak where a rival comes near; else None
+    status : accepted, rejected, or ambiguous (a rival transform explains the frames as well, or
+        what they share leaves a direction free)
+    strength : of an accepted match: strong, or weak where a rival comes near or little agrees;
+        else None
     reason : a short sentence
     T_match_query : (4, 4) query coordinates to the match's, x_match = T @ x_query; the best there
         is, whatever the status; None where the frames gave no hypothesis at all
@@ -125,14 +127,14 @@ def validate(
     Parameters
     ----------
     query, match : geometry artifacts made with one model
-    seed : of the random choices, the same seed giving the same answer
+    seed : of the random choices, 0 or more; the same seed gives the same answer
     p : see ValidationParameters
     mode : "full", or "paper": accept where the residual of the two directions is small, on no
         other evidence
 
     Raises
     ------
-    ValueError : the descriptors have different lengths, or an unknown mode.
+    ValueError : the descriptors have different lengths, an unknown mode, or a negative seed.
     """
     if mode not in ("full", "paper"):
         raise ValueError(f"mode {mode!r} is neither 'full' nor 'paper'")
@@ -147,7 +149,7 @@ def validate(
     there = align(query, match, np.random.default_rng((seed, 0)), p.alignment, p.agreement)
     back = align(match, query, np.random.default_rng((seed, 1)), p.alignment, p.agreement)
     if there is None or back is None:
-        return _nothing("no three correspondences agree on a transform", seed)
+        return _nothing("no correspondences agree on a transform that the surfaces bear out", seed)
     return _decided(query, match, there, back, seed, p, mode)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,12 @@ def evaluated(folder: Path, *arguments: object) -> dict[str, Any]:
     assert main(["evaluate", *map(str, arguments), "--json", str(path)]) == 0
     found: dict[str, Any] = json.loads(path.read_text(), parse_constant=pytest.fail)
     return found
+
+
+def copied(room: Path, to: Path) -> Path:
+    """A room of which frames may be spoilt."""
+    shutil.copytree(room, to)
+    return to
 
 
 @pytest.fixture(scope="module")
@@ -112,11 +119,7 @@ def test_a_scene_that_is_absent(
 def test_frames_that_cannot_be_used_are_named(
     building: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    copy = tmp_path / "room"
-    (copy / "seq-01").mkdir(parents=True)
-    for file in (building / "room-000").rglob("*.*"):
-        if file.is_file():
-            (copy / file.relative_to(building / "room-000")).write_bytes(file.read_bytes())
+    copy = copied(building / "room-000", tmp_path / "room")
     (copy / "seq-01" / "frame-000001.pose.txt").unlink()
     (copy / "seq-01" / "frame-000002.depth.png").write_bytes(b"no picture")
     found = evaluated(
@@ -176,6 +179,51 @@ def test_the_table_of_several_scenes(
     assert "room-001, alone" in out
     assert "Average" in out
     assert "Combine" in out
+
+
+def test_what_cannot_be_written_is_said_before_the_work(
+    building: Path,
+    model_file: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def work(*_: object) -> None:
+        raise AssertionError("hours of it")
+
+    monkeypatch.setattr("sceneprint.evaluation.run.evaluate", work)
+    (tmp_path / "file").touch()
+    asked = [str(building / "room-000"), "--db", "0:4", "--queries", "5:6"]
+    asked += ["--model", str(model_file), "--jobs", "1"]
+    for option, path in (
+        ("--json", tmp_path),
+        ("--json", tmp_path / "file" / "figures.json"),
+        ("--plots", tmp_path / "file"),
+    ):
+        assert main(["evaluate", *asked, option, str(path)]) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert str(tmp_path) in line
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_wrong_options_leave_no_folder(building: Path, model_file: Path, tmp_path: Path) -> None:
+    asked = [building / "room-000", "--db", "0:4", "--queries", "5:6", "--model", model_file]
+    asked += ["--levels", "99", "--json", tmp_path / "a" / "b.json", "--plots", tmp_path / "c"]
+    assert main(["evaluate", *map(str, asked)]) == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_reason_is_of_the_frames_that_are_missing(
+    building: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = copied(building / "room-000", tmp_path / "room")
+    for i in (0, 3):
+        (copy / "seq-01" / f"frame-{i:06d}.depth.png").write_bytes(b"no picture")
+    asked = [copy, "--db", "0:3", "--queries", "3:4", "--model", model_file, "--jobs", 1]
+    assert main(["evaluate", *map(str, asked)]) == 2
+    error = capsys.readouterr().err
+    assert "The first that was left out is room/seq-01/frame-000003" in error
+    assert ".." not in error
 
 
 @pytest.mark.parametrize(

@@ -208,6 +208,16 @@ def test_diversity_by_hand(make_outcome: MakeOutcome, make_pair: MakePair) -> No
     assert (found["queries"], found["queries_validated"]) == (1, 1)
 
 
+def test_views_that_see_only_what_is_too_far_cover_nothing(
+    make_outcome: MakeOutcome, make_pair: MakePair
+) -> None:
+    far = dots(0, depth=5.0)
+    both = make_outcome([0, 1], [0, 1], [make_pair(0), make_pair(1)])
+    found = diversity([both], [np.eye(4)] * 2, [far, far].__getitem__)
+    assert found["queries_validated"] == 1
+    assert set(found["coverage"].values()) == {None}
+
+
 def test_without_anything_to_count_there_is_null(
     make_outcome: MakeOutcome, make_pair: MakePair
 ) -> None:

@@ -1,0 +1,37 @@
+"""Pictures of what is out of the ordinary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sceneprint.evaluation.clouds import cloud_figure, merged
+from sceneprint.evaluation.contact import contact_sheet
+from sceneprint.evaluation.plots import save_figure
+from sceneprint.evaluation.records import Outcome, Pair
+from sceneprint.types import Frame, Intrinsics
+
+
+def wall(depth: float) -> Frame:
+    k = Intrinsics(32, 24, 30.0, 30.0, 16.0, 12.0)
+    return Frame(np.full((24, 32), depth, np.float32), k, "wall", np.eye(4))
+
+
+@pytest.mark.parametrize("name", [r"a$\frac$b", "one $ alone", "a_{b}^c"])
+def test_a_name_is_no_formula(
+    name: str,
+    tmp_path: Path,
+    make_outcome: Callable[..., Outcome],
+    make_pair: Callable[..., Pair],
+) -> None:
+    pairs = [make_pair(0), make_pair(1)]
+    one = replace(make_outcome([0, 1], [0, 1], pairs), name=name)
+    sheet = contact_sheet([one], lambda _: wall(2.0), lambda _: wall(2.0), None)
+    save_figure(sheet, tmp_path / "contact.png", 30)
+    cloud = merged(wall(2.0), pairs, lambda _: wall(2.0))
+    save_figure(cloud_figure(name, cloud, cloud, 1.0), tmp_path / "cloud.png", 30)
+    assert len(list(tmp_path.iterdir())) == 2
