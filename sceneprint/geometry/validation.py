@@ -41,6 +41,7 @@ class ValidationParameters:
     strong: float = 0.3  #: evidence below which an accepted match is weak
     weak: float = 0.05  #: ambiguity from which on an accepted match is weak
     ambiguous: float = 0.14  #: ambiguity from which on nothing is accepted
+    ambiguous_share: float = 0.5  #: nor from this share of `plane_overlap` on
     stiffness: float = 1e-5  #: least ratio of the eigenvalues of the information
     minimum_patches: int = 10  #: of either frame
     rivals: RivalParameters = field(default_factory=RivalParameters)
@@ -209,7 +210,7 @@ def _decided(
         )
     voted = np.concatenate([there.others, inverses(back.others)])
     ambiguity, T_rival = best_rival(*views, T, voted, p.rivals, p.agreement)
-    if ambiguity >= p.ambiguous:
+    if ambiguity >= min(p.ambiguous, p.ambiguous_share * plane_overlap):
         return answer("ambiguous", None, "another transform explains the frames as well")
     if ambiguity >= p.weak:
         return answer("accepted", "weak", "another transform is not ruled out")
