@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sceneprint.geometry.acceptance import Mode
 from sceneprint.geometry.association import preferred, voters
 from sceneprint.geometry.averaging import PoseAverage, average_poses
 from sceneprint.geometry.retrieval import Ranking
-from sceneprint.geometry.validation import Mode, Validation, ValidationParameters
+from sceneprint.geometry.validation import Validation, ValidationParameters
 from sceneprint.pipeline import validate
 from sceneprint.types import Floats, Geometry
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sceneprint.errors import ModelMismatch
+from sceneprint.geometry.acceptance import Mode
 from sceneprint.geometry.diversity import DiversityParameters, Selection
 from sceneprint.geometry.diversity import diversify as select
 from sceneprint.geometry.retrieval import (
@@ -22,7 +23,7 @@ from sceneprint.geometry.retrieval import (
 )
 from sceneprint.geometry.segmentation import patches_of, segment
 from sceneprint.geometry.surroundings import compress, surroundings
-from sceneprint.geometry.validation import Mode, Validation, ValidationParameters
+from sceneprint.geometry.validation import Validation, ValidationParameters
 from sceneprint.geometry.validation import validate as validate_geometry
 from sceneprint.models import Model
 from sceneprint.signing import Signature, Signer, encode, hierarchy_of, open_signer, see

@@ -15,10 +15,11 @@ import numpy as np
 
 from sceneprint.evaluation.frames import Store
 from sceneprint.evaluation.records import VIEWS, Error, Pair, in_preferred_order, pose_error
+from sceneprint.geometry.acceptance import Mode
 from sceneprint.geometry.association import voters
 from sceneprint.geometry.averaging import average_poses
 from sceneprint.geometry.rigid import inverse
-from sceneprint.geometry.validation import Mode, refined_at
+from sceneprint.geometry.validation import refined_at
 from sceneprint.pipeline import validate
 from sceneprint.types import Floats, Geometry
 

@@ -21,8 +21,8 @@ from sceneprint.evaluation.protocol import Protocol
 from sceneprint.evaluation.ranking import Ranked, rank
 from sceneprint.evaluation.records import Member, Outcome
 from sceneprint.evaluation.workers import Watch, map_over, unwatched
+from sceneprint.geometry.acceptance import Mode
 from sceneprint.geometry.retrieval import Metric
-from sceneprint.geometry.validation import Mode
 from sceneprint.pipeline import Signer
 
 #: Depth images that are held in memory at once, of queries and of the database.

@@ -12,10 +12,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 
+from sceneprint.geometry.acceptance import (
+    AcceptanceParameters,
+    Evidence,
+    Mode,
+    Status,
+    Strength,
+    belief,
+    objection,
+)
 from sceneprint.geometry.agreement import AgreementParameters, agreement, sampled
 from sceneprint.geometry.alignment import Alignment, AlignmentParameters, align
 from sceneprint.geometry.planes import explained, plane_view
@@ -24,26 +32,13 @@ from sceneprint.geometry.rigid import inverse, inverses, nearest_rotation, rotat
 from sceneprint.geometry.rivals import RivalParameters, best_rival
 from sceneprint.types import Floats, Geometry
 
-Status = Literal["accepted", "ambiguous", "rejected"]
-Strength = Literal["strong", "weak"]
-Mode = Literal["full", "paper"]
-
 
 @dataclass(frozen=True)
 class ValidationParameters:
-    """The numbers of acceptance; how they were chosen: docs/evaluation.md."""
+    """The numbers of every step."""
 
-    residual_m: float = 0.08  #: of the two directions composed: epsilon_val of Sec. III-E
-    residual_rad: float = math.radians(5.0)
-    violation_weight: float = 5.0  #: evidence = overlap - this x violations
-    evidence: float = 0.2  #: least
-    plane_overlap: float = 0.13  #: least
-    strong: float = 0.3  #: evidence below which an accepted match is weak
-    weak: float = 0.05  #: ambiguity from which on an accepted match is weak
-    ambiguous: float = 0.14  #: ambiguity from which on nothing is accepted
-    ambiguous_share: float = 0.5  #: nor from this share of `plane_overlap` on
-    stiffness: float = 1e-5  #: least ratio of the eigenvalues of the information
     minimum_patches: int = 10  #: of either frame
+    acceptance: AcceptanceParameters = field(default_factory=AcceptanceParameters)
     rivals: RivalParameters = field(default_factory=RivalParameters)
     alignment: AlignmentParameters = field(default_factory=AlignmentParameters)
     agreement: AgreementParameters = field(default_factory=AgreementParameters)
@@ -165,55 +160,32 @@ def _decided(
     p: ValidationParameters, mode: Mode,
 ) -> Validation:  # fmt: skip
     composed = there.T @ back.T  # reading R5: the residual transform T_Q^X T_X^Q itself
-    metres = float(np.linalg.norm(composed[:3, 3]))
-    radians = rotation_angle(composed[:3, :3])
     T = middle(there.T, inverse(back.T))
     of_query = agreement(there.points, match.surface, T, p.agreement)
     of_match = agreement(back.points, query.surface, inverse(T), p.agreement)
-    inliers = int(of_query.inliers + of_match.inliers)
-    overlap = inliers / max(of_query.points + of_match.points, 1.0)
+    inliers = of_query.inliers + of_match.inliers
     violated = of_query.violations + of_match.violations
-    violations = violated / max(inliers + violated, 1.0)
     views = plane_view(query, p.rivals.planes), plane_view(match, p.rivals.planes)
-    plane_overlap = float(explained(*views, T[None], p.agreement).share[0])
+    e = Evidence(
+        residual_m=float(np.linalg.norm(composed[:3, 3])),
+        residual_rad=rotation_angle(composed[:3, :3]),
+        overlap=inliers / max(of_query.points + of_match.points, 1),
+        plane_overlap=float(explained(*views, T[None], p.agreement).share[0]),
+        violations=violated / max(inliers + violated, 1),
+        stiffness=min(there.stiffness, back.stiffness),
+    )
     ambiguity, T_rival = 0.0, None
-
-    def answer(status: Status, strength: Strength | None, reason: str) -> Validation:
-        return Validation(
-            status, strength, reason, T, metres, radians, overlap, plane_overlap, violations,
-            inliers, ambiguity, T_rival, seed,
-        )  # fmt: skip
-
-    if metres > p.residual_m or radians > p.residual_rad:
-        degrees = math.degrees(radians)
-        return answer(
-            "rejected", None, f"the two directions disagree by {metres:.2g} m, {degrees:.2g} deg"
-        )
-    if mode == "paper":
-        return answer("accepted", "strong", "the two directions agree")
-    evidence = overlap - p.violation_weight * violations
-    if evidence < p.evidence:
-        return answer(
-            "rejected",
-            None,
-            f"only {overlap:.0%} of the surfaces agree"
-            if overlap < p.evidence
-            else f"{violations:.1%} lies where the other frame saw through",
-        )
-    if plane_overlap < p.plane_overlap:
-        return answer(
-            "rejected", None, f"what agrees is mostly one plane ({plane_overlap:.0%} by planes)"
-        )
-    if min(there.stiffness, back.stiffness) < p.stiffness:
-        return answer(
-            "ambiguous", None, "what the frames share leaves a direction free, as a plane does"
-        )
-    voted = np.concatenate([there.others, inverses(back.others)])
-    ambiguity, T_rival = best_rival(*views, T, voted, p.rivals, p.agreement)
-    if ambiguity >= min(p.ambiguous, p.ambiguous_share * plane_overlap):
-        return answer("ambiguous", None, "another transform explains the frames as well")
-    if ambiguity >= p.weak:
-        return answer("accepted", "weak", "another transform is not ruled out")
-    if evidence < p.strong:
-        return answer("accepted", "weak", f"{overlap:.0%} of the surfaces agree")
-    return answer("accepted", "strong", "surfaces agree, and nothing speaks against it")
+    strength: Strength | None = None
+    against = objection(e, p.acceptance, mode)
+    if against is not None:
+        status, reason = against
+    elif mode == "paper":
+        status, strength, reason = "accepted", "strong", "the two directions agree"
+    else:
+        voted = np.concatenate([there.others, inverses(back.others)])
+        ambiguity, T_rival = best_rival(*views, T, voted, p.rivals, p.agreement)
+        status, strength, reason = belief(e, ambiguity, p.acceptance)
+    return Validation(
+        status, strength, reason, T, e.residual_m, e.residual_rad, e.overlap, e.plane_overlap,
+        e.violations, inliers, ambiguity, T_rival, seed,
+    )  # fmt: skip

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from sceneprint import pipeline
 from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.errors import ModelMismatch
+from sceneprint.geometry.acceptance import AcceptanceParameters, Mode
 from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.geometry.validation import (
     Validation,
@@ -306,18 +307,22 @@ def test_the_papers_test_is_the_residual_alone(
     pairs: list[tuple[Geometry, Geometry, Floats]], model: Model
 ) -> None:
     query, match, _ = pairs[0]
-    hard = ValidationParameters(evidence=2.0)
-    full, paper = (sane(validate(query, match, 0, hard, mode)) for mode in ("full", "paper"))
+    hard = AcceptanceParameters(evidence=2.0)
+
+    def judged(p: AcceptanceParameters, mode: Mode) -> Validation:
+        return sane(validate(query, match, 0, ValidationParameters(acceptance=p), mode))
+
+    full, paper = judged(hard, "full"), judged(hard, "paper")
     assert (full.status, full.strength) == ("rejected", None)
     assert paper.status == "accepted"
     np.testing.assert_array_equal(full.T_match_query, paper.T_match_query)
     assert (full.residual_m, full.residual_rad) == (paper.residual_m, paper.residual_rad)
     exact = replace(hard, residual_m=paper.residual_m * 0.99)
-    assert sane(validate(query, match, 0, exact, "paper")).status == "rejected"
+    assert judged(exact, "paper").status == "rejected"
     exact = replace(hard, residual_rad=paper.residual_rad * 0.99)
-    assert sane(validate(query, match, 0, exact, "paper")).status == "rejected"
+    assert judged(exact, "paper").status == "rejected"
     exact = replace(hard, residual_m=paper.residual_m, residual_rad=paper.residual_rad)
-    assert sane(validate(query, match, 0, exact, "paper")).status == "accepted"
+    assert judged(exact, "paper").status == "accepted"
     # a wall on a wall, which evidence does not accept
     wall = geometry(model, np.full((480, 640), 2.0, np.float32))
     assert sane(validate(wall, wall, mode="paper")).status == "accepted"

@@ -1,0 +1,90 @@
+"""Sec. III-E, acceptance: what is known of a transform to whether it is believed.
+
+Evidence  --objection-->  why not        Evidence, ambiguity  --belief-->  how far
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+Status = Literal["accepted", "ambiguous", "rejected"]
+Strength = Literal["strong", "weak"]
+Mode = Literal["full", "paper"]
+
+
+@dataclass(frozen=True)
+class AcceptanceParameters:
+    """The numbers of acceptance; how they were chosen: docs/evaluation.md."""
+
+    residual_m: float = 0.08  #: of the two directions composed: epsilon_val of Sec. III-E
+    residual_rad: float = math.radians(5.0)
+    violation_weight: float = 5.0  #: evidence = overlap - this x violations
+    evidence: float = 0.2  #: least
+    plane_overlap: float = 0.13  #: least
+    strong: float = 0.3  #: evidence below which an accepted match is weak
+    weak: float = 0.05  #: ambiguity from which on an accepted match is weak
+    ambiguous: float = 0.14  #: ambiguity from which on nothing is accepted
+    ambiguous_share: float = 0.5  #: nor from this share of `plane_overlap` on
+    stiffness: float = 1e-5  #: least ratio of the eigenvalues of the information
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for and against a transform, before rivals are looked for.
+
+    Parameters
+    ----------
+    residual_m, residual_rad, overlap, plane_overlap, violations : as in Validation
+    stiffness : the less of both directions', as in Alignment
+    """
+
+    residual_m: float
+    residual_rad: float
+    overlap: float
+    plane_overlap: float
+    violations: float
+    stiffness: float
+
+    def total(self, p: AcceptanceParameters) -> float:
+        """For less against."""
+        return self.overlap - p.violation_weight * self.violations
+
+
+def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status, str] | None:
+    """Why not to accept, whatever the rivals: Sec. III-E. None where nothing speaks against it.
+
+    Parameters
+    ----------
+    e : see Evidence
+    p : see AcceptanceParameters
+    mode : "paper" asks for the residual alone
+    """
+    if e.residual_m > p.residual_m or e.residual_rad > p.residual_rad:
+        degrees = math.degrees(e.residual_rad)
+        return "rejected", f"the two directions disagree by {e.residual_m:.2g} m, {degrees:.2g} deg"
+    if mode == "paper":
+        return None
+    if e.total(p) < p.evidence:
+        if e.overlap < p.evidence:
+            return "rejected", f"only {e.overlap:.0%} of the surfaces agree"
+        return "rejected", f"{e.violations:.1%} lies where the other frame saw through"
+    if e.plane_overlap < p.plane_overlap:
+        return "rejected", f"what agrees is mostly one plane ({e.plane_overlap:.0%} by planes)"
+    if e.stiffness < p.stiffness:
+        return "ambiguous", "what the frames share leaves a direction free, as a plane does"
+    return None
+
+
+def belief(
+    e: Evidence, ambiguity: float, p: AcceptanceParameters
+) -> tuple[Status, Strength | None, str]:
+    """How far to believe a transform that nothing but its rivals speaks against."""
+    if ambiguity >= min(p.ambiguous, p.ambiguous_share * e.plane_overlap):
+        return "ambiguous", None, "another transform explains the frames as well"
+    if ambiguity >= p.weak:
+        return "accepted", "weak", "another transform is not ruled out"
+    if e.total(p) < p.strong:
+        return "accepted", "weak", f"{e.overlap:.0%} of the surfaces agree"
+    return "accepted", "strong", "surfaces agree, and nothing speaks against it"

@@ -1,0 +1,95 @@
+"""Whether to believe a transform, by hand: one case on each side of every threshold."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.acceptance import AcceptanceParameters, Evidence, belief, objection
+from sceneprint.geometry.agreement import AgreementParameters, agreements
+from sceneprint.geometry.alignment import AlignmentParameters, _scores
+from sceneprint.types import Floats32, Intrinsics, Surface
+
+P = AcceptanceParameters()
+GOOD = Evidence(0.01, 0.01, 0.6, 0.5, 0.01, 1e-3)
+
+
+def test_what_is_good_meets_no_objection() -> None:
+    assert objection(GOOD, P, "full") is None
+    # overlap less five times the violations
+    assert GOOD.total(P) == pytest.approx(0.55)
+    status, strength, _ = belief(GOOD, 0.0, P)
+    assert (status, strength) == ("accepted", "strong")
+
+
+@pytest.mark.parametrize(
+    ("worse", "just", "status", "reason"),
+    [
+        ({"residual_m": 0.081}, {"residual_m": 0.079}, "rejected", "disagree by 0.081 m"),
+        (
+            {"residual_rad": math.radians(5.1)}, {"residual_rad": math.radians(4.9)},
+            "rejected", "5.1 deg",
+        ),
+        ({"overlap": 0.24}, {"overlap": 0.26}, "rejected", "1.0% lies where the other frame"),
+        ({"overlap": 0.19}, {"overlap": 0.26}, "rejected", "only 19% of the surfaces"),
+        ({"violations": 0.09}, {"violations": 0.07}, "rejected", "9.0% lies where"),
+        ({"plane_overlap": 0.12}, {"plane_overlap": 0.14}, "rejected", "mostly one plane (12%"),
+        ({"stiffness": 9e-6}, {"stiffness": 1.1e-5}, "ambiguous", "leaves a direction free"),
+    ],
+)  # fmt: skip
+def test_each_objection_has_its_threshold(
+    worse: dict[str, float], just: dict[str, float], status: str, reason: str
+) -> None:
+    found = objection(replace(GOOD, **worse), P, "full")
+    assert found is not None
+    assert found[0] == status
+    assert reason in found[1]
+    assert objection(replace(GOOD, **just), P, "full") is None
+    # the paper asks for the residual alone
+    alone = objection(replace(GOOD, **worse), P, "paper")
+    assert (alone is not None) == ("disagree" in found[1])
+
+
+@pytest.mark.parametrize(
+    ("ambiguity", "changed", "status", "strength"),
+    [
+        (0.049, {}, "accepted", "strong"),
+        (0.051, {}, "accepted", "weak"),
+        (0.139, {}, "accepted", "weak"),
+        (0.141, {}, "ambiguous", None),
+        # half of what the transform itself explains by planes
+        (0.079, {"plane_overlap": 0.16}, "accepted", "weak"),
+        (0.081, {"plane_overlap": 0.16}, "ambiguous", None),
+        (0.0, {"overlap": 0.34}, "accepted", "weak"),
+        (0.0, {"overlap": 0.36}, "accepted", "strong"),
+        (0.0, {"violations": 0.061}, "accepted", "weak"),
+    ],
+)
+def test_rivals_and_little_agreement_weaken(
+    ambiguity: float, changed: dict[str, float], status: str, strength: str | None
+) -> None:
+    assert belief(replace(GOOD, **changed), ambiguity, P)[:2] == (status, strength)
+
+
+def wall(z: float) -> Surface:
+    """A wall square to the camera, which sees it in 40 x 30 pixels."""
+    k = Intrinsics(40, 30, 40.0, 40.0, 19.5, 14.5)
+    y, x = np.mgrid[:30, :40].astype(np.float32)
+    points = np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, np.full_like(x, z)], axis=-1)
+    normals = np.tile(np.array([0, 0, -1], np.float32), (30, 40, 1))
+    one = np.ones((30, 40), np.float32)
+    return Surface(points.astype(np.float32), normals, one > 0, one, k)
+
+
+def test_a_violation_costs_three_inliers() -> None:
+    p, seen = AgreementParameters(), wall(2.0)
+    on, before = np.zeros((5, 6), np.float32), np.zeros((2, 6), np.float32)
+    on[:, 2], before[:, 2] = 2.0, 1.0  # on the wall, and a metre before it
+    source: Floats32 = np.concatenate([on, before])
+    source[:, 5] = -1.0
+    assert agreements(source, seen, np.eye(4)[None], p).tolist() == [[5.0, 2.0]]
+    scores = _scores(source, seen, np.eye(4)[None], AlignmentParameters(), p)
+    assert scores.tolist() == [5.0 - 3 * 2.0]
