@@ -16,6 +16,7 @@ from sceneprint import pipeline
 from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.errors import ModelMismatch
 from sceneprint.geometry.acceptance import AcceptanceParameters, Mode
+from sceneprint.geometry.agreement import agreement, sampled
 from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.geometry.validation import (
     Validation,
@@ -327,6 +328,34 @@ def test_the_papers_test_is_the_residual_alone(
     wall = geometry(model, np.full((480, 640), 2.0, np.float32))
     assert sane(validate(wall, wall, mode="paper")).status == "accepted"
     assert sane(validate(wall, wall)).status == "ambiguous"
+
+
+def test_what_is_told_is_counted_under_the_transform_told(
+    pairs: list[tuple[Geometry, Geometry, Floats]],
+) -> None:
+    p, violated = ValidationParameters(), []
+    crossed = [(pairs[i][0], pairs[i - 1][1]) for i in range(len(pairs))]
+    for query, match in [(q, m) for q, m, _ in pairs] + crossed:
+        v = sane(validate(query, match))
+        if v.T_match_query is None:
+            continue
+        a = agreement(sampled(query.surface, 5), match.surface, v.T_match_query, p.agreement)
+        back = inverse(v.T_match_query)
+        b = agreement(sampled(match.surface, 5), query.surface, back, p.agreement)
+        inliers, violations = a.inliers + b.inliers, a.violations + b.violations
+        assert v.inliers == inliers
+        assert v.overlap == inliers / (a.points + b.points)
+        assert v.violations == violations / max(inliers + violations, 1)
+        violated.append(violations)
+    assert max(violated) > 10
+
+
+def test_a_free_direction_is_seen_without_rivals(model: Model) -> None:
+    wall = geometry(model, np.full((480, 640), 2.0, np.float32))
+    blind = AcceptanceParameters(ambiguous=9.0, ambiguous_share=9.0, weak=9.0)
+    v = sane(validate(wall, wall, 0, ValidationParameters(acceptance=blind)))
+    assert v.status == "ambiguous"
+    assert "leaves a direction free" in v.reason
 
 
 def test_wrong_calls(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
