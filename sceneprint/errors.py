@@ -10,7 +10,27 @@
       x ModelError
         - UnreadableModel       a model file that is none, or of another schema
         - ModelMismatch         signatures or artifacts of two models were compared
-      x UnreadableGeometry        a geometry artifact that is missing, damaged or of another schema
+      x UnreadableGeometry      a geometry artifact that is missing, damaged or of another schema
+      x DamagedIndex            a cache file of the index that is missing or damaged
+      x NotFound                there is no such map, frame or job
+        - UnknownMap, UnknownFrame, UnknownJob
+      x Conflict                the request contradicts what is there
+        - MapExists             a map of that name, made otherwise
+        - FrameConflict         the same content with other metadata
+      x InvalidRequest          a field of a request is missing, unknown or out of its range
+        - MalformedBody         its body cannot be parsed at all
+        - UnsupportedType       its body is of a type that is not read
+        - TooLarge              its body is larger than the service takes
+      x KeyRequired             the service asks for a key, and none or an unknown one was given
+      x Busy                    as many requests wait as may; come back
+      x StoreError
+        - UnusableStore         the folder or database cannot be opened or written
+        - NewerSchema           a later version of sceneprint wrote it
+        - DamagedBlob           stored bytes are missing or are not those that were stored
+        - LostLease             the job has been given to another worker
+      x ServiceError            what a client is told by, or of, a service
+        - Unreachable           no answer came
+        - Refused               the answer is a problem document
       x TrainingError           too little data, or parameters that cannot be fitted
       x MissingDependency       an optional part of the machine is absent
 
@@ -62,6 +82,116 @@ class ModelMismatch(ModelError):
 
 class UnreadableGeometry(SceneprintError):
     """The bytes are no geometry artifact, are damaged, or have another schema."""
+
+
+class DamagedIndex(SceneprintError):
+    """A cache file of the index is missing or damaged."""
+
+
+class NotFound(SceneprintError):
+    """What a request names is not there."""
+
+
+class UnknownMap(NotFound):
+    """There is no map of that name."""
+
+
+class UnknownFrame(NotFound):
+    """There is no frame of that id in the map."""
+
+
+class UnknownJob(NotFound):
+    """There is no job of that id."""
+
+
+class Conflict(SceneprintError):
+    """The request contradicts what is there."""
+
+
+class MapExists(Conflict):
+    """There is a map of that name, with another title or model."""
+
+
+class FrameConflict(Conflict):
+    """The map has a frame of the same content with other metadata."""
+
+
+class InvalidRequest(SceneprintError):
+    """A field of a request is missing, unknown or out of its range.
+
+    Parameters
+    ----------
+    message : what, why, and what to do
+    fields : (place, reason) of each field at fault
+    """
+
+    def __init__(self, message: str, fields: tuple[tuple[str, str], ...] = ()) -> None:
+        super().__init__(message)
+        self.fields = fields
+
+
+class MalformedBody(InvalidRequest):
+    """The body of a request cannot be parsed."""
+
+
+class UnsupportedType(InvalidRequest):
+    """The body of a request is of a type that is not read."""
+
+
+class TooLarge(InvalidRequest):
+    """The body of a request is larger than the service takes."""
+
+
+class KeyRequired(SceneprintError):
+    """The service asks for a key, and none or an unknown one was given."""
+
+
+class Busy(SceneprintError):
+    """As many requests wait as may."""
+
+
+class StoreError(SceneprintError):
+    """The store cannot do what it should."""
+
+
+class UnusableStore(StoreError):
+    """The folder or database cannot be opened or written."""
+
+
+class NewerSchema(StoreError):
+    """A later version of sceneprint wrote the database."""
+
+
+class DamagedBlob(StoreError):
+    """Stored bytes are missing, or are not those that were stored."""
+
+
+class LostLease(StoreError):
+    """The job's lease ran out, and it has been given to another worker."""
+
+
+class ServiceError(SceneprintError):
+    """What a client is told by, or of, a service."""
+
+
+class Unreachable(ServiceError):
+    """No answer came from the service."""
+
+
+class Refused(ServiceError):
+    """The service answered with a problem document.
+
+    Parameters
+    ----------
+    message : its detail
+    status : of HTTP
+    problem : the document
+    """
+
+    def __init__(self, message: str, status: int, problem: dict[str, object]) -> None:
+        super().__init__(message)
+        self.status = status
+        self.problem = problem
 
 
 class TrainingError(SceneprintError):

@@ -49,5 +49,43 @@ def write_whole(path: Path, data: bytes) -> None:
         raise
 
 
+def write_durable(path: Path, data: bytes) -> None:
+    """As `write_whole`, and when it returns the file survives the loss of power.
+
+    Parameters
+    ----------
+    path : of the file; its folder must exist
+    data : all of it
+
+    Raises
+    ------
+    OSError : it cannot be written; nothing is left behind.
+    """
+    part = _beside(path)
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())  # before its name: a name must never lead to half a file
+        os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
+        sync_folder(path.parent)
+        sync_folder(path.parent.parent)  # in which the folder itself may be new
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise type(error)(error.errno, error.strerror, str(path)) from error
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder survive the loss of power."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def _beside(path: Path) -> Path:
     return path.with_name(f".{secrets.token_hex(6)}.part")  # short: the name may be long already
