@@ -1,0 +1,110 @@
+"""What the index tests share: signatures of walks through a place that does not exist."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sceneprint.index import Generation, publish
+from sceneprint.index.segments import Block
+from sceneprint.types import Bytes
+
+Keys = NDArray[np.int64]
+Walk = Callable[..., Bytes]
+Publish = Callable[..., Generation]
+
+
+@pytest.fixture(scope="session")
+def walk() -> Walk:
+    """Signatures (n, length) of a camera on smooth walks: near frames alike, none a cluster.
+
+    Sixteen slow sinusoids of random period are where the camera is; a fixed nonlinear map of low
+    rank, the same for every walk, makes them bytes; and every byte has noise of its own.
+    """
+
+    def make(n: int, length: int = 256, seed: int = 0, walks: int = 1) -> Bytes:
+        place = np.random.default_rng(99)
+        mix, fold = place.normal(size=(16, 48)), place.normal(size=(48, length))
+        rng = np.random.default_rng(seed)
+        parts = []
+        for steps in np.array_split(np.arange(n), walks):
+            periods = rng.uniform(150, 900, 16)
+            angles = 2 * np.pi * (np.arange(len(steps))[:, None] / periods + rng.random(16))
+            parts.append(np.abs(np.tanh(np.sin(angles) @ mix / 2) @ fold) * 9)
+        smooth = np.concatenate(parts)
+        noisy = smooth + rng.normal(size=smooth.shape) * 4 + 12
+        found: Bytes = np.clip(noisy, 0, 255).astype(np.uint8)
+        return found
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def in_blocks() -> Callable[[Keys, Bytes, int], Iterator[Block]]:
+    def cut(keys: Keys, signatures: Bytes, step: int = 37) -> Iterator[Block]:
+        for start in range(0, len(keys), step):
+            yield keys[start : start + step], signatures[start : start + step]
+
+    return cut
+
+
+@pytest.fixture
+def published(tmp_path: Path) -> Publish:
+    """Publish keys and signatures as the next generation of one folder."""
+
+    def run(
+        keys: Keys,
+        signatures: Bytes,
+        previous: Generation | None = None,
+        folder: Path = tmp_path / "map",
+        revision: int = 0,
+        drop: frozenset[int] = frozenset(),
+    ) -> Generation:
+        generation = publish(
+            folder,
+            model_id="model",
+            revision=revision,
+            blocks=[(keys, signatures)],
+            previous=previous,
+            drop=drop,
+        )
+        assert generation is not None
+        return generation
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def nearest() -> Callable[..., tuple[list[int], list[int]]]:
+    """The oracle: keys and distances of the nearest, by Python's own sort of naive sums."""
+
+    def find(query: Bytes, frames: dict[int, Bytes], size: int) -> tuple[list[int], list[int]]:
+        asked = query.astype(np.int64)
+        found = sorted(
+            (int(np.abs(x.astype(np.int64) - asked).sum()), k) for k, x in frames.items()
+        )
+        return [k for _, k in found[:size]], [d for d, _ in found[:size]]
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def fingerprints() -> Callable[[Path], dict[str, tuple[int, int, str]]]:
+    """Inode, time of change and content of every segment in a folder."""
+
+    def take(folder: Path) -> dict[str, tuple[int, int, str]]:
+        return {
+            path.name: (
+                path.stat().st_ino,
+                path.stat().st_mtime_ns,
+                hashlib.sha256(path.read_bytes()).hexdigest(),
+            )
+            for path in folder.glob("*.segment")
+        }
+
+    return take

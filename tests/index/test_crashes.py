@@ -1,0 +1,190 @@
+"""Builders that are killed or run beside others, and readers that do not care."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from sceneprint.index import Generation, Tail, newest, newest_number, publish, search, signatures_of
+from sceneprint.types import Bytes
+
+LENGTH, STEP = 512, 25
+
+#: Publishes without end in a child of its own, and forks another for every line it reads: to
+#: import once is what makes many deaths affordable. FAISS runs in children only.
+NURSERY = """
+import os, signal, sys
+from pathlib import Path
+import faiss
+import numpy as np
+from sceneprint.index import newest, publish
+
+folder = Path(sys.argv[1])
+LENGTH, STEP = 512, 25
+
+def signatures(keys):
+    return np.stack([np.random.default_rng(k).integers(0, 256, LENGTH, np.uint8) for k in keys])
+
+for line in sys.stdin:
+    child = os.fork()
+    if child == 0:
+        while True:
+            before = newest(folder, "model", LENGTH)
+            n = 0 if before is None else len(before)
+            keys = np.arange(n, n + STEP)
+            publish(folder, model_id="model", revision=n + STEP,
+                    blocks=[(keys, signatures(keys))], previous=before)
+    print(child, flush=True)
+    sys.stdin.readline()
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    print("dead", flush=True)
+"""
+
+HOLDER = """
+import fcntl, sys
+file = open(sys.argv[1], "w")
+fcntl.flock(file, fcntl.LOCK_EX)
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def signatures_at(keys: np.ndarray) -> Bytes:
+    return np.stack([np.random.default_rng(k).integers(0, 256, LENGTH, np.uint8) for k in keys])
+
+
+def is_whole(generation: Generation) -> bool:
+    """Whether a generation holds the first `revision` frames, and nothing else."""
+    n = generation.revision
+    np.testing.assert_array_equal(generation.keys, np.arange(n))
+    assert len(generation.coarse) == n
+    keys = np.arange(0, n, 7)
+    stored = signatures_of(keys, generation, Tail.empty(LENGTH))
+    np.testing.assert_array_equal(stored, signatures_at(keys))
+    return True
+
+
+def test_a_builder_killed_at_any_moment(tmp_path: Path) -> None:
+    delays, revision, unfinished = random.Random(4), 0, 0
+    with subprocess.Popen(
+        [sys.executable, "-c", NURSERY, str(tmp_path)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
+    ) as nursery:  # fmt: skip
+        assert nursery.stdin is not None
+        assert nursery.stdout is not None
+        for _ in range(12):
+            nursery.stdin.write("born\n")
+            assert int(nursery.stdout.readline()) > 0
+            before = newest_number(tmp_path) or 0
+            waited = time.monotonic()
+            while newest_number(tmp_path) in (None, before):  # it has begun, and goes on
+                assert time.monotonic() - waited < 30
+                time.sleep(0.002)
+            time.sleep(delays.uniform(0, 0.08))
+            nursery.stdin.write("die\n")
+            assert nursery.stdout.readline() == "dead\n"
+            found = newest(tmp_path, "model", LENGTH, verify=True)
+            assert found is not None
+            assert found.revision > revision
+            assert is_whole(found)
+            revision = found.revision
+            unfinished += bool(list(tmp_path.glob(".*.part")))
+        nursery.stdin.close()
+    assert unfinished  # some died with a file half written
+    again = publish(
+        tmp_path, model_id="model", revision=revision + 1, previous=found,
+        blocks=[(np.array([revision]), signatures_at(np.array([revision])))],
+    )  # fmt: skip
+    assert again is not None
+    assert is_whole(again)
+    assert not list(tmp_path.glob(".*.part"))
+
+
+def test_another_process_builds(tmp_path: Path) -> None:
+    keys = np.arange(30)
+    block = (keys, signatures_at(keys))
+    folder = tmp_path / "map"
+    folder.mkdir()
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(folder / ".lock")],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    ) as holder:  # fmt: skip
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        refused = publish(folder, model_id="model", revision=30, blocks=[block], previous=None)
+        assert refused is None
+        assert newest_number(folder) is None
+        holder.kill()  # the kernel frees the lock of the dead
+    made = publish(folder, model_id="model", revision=30, blocks=[block], previous=None)
+    assert made is not None
+    assert is_whole(made)
+
+
+def test_readers_go_on_while_generations_pass(
+    walk: Callable[..., Bytes], published: Callable[..., Generation], tmp_path: Path
+) -> None:
+    """Threads search an old generation while its files are removed, others follow the newest."""
+    folder, signatures = tmp_path / "map", walk(1200, LENGTH)
+    first = published(np.arange(300), signatures[:300], revision=300)
+    old = {path.name for path in folder.iterdir()}
+    tail, errors, done = Tail.empty(LENGTH), [], threading.Event()
+    queries = signatures[::97]
+    expected = [search(q, first, tail, 20, shortlist=60) for q in queries]
+    counts = [0, 0]
+
+    def search_old() -> None:
+        while not done.is_set():
+            for query, right in zip(queries, expected, strict=True):
+                hits = search(query, first, tail, 20, shortlist=60)
+                if (hits.keys != right.keys).any() or (hits.distances != right.distances).any():
+                    errors.append("an old generation has changed")
+            counts[0] += 1
+
+    def follow() -> None:
+        known: Generation | None = None
+        while not done.is_set():
+            found = newest(folder, "model", LENGTH, known=known)
+            if found is None or (known is not None and found.number < known.number):
+                errors.append(f"{found and found.number} after {known and known.number}")
+                continue
+            known = found
+            n = known.revision
+            hits = search(signatures[n - 1], known, tail, 1, shortlist=50)
+            if len(known) != n or hits.keys.tolist() != [n - 1]:
+                errors.append(f"generation {known.number} has {len(known)} of {n}")
+            counts[1] += 1
+
+    def guarded(work: Callable[[], None]) -> Callable[[], None]:
+        def run() -> None:
+            try:
+                work()
+            except Exception as error:  # what a thread raises would be lost
+                errors.append(repr(error))
+
+        return run
+
+    threads = [threading.Thread(target=guarded(w)) for w in (search_old, search_old, follow)]
+    for thread in threads:
+        thread.start()
+    generation = first
+    for n in range(300, 1200, 30):
+        new = np.arange(n, n + 30)
+        generation = published(new, signatures[new], generation, revision=n + 30)
+    while min(counts) < 3 and not errors:
+        time.sleep(0.01)
+    done.set()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+    assert generation.number == 31
+    left = {path.name for path in folder.iterdir()}
+    gone = {name.rpartition(".")[2] for name in old - left}
+    assert gone == {"json", "faiss", "code", "rows"}  # the segment is still in use
