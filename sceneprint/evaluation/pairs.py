@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from zlib import crc32
 
 import numpy as np
 
@@ -32,13 +31,12 @@ class Candidate:
     ----------
     match : its index in the database
     number : of its files in the store
-    name, scene, pose : as in Member
+    scene, pose : as in Member
     overlap_mean, overlap_least : with the query
     """
 
     match: int
     number: int
-    name: str
     scene: str
     pose: Floats
     overlap_mean: float
@@ -52,14 +50,13 @@ class Task:
     Parameters
     ----------
     number : of the query's files in the store
-    name, scene, pose : of the query
+    scene, pose : of the query
     ranking : database indices of the first of R, in order
     selection : those of C, in order
     candidates : all of both, each once
     """
 
     number: int
-    name: str
     scene: str
     pose: Floats
     ranking: list[int]
@@ -86,7 +83,7 @@ class Judge:
     ----------
     geometry : gives that of a frame by its number in the store
     mode : see `validate`
-    seed : of the whole evaluation
+    seed : of every pair, as a service has one for all that it validates
     """
 
     geometry: Callable[[int], Geometry]
@@ -98,11 +95,6 @@ def open_judge(store: Store, mode: Mode, seed: int) -> Judge:
     """Make ready to validate frames of a store."""
     # neighbouring queries have many candidates in common
     return Judge(lru_cache(128)(store.geometry), mode, seed)
-
-
-def seed_of(seed: int, query: str, match: str) -> int:
-    """Seed of a pair: that of the evaluation and the two names, so that no order matters."""
-    return crc32(f"{seed}\n{query}\n{match}".encode())
 
 
 def views_to_average(pairs: Sequence[Pair]) -> list[Pair]:
@@ -158,9 +150,8 @@ def _truth(task: Task, candidate: Candidate) -> Floats:
 
 def _validated(judging: Judge, task: Task, candidate: Candidate) -> Pair:
     query, match = judging.geometry(task.number), judging.geometry(candidate.number)
-    seed = seed_of(judging.seed, task.name, candidate.name)
     start = time.perf_counter()
-    validation = validate(query, match, seed=seed, mode=judging.mode)
+    validation = validate(query, match, seed=judging.seed, mode=judging.mode)
     spent = 1e3 * (time.perf_counter() - start)
     same, T = candidate.scene == task.scene, validation.T_match_query
     return Pair(

@@ -140,6 +140,11 @@ class Outcome:
         pairs = [self.pairs[match] for match in first]
         return pairs if of in ("R", "DR") else in_preferred_order(pairs)
 
+    def tried(self) -> list[Pair]:
+        """All pairs of C as `associate` gives them: VDR's views, then the others as ranked."""
+        first = self.views("VDR")
+        return first + [pair for pair in self.views("DR") if not pair.accepted]
+
 
 def in_preferred_order(pairs: Sequence[Pair]) -> list[Pair]:
     """Accepted pairs, strong ones first: the order in which they are believed."""

@@ -111,7 +111,11 @@ def milliseconds(outcomes: Sequence[Outcome]) -> dict[str, float | None]:
 
 
 def per_query(outcome: Outcome, names: Sequence[str]) -> dict[str, Any]:
-    """What one query came to, to look into what was lost."""
+    """What one query came to: to look into what was lost, and to hold other answers to it.
+
+    `ranking` has the first of R, `selection` all of C, `matches` all pairs of C in the order in
+    which `associate` gives them.
+    """
     answers = outcome.views("VDR")
     best = int(np.argmax(outcome.overlap_mean)) if len(outcome.overlap_mean) else None
     return {
@@ -122,7 +126,24 @@ def per_query(outcome: Outcome, names: Sequence[str]) -> dict[str, Any]:
         "VDR": _answer(outcome, [pair.match for pair in answers[:1]], names),
         "accepted": len(answers),
         "pose_average": _error(outcome.average),
+        "ranking": [names[match] for match in outcome.ranking[: outcome.candidates]],
+        "selection": [names[match] for match in outcome.selection],
+        "matches": _matches(outcome, names),
     }
+
+
+def _matches(outcome: Outcome, names: Sequence[str]) -> list[dict[str, Any]]:
+    distance = dict(zip(outcome.ranking, outcome.distances.tolist(), strict=True))
+    return [
+        {
+            "match": names[pair.match],
+            "distance": distance[pair.match],
+            "status": pair.validation.status,
+            "strength": pair.validation.strength,
+            "T_match_query": None if (T := pair.validation.T_match_query) is None else T.tolist(),
+        }
+        for pair in outcome.tried()
+    ]
 
 
 def mistakes(outcomes: Sequence[Outcome], names: Sequence[str]) -> list[dict[str, Any]]:

@@ -42,7 +42,7 @@ class Settings:
     max_overlap : a query may find only database frames that overlap it by less (by the smaller
         direction, within 10 cm); None for all
     absent : a query may find only frames of other scenes
-    seed : of every random choice
+    seed : of every pair that is validated
     jobs : processes; no figure depends on it
     cache_dir : of derived files of the model; None for the user's
     """
@@ -194,7 +194,6 @@ def _task(
         Candidate(
             j,
             database[j].number,
-            database[j].name,
             database[j].scene,
             database[j].pose,
             float(truth.mean[row, j]),
@@ -202,9 +201,7 @@ def _task(
         )
         for j in sorted({*ranking, *ranked.selection})
     )
-    return Task(
-        query.number, query.name, query.scene, query.pose, ranking, ranked.selection, candidates
-    )
+    return Task(query.number, query.scene, query.pose, ranking, ranked.selection, candidates)
 
 
 def _outcome(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import sceneprint as sp
 from sceneprint.cli import main
 from sceneprint.models import Model, save_model
 
@@ -101,6 +102,50 @@ def test_the_number_of_processes_changes_nothing(
     several = evaluated(tmp_path, *ranges, "--model", model_file, "--jobs", 2)
     assert several["milliseconds"].keys() == alone["milliseconds"].keys()
     assert several | {"milliseconds": None} == alone | {"milliseconds": None}
+
+
+def test_the_answers_are_those_of_the_library(
+    building: Path, small_model: Model, model_file: Path, tmp_path: Path
+) -> None:
+    """What a service gives for the same frames, with the seed it is given, and no other."""
+    room, seed = building / "room-000", 3
+    found = evaluated(
+        tmp_path, room, "--db", "0:12:2", "--queries", "1:9:4", "--model", model_file,
+        "--seed", seed, "--jobs", 1,
+    )  # fmt: skip
+    signer = sp.open_signer(small_model)
+    (sequence,) = sp.find_sequences(room)
+    seen = [sp.prepare(reference.read(), signer) for reference in sequence.frames]
+    names = [f"room-000/{reference.name}" for reference in sequence.frames]
+    database = range(0, 12, 2)
+    signatures = [seen[i][0] for i in database]
+    stored = [sp.write_geometry(geometry) for _, geometry in seen]
+    assert [one["name"] for one in found["per_query"]] == [names[i] for i in (1, 5)]
+    for i, one in zip((1, 5), found["per_query"], strict=True):
+        ranking = sp.retrieve(seen[i][0], signatures, signer.model)
+        chosen = sp.diversify(ranking, signatures)
+        matches = sp.associate(
+            sp.read_geometry(stored[i]),
+            ranking,
+            chosen.indices.tolist(),
+            lambda index: sp.read_geometry(stored[database[index]]),
+            k=99,
+            seed=seed,
+        )
+        assert one["ranking"] == [names[database[j]] for j in ranking.indices[:10]]
+        assert one["selection"] == [names[database[ranking.indices[j]]] for j in chosen.indices]
+        assert {match.validation.seed for match in matches} == {seed}
+        assert one["matches"] == [
+            {
+                "match": names[database[match.index]],
+                "distance": match.distance,
+                "status": match.validation.status,
+                "strength": match.validation.strength,
+                "T_match_query": None if (T := match.validation.T_match_query) is None
+                else T.tolist(),
+            }
+            for match in matches
+        ]  # fmt: skip
 
 
 def test_a_scene_that_is_absent(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from sceneprint.evaluation.measures import (
     rows,
     validation,
 )
-from sceneprint.evaluation.pairs import seed_of, views_to_average
+from sceneprint.evaluation.pairs import views_to_average
 from sceneprint.evaluation.records import Error, Outcome, Pair, pose_error
 from sceneprint.evaluation.report import average, measured, per_query, to_json, without_infinities
 from sceneprint.evaluation.table import table
@@ -157,12 +158,6 @@ def test_pose_error() -> None:
     assert pose_error(truth, truth) == Error(0.0, 0.0)
 
 
-def test_seeds_depend_on_the_names_alone() -> None:
-    assert seed_of(0, "a", "b") == seed_of(0, "a", "b")
-    assert len({seed_of(s, q, m) for s in range(3) for q in "ab" for m in "ab"}) == 12
-    assert 0 <= seed_of(0, "a", "b") < 2**32
-
-
 CAMERA = Intrinsics(40, 4, 100.0, 100.0, 0.0, 0.0)
 
 
@@ -245,6 +240,39 @@ def test_json_has_null_for_what_is_infinite(three: list[Outcome]) -> None:
     assert read["per_query"][0]["pose_average"]["translation_m"] == pytest.approx(0.01)
     with pytest.raises(ValueError, match="not JSON compliant"):
         to_json({"x": math.nan})
+
+
+def test_answers_of_a_query_by_hand(make_outcome: MakeOutcome, make_pair: MakePair) -> None:
+    """Three of R count; C has a weak one, a rejected, a strong and an ambiguous one."""
+
+    def found(match: int, T: Floats | None, *how: str) -> Pair:
+        one = make_pair(match, *how)
+        return replace(one, validation=replace(one.validation, T_match_query=T))
+
+    moved: Floats = np.eye(4)
+    moved[:3, 3] = (1.5, -2.0, math.inf)
+    pairs = [
+        found(4, np.eye(4), "accepted", "weak"),
+        found(2, None, "rejected"),
+        found(0, np.eye(4)),
+        found(3, moved),
+        found(1, np.eye(4), "ambiguous"),
+    ]
+    one = make_outcome([4, 2, 0, 3, 1], [4, 2, 3, 1], pairs)
+    one = replace(one, distances=np.array([7, 11, 13, 17, 19]))
+    said = json.loads(to_json(without_infinities(per_query(one, ["a", "b", "c", "d", "e"]))))
+    assert said["ranking"] == ["e", "c", "a"]
+    assert said["selection"] == ["e", "c", "d", "b"]
+    still = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]]
+    off = [[1.0, 0, 0, 1.5], [0, 1.0, 0, -2.0], [0, 0, 1.0, None], [0, 0, 0, 1.0]]
+    keys = ("match", "distance", "status", "strength", "T_match_query")
+    assert [tuple(match[key] for key in keys) for match in said["matches"]] == [
+        ("d", 17, "accepted", "strong", off),
+        ("e", 7, "accepted", "weak", still),
+        ("c", 11, "rejected", None, None),
+        ("b", 19, "ambiguous", None, still),
+    ]
+    assert all(set(match) == set(keys) for match in said["matches"])
 
 
 def test_average_of_scenes(three: list[Outcome]) -> None:
