@@ -1,0 +1,153 @@
+"""Frames and jobs as JSON."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Annotated, Literal
+
+from pydantic import AwareDatetime, Field, field_validator, model_validator
+
+from sceneprint.schemas.base import Given, Label, Told
+from sceneprint.schemas.states import FrameState, JobState
+from sceneprint.schemas.transforms import Transform
+
+Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
+
+
+class CameraIntrinsics(Given):
+    """The camera: pixel = (fx x/z + cx, fy y/z + cy), pixel centres at integers."""
+
+    width: int = Field(ge=1, le=65535)
+    height: int = Field(ge=1, le=65535)
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: list[float] = Field(
+        default=[], max_length=5, description="k1, k2, p1, p2[, k3] of OpenCV; none by default."
+    )
+
+
+class GivenVector(Given):
+    """Metres."""
+
+    x: float
+    y: float
+    z: float
+
+
+class GivenQuaternion(GivenVector):
+    """Unit quaternion."""
+
+    w: float
+
+
+class GivenPose(Given):
+    """T_parent_sensor, as `translation` and `rotation` or as `matrix`."""
+
+    parent_frame: Label | None = Field(
+        default=None,
+        description="Poses are combined within one parent frame; default: the session's name.",
+    )
+    translation: GivenVector | None = None
+    rotation: GivenQuaternion | None = None
+    matrix: Annotated[list[Row4], Field(min_length=4, max_length=4)] | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> GivenPose:
+        parts = (self.translation is not None, self.rotation is not None)
+        if parts not in ((True, True), (False, False)) or parts[0] == (self.matrix is not None):
+            raise ValueError("give translation and rotation, or matrix")
+        return self
+
+
+class FrameMeta(Given):
+    """What is known of a frame beside its samples."""
+
+    intrinsics: CameraIntrinsics
+    depth_scale: float = Field(
+        default=1000.0,
+        gt=0,
+        description="Stored units per metre; NPY files are metres whatever it is.",
+    )
+    depth_along_ray: bool = Field(
+        default=False, description="Samples are ranges along the pixel's ray."
+    )
+    robot: Label | None = Field(default=None, description="Who took the frame.")
+    session: Label | None = Field(default=None, description="In which run.")
+    captured_at: AwareDatetime | None = Field(
+        default=None,
+        description="When, with its time zone.",
+    )
+    pose: GivenPose | None = None
+    tags: list[Label] = Field(default=[], max_length=32)
+
+    @field_validator("captured_at")
+    @classmethod
+    def _in_utc(cls, captured_at: datetime | None) -> datetime | None:
+        if captured_at is not None:
+            try:  # as it will be told
+                datetime.fromtimestamp(captured_at.timestamp(), UTC)
+            except (ValueError, OverflowError) as error:
+                raise ValueError("not within the years 1 to 9999 of UTC") from error
+        return captured_at
+
+    @model_validator(mode="after")
+    def _named_parent(self) -> FrameMeta:
+        if self.pose is not None and self.pose.parent_frame is None and self.session is None:
+            raise ValueError("pose: name its parent_frame, or the session it belongs to")
+        return self
+
+
+class Added(Told):
+    """What has become of an upload."""
+
+    frame_id: str
+    job_id: str = Field(description="The job that signs it: GET /v1/jobs/{job_id}.")
+    state: FrameState
+    reason: str | None = Field(default=None, description="Why it was rejected, or failed.")
+
+
+class Deleted(Told):
+    """What was removed."""
+
+    frames: int
+
+
+class Frame(Told):
+    """A frame of a map."""
+
+    frame_id: str
+    map: str
+    state: FrameState
+    reason: str | None = Field(description="Why it was rejected, or failed.")
+    job_id: str
+    content_id: str | None = Field(description="Hash of samples and camera; null when deleted.")
+    kind: Literal["depth"] = "depth"
+    bytes: int = Field(description="Size of the upload.")
+    intrinsics: CameraIntrinsics
+    depth_scale: float
+    depth_along_ray: bool
+    robot: str | None
+    session: str | None
+    captured_at: datetime | None
+    received_at: datetime
+    indexed_at: datetime | None
+    pose: Transform | None
+    tags: list[str]
+
+
+class Job(Told):
+    """A piece of work in the queue."""
+
+    job_id: str
+    kind: Literal["sign"]
+    state: JobState
+    map: str
+    frame_id: str
+    attempts: int
+    created_at: datetime
+    started_at: datetime | None = Field(description="Of the latest try.")
+    finished_at: datetime | None
+    error: str | None
+    traceback: str | None

@@ -1,0 +1,40 @@
+"""Maps as JSON."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Literal
+
+from pydantic import Field, StringConstraints
+
+from sceneprint.schemas.base import Given, Told
+
+#: A map's name: an immutable slug.
+Slug = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,62}$")]
+
+Preset = Literal["paper", "compact"]
+
+
+class NewMap(Given):
+    """A map to make."""
+
+    name: Slug = Field(
+        description="Lower-case letters, digits, - and _, up to 63; never changes.",
+        examples=["warehouse-2"],
+    )
+    title: str | None = Field(default=None, max_length=200, description="For people.")
+    model: Preset = Field(
+        default="paper", description="The model that signs its frames; never changes."
+    )
+
+
+class Map(Told):
+    """A namespace of frames that share one model."""
+
+    name: str
+    title: str | None
+    model: str = Field(description="Name and first digits of the id of its model.")
+    model_id: str
+    created_at: datetime
+    revision: int = Field(description="Grows with every frame that is indexed or deleted.")
+    frames: dict[str, int] = Field(description="How many frames are in each state.")

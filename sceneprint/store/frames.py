@@ -1,0 +1,154 @@
+"""Frames and their signatures."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Iterable
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, delete, func, insert, select, update
+
+from sceneprint.errors import UnknownFrame
+from sceneprint.schemas import FrameState
+from sceneprint.store.events import tell
+from sceneprint.store.maps import next_revision
+from sceneprint.store.records import FrameRow, MapRow, frame_row
+from sceneprint.store.tables import frames, signatures
+
+
+def add_frame(connection: Connection, map_number: int, values: dict[str, Any]) -> FrameRow:
+    """Insert a frame as received; `values` are its columns but number, id, state and times."""
+    frame_id = uuid.uuid4().hex
+    connection.execute(
+        insert(frames).values(
+            id=frame_id, map_number=map_number, state=FrameState.RECEIVED, received_at=time.time(),
+            **values,
+        )
+    )  # fmt: skip
+    return _one(connection, frames.c.id == frame_id)
+
+
+def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
+    """The frame of an id in a map, deleted ones too.
+
+    Raises
+    ------
+    UnknownFrame : there is none.
+    """
+    found = (
+        connection.execute(
+            select(frames).where(frames.c.map_number == row.number, frames.c.id == frame_id)
+        )
+        .mappings()
+        .first()
+    )
+    if found is None:
+        raise UnknownFrame(
+            f"There is no frame {frame_id!r:.80} in map {row.name!r}. List them with "
+            f"GET /v1/maps/{row.name}/frames."
+        )
+    return frame_row(found)
+
+
+def find_content(connection: Connection, map_number: int, content_id: str) -> FrameRow | None:
+    """The frame of a map with that content, or None."""
+    found = (
+        connection.execute(
+            select(frames).where(
+                frames.c.map_number == map_number, frames.c.content_id == content_id
+            )
+        )
+        .mappings()
+        .first()
+    )
+    return None if found is None else frame_row(found)
+
+
+def frame_of(connection: Connection, number: int) -> FrameRow:
+    """The frame of a number that is known to exist."""
+    return _one(connection, frames.c.number == number)
+
+
+def frames_of(connection: Connection, numbers: Iterable[int]) -> dict[int, FrameRow]:
+    """Frames by their numbers; those that are gone are left out."""
+    found = connection.execute(
+        select(frames).where(
+            frames.c.number.in_(list(numbers)), frames.c.state != FrameState.DELETED
+        )
+    ).mappings()
+    return {row["number"]: frame_row(row) for row in found}
+
+
+def list_frames(
+    connection: Connection, map_number: int, after: int, limit: int, state: FrameState | None
+) -> list[FrameRow]:
+    """Frames of a map in the order they came, from number `after` on; deleted ones on request."""
+    wanted = frames.c.state != FrameState.DELETED if state is None else frames.c.state == state
+    found = connection.execute(
+        select(frames)
+        .where(frames.c.map_number == map_number, frames.c.number > after, wanted)
+        .order_by(frames.c.number)
+        .limit(limit)
+    )
+    return [frame_row(row) for row in found.mappings()]
+
+
+def set_state(
+    connection: Connection, number: int, state: FrameState, reason: str | None = None
+) -> None:
+    """Move a frame to a state in which it is not searched; a deleted frame stays deleted."""
+    connection.execute(
+        update(frames)
+        .where(frames.c.number == number, frames.c.state != FrameState.DELETED)
+        .values(state=state, reason=reason)
+    )
+
+
+def delete_frame(connection: Connection, row: MapRow, frame: FrameRow) -> list[str]:
+    """Take a frame out of all searches and forget what was made of it.
+
+    The row stays, so that every reader learns of it.
+
+    Returns
+    -------
+    blobs : that it referred to
+
+    Raises
+    ------
+    UnknownFrame : it was deleted before.
+    """
+    if frame.state == FrameState.DELETED:
+        raise UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted before.")
+    own = signatures.c.frame_number == frame.number
+    blobs = [frame.blob, *connection.execute(select(signatures.c.geometry).where(own)).scalars()]
+    connection.execute(delete(signatures).where(own))
+    connection.execute(
+        update(frames)
+        .where(frames.c.number == frame.number)
+        .values(
+            state=FrameState.DELETED, content_id=None,
+            revision=next_revision(connection, row.number),
+        )
+    )  # fmt: skip
+    tell(connection, "frame.deleted", row.name, frame.id)
+    return blobs
+
+
+def refers_to(connection: Connection, blob: str) -> bool:
+    """Whether a frame that is not deleted, or a signature, refers to a blob."""
+    of_frame = select(frames.c.number).where(
+        frames.c.blob == blob, frames.c.state != FrameState.DELETED
+    )
+    of_artifact = select(signatures.c.frame_number).where(signatures.c.geometry == blob)
+    return any(connection.execute(one.limit(1)).first() for one in (of_frame, of_artifact))
+
+
+def count_states(connection: Connection) -> dict[str, int]:
+    """How many frames of all maps are in each state."""
+    rows = connection.execute(select(frames.c.state, func.count()).group_by(frames.c.state))
+    return {row[0]: row[1] for row in rows}
+
+
+def _one(connection: Connection, condition: ColumnElement[bool]) -> FrameRow:
+    return frame_row(connection.execute(select(frames).where(condition)).mappings().one())

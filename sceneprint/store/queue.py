@@ -1,0 +1,232 @@
+"""The queue: jobs as rows, so that a frame and its job are one commit.
+
+    enqueue  -->  queued  --claim-->  running  --finish | fail-->  over, or queued again
+
+A claim is a lease: who does not renew it in time loses the job to another worker. Each claim has
+a token greater than the last; a worker that comes back late holds an old one, and what it brings
+is refused. So a job may run twice, but takes effect once.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from dataclasses import dataclass
+
+from sqlalchemy import Connection, and_, func, insert, or_, select, update
+
+from sceneprint.errors import LostLease, UnknownJob
+from sceneprint.schemas import JobState
+from sceneprint.store.records import JobRow, job_row
+from sceneprint.store.tables import jobs
+
+#: Tries before a job is dead.
+MAXIMUM_ATTEMPTS = 3
+#: Seconds before the second try; each further one waits four times as long.
+BACKOFF_S = 2.0
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A job that this worker holds until its lease runs out."""
+
+    job: JobRow
+
+    @property
+    def token(self) -> int:
+        """Of this claim alone."""
+        return self.job.token
+
+
+def enqueue(connection: Connection, kind: str, frame_number: int, priority: int = 0) -> JobRow:
+    """Queue a job, in the transaction that stores what it is about."""
+    job_id = uuid.uuid4().hex
+    now = time.time()
+    connection.execute(
+        insert(jobs).values(
+            id=job_id, kind=kind, frame_number=frame_number, state=JobState.QUEUED,
+            priority=priority, attempts=0, token=0, run_after=now, created_at=now,
+        )
+    )  # fmt: skip
+    return find_job(connection, job_id)
+
+
+def find_job(connection: Connection, job_id: str) -> JobRow:
+    """The job of an id.
+
+    Raises
+    ------
+    UnknownJob : there is none.
+    """
+    row = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().first()
+    if row is None:
+        raise UnknownJob(
+            f"There is no job {job_id!r:.80}. An upload answers with the id of its job, and "
+            "deleting a map deletes its jobs."
+        )
+    return job_row(row)
+
+
+def jobs_of(connection: Connection, frame_numbers: list[int]) -> dict[int, JobRow]:
+    """The latest job of each frame."""
+    rows = connection.execute(
+        select(jobs).where(jobs.c.frame_number.in_(frame_numbers)).order_by(jobs.c.number)
+    ).mappings()
+    return {row["frame_number"]: job_row(row) for row in rows}
+
+
+def has_due(connection: Connection) -> bool:
+    """Whether there is a job to claim or to bury; costs no lock."""
+    return (
+        connection.execute(select(jobs.c.number).where(_due(time.time())).limit(1)).first()
+        is not None
+    )
+
+
+def claim(connection: Connection, worker: str, lease_s: float) -> Claim | None:
+    """Take the next job: one that waits, or one whose worker fell silent.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    worker : who asks
+    lease_s : seconds until it must be renewed
+    """
+    now = time.time()
+    number = connection.execute(
+        select(jobs.c.number)
+        .where(_due(now), jobs.c.attempts < MAXIMUM_ATTEMPTS)
+        .order_by(jobs.c.priority.desc(), jobs.c.number)
+        .limit(1)
+        .with_for_update(skip_locked=True)
+    ).scalar()
+    if number is None:
+        return None
+    row = connection.execute(
+        update(jobs)
+        .where(jobs.c.number == number)
+        .values(
+            state=JobState.RUNNING, attempts=jobs.c.attempts + 1, token=jobs.c.token + 1,
+            leased_until=now + lease_s, worker=worker, started_at=now,
+        )
+        .returning(jobs)
+    ).mappings().one()  # fmt: skip
+    return Claim(job_row(row))
+
+
+def bury(connection: Connection) -> list[JobRow]:
+    """Give up jobs whose workers fell silent in every try: a frame that kills its worker."""
+    now = time.time()
+    rows = connection.execute(
+        update(jobs)
+        .where(
+            jobs.c.state == JobState.RUNNING,
+            jobs.c.leased_until < now,
+            jobs.c.attempts >= MAXIMUM_ATTEMPTS,
+        )
+        .values(
+            state=JobState.DEAD, finished_at=now, leased_until=None,
+            error=f"its worker fell silent in each of {MAXIMUM_ATTEMPTS} tries",
+        )
+        .returning(jobs)
+    ).mappings()  # fmt: skip
+    return [job_row(row) for row in rows]
+
+
+def renew(connection: Connection, held: Claim, lease_s: float) -> None:
+    """Extend a lease.
+
+    Raises
+    ------
+    LostLease : the job has been given to another worker, or is over.
+    """
+    _hold(connection, held, leased_until=time.time() + lease_s)
+
+
+def finish(
+    connection: Connection, held: Claim, state: JobState, error: str | None = None,
+    traceback: str | None = None,
+) -> None:  # fmt: skip
+    """End a job, in the transaction that stores what it made.
+
+    Raises
+    ------
+    LostLease : as `renew`; the transaction must not be committed.
+    """
+    _hold(
+        connection, held, state=state, error=error, traceback=traceback, leased_until=None,
+        finished_at=time.time(),
+    )  # fmt: skip
+
+
+def fail(connection: Connection, held: Claim, error: str, traceback: str) -> JobState:
+    """Queue a job that broke down for another try, or let it be dead.
+
+    Raises
+    ------
+    LostLease : as `renew`.
+    """
+    if held.job.attempts >= MAXIMUM_ATTEMPTS:
+        finish(connection, held, JobState.DEAD, error, traceback)
+        return JobState.DEAD
+    wait = BACKOFF_S * 4.0 ** (held.job.attempts - 1)
+    _hold(
+        connection, held, state=JobState.QUEUED, error=error, traceback=traceback,
+        leased_until=None, run_after=time.time() + wait,
+    )  # fmt: skip
+    return JobState.QUEUED
+
+
+def give_back(connection: Connection, held: Claim) -> None:
+    """Queue a job again that was not begun, as if it had not been claimed.
+
+    Raises
+    ------
+    LostLease : as `renew`.
+    """
+    _hold(
+        connection, held, state=JobState.QUEUED, attempts=held.job.attempts - 1,
+        leased_until=None, worker=None,
+    )  # fmt: skip
+
+
+def cancel_of(connection: Connection, frame_number: int) -> None:
+    """Cancel what is still to be done for a frame."""
+    connection.execute(
+        update(jobs)
+        .where(
+            jobs.c.frame_number == frame_number,
+            jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING)),
+        )
+        .values(state=JobState.CANCELLED, finished_at=time.time(), leased_until=None)
+    )
+
+
+def count_jobs(connection: Connection) -> dict[str, int]:
+    """How many jobs are in each state that has any."""
+    rows = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state))
+    return {row[0]: row[1] for row in rows}
+
+
+def _due(now: float):  # type: ignore[no-untyped-def]
+    waiting = and_(jobs.c.state == JobState.QUEUED, jobs.c.run_after <= now)
+    silent = and_(jobs.c.state == JobState.RUNNING, jobs.c.leased_until < now)
+    return or_(waiting, silent)
+
+
+def _hold(connection: Connection, held: Claim, **values: object) -> None:
+    """Change a job while its claim is the latest."""
+    changed = connection.execute(
+        update(jobs)
+        .where(
+            jobs.c.number == held.job.number,
+            jobs.c.token == held.token,
+            jobs.c.state == JobState.RUNNING,
+        )
+        .values(**values)
+    )
+    if changed.rowcount != 1:
+        raise LostLease(
+            f"Job {held.job.id} is no longer held by this worker: its lease ran out, or it was "
+            "cancelled. Nothing was stored."
+        )

@@ -1,0 +1,85 @@
+"""Rows as the rest of the package sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import RowMapping
+
+from sceneprint.schemas import FrameState, JobState
+
+
+@dataclass(frozen=True)
+class MapRow:
+    """A map; fields as in the table."""
+
+    number: int
+    name: str
+    title: str | None
+    model_id: str
+    revision: int
+    created_at: float
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """A frame; fields as in the table."""
+
+    number: int
+    id: str
+    map_number: int
+    state: FrameState
+    reason: str | None
+    content_id: str | None
+    blob: str
+    bytes: int
+    intrinsics: dict[str, Any]
+    depth_scale: float
+    depth_along_ray: bool
+    robot: str | None
+    session: str | None
+    captured_at: float | None
+    tags: list[str]
+    pose_parent: str | None
+    pose: list[list[float]] | None
+    received_at: float
+    indexed_at: float | None
+    revision: int | None
+
+
+@dataclass(frozen=True)
+class JobRow:
+    """A job; fields as in the table."""
+
+    number: int
+    id: str
+    kind: str
+    frame_number: int
+    state: JobState
+    priority: int
+    attempts: int
+    token: int
+    run_after: float
+    leased_until: float | None
+    worker: str | None
+    error: str | None
+    traceback: str | None
+    created_at: float
+    started_at: float | None
+    finished_at: float | None
+
+
+def map_row(row: RowMapping) -> MapRow:
+    """A row of the table `maps`."""
+    return MapRow(**row)
+
+
+def frame_row(row: RowMapping) -> FrameRow:
+    """A row of the table `frames`."""
+    return FrameRow(**{**row, "state": FrameState(row["state"])})
+
+
+def job_row(row: RowMapping) -> JobRow:
+    """A row of the table `jobs`."""
+    return JobRow(**{**row, "state": JobState(row["state"])})

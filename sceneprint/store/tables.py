@@ -1,0 +1,145 @@
+"""The tables. `migrations/` makes them; a test holds the two together.
+
+Times are seconds since 1970. `number` orders rows as they came and is never given out twice;
+`id` is what the outside knows.
+"""
+
+from __future__ import annotations
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    Column,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+    UniqueConstraint,
+)
+
+metadata = MetaData(
+    naming_convention={
+        "pk": "pk_%(table_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_name)s",
+        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+        "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+    }
+)
+
+models = Table(
+    "models",
+    metadata,
+    Column("id", String(64), primary_key=True),
+    Column("name", String(64), nullable=False),
+    Column("content", LargeBinary, nullable=False),  # the model file: a node needs no other copy
+    Column("created_at", Float, nullable=False),
+)
+
+maps = Table(
+    "maps",
+    metadata,
+    Column("number", Integer, primary_key=True),
+    Column("name", String(63), nullable=False, unique=True),
+    Column("title", String(200)),
+    Column("model_id", String(64), ForeignKey("models.id"), nullable=False),
+    # counts what changes for searching; set on a frame in the commit that indexes or deletes it
+    Column("revision", Integer, nullable=False),
+    Column("created_at", Float, nullable=False),
+    sqlite_autoincrement=True,
+)
+
+frames = Table(
+    "frames",
+    metadata,
+    Column("number", Integer, primary_key=True),
+    Column("id", String(32), nullable=False, unique=True),
+    Column("map_number", Integer, ForeignKey("maps.number"), nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("reason", Text),
+    Column("content_id", String(64)),  # null when deleted: the same frame may come again
+    Column("blob", String(64), nullable=False),
+    Column("bytes", Integer, nullable=False),
+    Column("intrinsics", JSON, nullable=False),
+    Column("depth_scale", Float, nullable=False),
+    Column("depth_along_ray", Boolean, nullable=False),
+    Column("robot", String(128)),
+    Column("session", String(128)),
+    Column("captured_at", Float),
+    Column("tags", JSON, nullable=False),
+    Column("pose_parent", String(128)),
+    Column("pose", JSON(none_as_null=True)),  # T_parent_sensor, 4 rows of 4
+    Column("received_at", Float, nullable=False),
+    Column("indexed_at", Float),
+    Column("revision", Integer),
+    UniqueConstraint("map_number", "content_id"),
+    Index(None, "map_number", "revision"),
+    Index(None, "map_number", "number"),
+    Index(None, "blob"),
+    sqlite_autoincrement=True,
+)
+
+signatures = Table(
+    "signatures",
+    metadata,
+    Column("frame_number", Integer, ForeignKey("frames.number"), primary_key=True),
+    Column("model_id", String(64), ForeignKey("models.id"), primary_key=True),
+    Column("vector", LargeBinary, nullable=False),
+    Column("checksum", BigInteger, nullable=False),  # CRC-32 of the vector
+    Column("geometry", String(64), nullable=False),  # blob of the artifact
+    Column("n_patches", JSON, nullable=False),
+    Column("n_pairs", JSON, nullable=False),
+    Index(None, "geometry"),
+)
+
+jobs = Table(
+    "jobs",
+    metadata,
+    Column("number", Integer, primary_key=True),
+    Column("id", String(32), nullable=False, unique=True),
+    Column("kind", String(16), nullable=False),
+    Column("frame_number", Integer, ForeignKey("frames.number"), nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("priority", Integer, nullable=False),
+    Column("attempts", Integer, nullable=False),
+    Column("token", Integer, nullable=False),  # fencing: grows with every claim
+    Column("run_after", Float, nullable=False),
+    Column("leased_until", Float),
+    Column("worker", String(128)),
+    Column("error", Text),
+    Column("traceback", Text),
+    Column("created_at", Float, nullable=False),
+    Column("started_at", Float),
+    Column("finished_at", Float),
+    Index(None, "state", "run_after"),
+    Index(None, "frame_number"),
+    sqlite_autoincrement=True,
+)
+
+keys = Table(
+    "keys",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("name", String(128), nullable=False, unique=True),
+    Column("digest", String(64), nullable=False, unique=True),  # SHA-256 of the secret
+    Column("scopes", JSON, nullable=False),
+    Column("created_at", Float, nullable=False),
+)
+
+events = Table(
+    "events",
+    metadata,
+    Column("number", Integer, primary_key=True),
+    Column("at", Float, nullable=False),
+    Column("kind", String(32), nullable=False),
+    Column("map", String(63)),
+    Column("frame_id", String(32)),
+    Column("job_id", String(32)),
+    Column("data", JSON, nullable=False),
+    sqlite_autoincrement=True,
+)
