@@ -5,7 +5,7 @@ candidates of R  --associate-->  matches, C_vld first  --locate-->  pose of the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,8 +106,8 @@ def associate(
 
 def locate(
     matches: Sequence[Match],
-    poses: Sequence[Floats],
-    parents: Sequence[str] | None = None,
+    poses: Sequence[Floats] | Mapping[int, Floats],
+    parents: Sequence[str] | Mapping[int, str] | None = None,
     views: int = 5,
 ) -> Location | None:
     """Pose of the query: robust average over up to five validated views.
@@ -115,7 +115,7 @@ def locate(
     Parameters
     ----------
     matches : of `associate`
-    poses : T_parent_sensor (4, 4) of every row of the database
+    poses : T_parent_sensor (4, 4) of every row of the database, or by the rows of the matches
     parents : parent frame of every row; default: one for all. Poses are combined within one
         parent frame only, that of most of the matches
     views : most that are averaged, at least 1

@@ -1,10 +1,10 @@
 """Frames in and out: depth images, cameras, poses, and the sequences they come in.
 
 path  --find_sequences-->  Sequence  --FrameReference.read-->  Frame
-bytes  --decode_png | decode_npy-->  samples  --make_frame-->  Frame
+bytes  --decode_frame-->  Frame
 """
 
-from sceneprint.datasets.images import make_frame, read_frame
+from sceneprint.datasets.images import decode_frame, make_frame, read_frame
 from sceneprint.datasets.intrinsics import Camera, find_camera, read_camera
 from sceneprint.datasets.npy import decode_npy
 from sceneprint.datasets.png import decode_png
@@ -26,6 +26,7 @@ __all__ = [
     "Sequence",
     "Split",
     "Trajectory",
+    "decode_frame",
     "decode_npy",
     "decode_png",
     "find_camera",

@@ -105,17 +105,39 @@ def read_frame(
 
     Raises
     ------
-    UnreadableFrame : the file is absent, too large, or neither PNG nor NPY; and as
-        `decode_png`, `decode_npy` and `make_frame`. Each error names the file.
+    UnreadableFrame : the file is absent or too large; and as `decode_frame`. Each error names
+        the file.
     """
     data = read_bytes(path, png.MAXIMUM_BYTES, UnreadableFrame)
     with naming(str(path)):
+        frame = decode_frame(
+            data, intrinsics, depth_scale=depth_scale, along_ray=along_ray, pose=pose
+        )
+    return replace(frame, name=name)
+
+
+def decode_frame(
+    data: bytes,
+    intrinsics: Intrinsics,
+    *,
+    depth_scale: float = 1000.0,
+    along_ray: bool = False,
+    name: str = "",
+    pose: Floats | None = None,
+) -> Frame:
+    """Return the frame of the bytes of a PNG or NPY file.
+
+    Parameters
+    ----------
+    data : the whole file; the rest as for `make_frame`
+
+    Raises
+    ------
+    UnreadableFrame : neither PNG nor NPY; and as `decode_png`, `decode_npy` and `make_frame`.
+    """
+    with naming(name):
         frame = make_frame(
-            _decode(data),
-            intrinsics,
-            depth_scale=depth_scale,
-            along_ray=along_ray,
-            pose=pose,
+            _decode(data), intrinsics, depth_scale=depth_scale, along_ray=along_ray, pose=pose
         )
     return replace(frame, name=name)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from sceneprint.datasets.files import data_lines, naming, read_text
 from sceneprint.errors import InvalidPose
+from sceneprint.geometry.quaternions import rotation_of
 from sceneprint.types import Floats
 
 _TOLERANCE = 1e-2  #: how far a written rotation or quaternion may be from a true one
@@ -183,13 +184,8 @@ def _slerp(q: Floats, other: Floats, w: Floats) -> Floats:
 
 
 def _transform(position: Floats, quaternion: Floats) -> Floats:
-    x, y, z, w = quaternion
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
+    pose[:3, :3] = rotation_of(quaternion)
     pose[:3, 3] = position
     return pose
 

@@ -1,6 +1,6 @@
 """Models: what they consist of, their files, and their tables on disk."""
 
-from sceneprint.models.files import PRESETS, parse_model, read_model, save_model
+from sceneprint.models.files import PRESETS, parse_model, read_model, save_model, write_model
 from sceneprint.models.model import SCHEMA_VERSION, Model, ModelParameters
 from sceneprint.models.tables import build_table, default_cache_dir, open_table
 
@@ -15,4 +15,5 @@ __all__ = [
     "parse_model",
     "read_model",
     "save_model",
+    "write_model",
 ]

@@ -40,6 +40,18 @@ BOUNDS = {
 }
 
 
+def write_model(model: Model) -> bytes:
+    """A model as the bytes of its file."""
+    from safetensors.numpy import save
+
+    header = model.header | {
+        "id": model.id,
+        "name": model.name,
+        "provenance": dict(model.provenance),
+    }
+    return bytes(save(model.tensors, {"sceneprint": json.dumps(header, sort_keys=True)}))
+
+
 def save_model(model: Model, path: Path) -> None:
     """Write a model to a file, whole or not at all.
 
@@ -48,14 +60,7 @@ def save_model(model: Model, path: Path) -> None:
     model : see Model
     path : of the file; its folder must exist
     """
-    from safetensors.numpy import save
-
-    header = model.header | {
-        "id": model.id,
-        "name": model.name,
-        "provenance": dict(model.provenance),
-    }
-    data = save(model.tensors, {"sceneprint": json.dumps(header, sort_keys=True)})
+    data = write_model(model)
     parse_model(data, str(path))  # what cannot be read back is not written
     write_whole(path, data)
 

@@ -1,0 +1,143 @@
+"""Matches as JSON tells them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneprint.engine.transforms import transform
+from sceneprint.engine.wire import camera_frame
+from sceneprint.geometry.diversity import Selection
+from sceneprint.geometry.retrieval import Ranking
+from sceneprint.geometry.validation import Validation
+from sceneprint.matches import Match, locate
+from sceneprint.schemas import Location as ToldLocation
+from sceneprint.schemas import Match as ToldMatch
+from sceneprint.schemas import Residual
+from sceneprint.schemas import Validation as ToldValidation
+from sceneprint.store.records import FrameRow
+from sceneprint.types import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What there is to tell about candidates.
+
+    Parameters
+    ----------
+    map : its name
+    ranking : R, of frame numbers
+    selection : C, or None where diversification was not asked for
+    rows : frames of the candidates by number; those deleted in the meantime are not among them
+    unreadable : numbers of frames whose artifact cannot be read, and why
+    own : number and id of the query, if it is a frame of the map
+    """
+
+    map: str
+    ranking: Ranking
+    selection: Selection | None
+    rows: dict[int, FrameRow]
+    unreadable: dict[int, str]
+    own: tuple[int, str] | None
+
+    @property
+    def query_frame(self) -> str:
+        """What the query's camera frame is called."""
+        return camera_frame("query" if self.own is None else self.own[1])
+
+
+def tell_matches(
+    found: Found, chosen: Sequence[int], matches: Sequence[Match], *, validated: bool
+) -> list[ToldMatch]:
+    """What was validated, in the order of belief, then the other candidates in the order of R.
+
+    Parameters
+    ----------
+    found : see Found
+    chosen : positions in R of the candidates
+    matches : of `associate`
+    validated : whether validation was asked for
+    """
+    position = {int(found.ranking.indices[i]): i for i in chosen}
+    tried = {match.index: match.validation for match in matches}
+    order = [*tried, *(number for number in position if number not in tried)]
+    told = []
+    for number in order:
+        if number not in found.rows:
+            continue
+        if number in tried:
+            validation = _validation(tried[number])
+        elif number in found.unreadable:
+            validation = ToldValidation(status="skipped", reason=found.unreadable[number])
+        else:
+            reason = "enough were accepted before it" if validated else "not asked for"
+            validation = ToldValidation(status="skipped", reason=reason)
+        told.append(_match(found, position[number], number, tried.get(number), validation))
+    return told
+
+
+def tell_location(found: Found, matches: Sequence[Match]) -> ToldLocation | None:
+    """The query's pose, from the accepted matches whose poses are known."""
+    posed = {
+        number: np.array(row.pose) for number, row in found.rows.items() if row.pose is not None
+    }
+    parents = {number: str(found.rows[number].pose_parent) for number in posed}
+    location = locate([match for match in matches if match.index in posed], posed, parents)
+    if location is None:
+        return None
+    average = location.average
+    return ToldLocation(
+        pose=transform(average.T, location.parent, found.query_frame),
+        support=average.support,
+        votes=average.votes,
+        spread_m=average.spread_m,
+        spread_deg=math.degrees(average.spread_rad),
+    )
+
+
+def _match(
+    found: Found, position: int, number: int, tried: Validation | None, validation: ToldValidation
+) -> ToldMatch:
+    row, gain = found.rows[number], None
+    selected = None if found.selection is None else True
+    if found.selection is not None:
+        place = found.selection.indices.tolist().index(position)
+        gain = float(found.selection.gains[place])
+    T = None if tried is None else tried.T_match_query
+    in_map: Floats | None = None if T is None or row.pose is None else np.array(row.pose) @ T
+    return ToldMatch(
+        frame_id=row.id,
+        map=found.map,
+        robot=row.robot,
+        session=row.session,
+        rank=position + 1,
+        distance=int(found.ranking.distances[position]),
+        similarity=float(found.ranking.similarities[position]),
+        selected=selected,
+        diversity_gain=gain,
+        validation=validation,
+        transform=None if T is None else transform(T, camera_frame(row.id), found.query_frame),
+        pose_in_map=(
+            None if in_map is None else transform(in_map, str(row.pose_parent), found.query_frame)
+        ),
+    )
+
+
+def _validation(v: Validation) -> ToldValidation:
+    residual = None
+    if math.isfinite(v.residual_m):
+        residual = Residual(translation_m=v.residual_m, rotation_deg=math.degrees(v.residual_rad))
+    return ToldValidation(
+        status=v.status,
+        strength=v.strength,
+        reason=v.reason,
+        residual=residual,
+        overlap=v.overlap,
+        plane_overlap=v.plane_overlap,
+        free_space_violations=v.violations,
+        inliers=v.inliers,
+        ambiguity=v.ambiguity,
+    )
