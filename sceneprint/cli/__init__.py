@@ -17,15 +17,43 @@ USAGE = 2
 
 def parser() -> argparse.ArgumentParser:
     """All commands with their options."""
-    from sceneprint.cli import demo, evaluate, picture, sign, synth, train
+    from sceneprint.cli import (
+        demo,
+        doctor,
+        evaluate,
+        keys,
+        maps,
+        picture,
+        query,
+        serve,
+        sign,
+        synth,
+        train,
+        upload,
+        work,
+    )
 
     top = argparse.ArgumentParser(
         prog="sceneprint",
-        description="Place recognition from pure geometry: depth frames in, signatures out.",
+        description="Place recognition from pure geometry: depth frames in, places and poses out.",
     )
     top.add_argument("--version", action="version", version=f"sceneprint {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (demo, sign, picture, evaluate, synth, train):
+    for module in (
+        demo,
+        serve,
+        work,
+        keys,
+        maps,
+        upload,
+        query,
+        doctor,
+        sign,
+        picture,
+        evaluate,
+        synth,
+        train,
+    ):
         module.add_to(commands)
     return top
 

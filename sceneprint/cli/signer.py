@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from sceneprint.engine.warming import warm
 from sceneprint.errors import FrameError
 from sceneprint.geometry.counting import compiled_at
+from sceneprint.models import PRESETS
 from sceneprint.pipeline import Signer, open_signer, sign
 from sceneprint.settings import Settings
 from sceneprint.types import Frame, Intrinsics
@@ -38,23 +40,44 @@ def open_for(options: argparse.Namespace, settings: Settings) -> Signer:
     ------
     UnreadableModel : no such model.
     """
+    _announce()
+    signer = _opened(options.model or options.preset, settings)
+    with suppress(FrameError):  # a model of another range may see nothing there
+        sign(_wall(), signer)  # so that the first frame's time is that of signing, not of loading
+    return signer
+
+
+def prepare_presets(settings: Settings) -> None:
+    """See that code is compiled and the presets' tables are built, once an installation.
+
+    So that a service's first frame does not wait for what a person can watch now.
+    """
+    if _announce():
+        warm(_opened("paper", settings))
+    for preset in PRESETS:
+        _opened(preset, settings)
+
+
+def _announce() -> bool:
+    """Whether the code is yet to be compiled; says so."""
     folder, pattern = compiled_at()
-    if not any(Path(folder).glob(pattern)):
+    new = not any(Path(folder).glob(pattern))
+    if new:
         print(
             "sceneprint: first use of this installation; compiling (once, about 10 seconds)",
             file=sys.stderr,
         )
-    model = options.model or options.preset
+    return new
+
+
+def _opened(model: str | Path, settings: Settings) -> Signer:
     with tqdm(desc=f"pair table of {model}", unit="bin", unit_scale=True, delay=0.5) as bar:
 
         def progress(done: int, total: int) -> None:
             bar.total = total
             bar.update(done - bar.n)
 
-        signer = open_signer(model, settings.cache_dir, progress)
-    with suppress(FrameError):  # a model of another range may see nothing there
-        sign(_wall(), signer)  # so that the first frame's time is that of signing, not of loading
-    return signer
+        return open_signer(model, settings.cache_dir, progress)
 
 
 def _wall() -> Frame:

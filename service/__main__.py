@@ -1,0 +1,32 @@
+"""`python -m service`: the service alone, by the settings of the environment."""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+from pydantic import ValidationError
+
+from sceneprint.errors import SceneprintError
+from sceneprint.logs import log_as_json
+from sceneprint.settings import Settings
+from service.server import run
+
+
+def main() -> int:
+    """Serve until told to stop; errors are one line and exit code 2."""
+    log_as_json()
+    # uvicorn handles both signals while it runs, and raises them again at the end
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        run(Settings(), lambda url: print(f"sceneprint: serving {url}", flush=True))  # noqa: T201
+    except (SceneprintError, ValidationError) as error:
+        print(f"service: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201
+        return 2
+    except KeyboardInterrupt:
+        pass  # the ordinary end
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,132 @@
+"""Bodies of requests: forms with a frame, or JSON."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+from fastapi import Request
+from pydantic import ValidationError
+from pydantic_core import from_json
+from starlette.datastructures import UploadFile
+from starlette.exceptions import HTTPException
+from starlette.formparsers import MultiPartException
+
+from sceneprint.errors import InvalidRequest, MalformedBody, UnsupportedType
+from sceneprint.schemas import FrameMeta
+from service.problems import invalid
+
+#: Most bytes of a form field that is no file, and of a JSON body.
+FIELD_BYTES = 1 << 18
+FORM = "multipart/form-data"
+
+
+@dataclass(frozen=True, eq=False)
+class Upload:
+    """A frame that came in a form.
+
+    Parameters
+    ----------
+    file : its bytes, large ones on disk until they are read
+    meta : what is known of it
+    fields : the other fields of the form
+    """
+
+    file: BinaryIO
+    meta: FrameMeta
+    fields: dict[str, str]
+
+
+def media_type(request: Request) -> str:
+    """Type of the body, without its parameters."""
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+@asynccontextmanager
+async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
+    """Read a form with a file part `frame`, a field `meta`, and others that are named.
+
+    Raises
+    ------
+    UnsupportedType : no form.
+    MalformedBody : a form that cannot be parsed.
+    InvalidRequest : a part is missing or unknown, or `meta` is not as it should be.
+    """
+    if media_type(request) != FORM:
+        raise UnsupportedType(
+            f"The body is {media_type(request) or 'of no type'!r:.80}, and a frame comes as "
+            f"{FORM}: a file part `frame` and a field `meta` with JSON."
+        )
+    try:
+        form = await request.form(max_files=1, max_fields=16, max_part_size=FIELD_BYTES)
+    except (HTTPException, MultiPartException, UnicodeError) as error:  # of a strange charset
+        raise MalformedBody(
+            f"The form cannot be parsed ({getattr(error, 'detail', error)}). Send a file part "
+            "`frame` and a field `meta`, with a boundary as in RFC 7578."
+        ) from error
+    try:
+        known = {"frame", "meta", *fields}
+        for name in form:
+            if name not in known:
+                raise InvalidRequest(
+                    f"The form has a part {name!r:.80} that is not known. Its parts are "
+                    f"{', '.join(sorted(known))}.",
+                    ((name[:80], "not known"),),
+                )
+        frame = form.get("frame")
+        if not isinstance(frame, UploadFile) or len(form.getlist("frame")) != 1:
+            raise InvalidRequest(
+                "The form has no file part `frame`, or more than one part of that name. Send the "
+                "depth image in it, with a file name.",
+                (("frame", "not one file"),),
+            )
+        texts = {name: _text(form.getlist(name), name) for name in form if name != "frame"}
+        yield Upload(frame.file, _meta(texts.pop("meta", None)), texts)
+    finally:
+        await form.close()
+
+
+async def read_json(request: Request) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises
+    ------
+    MalformedBody : no JSON object, or one that is far too large.
+    """
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > FIELD_BYTES:
+            raise MalformedBody(f"The JSON has more than {FIELD_BYTES} bytes. Send an object.")
+    try:
+        value = from_json(bytes(body))  # unlike `json`, no text that is not Unicode
+    except ValueError as error:
+        raise MalformedBody(f"The body is not JSON ({error}). Send a JSON object.") from error
+    if not isinstance(value, dict):
+        raise MalformedBody("The body is not a JSON object. Send an object.")
+    return value
+
+
+def _meta(text: str | None) -> FrameMeta:
+    if text is None:
+        raise InvalidRequest(
+            "The form has no field `meta`. Send JSON in it, at least the camera's intrinsics.",
+            (("meta", "missing"),),
+        )
+    try:
+        return FrameMeta.model_validate_json(text)
+    except ValidationError as error:
+        if error.errors(include_url=False)[0]["type"] == "json_invalid":
+            raise MalformedBody("The field `meta` is not JSON. Send a JSON object.") from error
+        raise invalid(error, "The field `meta`") from error
+
+
+def _text(values: list[UploadFile | str], name: str) -> str:
+    if len(values) != 1 or not isinstance(values[0], str):
+        raise InvalidRequest(
+            f"The form has the part {name!r} more than once, or as a file. Send it once, as text.",
+            ((name, "not one text"),),
+        )
+    return values[0]

@@ -1,0 +1,165 @@
+"""Errors as problem documents (RFC 9457)."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Sequence
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import ValidationError
+from starlette.exceptions import HTTPException
+
+from sceneprint import errors
+from sceneprint.schemas import Problem
+
+log = logging.getLogger(__name__)
+
+#: The status of each error; of an error that is not here, that of its nearest base.
+STATUSES: dict[type[errors.SceneprintError], int] = {
+    errors.FrameError: 422,
+    errors.NotFound: 404,
+    errors.Conflict: 409,
+    errors.InvalidRequest: 422,
+    errors.MalformedBody: 400,
+    errors.UnsupportedType: 415,
+    errors.TooLarge: 413,
+    errors.KeyRequired: 401,
+    errors.Busy: 503,
+    errors.UnusableStore: 503,
+    errors.SceneprintError: 500,
+}
+#: Seconds after which to come back, where a status says that this may help.
+RETRY_AFTER_S = {503: "1"}
+MEDIA_TYPE = "application/problem+json"
+
+
+def status_of(error: errors.SceneprintError) -> int:
+    """The HTTP status of an error."""
+    return next(STATUSES[kind] for kind in type(error).__mro__ if kind in STATUSES)
+
+
+def type_of(name: str) -> str:
+    """The type of a problem: the error's name in kebab-case."""
+    return "/problems/" + re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
+
+
+def problem(
+    request_id: str, name: str, status: int, detail: str, fields: Sequence[tuple[str, str]] = ()
+) -> JSONResponse:
+    """A problem document as a response."""
+    document: dict[str, Any] = {
+        "type": type_of(name),
+        "title": re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).capitalize(),
+        "status": status,
+        "detail": detail,
+        "instance": f"/requests/{request_id}",
+    }
+    if fields:
+        document["errors"] = [{"field": place, "reason": reason} for place, reason in fields]
+    headers = {"Retry-After": RETRY_AFTER_S[status]} if status in RETRY_AFTER_S else {}
+    if status == 401:
+        headers["WWW-Authenticate"] = "Bearer"
+    return JSONResponse(document, status, headers, MEDIA_TYPE)
+
+
+def invalid(error: ValidationError, what: str) -> errors.InvalidRequest:
+    """What pydantic found, in our words."""
+    return _invalid([dict(one) for one in error.errors(include_url=False)], what)
+
+
+def declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Responses of these statuses for the OpenAPI document."""
+    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    return {
+        status: {"description": HTTPStatus(status).phrase, "content": content}
+        for status in (*statuses, 401, 500, 503)
+    }
+
+
+def install(app: FastAPI) -> None:
+    """Let every error of an application leave it as a problem document."""
+
+    @app.exception_handler(errors.SceneprintError)
+    async def _ours(request: Request, error: errors.SceneprintError) -> JSONResponse:
+        status = status_of(error)
+        if status >= 500 and not isinstance(error, errors.Busy):
+            log.error("request failed", extra={"request_id": _id(request), "error": str(error)})
+        fields = error.fields if isinstance(error, errors.InvalidRequest) else ()
+        detail = str(error)
+        if isinstance(error, errors.UnusableStore):  # names folders, which are the operator's
+            detail = (
+                "The service cannot use its store at the moment, and nothing was taken. Its log "
+                "says why under the request's id. Come back later."
+            )
+        return problem(_id(request), type(error).__name__, status, detail, fields)
+
+    @app.exception_handler(RequestValidationError)
+    async def _validation(request: Request, error: RequestValidationError) -> JSONResponse:
+        if any(one["type"] == "json_invalid" for one in error.errors()):
+            detail = "The body is not JSON. Send one JSON object."
+            return problem(_id(request), "MalformedBody", 400, detail)
+        kind = request.headers.get("content-type", "").partition(";")[0].strip()
+        if kind != "application/json" and any(one["loc"] == ("body",) for one in error.errors()):
+            detail = f"The body is {kind or 'of no type'!r:.80}. Send JSON as application/json."
+            return problem(_id(request), "UnsupportedType", 415, detail)
+        ours = _invalid([dict(one) for one in error.errors()], "The request")
+        return problem(_id(request), "InvalidRequest", 422, str(ours), ours.fields)
+
+    @app.exception_handler(HTTPException)
+    async def _http(request: Request, error: HTTPException) -> JSONResponse:
+        if error.status_code == 400:  # FastAPI's own word on bytes that are not even text
+            detail = "The body is not JSON. Send one JSON object."
+            return problem(_id(request), "MalformedBody", 400, detail)
+        name = HTTPStatus(error.status_code).phrase.title().replace(" ", "")
+        detail = f"{request.method} {request.url.path}: {error.detail}. See /docs."
+        answer = problem(_id(request), name, error.status_code, detail)
+        answer.headers.update(error.headers or {})
+        if error.status_code == 405:  # Starlette names those of the first route alone
+            answer.headers["Allow"] = ", ".join(_allowed(app, request.url.path))
+        return answer
+
+    @app.exception_handler(Exception)
+    async def _unexpected(request: Request, error: Exception) -> JSONResponse:
+        log.error("request broke down", exc_info=error, extra={"request_id": _id(request)})
+        detail = (
+            "The service broke down over this request; nothing was half-written. Its log has the "
+            "traceback under the request's id. Please report it."
+        )
+        answer = problem(_id(request), "InternalError", 500, detail)
+        answer.headers["X-Request-Id"] = _id(request)  # `Around` does not see this one
+        answer.headers["Connection"] = "close"  # as uvicorn does, unsaid, after an exception
+        return answer
+
+
+def _invalid(found: Sequence[dict[str, Any]], what: str) -> errors.InvalidRequest:
+    fields = tuple(
+        (".".join(str(part) for part in one["loc"] if part not in ("body", "query")), one["msg"])
+        for one in found
+    )
+    first = "; ".join(f"{place or 'it'}: {reason}" for place, reason in fields[:3])
+    more = f" (and {len(fields) - 3} more)" if len(fields) > 3 else ""
+    return errors.InvalidRequest(
+        f"{what} is not as it should be: {first}{more}. See /docs for its fields.", fields
+    )
+
+
+def _allowed(app: FastAPI, path: str) -> list[str]:
+    """Methods of a path."""
+    return sorted(
+        method.upper()
+        for pattern, operations in app.openapi()["paths"].items()
+        if re.fullmatch(re.sub(r"\{\w+\}", "[^/]+", pattern), path)
+        for method in operations
+    ) or ["GET"]  # what is not in the document is read only
+
+
+def _id(request: Request) -> str:
+    return str(getattr(request.state, "request_id", ""))
+
+
+__all__ = ["Problem", "declared", "install", "invalid", "problem", "status_of"]

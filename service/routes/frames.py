@@ -1,0 +1,120 @@
+"""Frames of a map."""
+
+from __future__ import annotations
+
+import re
+import time
+from typing import Annotated, Any
+
+import anyio
+from anyio import to_thread
+from fastapi import APIRouter, Header, Query, Request, Response
+
+from sceneprint.schemas import Added, Frame, FrameState, Page
+from service.bodies import FORM, uploaded
+from service.context import Context, Here
+from service.problems import declared
+
+router = APIRouter(prefix="/maps/{map_name}/frames", tags=["frames"])
+
+#: Longest time to wait for a worker, seconds, and the pause between two looks.
+LONGEST_WAIT_S, PAUSE_S = 60.0, 0.03
+
+BODY: dict[str, Any] = {
+    "required": True,
+    "content": {
+        FORM: {
+            "schema": {
+                "type": "object",
+                "required": ["frame", "meta"],
+                "properties": {
+                    "frame": {
+                        "type": "string",
+                        "format": "binary",
+                        "description": "16-bit greyscale PNG in stored units (0 and 65535 where "
+                        "missing), or a two-dimensional float NPY in metres.",
+                    },
+                    "meta": {"$ref": "#/components/schemas/FrameMeta"},
+                },
+            },
+            "encoding": {"meta": {"contentType": "application/json"}},
+        }
+    },
+}
+
+
+@router.post(
+    "",
+    status_code=202,
+    responses={
+        200: {"model": Added, "description": "The map has this frame already."},
+        201: {"model": Added, "description": "Waited for: indexed, rejected or failed."},
+        **declared(400, 404, 409, 413, 415, 422),
+    },
+    openapi_extra={"requestBody": BODY},
+)
+async def add_frame(
+    map_name: str,
+    request: Request,
+    here: Here,
+    response: Response,
+    prefer: Annotated[
+        str | None, Header(description="`wait=N`: answer when signed, or after N seconds.")
+    ] = None,
+) -> Added:
+    """Take a frame into a map. When this answers, the frame is safe; a worker signs it next."""
+    async with uploaded(request) as upload:
+        added, is_new = await here.gate.run(
+            lambda: here.engine.add_frame(map_name, upload.file.read(), upload.meta)
+        )
+    response.headers["Location"] = f"/v1/jobs/{added.job_id}"
+    if is_new:
+        wait_s = _wait(prefer)
+        if wait_s > 0:
+            response.headers["Preference-Applied"] = f"wait={wait_s:g}"
+            added = await _settled(here, map_name, added, wait_s)
+        is_over = added.state not in (FrameState.RECEIVED, FrameState.SIGNING)
+        response.status_code = 201 if is_over else 202
+    else:
+        response.status_code = 200
+    return added
+
+
+@router.get("", responses=declared(404, 422))
+def list_frames(
+    map_name: str,
+    here: Here,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    state: FrameState | None = None,
+) -> Page[Frame]:
+    """Frames in the order they came; deleted ones only with `state=deleted`."""
+    return here.engine.list_frames(map_name, cursor, limit, state)
+
+
+@router.get("/{frame_id}", responses=declared(404))
+def get_frame(map_name: str, frame_id: str, here: Here) -> Frame:
+    """A frame, and what has become of it."""
+    return here.engine.get_frame(map_name, frame_id)
+
+
+@router.delete("/{frame_id}", status_code=204, responses=declared(404))
+def delete_frame(map_name: str, frame_id: str, here: Here) -> None:
+    """Take a frame out of its map; from now on no query finds it."""
+    here.engine.delete_frame(map_name, frame_id)
+
+
+def _wait(prefer: str | None) -> float:
+    """Seconds that the header `Prefer` asks to wait (RFC 7240); what is not understood is none."""
+    found = re.search(r"(?:^|[,;\s])wait\s*=\s*\"?(\d{1,6})", prefer or "", re.IGNORECASE)
+    return min(float(found[1]), LONGEST_WAIT_S) if found else 0.0
+
+
+async def _settled(here: Context, map_name: str, added: Added, wait_s: float) -> Added:
+    """The frame once nothing more will happen to it, or as it is after the wait."""
+    until = time.monotonic() + wait_s
+    while added.state in (FrameState.RECEIVED, FrameState.SIGNING) and time.monotonic() < until:
+        await anyio.sleep(PAUSE_S)  # holds no thread meanwhile
+        frame = await to_thread.run_sync(here.engine.get_frame, map_name, added.frame_id)
+        added = added.model_copy(update={"state": frame.state, "reason": frame.reason})
+    return added

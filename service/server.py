@@ -1,0 +1,80 @@
+"""Running the service: one process, a socket, and word when it is ready."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+
+import uvicorn
+
+from sceneprint.engine import Engine
+from sceneprint.errors import UnusableStore
+from sceneprint.settings import Settings
+from service.app import create_app
+
+#: Seconds that requests in flight may take after the signal to stop.
+GRACE_S = 20
+
+
+def listen(settings: Settings) -> socket.socket:
+    """A socket on the address of the settings.
+
+    Raises
+    ------
+    UnusableStore : the address is not of this machine, or taken.
+    """
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    # the protocol named, or asyncio leaves Nagle on and every answer waits 40 ms for an ACK
+    listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((settings.host, settings.port))
+    except OSError as error:
+        listening.close()
+        raise UnusableStore(
+            f"{settings.host}:{settings.port} cannot be listened on ({error.strerror}). "
+            "Choose another --port, 0 for a free one, or stop what holds it."
+        ) from error
+    return listening
+
+
+def run(settings: Settings, ready: Callable[[str], None]) -> None:
+    """Serve until SIGINT or SIGTERM.
+
+    Parameters
+    ----------
+    settings : see Settings
+    ready : called with the service's address once it answers
+
+    Raises
+    ------
+    UnusableStore, NewerSchema : the store cannot be opened, or the address not listened on.
+    """
+    Engine(settings).close()  # uvicorn would make a traceback of what cannot be opened
+    listening = listen(settings)
+    host, port = listening.getsockname()[:2]
+    url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    config = uvicorn.Config(
+        create_app(settings),
+        log_config=None,  # ours is JSON
+        access_log=False,  # `Around` writes one line a request
+        server_header=False,
+        timeout_graceful_shutdown=GRACE_S,
+        timeout_keep_alive=30,
+        limit_concurrency=1000,
+    )
+    _Server(config, lambda: ready(url)).run(sockets=[listening])
+
+
+class _Server(uvicorn.Server):
+    """A server that says when it has started."""
+
+    def __init__(self, config: uvicorn.Config, started: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._started = started
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, and say so."""
+        await super().startup(sockets)
+        if self.started:
+            self._started()
