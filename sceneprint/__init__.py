@@ -7,6 +7,8 @@
     matches = sceneprint.associate(geometry, ranking, selection.indices, open_geometry)  # C_vld
     location = sceneprint.locate(matches, poses)
 
+    answer = sceneprint.Client("http://robot-server:8008").query("warehouse", path)  # all at once
+
 Names are loaded when first used, so that importing the package costs nothing.
 """
 
@@ -18,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sceneprint.artifacts import read_geometry, write_geometry
+    from sceneprint.client import Client
     from sceneprint.datasets import find_sequences, make_frame, read_frame
     from sceneprint.geometry.validation import Validation
     from sceneprint.matches import Location, Match, associate, locate
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
     from sceneprint.types import Frame, Geometry, Intrinsics
 
 __all__ = [
+    "Client",
     "Frame",
     "Geometry",
     "Intrinsics",
@@ -65,6 +69,7 @@ __all__ = [
 __version__ = _version("sceneprint")
 
 _HOME = {
+    "Client": "client",
     "Frame": "types",
     "Geometry": "types",
     "Intrinsics": "types",

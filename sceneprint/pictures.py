@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from sceneprint.geometry.depth import inverse_depth
 from sceneprint.geometry.normals import surface
+from sceneprint.geometry.rigid import moved
 from sceneprint.models import Model
 from sceneprint.signing import describe
-from sceneprint.types import Bytes, Floats32, Frame, Ints32
+from sceneprint.types import Bytes, Floats, Floats32, Frame, Ints32, Surface
 from sceneprint.writing import write_whole
 
 #: Colour where nothing is known: dark grey, which no normal and no depth has.
@@ -122,3 +123,57 @@ def _draw_depth(figure: Any, axis: Any, frame: Frame, model: Model) -> None:
     image = axis.imshow(np.ma.masked_where(~used, frame.depth), cmap=colours)
     axis.set_title(f"depth, {used.mean():.0%} of {frame.depth.size} samples used", fontsize=10)
     figure.colorbar(image, ax=axis, label="metres", shrink=0.8)
+
+
+#: Of the query and of the match in overlays.
+QUERY_COLOUR, MATCH_COLOUR = "#d9772b", "#2b6cb0"
+
+
+def save_overlay(
+    query: Surface, match: Surface, T_match_query: Floats, title: str, path: Path
+) -> None:
+    """Two frames before and after the transform, from above and from the side, in a PNG.
+
+    Parameters
+    ----------
+    query, match : points in their own cameras, metres
+    T_match_query : (4, 4) query coordinates to the match's
+    title : over the picture
+    path : of the PNG; its folder must exist
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    of_query = query.points[query.valid].astype(np.float64)
+    of_match = match.points[match.valid].astype(np.float64)
+    figure = Figure(figsize=(11, 8.4), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=12)
+    axes: Any = figure.subplots(2, 2)
+    aligned = moved(T_match_query, of_query)
+    everything = np.concatenate([of_match, of_query, aligned])
+    low, high = np.percentile(everything, (1, 99), axis=0)  # a few stray points lie far out
+    for row, (view, x, y) in enumerate((("above", 0, 2), ("the side", 2, 1))):
+        for axis, name, points in zip(
+            axes[row], ("before", "after"), (of_query, aligned), strict=True
+        ):
+            for drawn, colour in ((of_match, MATCH_COLOUR), (points, QUERY_COLOUR)):
+                axis.scatter(drawn[:, x], drawn[:, y], s=0.8, c=colour, alpha=0.5, linewidths=0)
+            axis.set(
+                aspect="equal",
+                xlim=(low[x] - 0.2, high[x] + 0.2),
+                ylim=(low[y] - 0.2, high[y] + 0.2),
+                xlabel=f"{'xyz'[x]}, m",
+                ylabel=f"{'xyz'[y]}, m",
+            )
+            axis.set_title(f"{name} alignment, from {view}", fontsize=10)
+            if view == "the side":
+                axis.invert_yaxis()  # y points down
+    handles = [
+        axes[0, 0].scatter([], [], c=colour, label=label)
+        for label, colour in (("query", QUERY_COLOUR), ("match", MATCH_COLOUR))
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
+    buffer = BytesIO()
+    figure.savefig(buffer, dpi=110, format="png", metadata={"Software": None})
+    write_whole(path, buffer.getvalue())

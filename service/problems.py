@@ -138,7 +138,10 @@ def install(app: FastAPI) -> None:
 
 def _invalid(found: Sequence[dict[str, Any]], what: str) -> errors.InvalidRequest:
     fields = tuple(
-        (".".join(str(part) for part in one["loc"] if part not in ("body", "query")), one["msg"])
+        (
+            ".".join(str(part) for part in one["loc"] if part not in ("body", "query")),
+            one["msg"].removeprefix("Value error, "),
+        )
         for one in found
     )
     first = "; ".join(f"{place or 'it'}: {reason}" for place, reason in fields[:3])

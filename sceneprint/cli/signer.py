@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from sceneprint.engine.warming import warm
 from sceneprint.errors import FrameError
 from sceneprint.geometry.counting import compiled_at
 from sceneprint.models import PRESETS
@@ -52,6 +51,8 @@ def prepare_presets(settings: Settings) -> None:
 
     So that a service's first frame does not wait for what a person can watch now.
     """
+    from sceneprint.engine.warming import warm
+
     if _announce():
         warm(_opened("paper", settings))
     for preset in PRESETS:

@@ -11,7 +11,9 @@ from service.problems import declared
 router = APIRouter(prefix="/maps", tags=["maps"])
 
 
-@router.post("", status_code=201, responses={200: {"model": Map}, **declared(400, 409, 413, 415, 422)})
+@router.post(
+    "", status_code=201, responses={200: {"model": Map}, **declared(400, 409, 413, 415, 422)}
+)
 def create_map(new: NewMap, here: Here, response: Response) -> Map:
     """Make a map. One that is there as wanted is answered with 200."""
     made, is_new = here.engine.create_map(new)

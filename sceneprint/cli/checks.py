@@ -1,0 +1,218 @@
+"""What `sceneprint doctor` looks at on this machine; nothing is changed by looking."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import sqlite3
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from sceneprint import __version__
+
+if TYPE_CHECKING:
+    from sceneprint.settings import Settings
+
+Verdict = Literal["ok", "note", "WRONG"]
+
+#: The oldest SQLite with all that the store asks for (UPDATE ... RETURNING).
+OLDEST_SQLITE = (3, 35, 0)
+#: Free space below which uploads are soon refused, and below which it is time to look, bytes.
+LEAST_FREE, LITTLE_FREE = 100 << 20, 5 << 30
+#: What open3d loads of the system, and the Debian packages that bring it.
+OPEN3D_LIBRARIES = {
+    "libGL.so.1": "libgl1",
+    "libEGL.so.1": "libegl1",
+    "libX11.so.6": "libx11-6",
+    "libusb-1.0.so.0": "libusb-1.0-0",
+    "libgomp.so.1": "libgomp1",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one look has shown.
+
+    Parameters
+    ----------
+    verdict : ok; note: something optional is missing, or will be made when it is needed; WRONG:
+        something needed is not there
+    subject : what was looked at
+    text : what is there, and what to do
+    """
+
+    verdict: Verdict
+    subject: str
+    text: str
+
+
+def machine(settings: Settings) -> Iterator[Finding]:
+    """Findings about this machine.
+
+    Parameters
+    ----------
+    settings : whose folders are looked at
+    """
+    yield _python()
+    yield _sqlite()
+    yield _kernels()
+    yield from _tables(settings.cache_dir)
+    yield from _folder(settings.data_dir)
+    yield _database(settings)
+    yield _embree()
+    yield _open3d()
+
+
+def _python() -> Finding:
+    version = ".".join(map(str, sys.version_info[:3]))  # an older than 3.11 cannot install this
+    return Finding("ok", "python", f"{version}, sceneprint {__version__}")
+
+
+def _sqlite() -> Finding:
+    if sqlite3.sqlite_version_info < OLDEST_SQLITE:
+        least = ".".join(map(str, OLDEST_SQLITE))
+        text = f"{sqlite3.sqlite_version} is too old. Use a Python with SQLite {least} or later."
+        return Finding("WRONG", "sqlite", text)
+    return Finding("ok", "sqlite", sqlite3.sqlite_version)
+
+
+def _kernels() -> Finding:
+    from sceneprint.geometry.counting import compiled_at
+
+    folder, pattern = compiled_at()
+    if folder and any(Path(folder).glob(pattern)):
+        return Finding("ok", "kernels", f"compiled, in {folder}")
+    if folder and _may_write(Path(folder)):
+        return Finding("note", "kernels", "not compiled yet; the first use does it, in 10 seconds")
+    text = (
+        f"{folder or 'no folder'} cannot be written, so that every process compiles for 10 "
+        "seconds. Set NUMBA_CACHE_DIR to a folder that can."
+    )
+    return Finding("note", "kernels", text)
+
+
+def _tables(cache_dir: Path) -> Iterator[Finding]:
+    from sceneprint.models import read_model
+    from sceneprint.models.tables import CACHE_VERSION
+
+    for preset in ("paper", "compact"):
+        subject, model = f"table {preset}", read_model(preset)
+        path = cache_dir / f"table-v{CACHE_VERSION}-{model.id}.bin"
+        if path.is_file():
+            yield Finding("ok", subject, str(path))
+        elif _may_write(cache_dir):
+            yield Finding("note", subject, "not built yet; the first use does it, in seconds")
+        else:
+            text = (
+                f"{cache_dir} cannot be written, so that every process builds it anew. "
+                "Set SCENEPRINT_CACHE_DIR to a folder that can."
+            )
+            yield Finding("note", subject, text)
+
+
+def _folder(data_dir: Path) -> Iterator[Finding]:
+    there = _nearest(data_dir)
+    if not _may_write(data_dir):
+        text = f"{data_dir} cannot be written. Check its permissions, or name another with --data."
+        yield Finding("WRONG", "data folder", text)
+    else:
+        text = f"{data_dir} can be written" if there == data_dir else f"{data_dir} can be made"
+        yield Finding("ok", "data folder", text)
+    free = shutil.disk_usage(there).free
+    text = f"{free / 1e9:.1f} GB free; a frame takes about 0.8 MB"
+    if free < LEAST_FREE:
+        yield Finding("WRONG", "disk", f"{text}. Make room, or uploads will be refused.")
+    else:
+        yield Finding("note" if free < LITTLE_FREE else "ok", "disk", text)
+
+
+def _database(settings: Settings) -> Finding:
+    from sqlalchemy.exc import SQLAlchemyError
+
+    path = settings.data_dir / "sceneprint.db"
+    if settings.database_url is None and not path.is_file():
+        return Finding("ok", "database", "none yet; the first use makes it")
+    try:
+        return _schema(settings, path)
+    except (SQLAlchemyError, ImportError) as error:
+        reason = str(getattr(error, "orig", None) or error).splitlines()[0]
+        text = f"cannot be opened ({reason}). Check SCENEPRINT_DATABASE_URL, or the data folder."
+        return Finding("WRONG", "database", text)
+
+
+def _schema(settings: Settings, path: Path) -> Finding:
+    """Compare the schema with the one of this version; the database is not touched."""
+    from alembic.config import Config
+    from alembic.migration import MigrationContext
+    from alembic.script import ScriptDirectory
+    from sqlalchemy import create_engine, make_url
+
+    import migrations
+
+    config = Config()
+    config.set_main_option("script_location", str(Path(migrations.__file__).parent))
+    scripts = ScriptDirectory.from_config(config)
+    head, known = scripts.get_current_head(), {one.revision for one in scripts.walk_revisions()}
+    connect: Callable[[], sqlite3.Connection] = lambda: sqlite3.connect(  # noqa: E731
+        f"{path.absolute().as_uri()}?mode=ro", uri=True
+    )
+    url = make_url(settings.database)
+    engine = (
+        create_engine("sqlite://", creator=connect)
+        if settings.database_url is None
+        else create_engine(url)
+    )
+    try:
+        with engine.connect() as connection:
+            found = MigrationContext.configure(connection).get_current_revision()
+    finally:
+        engine.dispose()
+    place = f"{url!r}, schema {found}"
+    if found == head:
+        return Finding("ok", "database", place)
+    if found is None or found in known:
+        return Finding("note", "database", f"{place}; the next use brings it to {head}")
+    text = f"{place}: a later version of sceneprint wrote it. Use that version, or another folder."
+    return Finding("WRONG", "database", text)
+
+
+def _embree() -> Finding:
+    try:
+        import_module("embreex.rtcore_scene")
+    except ImportError as error:
+        text = f"cannot be imported ({error}); only `synth`, `train` and `demo` need it"
+        return Finding("note", "embreex", text)
+    return Finding("ok", "embreex", "can be imported, for synthetic rooms")
+
+
+def _open3d() -> Finding:
+    missing = []
+    for library, package in OPEN3D_LIBRARIES.items():
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            missing.append(package)
+    if missing:
+        text = f"only benchmarks need them: apt-get install {' '.join(missing)}"
+        return Finding("note", "open3d libraries", text)
+    return Finding("ok", "open3d libraries", "all there")
+
+
+def _nearest(folder: Path) -> Path:
+    """The folder, or the first above it that is there."""
+    folder = folder.absolute()
+    return next(one for one in (folder, *folder.parents) if one.is_dir())
+
+
+def _may_write(folder: Path) -> bool:
+    """Whether a file can be made in the folder, or where the folder is missing, above it."""
+    try:  # tried, as permissions say little of read-only disks and to root; leaves no trace
+        with tempfile.TemporaryFile(dir=_nearest(folder)):
+            return True
+    except OSError:
+        return False

@@ -1,0 +1,203 @@
+"""`sceneprint upload`: frames of a data set into a map of a service."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+from sceneprint.cli.connection import add_service_options, open_client
+from sceneprint.cli.numbers import positive
+from sceneprint.cli.tally import Tally
+from sceneprint.datasets import FrameReference, Sequence, find_sequences
+from sceneprint.errors import (
+    DatasetError,
+    FrameConflict,
+    FrameError,
+    InvalidRequest,
+    MapExists,
+    Refused,
+    UnknownMap,
+)
+
+if TYPE_CHECKING:
+    from sceneprint.client import Client
+    from sceneprint.schemas import Added
+
+#: Seconds without a frame signed after which no worker is believed to be there.
+STALL_S = 120.0
+#: What is wrong with one frame, and says nothing of the next.
+_OF_FRAME = (FrameError, DatasetError, FrameConflict, InvalidRequest, Refused)
+
+
+def add_to(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "upload",
+        help="upload depth frames to a map of a service",
+        description="Upload every frame of the given files and folders (7-Scenes, TUM RGB-D or "
+        "plain depth images, with an intrinsics.json beside them or above), and wait until they "
+        "are signed. A frame that is in the map already is not stored twice.",
+    )
+    command.add_argument("map", metavar="MAP", help="made where missing")
+    command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
+    command.add_argument("--robot", metavar="NAME", help="who took the frames")
+    command.add_argument(
+        "--session", metavar="NAME", help="in which run (default: the sequence's name)"
+    )
+    command.add_argument(
+        "--tag", action="append", default=[], metavar="TAG", help="may be given several times"
+    )
+    command.add_argument("--no-pose", action="store_true", help="leave known poses out")
+    command.add_argument(
+        "--create",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="make the map where it is missing (default)",
+    )
+    command.add_argument(
+        "--model", choices=("paper", "compact"), help="of a map that is made (default: paper)"
+    )
+    command.add_argument(
+        "--every", type=positive, default=1, metavar="N", help="take every Nth frame"
+    )
+    command.add_argument("--no-wait", action="store_true", help="do not wait until all are signed")
+    command.add_argument(
+        "--parallel", type=positive, default=4, metavar="N", help="in flight at once (default: 4)"
+    )
+    add_service_options(command)
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Upload; returns 2 where a frame was not indexed."""
+    found = list(_found(options.paths, options.every))
+    tally, start, stalled = Tally(), time.perf_counter(), False
+    with open_client(options) as client:
+        _see_to_map(client, options)
+        try:
+            _send_all(client, options, found, tally)
+            if not options.no_wait:
+                stalled = not _wait_for_all(client, tally)
+        finally:  # what was received stays, however the run ended
+            tally.report(len(found), time.perf_counter() - start)
+            if stalled:
+                print(
+                    f"{len(tally.waiting)} frames are safe and wait, but none was signed for "
+                    f"{STALL_S:.0f} s. See that workers run: `sceneprint work` starts some.",
+                    file=sys.stderr,
+                )
+    return 2 if tally.errors or stalled else 0
+
+
+def _found(paths: list[Path], every: int) -> Iterator[tuple[Sequence, FrameReference]]:
+    """Frames with their sequences.
+
+    Raises
+    ------
+    DatasetError : nothing is found at a path, or two places share the name of their poses' frame.
+    """
+    places: dict[str, Path] = {}
+    for path in paths:
+        for sequence in find_sequences(path):
+            shared = sequence.parent_frame != sequence.name
+            place = (sequence.folder.parent if shared else sequence.folder).resolve()
+            if places.setdefault(sequence.parent_frame, place) != place:
+                raise DatasetError(
+                    f"{path}: Another place is called {sequence.parent_frame} too, "
+                    f"{places[sequence.parent_frame]}, and poses of the two would be mixed. "
+                    "Upload a folder above both, or rename one."
+                )
+            for reference in sequence.frames[::every]:
+                yield sequence, reference
+
+
+def _see_to_map(client: Client, options: argparse.Namespace) -> None:
+    try:
+        model = client.map(options.map).model
+    except UnknownMap:
+        if not options.create:
+            raise
+        made = client.create_map(options.map, model=options.model or "paper")
+        print(f"map {made.name} is made, with model {made.model}")
+        return
+    if options.model is not None and model.rpartition("-")[0] != options.model:
+        raise MapExists(
+            f"Map {options.map} is there, with model {model}. Leave --model out, or name another."
+        )
+
+
+def _send_all(
+    client: Client,
+    options: argparse.Namespace,
+    found: list[tuple[Sequence, FrameReference]],
+    tally: Tally,
+) -> None:
+    """Upload all, several at a time; what is wrong with the service ends it."""
+    pool = ThreadPoolExecutor(options.parallel, thread_name_prefix="upload")
+    sent = {pool.submit(_send, client, options, *one): one[1].name for one in found}
+    try:
+        with tqdm(total=len(sent), desc="upload", unit="frame", disable=None) as bar:
+            for future in as_completed(tuple(sent)):
+                name = sent.pop(future)
+                try:
+                    tally.count(name, *future.result())
+                except _OF_FRAME as error:
+                    tally.refuse(name, str(error))
+                bar.update()
+    finally:  # also where Ctrl-C ends it: what is in flight arrives, nothing follows it
+        pool.shutdown(cancel_futures=True)
+        for future, name in sent.items():
+            if not future.cancelled() and future.exception() is None:
+                tally.count(name, *future.result())
+
+
+def _send(
+    client: Client, options: argparse.Namespace, sequence: Sequence, reference: FrameReference
+) -> tuple[Added, bool]:
+    from sceneprint.client import meta_of
+
+    meta = meta_of(
+        reference,
+        robot=options.robot,
+        session=options.session or _session(sequence),
+        tags=options.tag,
+        with_pose=not options.no_pose,
+        parent_frame=sequence.parent_frame,
+    )
+    return client.add(options.map, reference, meta)
+
+
+def _session(sequence: Sequence) -> str:
+    """Name of a sequence, the same whether its own folder was named or the scene's."""
+    if sequence.parent_frame == sequence.name:
+        return sequence.name
+    return f"{sequence.parent_frame}/{sequence.folder.name}"
+
+
+def _wait_for_all(client: Client, tally: Tally) -> bool:
+    """Wait for the jobs as long as some end now and then; whether all did."""
+    total = len(tally.waiting)
+    with tqdm(total=total, desc="sign", unit="frame", disable=None) as bar:
+        while tally.waiting:
+            before = total - len(tally.waiting)
+
+            def progress(done: int, _: int, before: int = before) -> None:
+                bar.update(before + done - bar.n)
+
+            over = [
+                job
+                for job in client.wait(tally.waiting, timeout_s=STALL_S, progress=progress)
+                if job.state.over
+            ]
+            for job in over:
+                tally.end(job)
+            if not over:
+                return False
+    return True

@@ -1,0 +1,86 @@
+"""What a client needs of whoever does the work: the one seam between HTTP and the engine."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from pydantic import Field
+
+from sceneprint.schemas import (
+    Added,
+    Answer,
+    Frame,
+    FrameMeta,
+    FrameState,
+    Job,
+    Map,
+    NewMap,
+    Page,
+    Query,
+)
+from sceneprint.schemas.base import Told
+
+
+class Status(Told):
+    """How a service is."""
+
+    version: str
+    frames: dict[str, int] = Field(description="How many frames of all maps are in each state.")
+    jobs: dict[str, int] = Field(description="How many jobs are in each state that has any.")
+
+
+class Backend(Protocol):
+    """Does what a `Client` asks for; every method may be called from any thread.
+
+    Each raises what the engine raises for it, `Unreachable` and `Refused` besides where a
+    network lies between.
+    """
+
+    def create_map(self, new: NewMap) -> Map:
+        """Make a map, or find that it is there as wanted."""
+
+    def list_maps(self) -> list[Map]:
+        """All maps by name."""
+
+    def get_map(self, name: str) -> Map:
+        """A map."""
+
+    def delete_map(self, name: str) -> None:
+        """Remove a map with all that is in it."""
+
+    def add_frame(
+        self, map_name: str, data: bytes, meta: FrameMeta, wait_s: float
+    ) -> tuple[Added, bool]:
+        """Take a frame into a map, waiting for its job at most so long; whether it is new."""
+
+    def list_frames(
+        self, map_name: str, cursor: str | None, state: FrameState | None
+    ) -> Page[Frame]:
+        """A page of the frames of a map."""
+
+    def get_frame(self, map_name: str, frame_id: str) -> Frame:
+        """A frame."""
+
+    def delete_frame(self, map_name: str, frame_id: str) -> None:
+        """Take a frame out of its map."""
+
+    def get_job(self, job_id: str) -> Job:
+        """A job."""
+
+    def query_upload(self, map_name: str, data: bytes, meta: FrameMeta, query: Query) -> Answer:
+        """Look a frame up that is not kept."""
+
+    def query_frame(self, map_name: str, frame_id: str, query: Query) -> Answer:
+        """Look a frame of the map up among the others."""
+
+    def meanwhile(self, pause_s: float) -> None:
+        """Let jobs come nearer to their end: do one, or wait for others to."""
+
+    def status(self) -> Status:
+        """How the service is."""
+
+    def healthy(self) -> bool:
+        """Whether it answers at all."""
+
+    def close(self) -> None:
+        """Give back what was opened."""

@@ -1,0 +1,250 @@
+"""The client robots use."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from types import TracebackType
+
+from sceneprint.client.backend import Backend, Status
+from sceneprint.client.frames import checked, sendable
+from sceneprint.client.waiting import settle, wait_for
+from sceneprint.datasets import FrameReference
+from sceneprint.schemas import (
+    Added,
+    Answer,
+    Frame,
+    FrameMeta,
+    FrameState,
+    Job,
+    Map,
+    NewMap,
+    Page,
+    Query,
+    Stage,
+)
+from sceneprint.schemas.queries import STAGES
+
+DEFAULT_URL = "http://127.0.0.1:8008"
+
+
+class Client:
+    """Maps, frames and queries of a service; safe to share between threads.
+
+    Brief faults of the network and of a busy service are waited out; uploading twice is safe,
+    as the same frame is kept once.
+
+    Parameters
+    ----------
+    url : of the service
+    key : where it asks for one
+    timeout_s : longest silence of the service
+
+    Raises
+    ------
+    Unreachable : the address is none; whether anybody answers there, the first call tells.
+    """
+
+    def __init__(
+        self, url: str = DEFAULT_URL, key: str | None = None, *, timeout_s: float = 60.0
+    ) -> None:
+        from sceneprint.client.remote import Remote
+
+        self._backend: Backend = Remote(url, key, timeout_s)
+
+    @classmethod
+    def embedded(cls, path: str | Path) -> Client:
+        """A client that needs no service: the engine in this process, on a data folder.
+
+        Frames are signed in this process too, while somebody waits for them (`wait`, or
+        `upload` with `wait_s`). All is kept in the folder, whatever SCENEPRINT_DATABASE_URL
+        says, and `sceneprint serve --data` may serve it at the same time. Until it is closed,
+        BLAS and OpenMP run one thread in this process: sums then have one order.
+
+        Parameters
+        ----------
+        path : the folder, made where missing
+
+        Raises
+        ------
+        UnusableStore, NewerSchema : it cannot be opened.
+        """
+        from sceneprint.client.embedded import Embedded
+
+        client = cls.__new__(cls)
+        client._backend = Embedded(Path(path))
+        return client
+
+    def close(self) -> None:
+        """Give back what was opened."""
+        self._backend.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:  # fmt: skip
+        self.close()
+
+    # maps
+
+    def create_map(self, name: str, title: str | None = None, model: str = "paper") -> Map:
+        """Make a map, or find that it is there as wanted.
+
+        Raises
+        ------
+        InvalidRequest : the name is no slug, or there is no such model.
+        MapExists : there is one of that name with another title or model.
+        """
+        return self._backend.create_map(
+            checked(NewMap, "The map", name=name, title=title, model=model)
+        )
+
+    def maps(self) -> list[Map]:
+        """All maps by name."""
+        return self._backend.list_maps()
+
+    def map(self, name: str) -> Map:
+        """A map; UnknownMap where there is none."""
+        return self._backend.get_map(name)
+
+    def delete_map(self, name: str) -> None:
+        """Remove a map with all that is in it, for good; UnknownMap where there is none."""
+        self._backend.delete_map(name)
+
+    # frames
+
+    def upload(
+        self, map_name: str, frame: bytes | Path | FrameReference, meta: FrameMeta | None = None,
+        *, wait_s: float | None = None,
+    ) -> Added:  # fmt: skip
+        """Take a frame into a map; it is safe when this returns, and signed soon after.
+
+        Parameters
+        ----------
+        map_name : of the map
+        frame : content of a PNG or NPY file, the file, or a frame of `find_sequences`
+        meta : what is known of it; default: what `meta_of` finds
+        wait_s : seconds to wait until it is signed; default: none
+
+        Returns
+        -------
+        added : its state tells whether it is signed yet
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        FrameError, DatasetError : the frame cannot be read, or its camera or pose is none.
+        FrameConflict : the map has the same content with other metadata.
+        """
+        until = time.monotonic() + (wait_s or 0.0)
+        added, _ = self.add(map_name, frame, meta, wait_s=wait_s)
+        return settle(self._backend, map_name, added, until)
+
+    def add(
+        self, map_name: str, frame: bytes | Path | FrameReference, meta: FrameMeta | None = None,
+        *, wait_s: float | None = None,
+    ) -> tuple[Added, bool]:  # fmt: skip
+        """As `upload`, with a flag: False where the map had the frame already.
+
+        The wait may end early; `upload` goes on to the end of it.
+        """
+        data, known = sendable(frame, meta, with_pose=True)
+        return self._backend.add_frame(map_name, data, known, wait_s or 0.0)
+
+    def frames(self, map_name: str, state: FrameState | None = None) -> Iterator[Frame]:
+        """Frames of a map in the order they came; deleted ones only where asked for.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        """
+        return self._rest(map_name, state, self._backend.list_frames(map_name, None, state))
+
+    def frame(self, map_name: str, frame_id: str) -> Frame:
+        """A frame; UnknownMap or UnknownFrame where there is none."""
+        return self._backend.get_frame(map_name, frame_id)
+
+    def delete_frame(self, map_name: str, frame_id: str) -> None:
+        """Take a frame out of its map; UnknownMap or UnknownFrame where there is none."""
+        self._backend.delete_frame(map_name, frame_id)
+
+    # jobs
+
+    def job(self, job_id: str) -> Job:
+        """A job; UnknownJob where there is none."""
+        return self._backend.get_job(job_id)
+
+    def wait(
+        self, job_ids: Iterable[str], *, timeout_s: float = 600.0,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> list[Job]:  # fmt: skip
+        """Wait until jobs are over.
+
+        Parameters
+        ----------
+        job_ids : of uploads
+        timeout_s : after which they are returned as they are
+        progress : called with the number of jobs that are over, and of all
+
+        Returns
+        -------
+        jobs : in the order given; `job.state.over` is False where the time ran out
+
+        Raises
+        ------
+        UnknownJob : there is no job of one of the ids.
+        """
+        return wait_for(self._backend, list(job_ids), timeout_s, progress)
+
+    # queries
+
+    def query(
+        self, map_name: str, frame: bytes | Path | FrameReference | None = None,
+        meta: FrameMeta | None = None, *, frame_id: str | None = None, k: int = 5,
+        stages: Iterable[Stage] = STAGES, exact: bool = False, seed: int = 0,
+    ) -> Answer:  # fmt: skip
+        """Where was this frame taken? The frame is not kept.
+
+        Parameters
+        ----------
+        map_name : of the map
+        frame, meta : as for `upload`
+        frame_id : of a frame of the map, in place of `frame`; it does not find itself
+        k, stages, exact, seed : see Query
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : there is none.
+        FrameError, DatasetError : the frame cannot be read, or nothing in it can be signed.
+        InvalidRequest : an option is out of its range, or the frame of the map is not indexed.
+        TypeError : not one of `frame` and `frame_id`.
+        """
+        query = checked(
+            Query, "The query", k=k, stages=tuple(stages), exact=exact, seed=seed
+        )  # fmt: skip
+        if frame_id is not None and frame is None:
+            return self._backend.query_frame(map_name, frame_id, query)
+        if frame is None or frame_id is not None:
+            raise TypeError("give either `frame` or `frame_id`")
+        data, known = sendable(frame, meta, with_pose=False)
+        return self._backend.query_upload(map_name, data, known, query)
+
+    # the service
+
+    def status(self) -> Status:
+        """Version, and how many frames and jobs are in each state."""
+        return self._backend.status()
+
+    def healthy(self) -> bool:
+        """Whether it answers; asked once, without patience."""
+        return self._backend.healthy()
+
+    def _rest(self, map_name: str, state: FrameState | None, page: Page[Frame]) -> Iterator[Frame]:
+        yield from page.items
+        while page.next_cursor is not None:
+            page = self._backend.list_frames(map_name, page.next_cursor, state)
+            yield from page.items

@@ -1,0 +1,67 @@
+"""A real service for the commands that talk to one, and a data set to give them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from sceneprint.cli import main
+from sceneprint.cli.served import serving
+from sceneprint.datasets import Camera, write_depth_png, write_intrinsics, write_pose
+from sceneprint.types import Frame
+
+
+class Said(NamedTuple):
+    """What a command printed."""
+
+    stdout: str
+    stderr: str
+
+
+Run = Callable[..., Said]
+
+
+@pytest.fixture(scope="session")
+def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("service")
+
+
+@pytest.fixture(scope="session")
+def service_url(data_folder: Path) -> Iterator[str]:
+    """One service with one worker for all tests; each uses maps of its own."""
+    with serving(data_folder, 1) as url:
+        yield url
+
+
+@pytest.fixture
+def sceneprint(
+    service_url: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Run:
+    """Runs a command in this process against the service and checks its exit code."""
+    monkeypatch.setenv("SCENEPRINT_URL", service_url)
+
+    def run(*arguments: object, expect: int = 0) -> Said:
+        capsys.readouterr()
+        code = main([str(one) for one in arguments])
+        said = Said(*capsys.readouterr())
+        assert code == expect, said
+        return said
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def rooms(room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three views of each of two rooms, with poses, in 7-Scenes layout."""
+    root = tmp_path_factory.mktemp("rooms")
+    for number, frame in enumerate(room_frames):
+        folder = root / f"room-{number // 3}" / "seq-01"
+        folder.mkdir(parents=True, exist_ok=True)
+        write_intrinsics(folder, Camera(frame.intrinsics))
+        write_depth_png(folder / f"frame-{number % 3:06d}.depth.png", frame.depth, 1000.0)
+        assert frame.pose is not None
+        write_pose(folder / f"frame-{number % 3:06d}.pose.txt", frame.pose)
+    return root

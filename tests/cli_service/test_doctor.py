@@ -1,0 +1,142 @@
+"""`sceneprint doctor` on a sound machine, and on several that are not."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sceneprint import __version__
+from sceneprint.cli import checks, connection, doctor
+from sceneprint.cli.checks import Finding
+from sceneprint.client import Client, Status
+from sceneprint.datasets import find_sequences
+from sceneprint.geometry import counting
+from sceneprint.settings import Settings
+
+Run = Callable[..., Any]
+
+
+def verdicts(text: str) -> dict[str, str]:
+    """The first word of each line by its subject."""
+    lines = text.splitlines()[:-1]
+    return {line[7:23].strip(): line[:5].strip() for line in lines}
+
+
+def test_a_sound_machine(sceneprint: Run, data_folder: Path, service_url: str) -> None:
+    done = sceneprint("doctor", "--data", data_folder)
+    found = verdicts(done.stdout)
+    assert list(found) == [
+        "python", "sqlite", "kernels", "table paper", "table compact", "data folder", "disk",
+        "database", "embreex", "open3d libraries", "service", "workers",
+    ]  # fmt: skip
+    for needed in ("python", "sqlite", "data folder", "database", "service", "workers"):
+        assert found[needed] == "ok"
+    assert set(found.values()) <= {"ok", "note"}
+    assert f"{service_url} answers, version {__version__}" in done.stdout
+    assert done.stdout.splitlines()[-1] == "all that is needed is fine"
+
+
+def test_a_machine_where_nothing_was_used_yet(
+    sceneprint: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("SCENEPRINT_URL")
+    monkeypatch.setattr(connection, "DEFAULT_URL", "http://127.0.0.1:1")
+    monkeypatch.setattr(doctor, "DEFAULT_URL", "http://127.0.0.1:1")
+    monkeypatch.setenv("SCENEPRINT_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(counting, "compiled_at", lambda: (str(tmp_path / "numba"), "*.nbi"))
+    done = sceneprint("doctor", "--data", tmp_path / "new" / "data")
+    found = verdicts(done.stdout)
+    for made_later in ("kernels", "table paper", "table compact", "service"):
+        assert found[made_later] == "note"
+    assert (found["data folder"], found["database"]) == ("ok", "ok")
+    assert "none yet" in done.stdout
+    assert "`sceneprint serve` starts one" in done.stdout
+    assert list(tmp_path.rglob("*")) == []  # looking makes nothing
+
+
+def test_what_is_wrong_says_what_to_do(sceneprint: Run, tmp_path: Path) -> None:
+    (tmp_path / "sceneprint.db").write_bytes(b"not a database " * 100)
+    done = sceneprint("doctor", "--data", tmp_path, "--url", "http://127.0.0.1:1", expect=2)
+    found = verdicts(done.stdout)
+    assert [what for what, verdict in found.items() if verdict == "WRONG"] == [
+        "database",
+        "service",
+    ]
+    assert "file is not a database" in done.stdout
+    assert "none answers at http://127.0.0.1:1" in done.stdout
+    assert done.stdout.splitlines()[-1] == "2 things are wrong"
+    done = sceneprint("doctor", "--data", "/proc/none", expect=2)
+    assert verdicts(done.stdout)["data folder"] == "WRONG"
+
+
+def found_in(settings: Settings) -> dict[str, Finding]:
+    return {one.subject: one for one in checks.machine(settings)}
+
+
+def test_databases_of_other_versions(tmp_path: Path) -> None:
+    Client.embedded(tmp_path).close()
+    settings = Settings(data_dir=tmp_path, database_url=None)
+    path = tmp_path / "sceneprint.db"
+    assert found_in(settings)["database"].verdict == "ok"
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE alembic_version SET version_num = '9999'")
+    connection.close()
+    before = path.read_bytes()
+    finding = found_in(settings)["database"]
+    assert (finding.verdict, "schema 9999: a later version" in finding.text) == ("WRONG", True)
+    assert path.read_bytes() == before
+    with sqlite3.connect(path) as connection:
+        connection.execute("DELETE FROM alembic_version")
+    connection.close()
+    assert found_in(settings)["database"].verdict == "note"
+
+
+def test_what_a_machine_may_lack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(checks.OPEN3D_LIBRARIES, "libabsent.so.1", "libabsent1")
+    monkeypatch.setattr(checks, "LEAST_FREE", 1 << 62)
+    monkeypatch.setattr(checks, "OLDEST_SQLITE", (99, 0, 0))
+    found = found_in(Settings(data_dir=tmp_path, database_url=None))
+    assert found["open3d libraries"].verdict == "note"
+    assert "libabsent1" in found["open3d libraries"].text.split("apt-get install ")[1].split()
+    assert (found["disk"].verdict, found["sqlite"].verdict) == ("WRONG", "WRONG")
+    assert "SQLite 99.0.0 or later" in found["sqlite"].text
+
+
+@pytest.fixture
+def waiting(tmp_path: Path, rooms: Path) -> Iterator[Client]:
+    """A map with a frame that nobody signs."""
+    with Client.embedded(tmp_path / "waiting") as client:
+        client.create_map("m")
+        client.upload("m", find_sequences(rooms)[0].frames[0])
+        yield client
+
+
+def test_workers_that_are_missing(waiting: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    finding = doctor._workers(waiting, waiting.status())
+    assert finding.verdict == "ok"
+    assert finding.text.startswith("1 jobs wait, 0 are being done, the oldest came 0 s ago")
+
+    class Later(datetime):
+        @classmethod
+        def now(cls, tz: object = None) -> datetime:
+            return datetime.now(UTC) + timedelta(seconds=100)
+
+    monkeypatch.setattr(doctor, "datetime", Later)
+    finding = doctor._workers(waiting, waiting.status())
+    assert finding.verdict == "WRONG"
+    assert "the oldest came 100 s ago. No worker seems to run: `sceneprint work`" in finding.text
+    busy = Status(version="1", frames={}, jobs={"queued": 1, "running": 1, "dead": 2})
+    finding = doctor._workers(waiting, busy)
+    assert (finding.verdict, "2 were given up" in finding.text) == ("note", True)
+
+
+def test_a_service_of_another_version() -> None:
+    status = Status(version="99.1", frames={"indexed": 2, "rejected": 1}, jobs={})
+    finding = doctor._version("http://x", status)
+    assert finding.verdict == "note"
+    assert f"version 99.1, 3 frames; this is version {__version__}" in finding.text

@@ -1,0 +1,227 @@
+"""Upload, query and maps as a user runs them: real processes against a real service."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.client import Client, retrying
+from sceneprint.datasets import read_pose, write_depth_png
+from sceneprint.schemas import Answer, FrameState, Map
+
+Run = Callable[..., Any]
+
+
+@pytest.fixture(scope="session")
+def house(service_url: str, rooms: Path) -> str:
+    """A map with all frames of both rooms."""
+    arguments = ["upload", "house", rooms, "--robot", "r1", "--url", service_url]
+    done = subprocess.run(
+        [sys.executable, "-m", "sceneprint", *arguments], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    first, second = done.stdout.splitlines()
+    assert re.fullmatch(r"map house is made, with model paper-[0-9a-f]{12}", first)
+    assert second.startswith(
+        "6 frames: 6 received, 0 already there; 6 indexed, 0 rejected, 0 failed; "
+    )
+    assert re.search(r"; \d+\.\d frames/s$", second)
+    assert done.stderr == ""  # no bars where nobody looks
+    return "house"
+
+
+def test_what_was_uploaded_is_there(house: str, service_url: str, rooms: Path) -> None:
+    with Client(service_url) as client:
+        frames = sorted(client.frames(house), key=lambda one: (one.session, one.bytes))
+    assert {(one.state, one.robot) for one in frames} == {("indexed", "r1")}
+    assert {one.session for one in frames} == {"room-0/seq-01", "room-1/seq-01"}
+    files = sorted(path.stat().st_size for path in rooms.glob("room-0/*/*.png"))
+    assert [one.bytes for one in frames[:3]] == files
+    parents = {None if one.pose is None else one.pose.parent_frame for one in frames}
+    assert parents == {"room-0", "room-1"}
+
+
+def test_uploading_again_changes_nothing(sceneprint: Run, house: str, rooms: Path) -> None:
+    done = sceneprint("upload", house, rooms / "room-0", "--robot", "r1")  # by another path
+    assert done.stdout.startswith("3 frames: 0 received, 3 already there; 3 indexed, ")
+    done = sceneprint("upload", house, rooms / "room-0", "--every", 2, expect=2)
+    assert done.stdout.startswith("2 frames: 0 received, 0 already there, 2 refused; 0 indexed, ")
+    first, second = done.stderr.splitlines()
+    assert re.match(r"seq-01/frame-000000: Frame \w+ has the same content, but other robot", first)
+    assert second.startswith("seq-01/frame-000002: ")
+
+
+def test_bad_frames_stop_no_others(
+    sceneprint: Run, service_url: str, rooms: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "mixed"
+    shutil.copytree(rooms / "room-0" / "seq-01", folder)
+    (folder / "frame-000001.depth.png").write_bytes(b"no image")
+    wall = np.zeros((480, 640), np.float32)
+    wall[100:105, 100:106] = 2.0
+    write_depth_png(folder / "frame-000003.depth.png", wall, 1000.0)
+    (folder / "frame-000002.pose.txt").write_text("no pose")
+    done = sceneprint("upload", "mixed", folder, "--tag", "a", "--tag", "b", expect=2)
+    assert done.stdout.splitlines()[-1].startswith(
+        "4 frames: 2 received, 0 already there, 2 refused; 1 indexed, 1 rejected, 0 failed; "
+    )
+    lines = done.stderr.splitlines()
+    assert [line.split(": ")[0] for line in lines] == [f"mixed/frame-00000{i}" for i in (1, 2, 3)]
+    assert "neither PNG nor NPY" in lines[0]
+    assert "frame-000002.pose.txt" in lines[1]
+    assert "rejected: only 30 of its 30 valid depth samples" in lines[2]
+    with Client(service_url) as client:
+        indexed = list(client.frames("mixed", FrameState.INDEXED))
+    assert [(one.tags, one.session) for one in indexed] == [(["a", "b"], "mixed")]
+    without = sceneprint("upload", "mixed", folder, "--no-pose", "--session", "s", expect=2)
+    assert "3 refused" in without.stdout  # among them the two that are there with a pose or tags
+    assert "1 indexed" in without.stdout  # the one whose pose is none
+
+
+def test_upload_without_waiting(sceneprint: Run, service_url: str, rooms: Path) -> None:
+    done = sceneprint("upload", "later", rooms, "--no-wait", "--model", "compact", "--parallel", 2)
+    assert "6 received" in done.stdout
+    with Client(service_url) as client:
+        assert client.map("later").model.startswith("compact-")
+        ids = [one.job_id for one in client.frames("later")]
+        assert {job.state for job in client.wait(ids, timeout_s=60)} == {"succeeded"}
+
+
+def test_upload_refuses_what_would_mix(
+    sceneprint: Run, house: str, rooms: Path, tmp_path: Path
+) -> None:
+    done = sceneprint("upload", house, rooms, "--model", "compact", expect=2)
+    assert re.search(r"Map house is there, with model paper-\w+\. Leave --model out", done.stderr)
+    done = sceneprint("upload", "absent", rooms, "--no-create", expect=2)
+    assert "There is no map 'absent'" in done.stderr
+    other = tmp_path / "room-0"
+    shutil.copytree(rooms / "room-0", other)
+    done = sceneprint("upload", house, rooms / "room-0", other, expect=2)
+    assert "Another place is called room-0 too" in done.stderr
+    assert done.stdout == ""
+
+
+def test_ctrl_c_keeps_what_was_received(service_url: str, rooms: Path) -> None:
+    with Client(service_url) as client:
+        client.create_map("stopped")
+        process = subprocess.Popen(
+            [sys.executable, "-m", "sceneprint", "upload", "stopped", rooms, "--parallel", "1"],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, "SCENEPRINT_URL": service_url},
+        )  # fmt: skip
+        until = time.monotonic() + 30
+        while not sum(client.map("stopped").frames.values()) and time.monotonic() < until:
+            pass  # the first frame arrives
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+        kept = sum(client.map("stopped").frames.values())
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert err.splitlines()[-1] == "sceneprint upload: stopped"
+    received = re.match(r"6 frames: (\d) received", out)
+    assert received is not None
+    assert 1 <= int(received[1]) == kept
+
+
+def test_a_query_is_told_in_a_table(sceneprint: Run, house: str, rooms: Path) -> None:
+    done = sceneprint("query", house, rooms / "room-0", "--frame", 1, "--k", 2)
+    head, titles, *matches, place = done.stdout.splitlines()
+    assert re.fullmatch(
+        r"seq-01/frame-000001: found \(\d of \d validated, 6 ranked of 6 frames, \d+ ms\)", head
+    )
+    assert titles.split()[:4] == ["match", "rank", "similarity", "validation"]
+    first = re.match(
+        r"  r1/room-0/seq-01  [0-9a-f]{32} +1 +1\.00  accepted strong +1\.00 +"
+        r"(\S+) (\S+) (\S+) +0\.0 +(\S+) (\S+) (\S+)  surfaces agree",
+        matches[0],
+    )
+    assert first is not None, matches[0]
+    there = read_pose(rooms / "room-0/seq-01/frame-000001.pose.txt")
+    assert [float(value) for value in first.groups()[:3]] == pytest.approx([0, 0, 0], abs=2e-3)
+    assert [float(value) for value in first.groups()[3:]] == pytest.approx(there[:3, 3], abs=2e-3)
+    found = re.match(
+        r"  at (\S+) (\S+) (\S+) m in room-0, rotation .* matches agree, spread", place
+    )
+    assert found is not None, place
+    assert [float(value) for value in found.groups()] == pytest.approx(there[:3, 3], abs=0.05)
+
+
+def test_queries_as_json(sceneprint: Run, house: str, rooms: Path) -> None:
+    done = sceneprint("query", house, rooms / "room-1", "--json", "--seed", 3, "--exact")
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [line["frame"] for line in lines] == [f"seq-01/frame-00000{i}" for i in range(3)]
+    for line in lines:
+        answer = Answer.model_validate(line)
+        assert (answer.counts.map, answer.seed, answer.exact) == (6, 3, True)
+        assert min(match.distance for match in answer.matches) == 0
+    file = rooms / "room-1/seq-01/frame-000002.depth.png"
+    done = sceneprint("query", house, file, "--json", "--stages", "retrieve,diversify", "--k", 2)
+    answer = Answer.model_validate_json(done.stdout)
+    assert (answer.status, len(answer.matches)) == ("unvalidated", 2)
+    by_name = sceneprint("query", house, rooms, "--frame", file, "--json", "--stages", "retrieve")
+    assert json.loads(by_name.stdout)["frame"] == "room-1/seq-01/frame-000002"
+
+
+def test_queries_that_cannot_be_asked(
+    sceneprint: Run, house: str, rooms: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "seq-01"
+    shutil.copytree(rooms / "room-0" / "seq-01", folder)
+    (folder / "frame-000000.depth.png").write_bytes(b"no image")
+    done = sceneprint("query", house, folder, "--stages", "retrieve", "--json", expect=2)
+    assert len(done.stdout.splitlines()) == 2
+    assert done.stderr.startswith("seq-01/frame-000000: ")
+    for arguments, message in (
+        (("--frame", 3), r"has 3 frames\. Give --frame a place from 0 to 2"),
+        (("--frame", "x"), "no frame is called x"),
+        (("--stages", "validate", "--frame", 1), "every query begins with retrieve"),
+        (("--k", 51, "--frame", 1), "less than or equal to 50"),
+    ):
+        done = sceneprint("query", house, folder, *arguments, expect=2)
+        assert re.search(message, done.stderr)
+        assert len(done.stderr.splitlines()) == 1
+
+
+def test_maps_are_listed_made_and_deleted(sceneprint: Run, house: str) -> None:
+    sceneprint("maps", "--create", "hall", "--title", "Hall 2", "--model", "compact")
+    rows = [line.split() for line in sceneprint("maps").stdout.splitlines()]
+    assert rows[0] == ["map", "indexed", "waiting", "rejected", "failed", "model", "title"]
+    by_name = {row[0]: row for row in rows[1:]}
+    assert by_name[house][1:5] == ["6", "0", "0", "0"]
+    assert by_name["hall"][1:5] == ["0", "0", "0", "0"]
+    assert by_name["hall"][5].startswith("compact-")
+    assert by_name["hall"][6:] == ["Hall", "2"]
+    told = [
+        Map.model_validate_json(line) for line in sceneprint("maps", "--json").stdout.splitlines()
+    ]
+    assert {one.name: one.title for one in told}["hall"] == "Hall 2"
+    assert "Add --yes" in sceneprint("maps", "--delete", "hall", expect=2).stderr
+    done = sceneprint("maps", "--delete", "hall", "--yes")
+    assert done.stdout == "map hall and its 0 frames are deleted\n"
+    assert "hall" not in sceneprint("maps").stdout
+    assert (
+        "There is no map 'hall'" in sceneprint("maps", "--delete", "hall", "--yes", expect=2).stderr
+    )
+    assert "name: String should match" in sceneprint("maps", "--create", "A b", expect=2).stderr
+    assert "Add --create" in sceneprint("maps", "--title", "x", expect=2).stderr
+
+
+def test_a_service_that_is_not_there(sceneprint: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retrying, "FIRST_PAUSE_S", 0.01)
+    for url, message in (("http://127.0.0.1:1", "cannot be reached"), ("foo", "not the address")):
+        done = sceneprint("maps", "--url", url, expect=2)
+        assert done.stderr.startswith("sceneprint maps: ")
+        assert message in done.stderr
+        assert len(done.stderr.splitlines()) == 1

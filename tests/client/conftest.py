@@ -1,0 +1,172 @@
+"""A real service for the client's tests, frames as files, and small pieces of HTTP."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pytest
+
+from sceneprint.client import Client, retrying
+from sceneprint.datasets import (
+    Camera,
+    FrameReference,
+    find_sequences,
+    write_depth_png,
+    write_intrinsics,
+    write_pose,
+)
+from sceneprint.types import Frame
+
+#: Largest body the service of these tests takes, bytes.
+UPLOAD_BYTES = 2 << 20
+
+
+@pytest.fixture(scope="session")
+def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """One service with one worker for all tests; each uses maps of its own."""
+    data = tmp_path_factory.mktemp("service")
+    with pytest.MonkeyPatch.context() as patch, (data / "log").open("wb") as log:
+        patch.setenv("SCENEPRINT_UPLOAD_BYTES", str(UPLOAD_BYTES))
+        arguments = ["serve", "--port", "0", "--data", str(data), "--workers", "1"]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "sceneprint", *arguments], stdout=subprocess.PIPE, stderr=log
+        )
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline().decode()
+            assert line.startswith("sceneprint: serving http://"), (data / "log").read_text()
+            yield line.split()[-1]
+        finally:
+            process.terminate()
+            process.communicate(timeout=30)
+    assert process.returncode == 0
+
+
+@pytest.fixture
+def remote(service_url: str) -> Iterator[Client]:
+    with Client(service_url) as client:
+        yield client
+
+
+@pytest.fixture
+def embedded(tmp_path: Path) -> Iterator[Client]:
+    with Client.embedded(tmp_path / "embedded") as client:
+        yield client
+
+
+@pytest.fixture(params=["remote", "embedded"])
+def client(request: pytest.FixtureRequest) -> Client:
+    """The same test through HTTP and in process."""
+    found: Client = request.getfixturevalue(request.param)
+    return found
+
+
+@pytest.fixture
+def map_name(request: pytest.FixtureRequest) -> str:
+    """A name no other test uses."""
+    return "m" + f"{abs(hash(request.node.nodeid)):x}"[:20]
+
+
+@pytest.fixture(scope="session")
+def references(
+    room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[FrameReference, ...]:
+    """Three views of each of two rooms, with poses, as files in 7-Scenes layout."""
+    root = tmp_path_factory.mktemp("rooms")
+    for number, frame in enumerate(room_frames):
+        folder = root / f"room-{number // 3}" / "seq-01"
+        folder.mkdir(parents=True, exist_ok=True)
+        write_intrinsics(folder, Camera(frame.intrinsics))
+        write_depth_png(folder / f"frame-{number % 3:06d}.depth.png", frame.depth, 1000.0)
+        assert frame.pose is not None
+        write_pose(folder / f"frame-{number % 3:06d}.pose.txt", frame.pose)
+    return tuple(one for sequence in find_sequences(root) for one in sequence.frames)
+
+
+@pytest.fixture(scope="session")
+def bare_wall(
+    tmp_path_factory: pytest.TempPathFactory, references: tuple[FrameReference, ...]
+) -> Path:
+    """A frame that decodes, and in which nothing can be signed: 30 samples of a wall."""
+    folder = tmp_path_factory.mktemp("bare")
+    lens = references[0].camera.intrinsics
+    depth = np.zeros((lens.height, lens.width), np.float32)
+    depth[100:105, 100:106] = 2.0
+    write_intrinsics(folder, references[0].camera)
+    write_depth_png(folder / "wall.png", depth, 1000.0)
+    return folder / "wall.png"
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tries follow each other at once."""
+    monkeypatch.setattr(retrying, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(retrying, "LONGEST_PAUSE_S", 0.02)
+
+
+@dataclass
+class Scripted:
+    """A service that answers as it was told, and keeps what it was asked."""
+
+    url: str
+    asked: list[tuple[str, str, bytes]] = field(default_factory=list)
+    headers: list[dict[str, str]] = field(default_factory=list)
+    stop: Callable[[], None] = lambda: None
+
+
+#: Status, headers and JSON of one answer; status 0 breaks the connection.
+Reply = tuple[int, dict[str, str], object]
+
+
+@pytest.fixture
+def scripted() -> Iterator[Callable[[list[Reply]], Scripted]]:
+    """Makes a server that gives the replies one after the other, the last one for ever."""
+    servers: list[ThreadingHTTPServer] = []
+
+    def make(replies: list[Reply]) -> Scripted:
+        class Handler(BaseHTTPRequestHandler):
+            def answer(self) -> None:
+                body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+                told.asked.append((self.command, self.path, body))
+                told.headers.append(dict(self.headers.items()))
+                status, headers, document = replies[min(len(told.asked), len(replies)) - 1]
+                if status == 0:
+                    self.connection.close()
+                    return
+                content = b"" if document is None else json.dumps(document).encode()
+                self.send_response(status)
+                for name, value in {**headers, "Content-Length": str(len(content))}.items():
+                    self.send_header(name, value)
+                self.end_headers()
+                self.wfile.write(content)
+
+            do_GET = do_POST = do_DELETE = answer  # noqa: N815
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        server.handle_error = lambda *_: None  # type: ignore[method-assign, assignment]
+        servers.append(server)
+        told = Scripted(f"http://127.0.0.1:{server.server_address[1]}")
+
+        def stop() -> None:
+            server.shutdown()
+            server.server_close()
+
+        told.stop = stop
+        Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
+        return told
+
+    yield make
+    for server in servers:
+        server.shutdown()
+        server.server_close()

@@ -1,0 +1,202 @@
+"""What a client does, over HTTP and in process alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sceneprint.client import Client, meta_of
+from sceneprint.datasets import FrameReference
+from sceneprint.errors import (
+    FrameConflict,
+    InvalidIntrinsics,
+    InvalidRequest,
+    MapExists,
+    UnknownFrame,
+    UnknownJob,
+    UnknownMap,
+    UnreadableFrame,
+    UselessFrame,
+)
+from sceneprint.schemas import FrameState, JobState
+
+
+def test_maps(client: Client, map_name: str) -> None:
+    made = client.create_map(map_name, "Hall 2", "compact")
+    assert (made.name, made.title, made.revision) == (map_name, "Hall 2", 0)
+    assert made.model.startswith("compact-")
+    assert made.model.endswith(made.model_id[:12])
+    assert client.create_map(map_name, "Hall 2", "compact") == made
+    assert client.map(map_name) == made
+    assert made in client.maps()
+    with pytest.raises(MapExists, match="another title or model"):
+        client.create_map(map_name, "Hall 3", "compact")
+    client.delete_map(map_name)
+    with pytest.raises(UnknownMap, match=map_name):
+        client.map(map_name)
+    with pytest.raises(UnknownMap, match=map_name):
+        client.delete_map(map_name)
+    assert made not in client.maps()
+
+
+def test_a_frame_from_upload_to_deletion(
+    client: Client, map_name: str, references: tuple[FrameReference, ...]
+) -> None:
+    client.create_map(map_name)
+    reference = references[0]
+    added = client.upload(map_name, reference, wait_s=30)
+    assert (added.state, added.reason) == (FrameState.INDEXED, None)
+    frame = client.frame(map_name, added.frame_id)
+    assert (frame.map, frame.state, frame.job_id) == (map_name, "indexed", added.job_id)
+    assert (frame.session, frame.robot, frame.tags) == ("room-0/seq-01", None, [])
+    assert frame.bytes == reference.path.stat().st_size
+    assert frame.pose is not None
+    assert frame.pose.parent_frame == "room-0/seq-01"
+    np.testing.assert_allclose(frame.pose.matrix, reference.pose, atol=1e-12)
+    assert frame.intrinsics.fx == reference.camera.intrinsics.fx
+    job = client.job(added.job_id)
+    assert (job.state, job.frame_id, job.attempts) == (JobState.SUCCEEDED, added.frame_id, 1)
+    again, new = client.add(map_name, reference)
+    assert (again.frame_id, again.state, new) == (added.frame_id, FrameState.INDEXED, False)
+    with pytest.raises(FrameConflict, match=r"other robot, tags\."):
+        client.upload(map_name, reference, meta_of(reference, robot="r2", tags=["b"]))
+    assert client.map(map_name).frames["indexed"] == 1
+    client.delete_frame(map_name, added.frame_id)
+    with pytest.raises(UnknownFrame, match="deleted before"):
+        client.delete_frame(map_name, added.frame_id)
+    assert list(client.frames(map_name)) == []
+    assert [one.frame_id for one in client.frames(map_name, FrameState.DELETED)] == [added.frame_id]
+
+
+def test_jobs_are_waited_for(
+    client: Client, map_name: str, references: tuple[FrameReference, ...], bare_wall: Path
+) -> None:
+    client.create_map(map_name)
+    added = [client.upload(map_name, one) for one in (*references[:2], bare_wall)]
+    seen: list[tuple[int, int]] = []
+    ids = [one.job_id for one in added]
+    jobs = client.wait([*ids, ids[0]], timeout_s=60, progress=lambda *n: seen.append(n))
+    assert [job.job_id for job in jobs] == [*ids, ids[0]]
+    assert [job.state for job in jobs] == ["succeeded", "succeeded", "failed", "succeeded"]
+    assert seen[-1] == (3, 3)
+    assert seen == sorted(seen)
+    wall = client.frame(map_name, added[2].frame_id)
+    assert wall.state is FrameState.REJECTED
+    assert wall.reason == jobs[2].error
+    assert "only 30 of its 30 valid depth samples" in str(wall.reason)
+    assert [one.frame_id for one in client.frames(map_name)] == [one.frame_id for one in added]
+    rejected = client.frames(map_name, FrameState.REJECTED)
+    assert [one.frame_id for one in rejected] == [added[2].frame_id]
+
+
+def test_a_wait_ends_when_its_time_is_over(
+    embedded: Client, references: tuple[FrameReference, ...]
+) -> None:
+    embedded.create_map("m")
+    added = embedded.upload("m", references[0])
+    assert added.state is FrameState.RECEIVED
+    (job,) = embedded.wait([added.job_id], timeout_s=0)
+    assert (job.state, job.state.over, job.attempts) == (JobState.QUEUED, False, 0)
+    status = embedded.status()
+    assert (status.frames["received"], status.jobs) == (1, {"queued": 1})
+    (job,) = embedded.wait([added.job_id], timeout_s=30)
+    assert job.state is JobState.SUCCEEDED
+
+
+def test_what_is_not_there(client: Client, map_name: str) -> None:
+    client.create_map(map_name)
+    for name in ("nobody", "", "..", "a/b", "Ä"):
+        with pytest.raises(UnknownMap, match="There is no map"):
+            client.map(name)
+        with pytest.raises(UnknownFrame, match="There is no frame"):
+            client.frame(map_name, name)
+        with pytest.raises(UnknownFrame, match="There is no frame"):
+            client.delete_frame(map_name, name)
+        with pytest.raises(UnknownJob, match="There is no job"):
+            client.job(name)
+    with pytest.raises(UnknownMap, match="There is no map"):
+        client.frames("nobody")
+    assert client.map(map_name).name == map_name
+
+
+def test_frames_that_cannot_be_taken(
+    client: Client, map_name: str, references: tuple[FrameReference, ...]
+) -> None:
+    client.create_map(map_name)
+    meta = meta_of(references[0])
+    with pytest.raises(UnreadableFrame, match="neither PNG nor NPY"):
+        client.upload(map_name, b"no image", meta)
+    data = references[0].path.read_bytes()
+    lens = meta.intrinsics.model_copy(update={"width": 320})
+    with pytest.raises(InvalidIntrinsics, match="the intrinsics are of 320 x 480"):
+        client.upload(map_name, data, meta.model_copy(update={"intrinsics": lens}))
+    size = (references[0].camera.intrinsics.height, references[0].camera.intrinsics.width)
+    empty = Path(references[0].path.parent / "empty.npy")
+    np.save(empty, np.zeros(size, np.float16))
+    with pytest.raises(UselessFrame, match="All 307200 samples are missing"):
+        client.query(map_name, empty.read_bytes(), meta)
+    empty.unlink()
+    with pytest.raises(UnknownMap, match="nobody"):
+        client.upload("nobody", data, meta)
+    with pytest.raises(TypeError, match="meta"):
+        client.upload(map_name, data)
+    assert list(client.frames(map_name)) == []
+
+
+def test_requests_that_make_no_sense(
+    client: Client, map_name: str, references: tuple[FrameReference, ...], bare_wall: Path
+) -> None:
+    with pytest.raises(InvalidRequest, match="name: String should match") as told:
+        client.create_map("Big Hall")
+    assert [place for place, _ in told.value.fields] == ["name"]
+    with pytest.raises(InvalidRequest, match="model: Input should be 'paper' or 'compact'"):
+        client.create_map(map_name, model="huge")
+    client.create_map(map_name)
+    with pytest.raises(InvalidRequest, match="less than or equal to 50") as told:
+        client.query(map_name, references[0], k=51)
+    assert [place for place, _ in told.value.fields] == ["k"]
+    with pytest.raises(InvalidRequest, match="stages: every query begins with retrieve"):
+        client.query(map_name, references[0], stages=["validate"])
+    with pytest.raises(TypeError, match="either"):
+        client.query(map_name)
+    rejected = client.upload(map_name, bare_wall, wait_s=30)
+    assert rejected.state is FrameState.REJECTED
+    with pytest.raises(InvalidRequest, match="is rejected: Nothing in it can be signed") as told:
+        client.query(map_name, frame_id=rejected.frame_id)
+    assert told.value.fields == (("frame_id", "is rejected"),)
+    with pytest.raises(UnknownFrame, match="nobody"):
+        client.query(map_name, frame_id="nobody")
+
+
+def test_threads_share_a_client(
+    client: Client, map_name: str, references: tuple[FrameReference, ...]
+) -> None:
+    client.create_map(map_name, model="compact")
+    with ThreadPoolExecutor(6) as pool:
+        both = (*references, *references)  # each frame twice at the same time
+        added = list(pool.map(lambda one: client.add(map_name, one), both))
+        assert sum(new for _, new in added) == len(references)
+        ids = {one.frame_id for one, _ in added}
+        client.wait({one.job_id for one, _ in added})
+        answers = list(pool.map(lambda i: client.query(map_name, frame_id=i, k=1), ids))
+    assert len(ids) == len(references)
+    assert {answer.counts.map for answer in answers} == {len(references) - 1}
+
+
+def test_healthy(client: Client) -> None:
+    assert client.healthy()
+    assert client.status().version
+
+
+@pytest.fixture(autouse=True)
+def _clean(request: pytest.FixtureRequest) -> Iterator[None]:
+    """The maps of the shared service are removed, so that its worker has nothing left to do."""
+    yield
+    if "remote" in request.fixturenames or "remote" in request.node.name:
+        with Client(request.getfixturevalue("service_url")) as client:
+            for one in client.maps():
+                client.delete_map(one.name)

@@ -1,0 +1,96 @@
+"""What a frame at hand is sent as, and what is left of a job that is stopped."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sceneprint
+from sceneprint import errors
+from sceneprint.client import Client, meta_of
+from sceneprint.client.frames import sendable
+from sceneprint.datasets import FrameReference
+from sceneprint.schemas import FrameState, JobState
+
+
+def test_what_is_sent_of_a_data_set(references: tuple[FrameReference, ...], tmp_path: Path) -> None:
+    meta = meta_of(references[4], robot="r", session="s", tags=("a", "b"), parent_frame="p")
+    assert (meta.robot, meta.session, meta.tags) == ("r", "s", ["a", "b"])
+    assert (meta.depth_scale, meta.depth_along_ray, meta.captured_at) == (1000.0, False, None)
+    assert meta.pose is not None
+    assert (meta.pose.parent_frame, meta.pose.translation) == ("p", None)
+    np.testing.assert_array_equal(meta.pose.matrix, references[4].pose)
+    assert meta_of(references[4], with_pose=False).pose is None
+    assert meta_of(references[4]).session == "room-1/seq-01"
+    with pytest.raises(errors.InvalidRequest, match="robot: String should match"):
+        meta_of(references[4], robot="a\nb")
+    camera = references[4].camera
+    for stamp, year in ((1305031102.25, 2011), (12.5, None), (1.3e18, None)):
+        reference = FrameReference("seq/x", tmp_path / "x.png", camera, stamp)
+        dated = meta_of(reference).captured_at
+        assert (None if dated is None else dated.year) == year
+
+
+def test_a_path_is_sent_with_the_camera_beside_it(
+    references: tuple[FrameReference, ...], tmp_path: Path
+) -> None:
+    data, meta = sendable(references[2].path, None, with_pose=True)
+    assert data == references[2].path.read_bytes()
+    assert meta.pose is not None
+    np.testing.assert_array_equal(meta.pose.matrix, references[2].pose)
+    assert meta.intrinsics == meta_of(references[2]).intrinsics
+    given = meta.model_copy(update={"depth_scale": 5000.0})
+    assert sendable(references[2].path, given, with_pose=True) == (data, given)
+    bare = tmp_path / "frame.png"
+    shutil.copy(references[2].path, bare)
+    with pytest.raises(errors.DatasetError, match=r"intrinsics\.json"):
+        sendable(bare, None, with_pose=False)
+    with pytest.raises(errors.DatasetError, match="This is a folder"):
+        sendable(references[2].path.parent, None, with_pose=False)
+    with pytest.raises(errors.UnreadableFrame, match="cannot be read"):
+        sendable(tmp_path / "absent.png", meta, with_pose=False)
+
+
+def test_a_query_needs_no_pose(
+    embedded: Client, references: tuple[FrameReference, ...], tmp_path: Path
+) -> None:
+    folder = tmp_path / "seq-01"
+    shutil.copytree(references[0].path.parent, folder)
+    (folder / "frame-000000.pose.txt").write_text("no pose")
+    path = folder / "frame-000000.depth.png"
+    embedded.create_map("m")
+    answer = embedded.query("m", path)
+    assert (answer.status, answer.matches, answer.counts.map) == ("not_found", [], 0)
+    with pytest.raises(errors.InvalidPose, match=r"frame-000000\.pose\.txt"):
+        embedded.upload("m", path)
+
+
+def test_a_stopped_job_waits_for_the_next_worker(
+    embedded: Client, references: tuple[FrameReference, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    embedded.create_map("m")
+    with monkeypatch.context() as patch:
+        patch.setattr("sceneprint.engine.work.prepare", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            embedded.upload("m", references[0], wait_s=30)
+    (frame,) = embedded.frames("m")
+    job = embedded.job(frame.job_id)
+    assert (frame.state, job.state, job.attempts) == (FrameState.RECEIVED, JobState.QUEUED, 0)
+    (job,) = embedded.wait([job.job_id], timeout_s=30)  # at once: no lease has to run out
+    assert (job.state, job.attempts) == (JobState.SUCCEEDED, 1)
+
+
+def test_a_folder_is_all_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SCENEPRINT_DATABASE_URL", f"sqlite:///{tmp_path}/elsewhere.db")
+    monkeypatch.setenv("SCENEPRINT_INDEX_DIR", str(tmp_path / "elsewhere"))
+    with sceneprint.Client.embedded(tmp_path / "here") as client:
+        client.create_map("m")
+    assert [path.name for path in tmp_path.iterdir()] == ["here"]
+    with Client.embedded(str(tmp_path / "here")) as client:
+        assert [one.name for one in client.maps()] == ["m"]

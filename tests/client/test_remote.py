@@ -1,0 +1,247 @@
+"""What only happens where a network lies between: retries, refusals, addresses."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from email.utils import format_datetime
+from typing import Any
+
+import pytest
+
+from sceneprint import errors
+from sceneprint.client import Client, meta_of, retrying
+from sceneprint.client.retrying import retry_after_s
+from sceneprint.datasets import FrameReference
+
+MAP = {
+    "name": "m", "title": None, "model": "paper-0", "model_id": "0", "revision": 0,
+    "created_at": "2026-01-01T00:00:00Z", "frames": {},
+}  # fmt: skip
+ADDED = {"frame_id": "f", "job_id": "j", "state": "received", "reason": None}
+Make = Callable[[list[tuple[int, dict[str, str], object]]], Any]
+
+
+def problem(kind: str, status: int, **more: object) -> tuple[int, dict[str, str], object]:
+    document = {"type": f"https://x/problems/{kind}", "title": kind, "status": status}
+    return status, {}, {**document, "detail": f"it is {kind}", **more}
+
+
+def test_a_busy_service_is_asked_again_when_it_said(scripted: Make) -> None:
+    busy = problem("busy", 503)
+    server = scripted([(503, {"Retry-After": "1"}, busy[2]), (200, {}, MAP)])
+    with Client(server.url) as client:
+        start = time.monotonic()
+        assert client.map("m").name == "m"
+        assert 1.0 <= time.monotonic() - start < 3.0
+    assert [asked[:2] for asked in server.asked] == [("GET", "/v1/maps/m")] * 2
+
+
+@pytest.mark.usefixtures("hasty")
+def test_an_upload_survives_a_broken_connection_whole(
+    scripted: Make, references: tuple[FrameReference, ...]
+) -> None:
+    server = scripted([(0, {}, None), (429, {}, None), (202, {}, ADDED)])
+    with Client(server.url, "secret") as client:
+        added, new = client.add("m", references[0], wait_s=7.9)
+    assert (added.frame_id, new) == ("f", True)
+    assert len(server.asked) == 3
+    for (method, path, body), headers in zip(server.asked, server.headers, strict=True):
+        assert (method, path) == ("POST", "/v1/maps/m/frames")
+        assert references[0].path.read_bytes() in body
+        assert b'"parent_frame"' not in body  # it is the session's name
+        assert headers["Authorization"] == "Bearer secret"
+        assert headers["Prefer"] == "wait=7"
+        assert headers["User-Agent"].startswith("sceneprint/")
+
+
+@pytest.mark.usefixtures("hasty")
+def test_patience_ends(scripted: Make) -> None:
+    server = scripted([problem("busy", 503)])
+    with Client(server.url) as client, pytest.raises(errors.Busy, match="it is busy"):
+        client.maps()
+    assert len(server.asked) == retrying.TRIES == 8
+    server = scripted([(503, {"Retry-After": "31"}, problem("busy", 503)[2])])
+    with Client(server.url) as client, pytest.raises(errors.Busy):
+        client.maps()  # at once: nobody waits half a minute
+    assert len(server.asked) == 1
+    server = scripted([(0, {}, None)])
+    with Client(server.url) as client, pytest.raises(errors.Unreachable, match="cannot be reached"):
+        client.maps()
+    assert len(server.asked) == retrying.TRIES == 8
+
+
+def test_other_refusals_are_not_repeated(scripted: Make) -> None:
+    server = scripted([problem("internal-error", 500, instance="/requests/7")])
+    with Client(server.url) as client, pytest.raises(errors.Refused, match="it is intern") as told:
+        client.maps()
+    assert len(server.asked) == 1
+    assert told.value.status == 500
+    assert told.value.problem["instance"] == "/requests/7"
+
+
+@pytest.mark.usefixtures("hasty")
+def test_what_was_deleted_by_a_try_without_answer_is_deleted(scripted: Make) -> None:
+    server = scripted([(0, {}, None), problem("unknown-frame", 404)])
+    with Client(server.url) as client:
+        client.delete_frame("m", "f")
+    assert len(server.asked) == 2
+    server = scripted([problem("unknown-frame", 404)])
+    with Client(server.url) as client, pytest.raises(errors.UnknownFrame, match="it is unknown"):
+        client.delete_frame("m", "f")
+
+
+@pytest.mark.parametrize(
+    ("kind", "status", "error"),
+    [
+        ("unknown-map", 404, errors.UnknownMap),
+        ("unknown-job", 404, errors.UnknownJob),
+        ("not-found", 404, errors.NotFound),
+        ("map-exists", 409, errors.MapExists),
+        ("frame-conflict", 409, errors.FrameConflict),
+        ("unreadable-frame", 422, errors.UnreadableFrame),
+        ("useless-frame", 422, errors.UselessFrame),
+        ("invalid-pose", 422, errors.InvalidPose),
+        ("malformed-body", 400, errors.MalformedBody),
+        ("unsupported-type", 415, errors.UnsupportedType),
+        ("too-large", 413, errors.TooLarge),
+        ("key-required", 401, errors.KeyRequired),
+        ("damaged-blob", 500, errors.DamagedBlob),
+        ("refused", 418, errors.Refused),
+        ("method-not-allowed", 405, errors.Refused),
+        ("of-the-future", 400, errors.Refused),
+    ],
+)
+def test_problems_become_errors(
+    scripted: Make, kind: str, status: int, error: type[Exception]
+) -> None:
+    server = scripted([problem(kind, status)])
+    with Client(server.url) as client, pytest.raises(error, match=f"it is {kind}") as told:
+        client.map("m")
+    assert type(told.value) is error
+
+
+def test_fields_at_fault_are_told(scripted: Make) -> None:
+    fields = [{"field": "k", "reason": "too large"}, "nonsense", {"field": "seed"}]
+    server = scripted([problem("invalid-request", 422, errors=fields)])
+    with Client(server.url) as client, pytest.raises(errors.InvalidRequest) as told:
+        client.map("m")
+    assert told.value.fields == (("k", "too large"),)
+
+
+def test_another_kind_of_server(scripted: Make) -> None:
+    for reply, message in (
+        ((404, {}, {"message": "nothing here"}), "answered 404 Not Found without saying why"),
+        ((301, {"Location": "https://x/"}, None), "answered 301 Moved Permanently without"),
+        ((200, {}, {"hello": "world"}), "something else than this version"),
+    ):
+        server = scripted([reply])
+        with Client(server.url) as client, pytest.raises(errors.Refused, match=message):
+            client.map("m")
+        with Client(server.url) as client:
+            assert not client.healthy()
+
+
+def test_pages_are_followed(scripted: Make) -> None:
+    frame = {
+        "map": "m", "state": "received", "reason": None, "job_id": "j", "content_id": "c",
+        "bytes": 1, "depth_scale": 1000, "depth_along_ray": False, "robot": None, "session": None,
+        "captured_at": None, "received_at": "2026-01-01T00:00:00Z", "indexed_at": None,
+        "pose": None, "tags": [],
+        "intrinsics": {"width": 1, "height": 1, "fx": 1, "fy": 1, "cx": 0, "cy": 0},
+    }  # fmt: skip
+    pages = [
+        {"items": [{**frame, "frame_id": i} for i in ids], "next_cursor": following}
+        for ids, following in (("ab", "2"), ("c", "3"), ("", None))
+    ]
+    server = scripted([(200, {}, page) for page in pages])
+    with Client(server.url) as client:
+        assert [one.frame_id for one in client.frames("m")] == ["a", "b", "c"]
+    assert [path for _, path, _ in server.asked] == [
+        "/v1/maps/m/frames?limit=500",
+        "/v1/maps/m/frames?cursor=2&limit=500",
+        "/v1/maps/m/frames?cursor=3&limit=500",
+    ]
+
+
+@pytest.mark.parametrize("url", ["foo", "ftp://host", "http://", "http://[::1", "", "host:8008"])
+def test_addresses_that_are_none(url: str) -> None:
+    with pytest.raises(errors.Unreachable, match="not the address of a service"):
+        Client(url)
+
+
+@pytest.mark.usefixtures("hasty")
+def test_nobody_there() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{taken.getsockname()[1]}"
+        with Client(url) as client:
+            assert not client.healthy()
+            with pytest.raises(errors.Unreachable, match="sceneprint serve") as told:
+                client.maps()
+    assert "\n" not in str(told.value)
+    assert str(told.value).startswith(url)
+
+
+def test_who_answered_before_is_waited_for(scripted: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    def tries_on(client: Client) -> int:
+        pauses: list[float] = []
+        with monkeypatch.context() as patch:
+            patch.setattr("sceneprint.client.retrying.time.sleep", pauses.append)
+            with pytest.raises(errors.Unreachable):
+                client.map("m")
+        assert sum(pauses) < retrying.LIMIT_S
+        return 1 + len(pauses)
+
+    server = scripted([(200, {}, MAP)])
+    with Client("http://127.0.0.1:1") as stranger, Client(server.url) as client:
+        assert tries_on(stranger) == retrying.TRIES_UNMET == 2
+        assert client.map("m").name == "m"
+        server.stop()
+        assert tries_on(client) == retrying.TRIES
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_silent_service() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        with (
+            Client(url, timeout_s=0.1) as client,
+            pytest.raises(errors.Unreachable, match="did not answer in time"),
+        ):
+            client.maps()
+
+
+def test_a_key_that_cannot_be_sent() -> None:
+    with pytest.raises(errors.Unreachable, match="key"):
+        Client("http://127.0.0.1:8008", "schlüssel☃")
+
+
+def test_too_large_a_body_is_refused_by_the_service(
+    remote: Client, map_name: str, references: tuple[FrameReference, ...]
+) -> None:
+    remote.create_map(map_name)
+    with pytest.raises(errors.TooLarge, match="more than 2097152 bytes"):
+        remote.upload(map_name, bytes(3 << 20), meta_of(references[0]))
+    remote.delete_map(map_name)
+
+
+def test_no_line_a_request_in_the_users_log(
+    remote: Client, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    remote.maps()
+    assert [record for record in caplog.records if record.name.startswith("http")] == []
+    logging.getLogger("httpx").info("HTTP Request: %s %s", "GET", "http://elsewhere/")
+    assert len(caplog.records) == 1  # what is not ours is left alone
+
+
+def test_retry_after() -> None:
+    assert retry_after_s("7") == 7.0
+    assert retry_after_s("") == retry_after_s("soon") == retry_after_s("-1") == 0.0
+    in_a_minute = datetime.now(UTC) + timedelta(seconds=60)
+    assert 58.0 < retry_after_s(format_datetime(in_a_minute, usegmt=True)) <= 60.0
+    assert retry_after_s("Wed, 21 Oct 2015 07:28:00 GMT") == 0.0

@@ -1,0 +1,99 @@
+"""A service and the engine in process give the same answers, field by field."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from sceneprint.client import Client
+from sceneprint.datasets import FrameReference
+from sceneprint.schemas import Answer
+
+STAGES: tuple[Any, ...] = (
+    ("retrieve",),
+    ("retrieve", "diversify"),
+    ("retrieve", "validate"),
+    ("retrieve", "diversify", "validate"),
+)
+
+
+@pytest.fixture
+def filled(
+    remote: Client, embedded: Client, map_name: str, references: tuple[FrameReference, ...]
+) -> tuple[dict[str, int], dict[str, int]]:
+    """The same frames in both; their numbers by the ids that each gave them."""
+    numbers = []
+    for client in (remote, embedded):
+        client.create_map(map_name, "both")
+        added = [client.upload(map_name, one, wait_s=30) for one in references]
+        assert {one.state for one in added} == {"indexed"}
+        numbers.append({one.frame_id: i for i, one in enumerate(added)})
+    return numbers[0], numbers[1]
+
+
+def comparable(told: Any, numbers: dict[str, int]) -> Any:
+    """What is told, with frames by number, and without what differs from call to call."""
+    drop = {"query_id", "milliseconds", "job_id", "received_at", "indexed_at", "created_at"}
+    if isinstance(told, dict):
+        return {key: comparable(value, numbers) for key, value in told.items() if key not in drop}
+    if isinstance(told, list):
+        return [comparable(value, numbers) for value in told]
+    if isinstance(told, str):
+        for frame_id, number in numbers.items():
+            told = told.replace(frame_id, f"frame {number}")
+    return told
+
+
+def test_answers_are_equal(
+    remote: Client,
+    embedded: Client,
+    map_name: str,
+    references: tuple[FrameReference, ...],
+    filled: tuple[dict[str, int], dict[str, int]],
+) -> None:
+    def ask(client: Client, numbers: dict[str, int], **how: Any) -> tuple[Answer, Any]:
+        answer = client.query(map_name, **how)
+        return answer, comparable(answer.model_dump(mode="json"), numbers)
+
+    for stages in STAGES:
+        how = {"stages": stages, "k": 2, "seed": 7, "exact": True}
+        over_http, told = ask(remote, filled[0], frame=references[1], **how)
+        in_process, same = ask(embedded, filled[1], frame=references[1], **how)
+        assert told == same
+        assert type(over_http) is type(in_process) is Answer
+        assert over_http.milliseconds.keys() == in_process.milliseconds.keys()
+        assert (over_http.seed, over_http.exact, over_http.counts.map) == (7, True, 6)
+        assert over_http.matches[0].distance == 0  # the frame itself is in the map
+        assert filled[0][over_http.matches[0].frame_id] == 1
+    assert over_http.status == "found"
+    assert over_http.location is not None
+    assert over_http.location.pose.parent_frame == "room-0/seq-01"
+    by_id = {
+        client: {n: i for i, n in ids.items()}
+        for client, ids in zip((remote, embedded), filled, strict=True)
+    }
+    stored, told = ask(remote, filled[0], frame_id=by_id[remote][4])
+    _, same = ask(embedded, filled[1], frame_id=by_id[embedded][4])
+    assert told == same
+    assert by_id[remote][4] not in [match.frame_id for match in stored.matches]
+
+
+def test_maps_and_frames_are_equal(
+    remote: Client,
+    embedded: Client,
+    map_name: str,
+    filled: tuple[dict[str, int], dict[str, int]],
+) -> None:
+    told = [
+        [
+            comparable(one.model_dump(mode="json"), numbers)
+            for one in (client.map(map_name), *client.frames(map_name))
+        ]
+        for client, numbers in zip((remote, embedded), filled, strict=True)
+    ]
+    assert told[0] == told[1]
+    assert len(told[0]) == 7
+    assert told[0][0]["frames"]["indexed"] == 6
+    assert [one["frame_id"] for one in told[0][1:]] == [f"frame {i}" for i in range(6)]
+    remote.delete_map(map_name)

@@ -1,0 +1,117 @@
+"""Answers over HTTP are those of `sceneprint evaluate`: same matches, same transforms."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sceneprint.cli.choosing import choose_frames
+from sceneprint.cli.demo_building import write_building
+from sceneprint.cli.demo_map import Asked, ask, fill
+from sceneprint.cli.demo_report import place_of
+from sceneprint.cli.served import serving
+from sceneprint.client import Client, meta_of
+from sceneprint.datasets import FrameReference, find_sequences
+from sceneprint.evaluation.answers import answer_rows, judge_answers
+from sceneprint.schemas import Answer
+
+
+def evaluate(folder: Path, *arguments: str) -> dict[str, Any]:
+    out = folder / "figures.json"
+    subprocess.run(
+        [sys.executable, "-m", "sceneprint", "evaluate", *arguments, "--json", str(out)],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    figures: dict[str, Any] = json.loads(out.read_text())
+    return figures
+
+
+def told(answer: Answer, names: dict[str, str]) -> list[dict[str, Any]]:
+    """The matches of an answer as `per_query` of an evaluation tells them."""
+    return [
+        {
+            "match": names[match.frame_id],
+            "distance": match.distance,
+            "status": match.validation.status,
+            "strength": match.validation.strength,
+            "T_match_query": None if match.transform is None else match.transform.matrix,
+        }
+        for match in answer.matches
+    ]
+
+
+def check(
+    folder: Path, expected: dict[str, Any], database: dict[str, FrameReference],
+    queries: dict[str, FrameReference],
+) -> None:  # fmt: skip
+    """Ask a service of the same frames, and compare to the last bit."""
+    data = folder / "data"
+    data.mkdir()
+    with serving(data, workers=1) as url, Client(url) as client:
+        client.create_map("same")
+        added = {name: client.upload("same", frame) for name, frame in database.items()}
+        client.wait([one.job_id for one in added.values()])
+        names = {one.frame_id: name for name, one in added.items()}
+        assert [one["name"] for one in expected["per_query"]] == list(queries)
+        for one in expected["per_query"]:
+            frame = queries[one["name"]]
+            meta = meta_of(frame, with_pose=False)
+            answer = client.query("same", frame.path, meta, k=10, exact=True)
+            assert answer.exact
+            assert told(answer, names) == one["matches"]
+            by_rank = sorted(answer.matches, key=lambda match: match.rank)
+            assert [names[match.frame_id] for match in by_rank] == one["selection"]
+            ranked = client.query("same", frame.path, meta, k=10, stages=("retrieve",), exact=True)
+            assert [names[match.frame_id] for match in ranked.matches] == one["ranking"]
+
+
+def test_redkitchen_over_http_is_redkitchen_evaluated(data_root: Path, tmp_path: Path) -> None:
+    recording = data_root / "7scenes" / "redkitchen"
+    figures = evaluate(
+        tmp_path, str(recording), "--db", "0:600:15", "--queries", "650:1000:44", "--jobs", "1"
+    )
+    frames = [frame for sequence in find_sequences(recording) for frame in sequence.frames]
+    assert figures["counts"] == {"queries": 8, "database": 40, "left_out": 0}
+
+    def named(some: list[FrameReference]) -> dict[str, FrameReference]:
+        return {f"redkitchen/{frame.name}": frame for frame in some}
+
+    check(tmp_path, figures, named(frames[0:600:15]), named(frames[650:1000:44]))
+
+
+@pytest.fixture(scope="module")
+def building(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder: Path = tmp_path_factory.mktemp("same") / "building"
+    assert len(list(write_building(folder, 1))) == 1
+    return folder
+
+
+def test_the_demo_prints_the_figures_of_evaluate(building: Path, tmp_path: Path) -> None:
+    figures = evaluate(tmp_path, str(building), "--jobs", "1")
+    choice = choose_frames(building)
+    assert (len(choice.database), len(choice.queries)) == (30, 20)
+    data = tmp_path / "data"
+    data.mkdir()
+    with serving(data, workers=1) as url, Client(url) as client:
+        known = fill(client, "paper", choice)
+        asked: list[Asked] = ask(client, choice)
+    places = {key: place for key, one in known.items() if (place := place_of(one)) is not None}
+    rows = answer_rows(
+        [
+            judge_answers(truth, one.ranked, one.diverse, places)
+            for one in asked
+            if (truth := place_of(one.chosen)) is not None
+        ]
+    )
+    for row in ("R", "VR", "DR", "VDR", "pose_average"):
+        for column in ("within_5cm_5deg", "within_10cm_10deg"):
+            assert rows[row][column] == figures[row][column], (row, column)
+        for column in ("median_translation_m", "median_rotation_deg"):
+            assert rows[row][column] == pytest.approx(figures[row][column], rel=1e-9), (row, column)
+    assert [one.diverse.counts.validated for one in asked] == [10] * 20
