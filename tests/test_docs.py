@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import re
+import socket
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from sceneprint.models import PRESETS, read_model
+from sceneprint.settings import Settings
 
 ROOT = Path(__file__).resolve().parent.parent
 PAPER = (ROOT / "docs/paper.md").read_text()
@@ -102,39 +107,115 @@ def test_every_dependency_has_a_reason() -> None:
     assert [name for name in names if name not in reasons] == []
     locked = (ROOT / "requirements.txt").read_text()
     assert [name for name in names if f"\n{name}==" not in f"\n{locked}"] == []
-    assert "http" not in locked
+    assert "://" not in locked
 
 
 def blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
-def test_readme_commands_and_library_example_run(tmp_path: Path) -> None:
+@contextmanager
+def served(line: str, folder: Path, environment: dict[str, str]) -> Iterator[None]:
+    """The README's service, running."""
+    program, *arguments = line.split()
+    assert (program, arguments) == (".venv/bin/sceneprint", ["serve"])
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sceneprint", *arguments],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("sceneprint: serving http://127.0.0.1:")
+        yield
+    finally:
+        process.terminate()
+        out, _ = process.communicate()
+        assert (process.returncode, out) == (0, "")
+
+
+def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
     """Every command but `make`, which the tests themselves run under, in the README's order."""
     commands = [line for block in blocks(README, "sh") for line in block.strip().splitlines()]
     makes = [line for line in commands if line.startswith("make")]
     assert makes == ["make demo"]
-    rest = [line for line in commands if line not in makes]
-    assert len(rest) == 4
-    for line in rest:
-        program, *arguments = line.split()
-        assert program == ".venv/bin/sceneprint"
-        subprocess.run([sys.executable, "-m", "sceneprint", *arguments], cwd=tmp_path, check=True)
+    serve, *rest = [line for line in commands if line not in makes]
+    assert len(rest) == 8
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    environment = {
+        **os.environ,
+        "SCENEPRINT_PORT": str(port),
+        "SCENEPRINT_URL": f"http://127.0.0.1:{port}",
+        "SCENEPRINT_DATA_DIR": str(tmp_path / "data"),
+        "SCENEPRINT_WORKERS": "1",
+    }
+    printed = {}
+    with served(serve, tmp_path, environment):
+        for line in rest:
+            program, *arguments = line.split()
+            assert program == ".venv/bin/sceneprint"
+            done = subprocess.run(
+                [sys.executable, "-m", "sceneprint", *arguments],
+                cwd=tmp_path,
+                env=environment,
+                check=True,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            printed[arguments[0]] = done.stdout
+    assert "6 indexed" in printed["upload"]
+    assert "found" in printed["query"]
+    assert "building" in printed["maps"]
     index = json.loads((tmp_path / "signatures/signatures.json").read_text())
-    assert [entry["signed"] for entry in index["frames"]] == [True] * 6
+    assert [entry["signed"] for entry in index["frames"]] == [True] * 12
     assert (tmp_path / "frame.png").stat().st_size > 10_000
-    (example,) = blocks(README, "python")
-    assert len([line for line in example.splitlines() if line]) <= 10
-    done = subprocess.run(
-        [sys.executable, "-c", example], cwd=tmp_path, check=True, capture_output=True, text=True
-    )
-    # the first frame of room 0 is found in another frame of room 0, and in none of room 1
-    lines = done.stdout.splitlines()
-    assert re.match(r"room-000\S+ 0\.\d\d accepted ", lines[0])
-    assert [line.split()[2] for line in lines if line.startswith("room-001")] == ["rejected"] * 3
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert figures["counts"]["queries"] == 3
     assert (tmp_path / "plots/contact.png").stat().st_size > 10_000
+    client, library = blocks(README, "python")
+    assert re.match(r"found x=\S+ y=\S+ z=\S+$", run_example(client, tmp_path).strip())
+    assert len([line for line in library.splitlines() if line]) <= 10
+    # the first frame of room 0 is found in other frames of room 0, and in none of room 1
+    lines = run_example(library, tmp_path).splitlines()
+    accepted = [line.split()[0] for line in lines if line.split()[2] == "accepted"]
+    assert accepted
+    assert all(name.startswith("room-000/") for name in accepted)
+
+
+def run_example(code: str, folder: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, check=True, stdout=subprocess.PIPE, text=True
+    )
+    return done.stdout
+
+
+def test_every_setting_is_in_its_table() -> None:
+    page = (ROOT / "docs/architecture.md").read_text()
+    rows = dict(re.findall(r"^\| `([A-Z_]+)` \| (.*?) \|", page, re.MULTILINE))
+    assert set(rows) == {name.upper() for name in Settings.model_fields}
+    for name, field in Settings.model_fields.items():
+        if isinstance(field.default, str | int | float):
+            assert rows[name.upper()] == f"`{field.default}`"
+
+
+def test_every_room_of_the_staircase_is_on_its_page() -> None:
+    import tomllib
+
+    page = (ROOT / "docs/architecture.md").read_text()
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    layers = contracts["contracts"][0]["layers"]
+    rooms = {
+        one.strip().removeprefix("sceneprint.") for layer in layers for one in layer.split("|")
+    }
+    told = {"cli", "service", "worker", "client", "engine", "settings", "pipeline", "matches",
+            "store", "index", "schemas", "geometry", "errors"}  # fmt: skip
+    assert told <= rooms
+    assert all(re.search(rf"\b{name}\b", page) for name in told)
 
 
 def test_readme_camera_is_valid_json() -> None:
