@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks import dpp, registration, scan
+from benchmarks import dpp, registration, scan, search, service
 from benchmarks.encode import EncodeFigures, measure
 from benchmarks.machine import (
     Machine,
@@ -30,6 +30,8 @@ from sceneprint.synth import synthesise_room
 from sceneprint.types import Frame
 
 ROOT = Path(__file__).resolve().parent.parent
+#: Frames and bytes of the maps that are searched.
+SEARCHED = ((1_000, 12_800), (10_000, 12_800), (4_000, 125_000))
 BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
 
 
@@ -100,6 +102,8 @@ class Rows:
     scan: scan.ScanFigures
     dpp: dpp.DppFigures
     registration: registration.RegistrationFigures
+    search: list[search.SearchFigures]
+    service: service.ServiceFigures
 
 
 def page(machine: Machine, rows: Rows, start: float) -> str:
@@ -114,21 +118,26 @@ def page(machine: Machine, rows: Rows, start: float) -> str:
     ]
     for preset, (figures, peak) in rows.encode.items():
         lines += table(preset, figures, peak)
-    lines += scan.table(rows.scan) + dpp.table(rows.dpp) + registration.table(rows.registration)
+    lines += service.table(rows.service) + scan.table(rows.scan) + search.table(rows.search)
+    lines += dpp.table(rows.dpp) + registration.table(rows.registration)
     return "\n".join([*lines, f"`import sceneprint`: {start:.2f} s.", END])
 
 
 def measure_all(n_frames: int, n_pairs: int) -> Rows:
-    """Every row, on one processor, one after the other."""
+    """Every row, one after the other."""
     frames = real_frames(n_frames) or synthetic_frames(n_frames)
     pairs = real_pairs(recordings(), n_pairs) or synthetic_pairs(n_pairs)
-    pin_to_one_processor()
+    recording = recordings() / "7scenes" / "redkitchen"
+    served = service.measure(service.frames_of(recording if recording.is_dir() else None))
+    pin_to_one_processor()  # the service above has all processors, as it would
     signers = {preset: open_signer(preset) for preset in PRESETS}
     return Rows(
         encode={p: (measure(frames, s), peak_memory(frames, p)) for p, s in signers.items()},
         scan=scan.measure(),
         dpp=dpp.measure(),
         registration=registration.measure(pairs, signers["paper"].model),
+        search=[search.measure(*size) for size in SEARCHED],
+        service=served,
     )
 
 
@@ -153,6 +162,8 @@ def main() -> int:
         "scan": asdict(rows.scan),
         "dpp": asdict(rows.dpp),
         "registration": asdict(rows.registration),
+        "search": [asdict(one) for one in rows.search],
+        "service": asdict(rows.service),
     }
     options.json.write_text(json.dumps(result, indent=1) + "\n")
     if options.page is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import sys
 from collections.abc import Callable
 
 import uvicorn
@@ -51,6 +52,8 @@ def run(settings: Settings, ready: Callable[[str], None]) -> None:
     UnusableStore, NewerSchema : the store cannot be opened, or the address not listened on.
     """
     Engine(settings).close()  # uvicorn would make a traceback of what cannot be opened
+    # a thread that computes gives way to the event loop after this long, not after 5 ms
+    sys.setswitchinterval(0.001)
     listening = listen(settings)
     host, port = listening.getsockname()[:2]
     url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import dpp, registration, scan
+from benchmarks import dpp, registration, scan, search, service
 from benchmarks.__main__ import BEGIN, END, Rows, page
 from benchmarks.encode import Clock, EncodeFigures, open3d, points_of
 from benchmarks.machine import Machine
 from benchmarks.pairs import FramePair, pairs_among, real_pairs, synthetic_pairs
+from sceneprint.cli.demo_building import write_building
 from sceneprint.errors import MissingDependency
 from sceneprint.geometry.diversity import diversify
 from sceneprint.geometry.retrieval import distances, pairwise_distances, rank
@@ -157,11 +158,19 @@ def test_page_and_json_hold_every_row() -> None:
         registration.RegistrationFigures(
             20, 0.5, {"validation": 20.0}, 20.0, 1.0, {"RANSAC": 200.0}, 200.0, 0.9, 0.1, 0.1, ""
         ),
+        [search.SearchFigures(1000, 12_800, 1000, 5.0, 1.5, 1.0, 0.1, 0.2, 0.6)],
+        service.ServiceFigures(
+            300, 20, {"decode": 5.0}, 200.0, 210.0, 1.05, (1.0, 2.0), (9.0, 30.0), 7.5
+        ),
     )
     section = page(Machine("a processor", 2, 8.0, "3.11", {"numpy": "2"}), rows, 0.1)
     assert section.startswith(BEGIN)
     assert section.endswith(END)
     for wanted in (
+        "### A query over HTTP, 300 frames in the map",
+        "| **HTTP / library** | **1.05** |",
+        "| /healthz while 4 clients query and a worker signs: p50, p99 | 9.0, 30.0 |",
+        "| 1,000 | 12,800 | 1,000 | 1.50 | 1.00 | 0.10 | 0.20 | **0.60** |",
         "### Signing, `paper`",
         "### Exact scan of 500 signatures of 125,000 bytes (62.5 MB)",
         "| L1, one query | 4.00 | 0.50 |",
@@ -173,3 +182,23 @@ def test_page_and_json_hold_every_row() -> None:
         assert wanted in section
     for one in (rows.scan, rows.dpp, rows.registration):
         assert json.loads(json.dumps(asdict(one))) == asdict(one)
+
+
+def test_service_and_library_do_the_same_work(tmp_path: Path) -> None:
+    """`measure` compares every answer with the library's; here on a room of the demo."""
+    assert len(list(write_building(tmp_path / "building", 1))) == 1
+    found = service.measure(service.frames_of(tmp_path / "building", 12), 2, seconds=1.0)
+    assert (found.frames, found.queries) == (10, 2)
+    assert list(found.stages) == [
+        "decode", "sign, with geometry", "retrieve", "diversify", "validate"
+    ]  # fmt: skip
+    assert found.ratio > 0
+    assert 0 < found.idle[0] <= found.idle[1]
+    assert 0 < found.loaded[0] <= found.loaded[1]
+
+
+def test_a_search_from_a_shortlist_is_compared_with_the_scan_of_all() -> None:
+    found = search.measure(frames=300, length=512, runs=2, shortlist=50)
+    assert (found.frames, found.signature_bytes, found.shortlist) == (300, 512, 50)
+    assert min(found.publish, found.exact, found.search, found.code, found.nearest) > 0
+    assert found.ratio > 0

@@ -19,6 +19,8 @@ log = logging.getLogger(__name__)
 
 #: Seconds between two looks at an empty queue, and between two looks at the indexes.
 IDLE_S, UPKEEP_S = 0.1, 5.0
+#: A robot that waits for an answer goes before a frame that waits to be signed.
+NICENESS = 5
 #: Seconds to wait where the database does not answer.
 TROUBLE_S = 2.0
 
@@ -34,6 +36,7 @@ def work(settings: Settings, parent: int) -> None:
     parent : process id of the one that started this
     """
     log_as_json()
+    os.nice(NICENESS)
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())

@@ -1,0 +1,217 @@
+"""What HTTP and the store add to a query, and whether the service stays awake under load.
+
+`python -m benchmarks.service [DATASET]` measures this row alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.sharedctypes import Synchronized
+from multiprocessing.synchronize import Event as EventType
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import httpx
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.library import Library, accepted
+from sceneprint.cli.demo_building import write_building
+from sceneprint.cli.served import serving
+from sceneprint.client import Client
+from sceneprint.datasets import FrameReference, find_sequences
+
+#: Processes that query at once while a worker signs, and for how long.
+CLIENTS, SECONDS = 4, 20.0
+#: Requests a second to /healthz.
+RATE = 50.0
+
+
+@dataclass(frozen=True)
+class ServiceFigures:
+    """Medians in milliseconds; `ratio` is the median of the ratios of single queries.
+
+    `stages`: of the library, one after the other. `idle`, `loaded`: p50 and p99 of /healthz.
+    """
+
+    frames: int
+    queries: int
+    stages: dict[str, float]
+    library: float
+    http: float
+    ratio: float
+    idle: tuple[float, float]
+    loaded: tuple[float, float]
+    queries_per_second: float
+
+
+def measure(
+    frames: Sequence[FrameReference], n_queries: int = 20, seconds: float = SECONDS
+) -> ServiceFigures:
+    """Fill a map with all but a few frames, and look those up over HTTP and with the library.
+
+    Parameters
+    ----------
+    frames : of a data set
+    n_queries : how many are looked up, spread among the others
+    seconds : how long the service is kept under load
+
+    Raises
+    ------
+    AssertionError : service and library answer differently, and so do not do the same work.
+    """
+    asked = {int(i) for i in np.linspace(1, len(frames) - 2, n_queries)}
+    database = [frame for i, frame in enumerate(frames) if i not in asked]
+    queries = [frames[i] for i in sorted(asked)]
+    with (
+        TemporaryDirectory() as folder,
+        serving(Path(folder), workers=1) as url,
+        Client(url) as client,
+    ):
+        client.create_map("bench")
+        added = [client.upload("bench", one) for one in tqdm(database, "upload", disable=None)]
+        library = Library(database)
+        client.wait([one.job_id for one in added])
+        names = {one.frame_id: i for i, one in enumerate(added)}
+        client.query("bench", queries[0])  # warm
+        library.ask(queries[0])
+        http, stages = [], []
+        for frame in queries:  # in turn, so that both meet the same machine
+            start = time.perf_counter()
+            answer = client.query("bench", frame)
+            http.append(1e3 * (time.perf_counter() - start))
+            spent, expected = library.ask(frame)
+            stages.append(spent)
+            assert accepted(answer, names) == expected
+        idle = _healthz(url, min(seconds, 3.0))
+        loaded, rate = _loaded(url, queries, seconds)
+    sums = [sum(one.values()) for one in stages]
+    return ServiceFigures(
+        frames=len(database),
+        queries=len(queries),
+        stages={name: statistics.median(one[name] for one in stages) for name in stages[0]},
+        library=statistics.median(sums),
+        http=statistics.median(http),
+        ratio=statistics.median(h / s for h, s in zip(http, sums, strict=True)),
+        idle=idle,
+        loaded=loaded,
+        queries_per_second=rate,
+    )
+
+
+def _healthz(url: str, seconds: float) -> tuple[float, float]:
+    """p50 and p99 of /healthz, asked at a steady rate, milliseconds."""
+    taken = []
+    with httpx.Client(base_url=url) as client:
+        until = time.perf_counter() + seconds
+        while (start := time.perf_counter()) < until:
+            assert client.get("/healthz").status_code == 200
+            taken.append(1e3 * (time.perf_counter() - start))
+            time.sleep(max(1 / RATE - (time.perf_counter() - start), 0.0))
+    p50, p99 = np.percentile(taken, (50, 99)).tolist()
+    return p50, p99
+
+
+def _loaded(
+    url: str, queries: Sequence[FrameReference], seconds: float
+) -> tuple[tuple[float, float], float]:
+    """/healthz while clients query and a worker signs, and queries answered a second."""
+    context = get_context("spawn")
+    stop, done = context.Event(), context.Value("i", 0)
+    load = [
+        context.Process(target=_query_on, args=(url, list(queries), stop, done))
+        for _ in range(CLIENTS)
+    ]
+    load.append(context.Process(target=_upload_on, args=(url, list(queries), stop)))
+    for one in load:
+        one.start()
+    while done.value < CLIENTS:  # until all are at work
+        time.sleep(0.1)
+    begin, counted = time.perf_counter(), done.value
+    figures = _healthz(url, seconds)
+    rate = (done.value - counted) / (time.perf_counter() - begin)
+    stop.set()
+    for one in load:
+        one.join()
+    return figures, rate
+
+
+def _query_on(
+    url: str, frames: Sequence[FrameReference], stop: EventType, done: Synchronized[int]
+) -> None:
+    with Client(url) as client:
+        while not stop.is_set():
+            for frame in frames:
+                if stop.is_set():
+                    return
+                client.query("bench", frame)
+                with done.get_lock():
+                    done.value += 1
+
+
+def _upload_on(url: str, frames: Sequence[FrameReference], stop: EventType) -> None:
+    """Keep the worker busy: the same frames in one map after another."""
+    with Client(url) as client:
+        for number in range(10_000):
+            client.create_map(f"load-{number}")
+            jobs = [client.upload(f"load-{number}", frame).job_id for frame in frames]
+            client.wait(jobs)
+            if stop.is_set():
+                return
+
+
+def table(f: ServiceFigures) -> list[str]:
+    """The figures as lines of Markdown."""
+    return [
+        f"### A query over HTTP, {f.frames} frames in the map, k = 5, all stages, warm: "
+        f"median of {f.queries}",
+        "",
+        "| | ms |",
+        "|---|--:|",
+        *(f"| {stage} | {ms:.1f} |" for stage, ms in f.stages.items()),
+        f"| **library, sum** | **{f.library:.1f}** |",
+        f"| **over HTTP** | **{f.http:.1f}** |",
+        f"| **HTTP / library** | **{f.ratio:.2f}** |",
+        f"| /healthz, idle: p50, p99 | {f.idle[0]:.1f}, {f.idle[1]:.1f} |",
+        f"| /healthz while {CLIENTS} clients query and a worker signs: p50, p99 | "
+        f"{f.loaded[0]:.1f}, {f.loaded[1]:.1f} |",
+        "",
+        f"Queries answered meanwhile: {f.queries_per_second:.1f} a second.",
+        "",
+    ]
+
+
+def frames_of(dataset: Path | None, most: int = 320) -> list[FrameReference]:
+    """Frames of a data set, or of a synthetic building, evenly thinned."""
+    folder = dataset or _building()
+    found = [frame for sequence in find_sequences(folder) for frame in sequence.frames]
+    return found[:: max(len(found) // most, 1)][:most]
+
+
+def _building() -> Path:
+    import tempfile
+
+    folder = Path(tempfile.mkdtemp(prefix="sceneprint-bench-"))
+    for _ in tqdm(write_building(folder, 6), "synthetic rooms", 6, disable=None):
+        pass
+    return folder
+
+
+def main() -> int:
+    """Measure this row alone."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("dataset", type=Path, nargs="?")
+    parser.add_argument("--frames", type=int, default=320)
+    options = parser.parse_args()
+    print(*table(measure(frames_of(options.dataset, options.frames))), sep="\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
