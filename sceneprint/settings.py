@@ -51,9 +51,13 @@ class Settings(BaseSettings):
     @property
     def database(self) -> str:
         """URL of the database."""
+        from sqlalchemy import URL
+
         if self.database_url is not None:
             return self.database_url.get_secret_value()
-        return f"sqlite:///{(self.data_dir / 'sceneprint.db').absolute()}"
+        # put together by SQLAlchemy: a folder's name may hold what means something in a URL
+        url = URL.create("sqlite", database=str((self.data_dir / "sceneprint.db").absolute()))
+        return url.render_as_string(hide_password=False)
 
     @property
     def blob_dir(self) -> Path:

@@ -48,9 +48,9 @@ class Upkeep:
         return count_indexed(connection, row.number, known) > self._tail_frames
 
     def _publish(self, row: MapRow) -> bool:
-        folder = index_folder(self._indexes, row)
         with self._store.database.read() as connection:
             row = find_map(connection, row.name)
+            folder = index_folder(self._indexes, row)  # the map may just have been made anew
             length = self._signers(row.model_id).model.signature_bytes
             previous = newest(folder, row.model_id, length)
             if previous is not None and previous.revision > row.revision:

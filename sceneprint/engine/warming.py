@@ -6,30 +6,43 @@ from contextlib import suppress
 
 import numpy as np
 
+from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.errors import FrameError
+from sceneprint.geometry.retrieval import distances, pairwise_distances
+from sceneprint.index import Tail, search
 from sceneprint.pipeline import Signer, prepare, validate
 from sceneprint.types import Frame, Intrinsics
 
 
-def warm(signer: Signer) -> None:
-    """Sign and validate a corner of a room, so that kernels are compiled or loaded.
+def warm(signer: Signer) -> bool:
+    """Sign, search and validate a corner of a room, so that kernels are compiled or loaded.
 
     Parameters
     ----------
     signer : whose table is touched
+
+    Returns
+    -------
+    whole : the corner was recognised, so every stage has run; False where a model of another
+        range sees nothing there
     """
-    with suppress(FrameError):  # a model of another range may see nothing there
-        _, geometry = prepare(_corner(), signer)
-        validate(geometry, geometry)
+    with suppress(FrameError):
+        signature, seen = prepare(_corner(), signer)
+        rows = signature.vector[None].copy()
+        search(signature.vector, None, Tail(np.zeros(1, np.int64), rows), 1)
+        pairwise_distances(rows)
+        rows.flags.writeable = False  # as a mapped segment is: another compilation
+        distances(signature.vector.copy(), rows)
+        geometry = read_geometry(write_geometry(seen))
+        return validate(geometry, geometry).status == "accepted"
+    return False
 
 
 def _corner() -> Frame:
-    """Two walls, a floor and a box, two metres away."""
+    """A wall, a floor and a box that stands off the middle, two metres away."""
     camera = Intrinsics(256, 192, 220, 220, 127.5, 95.5)
     y, x = np.mgrid[0:192, 0:256]
     right, down = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
-    walls = [2.4 / np.maximum(1 + 0.8 * right, 0.1), 2.4 / np.maximum(1 - 0.8 * right, 0.1)]
-    floor = 1.2 / np.maximum(down, 1e-3)
-    box = np.where((abs(right) < 0.2) & (down > 0.1), 1.5, np.inf)
-    depth = np.minimum.reduce([*walls, floor, box]).astype(np.float32)
-    return Frame(depth, camera)
+    wall, floor = 2.4 / np.maximum(1 + right, 0.1), 1.2 / np.maximum(down, 0.01)
+    box = np.where((abs(right - 0.1) < 0.2) & (down > 0.1), 1.5, np.inf)
+    return Frame(np.minimum.reduce([wall, floor, box]).astype(np.float32), camera)

@@ -20,8 +20,11 @@ from sceneprint.schemas import JobState
 from sceneprint.store.records import JobRow, job_row
 from sceneprint.store.tables import jobs
 
-#: Tries before a job is dead.
-MAXIMUM_ATTEMPTS = 3
+#: Tries that broke down before a job is dead.
+MAXIMUM_FAILURES = 3
+#: Tries in all before it is. More, as a worker that fell silent may have died of something else:
+#: a machine that is restarted again and again must not cost a frame.
+MAXIMUM_ATTEMPTS = 10
 #: Seconds before the second try; each further one waits four times as long.
 BACKOFF_S = 2.0
 
@@ -45,7 +48,7 @@ def enqueue(connection: Connection, kind: str, frame_number: int, priority: int 
     connection.execute(
         insert(jobs).values(
             id=job_id, kind=kind, frame_number=frame_number, state=JobState.QUEUED,
-            priority=priority, attempts=0, token=0, run_after=now, created_at=now,
+            priority=priority, attempts=0, failures=0, token=0, run_after=now, created_at=now,
         )
     )  # fmt: skip
     return find_job(connection, job_id)
@@ -115,7 +118,7 @@ def claim(connection: Connection, worker: str, lease_s: float) -> Claim | None:
 
 
 def bury(connection: Connection) -> list[JobRow]:
-    """Give up jobs whose workers fell silent in every try: a frame that kills its worker."""
+    """Give up jobs whose workers fall silent again and again: a frame that kills its worker."""
     now = time.time()
     rows = connection.execute(
         update(jobs)
@@ -126,7 +129,7 @@ def bury(connection: Connection) -> list[JobRow]:
         )
         .values(
             state=JobState.DEAD, finished_at=now, leased_until=None,
-            error=f"its worker fell silent in each of {MAXIMUM_ATTEMPTS} tries",
+            error=f"its worker fell silent, and {MAXIMUM_ATTEMPTS} tries are over",
         )
         .returning(jobs)
     ).mappings()  # fmt: skip
@@ -166,13 +169,14 @@ def fail(connection: Connection, held: Claim, error: str, traceback: str) -> Job
     ------
     LostLease : as `renew`.
     """
-    if held.job.attempts >= MAXIMUM_ATTEMPTS:
+    failures = held.job.failures + 1
+    if failures >= MAXIMUM_FAILURES or held.job.attempts >= MAXIMUM_ATTEMPTS:
         finish(connection, held, JobState.DEAD, error, traceback)
         return JobState.DEAD
-    wait = BACKOFF_S * 4.0 ** (held.job.attempts - 1)
+    wait = BACKOFF_S * 4.0 ** (failures - 1)
     _hold(
         connection, held, state=JobState.QUEUED, error=error, traceback=traceback,
-        leased_until=None, run_after=time.time() + wait,
+        failures=failures, leased_until=None, run_after=time.time() + wait,
     )  # fmt: skip
     return JobState.QUEUED
 

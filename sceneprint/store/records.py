@@ -59,6 +59,7 @@ class JobRow:
     state: JobState
     priority: int
     attempts: int
+    failures: int
     token: int
     run_after: float
     leased_until: float | None

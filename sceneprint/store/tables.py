@@ -107,6 +107,7 @@ jobs = Table(
     Column("state", String(16), nullable=False),
     Column("priority", Integer, nullable=False),
     Column("attempts", Integer, nullable=False),
+    Column("failures", Integer, nullable=False),  # of the attempts, those that broke down
     Column("token", Integer, nullable=False),  # fencing: grows with every claim
     Column("run_after", Float, nullable=False),
     Column("leased_until", Float),

@@ -1,0 +1,158 @@
+"""What the engine tests share: two paths through two rooms, and maps that hold them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select, update
+
+from sceneprint.artifacts import read_geometry, write_geometry
+from sceneprint.datasets import decode_frame, write_depth_png
+from sceneprint.engine import Engine
+from sceneprint.pipeline import Signature, Signer, open_signer, prepare
+from sceneprint.schemas import CameraIntrinsics, FrameMeta, GivenPose, JobState, NewMap
+from sceneprint.settings import Settings
+from sceneprint.store.tables import events, jobs
+from sceneprint.synth import synthesise_room
+from sceneprint.types import Floats, Frame, Geometry
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A frame as a robot sends it, and where it was really taken."""
+
+    data: bytes
+    meta: FrameMeta
+    frame: Frame
+    pose: Floats
+    room: str
+
+
+@pytest.fixture(scope="session")
+def make_upload(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Upload]:
+    path = tmp_path_factory.mktemp("upload") / "depth.png"
+
+    def make(frame: Frame, room: str, **more: object) -> Upload:
+        write_depth_png(path, frame.depth, 1000.0)
+        data, k, pose = path.read_bytes(), frame.intrinsics, frame.pose
+        assert pose is not None
+        camera = CameraIntrinsics(
+            width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy
+        )
+        given = GivenPose(parent_frame=room, matrix=pose.tolist())
+        meta = FrameMeta.model_validate({"intrinsics": camera, "pose": given} | more)
+        return Upload(data, meta, decode_frame(data, k), pose, room)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def uploads(make_upload: Callable[..., Upload]) -> tuple[Upload, ...]:
+    """Six views along a path in each of two rooms."""
+    rooms = [synthesise_room(21, i, 6, along_path=True) for i in range(2)]
+    return tuple(make_upload(frame, room.name) for room in rooms for frame in room.frames)
+
+
+@pytest.fixture(scope="session")
+def signer() -> Signer:
+    return open_signer("compact")
+
+
+@pytest.fixture(scope="session")
+def prepared(uploads: tuple[Upload, ...], signer: Signer) -> list[tuple[Signature, Geometry]]:
+    """What the library makes of the uploads, with artifacts as they are read back."""
+    made = [prepare(each.frame, signer) for each in uploads]
+    return [(signature, read_geometry(write_geometry(seen))) for signature, seen in made]
+
+
+@pytest.fixture
+def make_engine(tmp_path: Path) -> Iterator[Callable[..., Engine]]:
+    """Engines on one data folder; all are closed at the end."""
+    opened: list[Engine] = []
+
+    def make(folder: Path = tmp_path / "data", **more: object) -> Engine:
+        opened.append(Engine(Settings.model_validate({"data_dir": folder} | more)))
+        return opened[-1]
+
+    yield make
+    for engine in reversed(opened):
+        engine.close()
+
+
+@pytest.fixture(scope="session")
+def work_off() -> Callable[[Engine], list[JobState | None]]:
+    """Do all jobs that are due; returns what became of them."""
+
+    def work(engine: Engine) -> list[JobState | None]:
+        states = []
+        while (claimed := engine.claim("w")) is not None:
+            states.append(engine.run(claimed))
+        return states
+
+    return work
+
+
+@pytest.fixture(scope="session")
+def signed_folder(
+    tmp_path_factory: pytest.TempPathFactory, uploads: tuple[Upload, ...],
+    work_off: Callable[[Engine], list[JobState | None]],
+) -> Path:  # fmt: skip
+    """A data folder whose map `hall` holds all uploads, signed in their order."""
+    folder = tmp_path_factory.mktemp("signed") / "data"
+    with Engine(Settings(data_dir=folder)) as engine:
+        engine.create_map(NewMap(name="hall", model="compact"))
+        for each in uploads:
+            engine.add_frame("hall", each.data, each.meta)
+        assert work_off(engine) == [JobState.SUCCEEDED] * len(uploads)
+    return folder
+
+
+@pytest.fixture
+def full(signed_folder: Path, tmp_path: Path, make_engine: Callable[..., Engine]) -> Engine:
+    """An engine on a copy of `signed_folder`."""
+    shutil.copytree(signed_folder, tmp_path / "data")
+    return make_engine()
+
+
+@pytest.fixture
+def empty(make_engine: Callable[..., Engine]) -> Engine:
+    """An engine with the empty map `hall`."""
+    engine = make_engine()
+    engine.create_map(NewMap(name="hall", model="compact"))
+    return engine
+
+
+@pytest.fixture(scope="session")
+def ids() -> Callable[[Engine], list[str]]:
+    """Ids of the frames of `hall`, as they came."""
+    return lambda engine: [frame.frame_id for frame in engine.list_frames("hall").items]
+
+
+@pytest.fixture(scope="session")
+def told() -> Callable[[Engine], list[str]]:
+    """Kinds of all events, in order."""
+
+    def tell(engine: Engine) -> list[str]:
+        with engine.store.database.read() as connection:
+            return list(
+                connection.execute(select(events.c.kind).order_by(events.c.number)).scalars()
+            )
+
+    return tell
+
+
+@pytest.fixture(scope="session")
+def due_now() -> Callable[..., None]:
+    """Let nobody wait: neither for a lease to run out nor for another try."""
+
+    def turn(engine: Engine) -> None:
+        with engine.store.database.write() as connection:
+            connection.execute(update(jobs).values(run_after=0.0))
+            running = jobs.c.leased_until.is_not(None)
+            connection.execute(update(jobs).where(running).values(leased_until=1.0))
+
+    return turn

@@ -1,0 +1,188 @@
+"""Queries: the right room, the right pose, and the same numbers as the library gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
+from sceneprint.matches import associate, locate
+from sceneprint.pipeline import Signature, Signer, diversify, retrieve
+from sceneprint.schemas import Answer, NewMap, Query
+from sceneprint.types import Geometry
+
+Prepared = list[tuple[Signature, Geometry]]
+Ids = Callable[[Engine], list[str]]
+
+
+def same(a: Answer, b: Answer) -> bool:
+    """Whether two answers differ in nothing but who they are and how long they took."""
+    free = {"query_id": "", "milliseconds": {}}
+    return a.model_copy(update=free) == b.model_copy(update=free)
+
+
+def test_an_upload_is_found_where_it_was_taken(full: Engine, uploads: Any, ids: Ids) -> None:
+    numbers = {frame_id: i for i, frame_id in enumerate(ids(full))}
+    full.delete_frame("hall", ids(full)[8])
+    asked = uploads[8]  # of the second room
+    answer = full.query_upload("hall", asked.data, asked.meta, Query())
+    assert answer.status == "found"
+    accepted = [m for m in answer.matches if m.validation.status == "accepted"]
+    assert len(accepted) == 5 == answer.counts.accepted
+    assert answer.matches[:5] == accepted
+    for match in accepted:
+        there = uploads[numbers[match.frame_id]]
+        assert there.room == asked.room
+        T = np.linalg.inv(there.pose) @ asked.pose
+        found = np.array(match.transform.matrix)
+        assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < 0.05
+        assert np.trace(found[:3, :3].T @ T[:3, :3]) > 1 + 2 * np.cos(np.radians(2))
+        np.testing.assert_allclose(match.pose_in_map.matrix, there.pose @ found, rtol=0, atol=1e-14)
+        assert match.transform.parent_frame == f"{match.frame_id}.optical"
+        assert match.transform.child_frame == match.pose_in_map.child_frame == "query.optical"
+        assert match.pose_in_map.parent_frame == asked.room
+    assert answer.location is not None
+    assert (answer.location.support, answer.location.votes) == (5, 5)
+    assert answer.location.pose.parent_frame == asked.room
+    place = np.array(answer.location.pose.matrix)
+    assert np.linalg.norm(place[:3, 3] - asked.pose[:3, 3]) < 0.03
+    assert np.trace(place[:3, :3].T @ asked.pose[:3, :3]) > 1 + 2 * np.cos(np.radians(1))
+
+
+@pytest.mark.parametrize(("asked", "k", "seed"), [(0, 5, 0), (8, 2, 7), (3, 11, 1)])
+def test_an_answer_has_the_numbers_of_the_library(
+    full: Engine, prepared: Prepared, signer: Signer, uploads: Any, ids: Ids,
+    asked: int, k: int, seed: int,
+) -> None:  # fmt: skip
+    names = ids(full)
+    others = [i for i in range(len(prepared)) if i != asked]
+    signatures = [prepared[i][0] for i in others]
+    geometries = [prepared[i][1] for i in others]
+    query, seen = prepared[asked]
+    ranking = retrieve(query, signatures, signer.model)
+    chosen = diversify(ranking, signatures, max(10, k))
+    matches = associate(seen, ranking, chosen.indices, geometries.__getitem__, k, seed)
+    poses = [np.array(full.get_frame("hall", names[i]).pose.matrix) for i in others]
+    place = locate(matches, poses, [uploads[i].room for i in others])
+
+    answer = full.query_frame("hall", names[asked], Query(k=k, seed=seed))
+    tried = answer.matches[: len(matches)]
+    assert [m.frame_id for m in tried] == [names[others[m.index]] for m in matches]
+    for told, match in zip(tried, matches, strict=True):
+        v = match.validation
+        assert told.distance == match.distance
+        assert told.similarity == match.similarity
+        assert (told.validation.status, told.validation.strength) == (v.status, v.strength)
+        assert (told.validation.overlap, told.validation.inliers) == (v.overlap, v.inliers)
+        assert told.validation.ambiguity == v.ambiguity
+        assert told.validation.free_space_violations == v.violations
+        if v.T_match_query is None:
+            assert told.transform is None
+        else:
+            assert np.array(told.transform.matrix).tobytes() == v.T_match_query.tobytes()
+    assert place is not None
+    assert np.array(answer.location.pose.matrix).tobytes() == place.average.T.tobytes()
+    assert answer.location.spread_m == place.average.spread_m
+    ranks = {m.frame_id: (m.rank, m.diversity_gain) for m in answer.matches}
+    assert ranks == {
+        names[others[ranking.indices[i]]]: (i + 1, gain)
+        for i, gain in zip(chosen.indices.tolist(), chosen.gains.tolist(), strict=True)
+    }
+    rest = [m.rank for m in answer.matches[len(matches) :]]
+    assert rest == sorted(rest)
+    assert {m.validation.reason for m in answer.matches[len(matches) :]} <= {
+        "enough were accepted before it"
+    }
+
+
+@pytest.mark.parametrize(
+    ("stages", "k", "matches", "selected", "validated"),
+    [
+        (("retrieve",), 3, 3, 0, 0),
+        (("retrieve",), 50, 12, 0, 0),
+        (("retrieve", "diversify"), 3, 3, 3, 0),
+        (("retrieve", "validate"), 1, 10, 0, 1),
+        (("retrieve", "validate"), 11, 11, 0, 11),
+        (("retrieve", "diversify", "validate"), 1, 10, 10, 1),
+    ],
+)
+def test_stages_are_done_as_asked(
+    full: Engine, uploads: Any, stages: Any, k: int, matches: int, selected: int, validated: int
+) -> None:
+    answer = full.query_upload("hall", uploads[0].data, uploads[0].meta, Query(k=k, stages=stages))
+    assert len(answer.matches) == matches
+    counts = answer.counts
+    assert (counts.map, counts.compared, counts.ranked) == (12, 12, 12)
+    assert (counts.selected, counts.validated) == (selected, validated)
+    chosen = {(m.selected, m.diversity_gain is None) for m in answer.matches}
+    assert chosen == ({(True, False)} if "diversify" in stages else {(None, True)})
+    if "validate" in stages:
+        assert answer.status == "found"
+        assert counts.accepted == min(k, sum(m.transform is not None for m in answer.matches), 6)
+        assert answer.location is not None
+    else:
+        assert answer.status == "unvalidated"
+        assert (counts.accepted, answer.location) == (0, None)
+        assert {m.validation.reason for m in answer.matches} == {"not asked for"}
+        assert {m.validation.status for m in answer.matches} == {"skipped"}
+        assert all(
+            a.rank < b.rank and a.distance <= b.distance for a, b in pairwise(answer.matches)
+        )
+    assert answer.matches[0].distance == 0
+    assert answer.matches[0].similarity == 1.0
+    assert set(answer.milliseconds) == {"prepare", "retrieve", "diversify", "validate", "total"}
+
+
+def test_the_same_question_has_the_same_answer(full: Engine, uploads: Any, ids: Ids) -> None:
+    frame_id = ids(full)[4]
+    for ask in (
+        lambda: full.query_upload("hall", uploads[4].data, uploads[4].meta, Query(seed=9)),
+        lambda: full.query_frame("hall", frame_id, Query(seed=9)),
+    ):
+        first, second = ask(), ask()
+        assert first.query_id != second.query_id
+        assert same(first, second)
+        assert (first.seed, first.exact, first.index_generation) == (9, True, 0)
+        assert first.model == full.get_map("hall").model
+
+
+def test_a_frame_of_the_map_finds_what_its_upload_finds_but_not_itself(
+    full: Engine, uploads: Any, ids: Ids
+) -> None:
+    frame_id = ids(full)[2]
+    asked = full.query_frame("hall", frame_id, Query(k=50))
+    assert len(asked.matches) == 11 == asked.counts.map == asked.counts.compared
+    assert frame_id not in [m.frame_id for m in asked.matches]
+    assert asked.matches[0].transform.child_frame == f"{frame_id}.optical"
+    full.delete_frame("hall", frame_id)
+    sent = full.query_upload("hall", uploads[2].data, uploads[2].meta, Query(k=50))
+    assert [m.frame_id for m in sent.matches] == [m.frame_id for m in asked.matches]
+    assert [m.transform and m.transform.matrix for m in sent.matches] == [
+        m.transform and m.transform.matrix for m in asked.matches
+    ]
+    assert sent.location.pose.matrix == asked.location.pose.matrix
+
+
+@pytest.mark.parametrize("stages", [("retrieve",), ("retrieve", "diversify", "validate")])
+def test_an_empty_map_finds_nothing(empty: Engine, uploads: Any, stages: Any) -> None:
+    answer = empty.query_upload("hall", uploads[0].data, uploads[0].meta, Query(stages=stages))
+    assert answer.status == ("unvalidated" if len(stages) == 1 else "not_found")
+    assert (answer.matches, answer.location) == ([], None)
+    assert set(answer.counts.model_dump().values()) == {0}
+
+
+def test_what_is_not_there_cannot_be_asked(full: Engine, uploads: Any) -> None:
+    full.create_map(NewMap(name="other", model="compact"))
+    added, _ = full.add_frame("other", uploads[0].data, uploads[0].meta)
+    with pytest.raises(UnknownMap, match="'attic'"):
+        full.query_upload("attic", uploads[0].data, uploads[0].meta, Query())
+    with pytest.raises(UnknownFrame, match="in map 'hall'"):
+        full.query_frame("hall", added.frame_id, Query())
+    with pytest.raises(InvalidRequest, match="is received: Stored durably") as caught:
+        full.query_frame("other", added.frame_id, Query())
+    assert caught.value.fields == (("frame_id", "is received"),)

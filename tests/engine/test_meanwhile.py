@@ -1,0 +1,182 @@
+"""Answers while frames come, go and are damaged."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+
+from sceneprint.engine import Engine, answers, readers, upkeep
+from sceneprint.engine.asking import ask_stored
+from sceneprint.errors import DamagedBlob
+from sceneprint.schemas import NewMap, Query
+from sceneprint.store.tables import frames, signatures
+
+Ids = Callable[[Engine], list[str]]
+R = Query(stages=("retrieve",), k=50)
+
+
+def damage_artifact(engine: Engine, frame_id: str, how: str) -> None:
+    with engine.store.database.read() as connection:
+        digest = connection.execute(
+            select(signatures.c.geometry)
+            .join(frames, frames.c.number == signatures.c.frame_number)
+            .where(frames.c.id == frame_id)
+        ).scalar_one()
+    path = Path(engine.settings.blob_dir) / digest[:2] / digest
+    if how == "missing":
+        path.unlink()
+    else:
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 1
+        path.write_bytes(data)
+
+
+@pytest.mark.parametrize("how", ["missing", "flipped"])
+def test_a_damaged_artifact_costs_its_match_and_no_other(
+    full: Engine, uploads: Any, ids: Ids, how: str
+) -> None:
+    names = ids(full)
+    before = full.query_frame("hall", names[7], Query())
+    bad = before.matches[1].frame_id
+    damage_artifact(full, bad, how)
+    after = full.query_frame("hall", names[7], Query())
+    assert after.status == "found"
+    told = {m.frame_id: m for m in after.matches}
+    assert told[bad].validation.status == "skipped"
+    assert told[bad].transform is None
+    reason = {"missing": "cannot be read (No such file", "flipped": "is damaged: its content has"}
+    assert reason[how] in told[bad].validation.reason
+    assert after.matches[-1].frame_id == bad  # after all that were tried
+    was = {m.frame_id: m for m in before.matches}
+    assert set(told) == set(was)
+    assert [m.frame_id for m in after.matches[:4]] == [
+        m.frame_id for m in before.matches[:5] if m.frame_id != bad
+    ]
+    for m in after.matches[:4]:
+        assert m == was[m.frame_id]
+    assert after.counts.accepted == 4
+    assert (after.location.support, before.location.support) == (4, 5)
+    with pytest.raises(DamagedBlob):  # of the query itself there is no other
+        full.query_frame("hall", bad, Query())
+    assert full.query_frame("hall", bad, R).matches[0].validation.reason == "not asked for"
+
+
+def test_what_is_deleted_while_a_query_runs_is_not_told(
+    full: Engine, uploads: Any, ids: Ids, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names, search = ids(full), answers.search
+    gone = [names[6], names[1]]
+
+    def then_delete(*given: Any, **more: Any) -> Any:
+        hits = search(*given, **more)
+        if gone:
+            full.delete_frame("hall", gone.pop())
+        return hits
+
+    monkeypatch.setattr(answers, "search", then_delete)
+    for query, missing in ((Query(), names[1]), (R, names[6])):
+        answer = full.query_upload("hall", uploads[1].data, uploads[1].meta, query)
+        assert missing not in [m.frame_id for m in answer.matches]
+        assert len(answer.matches) == (9 if query != R else 10)
+    assert gone == []
+
+
+def test_a_frame_deleted_after_it_was_asked_for_is_answered(
+    empty: Engine, uploads: Any, work_off: Any, ids: Ids
+) -> None:
+    empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    work_off(empty)
+    (name,) = ids(empty)
+    asked = ask_stored(empty.store, "hall", name, Query())
+    empty.delete_frame("hall", name)
+    answer = empty._answer("hall", asked, Query())
+    assert (answer.status, answer.matches, answer.counts.map) == ("not_found", [], 0)
+
+
+def test_maps_are_never_mixed(full: Engine, uploads: Any, work_off: Any) -> None:
+    full.create_map(NewMap(name="other", model="compact"))
+    added, _ = full.add_frame("other", uploads[5].data, uploads[5].meta)
+    work_off(full)
+    for name, count in (("other", 1), ("hall", 12)):
+        answer = full.query_upload(name, uploads[5].data, uploads[5].meta, R)
+        assert (answer.counts.map, {m.map for m in answer.matches}) == (count, {name})
+        assert answer.matches[0].distance == 0
+        assert (added.frame_id in [m.frame_id for m in answer.matches]) == (name == "other")
+
+
+def test_queries_beside_deletions_and_publishing_see_one_state(
+    full: Engine, make_engine: Callable[..., Engine], uploads: Any, ids: Ids,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Frames go one by one, from the last: every answer has the first n, rightly ranked."""
+    monkeypatch.setattr(readers, "_LOOK_S", 0.0)
+    engine, builder = make_engine(tail_frames=1), make_engine(tail_frames=1)
+    names = ids(full)
+    whole = [(m.frame_id, m.distance) for m in full.query_frame("hall", names[0], R).matches]
+    over, raised, sizes = threading.Event(), [], [[] for _ in range(4)]
+
+    def work(seen: list[int]) -> None:
+        try:
+            while not over.is_set():
+                answer = engine.query_frame("hall", names[0], R)
+                live = set(names[1 : answer.counts.map + 1])
+                told = [(m.frame_id, m.distance) for m in answer.matches]
+                wanted = [pair for pair in whole if pair[0] in live]
+                # what went after the view was taken is left out, and nothing else
+                assert [pair for pair in wanted if pair in told] == told
+                seen.append(answer.counts.map)
+        except BaseException as error:
+            raised.append(error)
+
+    threads = [threading.Thread(target=work, args=(seen,)) for seen in sizes]
+    for thread in threads:
+        thread.start()
+    for i, name in enumerate(reversed(names[4:])):
+        builder.delete_frame("hall", name)
+        if i == 3:
+            assert builder.publish_due() == 1
+    while not all(seen and seen[-1] == 3 for seen in sizes) and not raised:
+        over.wait(0.01)
+    over.set()
+    for thread in threads:
+        thread.join()
+    assert raised == []
+    for seen in sizes:
+        assert seen == sorted(seen, reverse=True)
+    assert engine.query_frame("hall", names[0], R).index_generation == 1
+
+
+def test_what_is_deleted_while_an_index_is_published_stays_deleted(
+    full: Engine, make_engine: Callable[..., Engine], uploads: Any, ids: Ids, work_off: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """The generation holds it, and readers have heard of its end but never of its beginning."""
+    monkeypatch.setattr(readers, "_LOOK_S", 0.0)
+    reader, builder = make_engine(tail_frames=5), make_engine(tail_frames=5)
+    names, publish = ids(full), upkeep.publish
+    assert full.get_map("hall").revision == 12
+    reader.query_frame("hall", names[0], R)
+    meta = uploads[3].meta
+    camera = meta.intrinsics.model_copy(update={"cx": meta.intrinsics.cx + 1})
+    given = meta.model_copy(update={"intrinsics": camera})
+    gone = full.add_frame("hall", uploads[3].data, given)[0].frame_id
+    work_off(full)
+
+    def slowly(*given: Any, **more: Any) -> Any:
+        full.delete_frame("hall", gone)
+        assert len(reader.query_frame("hall", names[0], R).matches) == 11
+        return publish(*given, **more)
+
+    monkeypatch.setattr(upkeep, "publish", slowly)
+    assert builder.publish_due() == 1
+    full.delete_frame("hall", names[11])
+    for engine in (reader, make_engine(tail_frames=5)):
+        answer = engine.query_frame("hall", names[0], R)
+        assert answer.index_generation == 1
+        assert answer.counts.map == answer.counts.ranked == len(answer.matches) == 10
+        assert {m.frame_id for m in answer.matches} == set(names[1:11])

@@ -1,0 +1,202 @@
+"""What may be sent, what may not, and what poses become of it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import BaseModel, ValidationError
+from scipy.spatial.transform import Rotation
+
+from sceneprint.engine import Engine
+from sceneprint.engine.transforms import pose_matrix, transform
+from sceneprint.errors import InvalidPose, InvalidRequest, MapExists
+from sceneprint.schemas import FrameMeta, FrameState, GivenPose, JobState, NewMap, Query
+
+CAMERA: dict[str, Any] = {"width": 4, "height": 3, "fx": 2, "fy": 2, "cx": 2, "cy": 1}
+EYE = np.eye(4).tolist()
+ORIGIN = {"x": 0, "y": 0, "z": 0}
+LEVEL = {"x": 0, "y": 0, "z": 0, "w": 1}
+
+
+def meta(**more: object) -> dict[str, object]:
+    return {"intrinsics": CAMERA} | more
+
+
+REFUSED: list[tuple[type[BaseModel], dict[str, Any], str]] = [
+    (Query, {"K": 5}, "K"),
+    (Query, {"k": 0}, "k"),
+    (Query, {"k": 51}, "k"),
+    (Query, {"k": 2.5}, "k"),
+    (Query, {"seed": -1}, "seed"),
+    (Query, {"seed": 2**32}, "seed"),
+    (Query, {"stages": []}, "stages"),
+    (Query, {"stages": ["validate"]}, "stages"),
+    (Query, {"stages": ["diversify", "retrieve"]}, "stages"),
+    (Query, {"stages": ["retrieve", "validate", "diversify"]}, "stages"),
+    (Query, {"stages": ["retrieve", "retrieve"]}, "stages"),
+    (Query, {"stages": ["retrieve", "rank"]}, "stages.1"),
+    (NewMap, {"name": ""}, "name"),
+    (NewMap, {"name": "Hall"}, "name"),
+    (NewMap, {"name": "-hall"}, "name"),
+    (NewMap, {"name": "hall\n"}, "name"),
+    (NewMap, {"name": "../hall"}, "name"),
+    (NewMap, {"name": "h" * 64}, "name"),
+    (NewMap, {"name": "hall", "model": "large"}, "model"),
+    (NewMap, {"name": "hall", "frames": 3}, "frames"),
+    (FrameMeta, {}, "intrinsics"),
+    (FrameMeta, meta(colour="red"), "colour"),
+    (FrameMeta, meta(intrinsics=CAMERA | {"skew": 0}), "intrinsics.skew"),
+    (FrameMeta, meta(intrinsics=CAMERA | {"fx": math.nan}), "intrinsics.fx"),
+    (FrameMeta, meta(intrinsics=CAMERA | {"cy": -math.inf}), "intrinsics.cy"),
+    (FrameMeta, meta(intrinsics=CAMERA | {"width": 0}), "intrinsics.width"),
+    (FrameMeta, meta(intrinsics=CAMERA | {"distortion": [math.nan]}), "intrinsics.distortion.0"),
+    (FrameMeta, meta(intrinsics=CAMERA | {"distortion": [0] * 6}), "intrinsics.distortion"),
+    (FrameMeta, meta(depth_scale=0), "depth_scale"),
+    (FrameMeta, meta(depth_scale=math.inf), "depth_scale"),
+    (FrameMeta, meta(robot=""), "robot"),
+    (FrameMeta, meta(robot="r\n"), "robot"),
+    (FrameMeta, meta(robot="r\0"), "robot"),
+    (FrameMeta, meta(session="s" * 129), "session"),
+    (FrameMeta, meta(tags=["a"] * 33), "tags"),
+    (FrameMeta, meta(tags=["a", ""]), "tags.1"),
+    (FrameMeta, meta(captured_at="2026-01-01T00:00:00"), "captured_at"),
+    (FrameMeta, meta(captured_at="9999-12-31T23:59:59-12:00"), "captured_at"),
+    (FrameMeta, meta(captured_at="9999-12-31T23:59:59.999999Z"), "captured_at"),
+    (FrameMeta, meta(captured_at="0001-01-01T00:00:00+12:00"), "captured_at"),
+    (FrameMeta, meta(pose={"matrix": EYE}), ""),  # in which frame?
+    (GivenPose, {}, ""),
+    (GivenPose, {"translation": ORIGIN}, ""),
+    (GivenPose, {"rotation": LEVEL}, ""),
+    (GivenPose, {"translation": ORIGIN, "rotation": LEVEL, "matrix": EYE}, ""),
+    (GivenPose, {"translation": ORIGIN, "matrix": EYE}, ""),
+    (GivenPose, {"rotation": LEVEL, "matrix": EYE}, ""),
+    (GivenPose, {"matrix": EYE[:3]}, "matrix"),
+    (GivenPose, {"matrix": [[*row, 0.0] for row in EYE]}, "matrix.0"),
+    (GivenPose, {"matrix": [[math.nan, 0, 0, 0], *EYE[1:]]}, "matrix.0.0"),
+    (GivenPose, {"translation": ORIGIN | {"x": math.inf}, "rotation": LEVEL}, "translation.x"),
+    (GivenPose, {"translation": ORIGIN | {"w": 1}, "rotation": LEVEL}, "translation.w"),
+    (GivenPose, {"translation": ORIGIN, "rotation": ORIGIN}, "rotation.w"),
+]
+
+
+@pytest.mark.parametrize(("kind", "given", "place"), REFUSED)
+def test_what_would_mean_nothing_is_refused_at_its_place(
+    kind: type[BaseModel], given: dict[str, Any], place: str
+) -> None:
+    with pytest.raises(ValidationError) as caught:
+        kind.model_validate(given)
+    assert place in [".".join(map(str, e["loc"])) for e in caught.value.errors()]
+    with pytest.raises(ValidationError):
+        kind.model_validate_json(json.dumps(given))
+
+
+@pytest.mark.parametrize(
+    ("stages", "k", "seed"),
+    [(["retrieve"], 1, 0), (["retrieve", "validate"], 50, 2**32 - 1),
+     (["retrieve", "diversify"], 5, 1), (["retrieve", "diversify", "validate"], 5, 0)],
+)  # fmt: skip
+def test_a_query_at_its_limits_is_taken(stages: list[str], k: int, seed: int) -> None:
+    query = Query.model_validate({"stages": stages, "k": k, "seed": seed})
+    assert (list(query.stages), query.k, query.seed) == (stages, k, seed)
+    assert Query() == Query(k=5, stages=("retrieve", "diversify", "validate"), seed=0, exact=False)
+
+
+def test_a_pose_may_be_in_the_frame_of_its_session() -> None:
+    given = FrameMeta.model_validate(meta(pose={"matrix": EYE}, session="night"))
+    assert given.pose is not None
+    assert given.pose.parent_frame is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_both_ways_of_a_pose_are_one(seed: int) -> None:
+    rotation, t = Rotation.random(random_state=seed), [1.5, -2.25, 1e3]
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation.as_matrix(), t
+    x, y, z, w = (rotation.as_quat() * 1.005).tolist()  # as rounded somewhere
+    parts = {
+        "translation": {"x": t[0], "y": t[1], "z": t[2]},
+        "rotation": {"x": x, "y": y, "z": z, "w": w},
+    }
+    by_parts = pose_matrix(GivenPose.model_validate(parts))
+    by_matrix = pose_matrix(GivenPose(matrix=T.tolist()))
+    np.testing.assert_allclose(by_parts, T, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(by_matrix, T, rtol=0, atol=1e-14)
+    told = transform(by_parts, "map", "camera")
+    assert (told.parent_frame, told.child_frame) == ("map", "camera")
+    assert told.matrix == by_parts.tolist()
+    assert list(told.translation.model_dump().values()) == t
+    quaternion = np.array([told.rotation.x, told.rotation.y, told.rotation.z, told.rotation.w])
+    theirs = rotation.as_quat()
+    np.testing.assert_allclose(quaternion, theirs * np.sign(theirs[3]), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("length", [0.0, 0.5, 0.98, 1.02, 2.0, 1e200])
+def test_a_quaternion_that_is_not_of_unit_length_is_no_rotation(length: float) -> None:
+    q = {"x": 0.0, "y": 0.6 * length, "z": 0.0, "w": 0.8 * length}
+    with np.errstate(over="ignore"), pytest.raises(InvalidPose, match=r"quaternion .* has length"):
+        pose_matrix(GivenPose.model_validate({"translation": ORIGIN, "rotation": q}))
+
+
+def test_what_is_no_rigid_transform_is_no_pose() -> None:
+    for bad in (np.diag([1.0, 1, -1, 1]), np.diag([2.0, 2, 2, 1]), np.zeros((4, 4))):
+        with pytest.raises(InvalidPose):
+            pose_matrix(GivenPose(matrix=bad.tolist()))
+
+
+def test_maps_are_made_once(make_engine: Callable[..., Engine]) -> None:
+    engine = make_engine()
+    made, new = engine.create_map(NewMap(name="hall", title="Hall", model="compact"))
+    assert (new, made.revision, made.frames, made.title) == (True, 0, {}, "Hall")
+    assert made.model == f"compact-{made.model_id[:12]}"
+    assert engine.create_map(NewMap(name="hall", title="Hall", model="compact")) == (made, False)
+    for other in ({"title": "Room"}, {"model": "paper"}, {"title": None}):
+        given = {"name": "hall", "title": "Hall", "model": "compact"} | other
+        with pytest.raises(MapExists, match="'hall' with another title or model"):
+            engine.create_map(NewMap.model_validate(given))
+    assert engine.list_maps().items == [made]
+
+
+def test_a_frame_is_told_as_it_was_sent(
+    empty: Engine, uploads: Any, work_off: Callable[[Engine], list[JobState | None]]
+) -> None:
+    given = uploads[0].meta.model_copy(update={"pose": None}).model_dump() | {
+        "robot": "R2", "session": "night", "tags": ["a", "b"],
+        "captured_at": "2026-03-01T12:00:00.123456+05:30", "pose": {"matrix": EYE},
+    }  # fmt: skip
+    added, _ = empty.add_frame("hall", uploads[0].data, FrameMeta.model_validate(given))
+    work_off(empty)
+    frame = empty.get_frame("hall", added.frame_id)
+    assert (frame.robot, frame.session, frame.tags) == ("R2", "night", ["a", "b"])
+    assert frame.captured_at is not None
+    assert frame.captured_at.isoformat() == "2026-03-01T06:30:00.123456+00:00"
+    assert frame.intrinsics == uploads[0].meta.intrinsics
+    assert (frame.bytes, frame.map, frame.job_id) == (len(uploads[0].data), "hall", added.job_id)
+    assert frame.pose is not None
+    assert (frame.pose.parent_frame, frame.pose.matrix) == ("night", EYE)
+    assert frame.pose.child_frame == f"{frame.frame_id}.optical"
+    assert frame.indexed_at is not None
+    assert frame.received_at < frame.indexed_at
+
+
+def test_pages_hold_every_frame_once(full: Engine) -> None:
+    pages, cursor = [], None
+    while True:
+        page = full.list_frames("hall", cursor, limit=5)
+        pages.append([frame.frame_id for frame in page.items])
+        cursor = page.next_cursor
+        if cursor is None:
+            break
+    assert [len(page) for page in pages] == [5, 5, 2]
+    assert [name for page in pages for name in page] == [
+        frame.frame_id for frame in full.list_frames("hall").items
+    ]
+    assert full.list_frames("hall", limit=12).next_cursor is None
+    assert full.list_frames("hall", state=FrameState.DELETED).items == []
+    for bad in ("", "x", "-1", "1.5", "\u0663", "9" * 19, "1 "):
+        with pytest.raises(InvalidRequest, match="was not given out"):
+            full.list_frames("hall", bad)

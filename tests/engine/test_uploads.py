@@ -1,0 +1,192 @@
+"""Uploads: taken once, refused where they contradict, and gone when deleted."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sceneprint.engine import Engine
+from sceneprint.engine import uploads as uploading
+from sceneprint.errors import FrameConflict, InvalidIntrinsics, UnknownFrame, UselessFrame
+from sceneprint.schemas import FrameMeta, FrameState, JobState, NewMap, Query
+
+Told = Callable[[Engine], list[str]]
+WorkOff = Callable[[Engine], list[JobState | None]]
+ASK = Query(stages=("retrieve",), k=50)
+
+
+def packed(data: bytes, level: int) -> bytes:
+    """The same pixels as another PNG."""
+    out = io.BytesIO()
+    Image.open(io.BytesIO(data)).save(out, "PNG", compress_level=level)
+    assert out.getvalue() != data
+    return out.getvalue()
+
+
+def blobs(engine: Engine) -> list[str]:
+    return sorted(engine.store.blobs.digests())
+
+
+def with_(meta: FrameMeta, **more: object) -> FrameMeta:
+    return FrameMeta.model_validate(meta.model_dump() | more)
+
+
+def test_the_same_upload_is_the_frame_that_is_there(
+    empty: Engine, uploads: Any, work_off: WorkOff, told: Told
+) -> None:
+    data, meta = uploads[0].data, uploads[0].meta
+    first, new = empty.add_frame("hall", data, meta)
+    assert (new, first.state, first.reason) == (True, FrameState.RECEIVED, None)
+    assert empty.get_frame("hall", first.frame_id).state == FrameState.RECEIVED
+    assert empty.add_frame("hall", data, meta) == (first, False)
+    assert empty.add_frame("hall", packed(data, 0), meta) == (first, False)
+    assert len(blobs(empty)) == 1  # other bytes of the same frame are not kept
+    assert work_off(empty) == [JobState.SUCCEEDED]
+    again, new = empty.add_frame("hall", packed(data, 9), meta)
+    assert (again.frame_id, again.job_id, new) == (first.frame_id, first.job_id, False)
+    assert again.state == FrameState.INDEXED
+    assert told(empty) == ["map.created", "frame.received", "frame.indexed"]
+    assert empty.counts() == ({"indexed": 1}, {"succeeded": 1})
+
+
+@pytest.mark.parametrize(
+    ("more", "fields"),
+    [
+        ({"robot": "R2"}, "robot"),
+        ({"session": "night"}, "session"),
+        ({"tags": ["a"]}, "tags"),
+        ({"captured_at": "2026-01-01T00:00:00Z"}, "captured_at"),
+        ({"pose": None}, "pose.parent_frame, pose"),
+        ({"robot": "R2", "tags": ["a", "b"]}, "robot, tags"),
+    ],
+)
+def test_other_metadata_of_the_same_content_is_a_conflict_that_names_it(
+    empty: Engine, uploads: Any, more: dict[str, object], fields: str
+) -> None:
+    data, meta = uploads[0].data, uploads[0].meta
+    added, _ = empty.add_frame("hall", data, meta)
+    with pytest.raises(FrameConflict) as caught:
+        empty.add_frame("hall", packed(data, 1), with_(meta, **more))
+    said = f"Frame {added.frame_id} has the same content, but other {fields}. A frame is in a map"
+    assert str(caught.value).startswith(said)
+    assert len(blobs(empty)) == 1
+    assert empty.counts() == ({"received": 1}, {"queued": 1})
+
+
+def test_another_parent_frame_or_pose_is_a_conflict(empty: Engine, uploads: Any) -> None:
+    data, meta = uploads[0].data, uploads[0].meta
+    empty.add_frame("hall", data, meta)
+    assert meta.pose is not None
+    matrix = np.array(meta.pose.matrix)
+    for parent, shift, fields in (("x", 0.0, "pose.parent_frame"), (uploads[0].room, 1e-9, "pose")):
+        moved = matrix.copy()
+        moved[0, 3] += shift
+        pose = {"parent_frame": parent, "matrix": moved.tolist()}
+        with pytest.raises(FrameConflict, match=f"but other {fields}\\. A frame"):
+            empty.add_frame("hall", data, with_(meta, pose=pose))
+
+
+def test_other_samples_another_camera_and_another_map_are_other_frames(
+    empty: Engine, uploads: Any
+) -> None:
+    data, meta = uploads[0].data, uploads[0].meta
+    empty.create_map(NewMap(name="other", model="compact"))
+    image = np.array(Image.open(io.BytesIO(data)))
+    image[np.unravel_index(image.argmax(), image.shape)] -= 1  # one millimetre of one pixel
+    out = io.BytesIO()
+    Image.fromarray(image).save(out, "PNG")
+    camera = meta.intrinsics.model_dump() | {"fx": meta.intrinsics.fx + 1e-6}
+    added = [
+        empty.add_frame("hall", data, meta),
+        empty.add_frame("hall", out.getvalue(), meta),
+        empty.add_frame("hall", data, with_(meta, intrinsics=camera)),
+        empty.add_frame("other", data, meta),
+    ]
+    assert [new for _, new in added] == [True] * 4
+    assert len({each.frame_id for each, _ in added}) == 4
+    assert len(blobs(empty)) == 2
+
+
+def test_what_cannot_be_a_frame_is_refused_and_not_kept(empty: Engine, uploads: Any) -> None:
+    data, meta = uploads[0].data, uploads[0].meta
+    small = meta.intrinsics.model_dump() | {"width": 320, "height": 240}
+    with pytest.raises(InvalidIntrinsics, match="640 x 480 pixels"):
+        empty.add_frame("hall", data, with_(meta, intrinsics=small))
+    out = io.BytesIO()
+    Image.fromarray(np.zeros((480, 640), np.uint16)).save(out, "PNG")
+    with pytest.raises(UselessFrame, match="All 307200 samples are missing"):
+        empty.add_frame("hall", out.getvalue(), meta)
+    assert blobs(empty) == []
+    assert empty.counts() == ({}, {})
+
+
+def test_a_deleted_frame_is_found_no_more_and_may_come_again(
+    full: Engine, uploads: Any, ids: Callable[[Engine], list[str]], work_off: WorkOff, told: Told
+) -> None:
+    data, meta, gone = uploads[3].data, uploads[3].meta, ids(full)[3]
+    assert full.query_upload("hall", data, meta, ASK).matches[0].frame_id == gone
+    before = set(blobs(full))
+    full.delete_frame("hall", gone)
+    assert len(before - set(blobs(full))) == 2  # upload and artifact
+    answer = full.query_upload("hall", data, meta, ASK)
+    assert len(answer.matches) == answer.counts.map == answer.counts.compared == 11
+    assert gone not in [m.frame_id for m in answer.matches]
+    assert full.get_frame("hall", gone).state == FrameState.DELETED
+    assert full.get_frame("hall", gone).content_id is None
+    assert gone not in ids(full)
+    with pytest.raises(UnknownFrame, match="deleted before"):
+        full.delete_frame("hall", gone)
+    again, new = full.add_frame("hall", data, meta)
+    assert new
+    assert again.frame_id != gone
+    assert work_off(full) == [JobState.SUCCEEDED]
+    assert set(blobs(full)) == before
+    answer = full.query_upload("hall", data, meta, ASK)
+    assert (answer.matches[0].frame_id, answer.matches[0].distance) == (again.frame_id, 0)
+    assert answer.counts.map == 12
+    assert told(full)[-3:] == ["frame.deleted", "frame.received", "frame.indexed"]
+
+
+@pytest.mark.parametrize("how", ["frame", "map"])
+def test_blobs_stay_while_another_map_refers_to_them(
+    empty: Engine, uploads: Any, work_off: WorkOff, how: str
+) -> None:
+    empty.create_map(NewMap(name="other", model="compact"))
+    added = {}
+    for name in ("hall", "other"):
+        added[name], _ = empty.add_frame(name, uploads[0].data, uploads[0].meta)
+    assert work_off(empty) == [JobState.SUCCEEDED] * 2
+    both = blobs(empty)
+    assert len(both) == 2
+    for name, left in (("hall", both), ("other", [])):
+        if how == "map":
+            empty.delete_map(name)
+        else:
+            empty.delete_frame(name, added[name].frame_id)
+        assert blobs(empty) == left
+
+
+def test_a_blob_swept_while_its_upload_comes_in_is_put_again(
+    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sweep of a deletion runs between the upload's blob and its commit."""
+    put, puts = empty.store.blobs.put, []
+
+    def swept(data: bytes) -> str:
+        digest = put(data)
+        puts.append(digest)
+        if len(puts) == 1:
+            uploading.sweep(empty.store, [digest])
+        return digest
+
+    monkeypatch.setattr(empty.store.blobs, "put", swept)
+    _, new = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    assert new
+    assert len(puts) == 2
+    assert blobs(empty) == puts[:1]
+    assert empty.store.blobs.get(puts[0]) == uploads[0].data

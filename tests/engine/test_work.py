@@ -1,0 +1,221 @@
+"""Work: what becomes of frames that cannot be signed, and of workers that come too late."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sceneprint.engine import Engine
+from sceneprint.engine import work as working
+from sceneprint.schemas import FrameMeta, FrameState, JobState, NewMap, Query
+from sceneprint.store.maps import find_map
+from sceneprint.store.signatures import changes_since
+
+Told = Callable[[Engine], list[str]]
+WorkOff = Callable[[Engine], list[JobState | None]]
+DueNow = Callable[[Engine], None]
+
+
+def png(samples: Any) -> bytes:
+    out = io.BytesIO()
+    Image.fromarray(samples.astype(np.uint16)).save(out, "PNG")
+    return out.getvalue()
+
+
+def lone_pixel() -> Any:
+    samples = np.zeros((480, 640))
+    samples[240, 320] = 2000
+    return samples
+
+
+def far_away() -> Any:
+    return np.full((480, 640), 60_000)
+
+
+def changes(engine: Engine) -> list[Any]:
+    with engine.store.database.read() as connection:
+        row = find_map(connection, "hall")
+        return [one for block in changes_since(connection, row, 0) for one in block]
+
+
+def remove_blob(engine: Engine, data: bytes) -> None:
+    engine.store.blobs.remove(engine.store.blobs.put(data))
+
+
+@pytest.mark.parametrize("samples", [lone_pixel(), far_away()])
+def test_a_frame_with_nothing_to_sign_is_rejected_with_the_reason(
+    empty: Engine, uploads: Any, told: Told, work_off: WorkOff, samples: Any
+) -> None:
+    meta = FrameMeta(intrinsics=uploads[0].meta.intrinsics)
+    added, _ = empty.add_frame("hall", png(samples), meta)
+    assert work_off(empty) == [JobState.FAILED]
+    frame, job = empty.get_frame("hall", added.frame_id), empty.get_job(added.job_id)
+    assert frame.state == FrameState.REJECTED
+    assert frame.reason == job.error
+    assert frame.reason
+    assert added.frame_id not in frame.reason
+    assert (job.state, job.attempts, job.traceback) == (JobState.FAILED, 1, None)
+    assert job.finished_at is not None
+    assert told(empty)[-1] == "frame.rejected"
+    again, new = empty.add_frame("hall", png(samples), meta)
+    assert (new, again.state, again.reason) == (False, FrameState.REJECTED, frame.reason)
+    assert changes(empty) == []
+    assert empty.get_map("hall").revision == 0
+    empty.delete_frame("hall", added.frame_id)
+    assert list(empty.store.blobs.digests()) == []
+    assert empty.get_job(added.job_id).state == JobState.FAILED
+
+
+def test_a_frame_whose_blob_is_gone_is_tried_thrice_and_failed(
+    empty: Engine, uploads: Any, told: Told, due_now: DueNow
+) -> None:
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    remove_blob(empty, uploads[0].data)
+    for attempt in (1, 2):
+        claimed = empty.claim("w")
+        assert claimed is not None
+        assert empty.get_frame("hall", added.frame_id).state == FrameState.SIGNING
+        assert empty.run(claimed) == JobState.QUEUED
+        job = empty.get_job(added.job_id)
+        assert (job.state, job.attempts, job.finished_at) == (JobState.QUEUED, attempt, None)
+        frame = empty.get_frame("hall", added.frame_id)
+        assert (frame.state, frame.reason) == (FrameState.RECEIVED, None)
+        assert empty.claim("w") is None  # not at once
+        due_now(empty)
+    claimed = empty.claim("w")
+    assert claimed is not None
+    assert empty.run(claimed) == JobState.DEAD
+    frame, job = empty.get_frame("hall", added.frame_id), empty.get_job(added.job_id)
+    assert (frame.state, job.state, job.attempts) == (FrameState.FAILED, JobState.DEAD, 3)
+    assert frame.reason == job.error
+    assert frame.reason is not None
+    assert "cannot be read (No such file or directory)" in frame.reason
+    assert job.traceback is not None
+    assert "DamagedBlob" in job.traceback
+    assert "read_stored" in job.traceback
+    assert told(empty) == ["map.created", "frame.received", "frame.failed"]
+    due_now(empty)
+    assert empty.claim("w") is None
+
+
+def test_a_frame_whose_blob_comes_back_is_signed_after_all(
+    empty: Engine, uploads: Any, due_now: DueNow, work_off: WorkOff
+) -> None:
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    remove_blob(empty, uploads[0].data)
+    assert work_off(empty) == [JobState.QUEUED]
+    empty.store.blobs.put(uploads[0].data)
+    due_now(empty)
+    assert work_off(empty) == [JobState.SUCCEEDED]
+    job = empty.get_job(added.job_id)
+    assert (job.attempts, job.error, job.traceback) == (2, None, None)
+    assert empty.get_frame("hall", added.frame_id).state == FrameState.INDEXED
+
+
+def test_a_worker_that_comes_late_changes_nothing(
+    empty: Engine, uploads: Any, due_now: DueNow, told: Told
+) -> None:
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    first = empty.claim("first")
+    assert first is not None
+    due_now(empty)
+    second = empty.claim("second")
+    assert second is not None
+    assert (first.claim.token, second.claim.token) == (1, 2)
+    assert empty.run(first) is None
+    assert changes(empty) == []
+    assert empty.get_frame("hall", added.frame_id).state == FrameState.SIGNING
+    remove_blob(empty, uploads[0].data)
+    assert empty.run(first) is None  # nor does its trouble count
+    assert empty.get_job(added.job_id).error is None
+    empty.put_back(first)
+    assert empty.get_job(added.job_id).state == JobState.RUNNING
+    assert empty.get_frame("hall", added.frame_id).state == FrameState.SIGNING
+    empty.store.blobs.put(uploads[0].data)
+    assert empty.run(second) == JobState.SUCCEEDED
+    assert len(changes(empty)) == 1
+    assert told(empty) == ["map.created", "frame.received", "frame.indexed"]
+
+
+@pytest.mark.parametrize("how", ["frame", "map"])
+def test_what_is_deleted_while_it_is_signed_stays_deleted(
+    empty: Engine, uploads: Any, told: Told, how: str
+) -> None:
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    claimed = empty.claim("w")
+    assert claimed is not None
+    if how == "map":
+        empty.delete_map("hall")
+    else:
+        empty.delete_frame("hall", added.frame_id)
+        assert empty.get_job(added.job_id).state == JobState.CANCELLED
+    empty.store.blobs.put(uploads[0].data)  # it had read it before
+    assert empty.run(claimed) is None
+    assert told(empty)[-1] == f"{how}.deleted"
+    if how == "frame":
+        assert empty.get_frame("hall", added.frame_id).state == FrameState.DELETED
+        assert empty.get_map("hall").revision == 1
+    empty.store.blobs.remove(empty.store.blobs.put(uploads[0].data))
+    assert list(empty.store.blobs.digests()) == []  # nor is what it made kept
+
+
+def test_an_artifact_swept_before_its_commit_is_not_referred_to(
+    empty: Engine, uploads: Any, due_now: DueNow, work_off: WorkOff
+) -> None:
+    """Another map's frame with the same artifact is deleted while this one is signed."""
+    empty.create_map(NewMap(name="other", model="compact"))
+    other, _ = empty.add_frame("other", uploads[0].data, uploads[0].meta)
+    assert work_off(empty) == [JobState.SUCCEEDED]
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    claimed = empty.claim("w")
+    assert claimed is not None
+    sign = working._sign
+
+    def slowly(*given: Any) -> Any:
+        made = sign(*given)
+        empty.delete_frame("other", other.frame_id)
+        return made
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(working, "_sign", slowly)
+        empty.run(claimed)
+    due_now(empty)
+    work_off(empty)
+    assert empty.get_frame("hall", added.frame_id).state == FrameState.INDEXED
+    answer = empty.query_upload("hall", uploads[1].data, uploads[1].meta, Query())
+    assert [m.validation.status for m in answer.matches] == ["accepted"]
+
+
+def test_a_job_that_silences_every_worker_is_given_up(
+    empty: Engine, uploads: Any, due_now: DueNow, told: Told
+) -> None:
+    bad, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    for attempt in range(1, 11):
+        claimed = empty.claim("w")  # and dies
+        assert claimed is not None
+        assert claimed.claim.job.attempts == attempt
+        due_now(empty)
+    good, _ = empty.add_frame("hall", uploads[1].data, uploads[1].meta)
+    claimed = empty.claim("w")
+    assert claimed is not None
+    assert claimed.frame.id == good.frame_id
+    frame, job = empty.get_frame("hall", bad.frame_id), empty.get_job(bad.job_id)
+    assert (frame.state, job.state) == (FrameState.FAILED, JobState.DEAD)
+    assert frame.reason == job.error == "its worker fell silent, and 10 tries are over"
+    assert told(empty) == ["map.created", "frame.received", "frame.received", "frame.failed"]
+
+
+def test_what_is_put_back_is_as_it_was(empty: Engine, uploads: Any, work_off: WorkOff) -> None:
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    for _ in range(4):
+        claimed = empty.claim("w")
+        assert claimed is not None
+        empty.put_back(claimed)
+        assert empty.get_frame("hall", added.frame_id).state == FrameState.RECEIVED
+        assert empty.get_job(added.job_id).attempts == 0
+    assert work_off(empty) == [JobState.SUCCEEDED]

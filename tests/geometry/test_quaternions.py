@@ -1,0 +1,72 @@
+"""Quaternions against SciPy, where they are easy and where they are not."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sceneprint.geometry.quaternions import quaternion_of, rotation_of
+from sceneprint.types import Floats
+
+AXES = [np.array(a, float) for a in itertools.product((-1, 0, 1), repeat=3) if any(a)]
+
+
+def rotations() -> list[Floats]:
+    """Random ones, and turns by and near 0, 90, 120 and 180 degrees about every simple axis."""
+    found = list(Rotation.random(300, random_state=1).as_matrix())
+    for axis in AXES:
+        for degrees in (0, 1e-9, 1e-6, 90, 120, 179.999, 180 - 1e-9, 180, 180 + 1e-9, 270):
+            turn = np.radians(degrees) * axis / np.linalg.norm(axis)
+            found.append(Rotation.from_rotvec(turn).as_matrix())
+    return found
+
+
+def test_a_rotation_comes_back_to_machine_precision() -> None:
+    worst = 0.0
+    for R in rotations():
+        q = quaternion_of(R)
+        assert q[3] >= 0
+        assert abs(np.linalg.norm(q) - 1) < 4e-16
+        worst = max(worst, float(np.abs(rotation_of(q) - R).max()))
+    assert worst < 2e-15
+
+
+def test_both_ways_agree_with_scipy() -> None:
+    for R in rotations():
+        theirs = Rotation.from_matrix(R).as_quat()
+        ours = quaternion_of(R)
+        # the sign is free where w vanishes
+        assert min(np.abs(ours - theirs).max(), np.abs(ours + theirs).max()) < 1e-12
+        np.testing.assert_allclose(
+            rotation_of(theirs), Rotation.from_quat(theirs).as_matrix(), rtol=0, atol=1e-15
+        )
+
+
+@pytest.mark.parametrize(
+    ("R", "q"),
+    [
+        (np.diag([1.0, 1, 1]), [0, 0, 0, 1]),
+        (np.diag([1.0, -1, -1]), [1, 0, 0, 0]),
+        (np.diag([-1.0, 1, -1]), [0, 1, 0, 0]),
+        (np.diag([-1.0, -1, 1]), [0, 0, 1, 0]),
+        (np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), [0, 0, 0.5**0.5, 0.5**0.5]),
+        (np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), [0, 0, -(0.5**0.5), 0.5**0.5]),
+        (np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), [0.5, 0.5, 0.5, 0.5]),
+    ],
+)
+def test_simple_turns_are_the_quaternions_of_the_textbook(R: Floats, q: list[float]) -> None:
+    np.testing.assert_allclose(quaternion_of(R), q, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(rotation_of(np.array(q, float)), R, rtol=0, atol=4e-16)
+
+
+def test_a_point_turns_the_way_the_order_x_y_z_w_says() -> None:
+    about_z = np.array([0, 0, np.sin(np.radians(15)), np.cos(np.radians(15))])
+    turned = rotation_of(about_z) @ (2.0, 0, 7)
+    np.testing.assert_allclose(turned, [3**0.5, 1, 7], rtol=0, atol=1e-15)
+    x, y, z, w = quaternion_of(rotation_of(about_z))
+    assert (x, y) == (0, 0)
+    assert z == pytest.approx(np.sin(np.radians(15)), abs=1e-15)
+    assert w == pytest.approx(np.cos(np.radians(15)), abs=1e-15)

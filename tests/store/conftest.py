@@ -1,0 +1,157 @@
+"""What the store tests share: an opened store, jobs to claim, and processes that race."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import update
+
+from sceneprint.schemas import JobState
+from sceneprint.store import Store, open_store, queue
+from sceneprint.store.frames import add_frame
+from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.records import FrameRow, JobRow, MapRow
+from sceneprint.store.tables import jobs
+
+MODEL = "ab" * 32
+
+#: Imports once, then lets children loose at one moment: they are processes of their own, and
+#: what they return comes back as JSON, or the name and text of what they raised.
+NURSERY = """
+import json, sys
+from multiprocessing import get_context
+
+code, count, ARGS = sys.argv[1], int(sys.argv[2]), json.loads(sys.argv[3])
+exec(code)
+
+def run(i, start, told):
+    start.wait()
+    try:
+        told.put([i, work(i)])
+    except BaseException as error:
+        told.put([i, f"{type(error).__name__}: {error}"])
+
+fork = get_context("fork")
+start, told = fork.Barrier(count), fork.Queue()
+children = [fork.Process(target=run, args=(i, start, told)) for i in range(count)]
+for child in children:
+    child.start()
+results = dict(told.get(timeout=60) for _ in children)
+for child in children:
+    child.join()
+print(json.dumps([results[i] for i in range(count)]))
+"""
+
+
+@pytest.fixture(scope="session")
+def race() -> Callable[..., list[Any]]:
+    """Run `work(i)` of some code in that many processes at once; ARGS are what it is given."""
+
+    def run(code: str, count: int, *args: object) -> list[Any]:
+        done = subprocess.run(
+            [sys.executable, "-c", NURSERY, code, str(count), json.dumps([str(a) for a in args])],
+            capture_output=True, text=True, timeout=120, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        found: list[Any] = json.loads(done.stdout)
+        return found
+
+    return run
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> str:
+    return f"sqlite:///{tmp_path / 'truth.db'}"
+
+
+@pytest.fixture
+def store(url: str, tmp_path: Path) -> Iterator[Store]:
+    opened = open_store(url, tmp_path / "blobs")
+    yield opened
+    opened.database.close()
+
+
+@pytest.fixture
+def hall(store: Store) -> MapRow:
+    """An empty map."""
+    with store.database.write() as connection:
+        keep_model(connection, MODEL, "toy", b"the file of a model")
+        return add_map(connection, "hall", None, MODEL)
+
+
+@pytest.fixture
+def received(store: Store, hall: MapRow) -> Callable[..., FrameRow]:
+    """Insert a frame; what is not given is like that of any other."""
+
+    def add(content: str, row: MapRow = hall, **given: object) -> FrameRow:
+        values: dict[str, Any] = {
+            "content_id": content, "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1},
+            "depth_scale": 1000.0, "depth_along_ray": False, "robot": None, "session": None,
+            "captured_at": None, "tags": [], "pose_parent": None, "pose": None,
+        }  # fmt: skip
+        with store.database.write() as connection:
+            return add_frame(connection, row.number, values | given)
+
+    return add
+
+
+@pytest.fixture
+def queued(store: Store, received: Callable[..., FrameRow]) -> Callable[..., JobRow]:
+    """Queue a job for a frame of its own."""
+
+    def add(name: str, priority: int = 0) -> JobRow:
+        frame = received(name)
+        with store.database.write() as connection:
+            return queue.enqueue(connection, "sign", frame.number, priority)
+
+    return add
+
+
+@pytest.fixture
+def turned(store: Store) -> Callable[..., None]:
+    """Write columns of a job, such as a lease that is over: no test waits for one."""
+
+    def write(job: JobRow, **values: object) -> None:
+        with store.database.write() as connection:
+            connection.execute(update(jobs).where(jobs.c.number == job.number).values(**values))
+
+    return write
+
+
+class Hand:
+    """A worker's hand at the queue."""
+
+    def __init__(self, store: Store) -> None:
+        self.database = store.database
+
+    def take(self, worker: str = "w", lease_s: float = 60.0) -> queue.Claim | None:
+        with self.database.write() as connection:
+            return queue.claim(connection, worker, lease_s)
+
+    def taken(self, worker: str = "w", lease_s: float = 60.0) -> queue.Claim:
+        held = self.take(worker, lease_s)
+        assert held is not None
+        return held
+
+    def row(self, job: JobRow) -> JobRow:
+        with self.database.read() as connection:
+            return queue.find_job(connection, job.id)
+
+    def fail(self, held: queue.Claim, error: str = "broke", trace: str = "Trace") -> JobState:
+        with self.database.write() as connection:
+            return queue.fail(connection, held, error, trace)
+
+    def due(self) -> bool:
+        with self.database.read() as connection:
+            return queue.has_due(connection)
+
+
+@pytest.fixture
+def hand(store: Store) -> Hand:
+    return Hand(store)

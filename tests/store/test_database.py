@@ -1,0 +1,184 @@
+"""The database: its schema, what it refuses to open, and what its transactions promise."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from sqlalchemy import create_engine
+
+from sceneprint.errors import NewerSchema, UnusableStore
+from sceneprint.store import Store, open_database
+from sceneprint.store.maps import find_map
+from sceneprint.store.records import MapRow
+from sceneprint.store.tables import metadata
+
+TABLES = ["events", "frames", "jobs", "keys", "maps", "models", "signatures"]
+
+OPENS = """
+from sceneprint.store import open_database
+from sqlalchemy import text
+
+def work(i):
+    database = open_database(ARGS[0])
+    with database.read() as connection:
+        found = connection.execute(text("SELECT version_num FROM alembic_version")).all()
+    database.close()
+    return [row[0] for row in found]
+"""
+
+AS_NOBODY = """
+import os, sqlite3, sys
+from pathlib import Path
+from sceneprint.errors import UnusableStore
+from sceneprint.store import open_database, open_store
+os.setgroups([]), os.setgid(65534), os.setuid(65534)
+folder = Path(sys.argv[1])
+for what in (lambda: open_store("sqlite://", folder / "blobs"),
+             lambda: open_database(f"sqlite:///{folder}/new.db"),
+             lambda: open_database(f"sqlite:///{folder}/other/there.db")):
+    try:
+        what()
+        print("opened")
+    except UnusableStore as error:
+        print(error)
+"""
+
+
+def described(path: Path) -> set[tuple[str, ...]]:
+    """What SQLite itself says of tables and indexes, in words: the order of constraints is free."""
+    with closing(sqlite3.connect(path)) as connection:
+        rows = connection.execute(
+            "SELECT type, name, tbl_name, sql FROM sqlite_master WHERE tbl_name NOT LIKE 'alembic%'"
+        ).fetchall()
+    return {
+        (kind, name, table, *sorted((sql or "").replace(",", " ").split()))
+        for kind, name, table, sql in rows
+    }
+
+
+def test_the_migrations_make_the_tables_that_the_code_knows(store: Store, tmp_path: Path) -> None:
+    with store.database.read() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, metadata) == []
+    engine = create_engine(f"sqlite:///{tmp_path / 'other.db'}")
+    metadata.create_all(engine)
+    engine.dispose()
+    assert described(tmp_path / "truth.db") == described(tmp_path / "other.db")
+    assert sorted(name for kind, name, *_ in described(tmp_path / "truth.db") if kind == "table") \
+        == [*TABLES[:-1], "signatures", "sqlite_sequence"]  # fmt: skip
+
+
+def test_opening_again_changes_nothing(url: str, store: Store, hall: MapRow) -> None:
+    again = open_database(url)
+    with again.read() as connection:
+        assert find_map(connection, "hall") == hall
+    again.close()
+
+
+def test_four_processes_may_migrate_one_empty_database_at_once(
+    url: str, tmp_path: Path, race: Callable[..., list[Any]]
+) -> None:
+    assert race(OPENS, 4, url) == [["0001"]] * 4
+    with closing(sqlite3.connect(tmp_path / "truth.db")) as connection:
+        assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+        names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+    assert sorted(name for (name,) in names) == ["alembic_version", *TABLES, "sqlite_sequence"]
+
+
+def test_threads_may_migrate_databases_of_their_own_at_once(tmp_path: Path) -> None:
+    start, raised = threading.Barrier(6), []
+
+    def open_one(i: int) -> None:
+        start.wait()
+        try:
+            open_database(f"sqlite:///{tmp_path / f'{i}.db'}").close()
+        except BaseException as error:
+            raised.append(error)
+
+    threads = [threading.Thread(target=open_one, args=(i,)) for i in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert raised == []
+    whole = described(tmp_path / "0.db")
+    assert len(whole) > len(TABLES)
+    assert all(described(tmp_path / f"{i}.db") == whole for i in range(6))
+
+
+def test_a_database_of_a_later_version_is_left_as_it_is(url: str, tmp_path: Path) -> None:
+    open_database(url).close()
+    path = tmp_path / "truth.db"
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        connection.execute("UPDATE alembic_version SET version_num = '9999'")
+    before = path.read_bytes()
+    with pytest.raises(NewerSchema, match="has schema 9999, which this version"):
+        open_database(url)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["truth.db"]
+
+
+def test_a_file_that_is_no_database_is_left_as_it_is(url: str, tmp_path: Path) -> None:
+    path = tmp_path / "truth.db"
+    path.write_bytes(b"my notes about the warehouse\n" * 400)
+    with pytest.raises(UnusableStore, match=r"not a database\. Restore the data folder"):
+        open_database(url)
+    assert path.read_bytes() == b"my notes about the warehouse\n" * 400
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("sqlite:////nowhere/at/all.db", "Check that the database is there"),
+        ("no url", "SCENEPRINT_DATABASE_URL"),
+        ("soup://reader:hunter2@host/db", "SCENEPRINT_DATABASE_URL"),
+        ("postgresql+nodriver://reader:hunter2@host/db", "SCENEPRINT_DATABASE_URL"),
+    ],
+)
+def test_what_cannot_be_opened_says_so_without_the_password(given: str, said: str) -> None:
+    with pytest.raises(UnusableStore, match=said) as caught:
+        open_database(given)
+    assert "hunter2" not in str(caught.value)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody who may not write")
+def test_a_folder_that_may_not_be_written_says_so() -> None:
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        (folder / "other").mkdir()
+        open_database(f"sqlite:///{folder}/other/there.db").close()
+        for path in (folder, folder / "other"):
+            path.chmod(0o755)
+        done = subprocess.run(
+            [sys.executable, "-c", AS_NOBODY, made], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert sorted(p.name for p in folder.rglob("*")) == ["other", "there.db"]
+    told = done.stdout.splitlines()
+    assert len(told) == 3
+    assert "the folder cannot be made (Permission denied)" in told[0]
+    assert "unable to open database file" in told[1]
+    assert "truth.db" not in told[2]
+    assert "that it may be written" in told[2]
+
+
+def test_a_damaged_page_is_said(url: str, store: Store, tmp_path: Path) -> None:
+    store.database.close()
+    path = tmp_path / "truth.db"
+    data = bytearray(path.read_bytes())
+    data[4096:] = bytes(len(data) - 4096)
+    path.write_bytes(data)
+    with pytest.raises(UnusableStore, match=r"malformed\. Restore the data folder from a copy"):
+        open_database(url)

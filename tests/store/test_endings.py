@@ -1,0 +1,152 @@
+"""The queue: how jobs end, are tried again, are given up and given back."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from sceneprint.errors import LostLease
+from sceneprint.schemas import JobState
+from sceneprint.store import Store, queue
+from sceneprint.store.records import JobRow
+
+Queued = Callable[..., JobRow]
+Turned = Callable[..., None]
+
+
+@pytest.mark.parametrize("state", [JobState.SUCCEEDED, JobState.FAILED])
+def test_what_is_finished_stays_so(
+    store: Store, hand: Any, queued: Queued, state: JobState
+) -> None:
+    job = queued("a")
+    held = hand.taken()
+    before = time.time()
+    with store.database.write() as connection:
+        queue.finish(connection, held, state, "why")
+    now = hand.row(job)
+    assert (now.state, now.error, now.leased_until) == (state, "why", None)
+    assert now.finished_at is not None
+    assert before <= now.finished_at <= time.time()
+    with pytest.raises(LostLease), store.database.write() as connection:
+        queue.finish(connection, held, JobState.SUCCEEDED)
+    assert hand.row(job) == now
+    assert not hand.due()
+
+
+def test_a_job_that_breaks_waits_longer_each_time_and_is_dead_after_three(
+    store: Store, hand: Any, queued: Queued, turned: Turned
+) -> None:
+    job = queued("a")
+    for attempt, wait in ((1, 2.0), (2, 8.0)):
+        held = hand.taken()
+        assert held.job.attempts == attempt
+        before = time.time()
+        assert hand.fail(held, f"error {attempt}", f"trace {attempt}") == JobState.QUEUED
+        now = hand.row(job)
+        assert before + wait <= now.run_after <= time.time() + wait
+        assert (now.state, now.leased_until, now.finished_at) == (JobState.QUEUED, None, None)
+        assert (now.error, now.traceback) == (f"error {attempt}", f"trace {attempt}")
+        assert hand.take() is None
+        turned(job, run_after=0.0)
+    assert hand.fail(hand.taken(), "error 3", "trace 3") == JobState.DEAD
+    dead = hand.row(job)
+    assert (dead.state, dead.attempts, dead.token) == (JobState.DEAD, 3, 3)
+    assert (dead.error, dead.traceback) == ("error 3", "trace 3")
+    assert dead.finished_at is not None
+    turned(job, run_after=0.0)
+    assert not hand.due()
+    assert hand.take() is None
+
+
+def test_success_forgets_the_errors_of_earlier_tries(
+    store: Store, hand: Any, queued: Queued, turned: Turned
+) -> None:
+    job = queued("a")
+    hand.fail(hand.taken())
+    turned(job, run_after=0.0)
+    with store.database.write() as connection:
+        held = queue.claim(connection, "w", 60.0)
+        assert held is not None
+        queue.finish(connection, held, JobState.SUCCEEDED)
+    now = hand.row(job)
+    assert (now.state, now.attempts, now.error, now.traceback) == (
+        JobState.SUCCEEDED, 2, None, None,
+    )  # fmt: skip
+
+
+def test_a_job_whose_workers_all_fell_silent_is_buried(
+    store: Store, hand: Any, queued: Queued, turned: Turned
+) -> None:
+    silent, lively = queued("a"), queued("b")
+    for attempt in range(1, 11):
+        held = hand.taken()
+        assert (held.job.number, held.job.attempts) == (silent.number, attempt)
+        with store.database.write() as connection:  # its last lease still runs
+            assert queue.bury(connection) == []
+        turned(silent, leased_until=time.time() - 1)
+        if attempt < 10:
+            with store.database.write() as connection:  # another may try
+                assert queue.bury(connection) == []
+    assert hand.taken().job.number == lively.number  # not an eleventh time
+    assert hand.due()  # to be buried
+    with store.database.write() as connection:
+        (buried,) = queue.bury(connection)
+    assert buried == hand.row(silent)
+    assert (buried.state, buried.leased_until) == (JobState.DEAD, None)
+    assert buried.error == "its worker fell silent, and 10 tries are over"
+    assert buried.finished_at is not None
+    assert not hand.due()
+    with pytest.raises(LostLease), store.database.write() as connection:
+        queue.finish(connection, held, JobState.SUCCEEDED)
+
+
+def test_silence_is_not_counted_as_breaking_down(hand: Any, queued: Queued, turned: Turned) -> None:
+    """A machine restarted eight times must not cost a frame that then breaks down once."""
+    job = queued("a")
+    for _ in range(8):
+        hand.taken()
+        turned(job, leased_until=time.time() - 1)
+    assert hand.fail(hand.taken()) == JobState.QUEUED
+    assert (hand.row(job).attempts, hand.row(job).failures) == (9, 1)
+    turned(job, run_after=0.0)
+    assert hand.fail(hand.taken()) == JobState.DEAD  # the tenth try is the last, whatever ended it
+
+
+def test_cancelling_takes_a_job_from_whoever_has_it(
+    store: Store, hand: Any, queued: Queued
+) -> None:
+    running, waiting, over, other = (queued(name) for name in "abcd")
+    held = hand.taken()
+    with store.database.write() as connection:
+        queue.cancel_of(connection, waiting.frame_number)
+    assert hand.row(waiting).state == JobState.CANCELLED
+    done = hand.taken()
+    assert done.job.number == over.number  # not the cancelled one
+    with store.database.write() as connection:
+        queue.finish(connection, done, JobState.SUCCEEDED)
+        queue.cancel_of(connection, over.frame_number)
+        queue.cancel_of(connection, running.frame_number)
+    assert hand.row(over).state == JobState.SUCCEEDED
+    with pytest.raises(LostLease), store.database.write() as connection:
+        queue.finish(connection, held, JobState.SUCCEEDED)
+    now = hand.row(running)
+    assert (now.state, now.leased_until) == (JobState.CANCELLED, None)
+    assert now.finished_at is not None
+    assert hand.row(other) == other
+
+
+def test_what_is_given_back_was_never_tried(store: Store, hand: Any, queued: Queued) -> None:
+    job = queued("a")
+    for token in (1, 2, 3, 4, 5):  # as often as workers are stopped
+        held = hand.taken()
+        assert (held.token, held.job.attempts) == (token, 1)
+        with store.database.write() as connection:
+            queue.give_back(connection, held)
+        now = hand.row(job)
+        assert (now.state, now.attempts, now.worker, now.leased_until) == (
+            JobState.QUEUED, 0, None, None,
+        )  # fmt: skip
+        assert now.run_after == job.run_after

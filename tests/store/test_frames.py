@@ -1,0 +1,222 @@
+"""Frames, signatures and keys as rows: what is there, what is gone, and who learns of it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+
+import pytest
+from sqlalchemy import select, update
+from sqlalchemy.exc import IntegrityError
+
+from sceneprint.errors import Conflict, DamagedBlob, UnknownFrame, UnknownMap
+from sceneprint.schemas import FrameState
+from sceneprint.store import Store, queue
+from sceneprint.store import frames as stored
+from sceneprint.store import keys as stored_keys
+from sceneprint.store import maps as stored_maps
+from sceneprint.store import signatures as signed
+from sceneprint.store.records import FrameRow, MapRow
+from sceneprint.store.tables import events, keys, signatures
+
+Received = Callable[..., FrameRow]
+Indexed = Callable[[FrameRow], int]
+
+
+@pytest.fixture
+def indexed(store: Store, hall: MapRow) -> Indexed:
+    """Give a frame a signature of three bytes that tell its number."""
+
+    def index(frame: FrameRow) -> int:
+        made = signed.StoredSignature(
+            hall.model_id, bytes([frame.number, 2, 3]), f"{frame.number:064d}", [4], [12]
+        )
+        with store.database.write() as connection:
+            return signed.index_frame(connection, frame, made)
+
+    return index
+
+
+def delete(store: Store, row: MapRow, frame: FrameRow) -> list[str]:
+    with store.database.write() as connection:
+        now = stored.find_frame(connection, row, frame.id)
+        return stored.delete_frame(connection, row, now)
+
+
+def changes(store: Store, row: MapRow, since: int, limit: int = 256) -> list[list[signed.Change]]:
+    with store.database.read() as connection:
+        return list(signed.changes_since(connection, row, since, limit))
+
+
+def test_a_row_comes_back_as_it_was_given(store: Store, hall: MapRow, received: Received) -> None:
+    pose = [[0.1 + 0.2, -0.0, 1 / 3, 5e-324], [0.0, 1.0, 0.0, 1e22], [0.0, 0.0, 1.0, 0.0],
+            [0.0, 0.0, 0.0, 1.0]]  # fmt: skip
+    frame = received(
+        "a", robot="R2", session="s\u00e9ance", captured_at=1763731200.123456, tags=["x", "\u2764"],
+        pose_parent="p", pose=pose,
+    )  # fmt: skip
+    with store.database.read() as connection:
+        assert stored.find_frame(connection, hall, frame.id) == frame
+        assert stored.find_content(connection, hall.number, "a") == frame
+        assert stored.find_content(connection, hall.number, "b") is None
+        assert stored.find_content(connection, hall.number + 1, "a") is None
+        with pytest.raises(UnknownFrame, match="no frame 'x' in map 'hall'"):
+            stored.find_frame(connection, hall, "x")
+        with pytest.raises(UnknownMap, match="no map 'x'"):
+            stored_maps.find_map(connection, "x")
+    assert frame.pose == pose
+    assert (frame.state, frame.robot, frame.tags) == (FrameState.RECEIVED, "R2", ["x", "\u2764"])
+    assert (frame.captured_at, frame.session) == (1763731200.123456, "s\u00e9ance")
+
+
+def test_a_map_has_a_content_once(store: Store, hall: MapRow, received: Received) -> None:
+    received("a")
+    with pytest.raises(IntegrityError):
+        received("a")
+    with store.database.write() as connection:
+        other = stored_maps.add_map(connection, "other", None, hall.model_id)
+    assert received("a", other).map_number == other.number
+
+
+def test_changes_come_in_order_whatever_the_block(
+    store: Store, hall: MapRow, received: Received, indexed: Indexed
+) -> None:
+    frames = [received(str(i)) for i in range(5)]
+    revisions = [indexed(frames[i]) for i in (3, 0, 4, 1)]
+    assert revisions == [1, 2, 3, 4]  # frame 2 is never signed
+    delete(store, hall, frames[0])
+    delete(store, hall, frames[2])
+    wanted = [
+        signed.Change(
+            frames[i].number, revision, bytes([frames[i].number, 2, 3]) if there else None
+        )
+        for i, revision, there in [(3, 1, 1), (4, 3, 1), (1, 4, 1), (0, 5, 0), (2, 6, 0)]
+    ]
+    assert changes(store, hall, 0) == [wanted]
+    assert changes(store, hall, 0, 2) == [wanted[:2], wanted[2:4], wanted[4:]]
+    assert changes(store, hall, 0, 5) == [wanted]
+    assert changes(store, hall, 3) == [wanted[2:]]
+    assert changes(store, hall, 6) == []
+    with store.database.read() as connection:
+        counts = [signed.count_indexed(connection, hall.number, since) for since in (0, 1, 3, 4)]
+        assert counts == [3, 2, 1, 0]
+        gone = [signed.deleted_since(connection, hall.number, since) for since in (0, 5, 6)]
+        assert gone == [{frames[0].number, frames[2].number}, {frames[2].number}, set()]
+        assert stored_maps.find_map(connection, "hall").revision == 6
+
+
+def test_a_damaged_signature_is_noticed_and_deleting_its_frame_helps(
+    store: Store, hall: MapRow, received: Received, indexed: Indexed
+) -> None:
+    good, bad = received("a"), received("b")
+    indexed(good)
+    indexed(bad)
+    with store.database.write() as connection:
+        connection.execute(
+            update(signatures).where(signatures.c.frame_number == bad.number).values(vector=b"\0")
+        )
+    with pytest.raises(DamagedBlob, match=f"frame number {bad.number} is damaged"):
+        changes(store, hall, 0)
+    delete(store, hall, bad)
+    (block,) = changes(store, hall, 0)
+    assert [(one.number, one.vector is None) for one in block] == [
+        (good.number, False), (bad.number, True),
+    ]  # fmt: skip
+
+
+def test_a_deleted_frame_leaves_a_row_and_nothing_else(
+    store: Store, hall: MapRow, received: Received, indexed: Indexed
+) -> None:
+    frame, other = received("a", blob="11" * 32), received("b", blob="11" * 32)
+    indexed(frame)
+    artifact = f"{frame.number:064d}"
+    assert delete(store, hall, frame) == ["11" * 32, artifact]
+    with store.database.read() as connection:
+        now = stored.find_frame(connection, hall, frame.id)
+        assert (now.state, now.content_id, now.revision) == (FrameState.DELETED, None, 2)
+        assert stored.find_content(connection, hall.number, "a") is None
+        assert stored.list_frames(connection, hall.number, 0, 9, None) == [other]
+        assert stored.list_frames(connection, hall.number, 0, 9, FrameState.DELETED) == [now]
+        assert stored.frames_of(connection, [frame.number, other.number]) == {other.number: other}
+        assert signed.stored_vector(connection, frame.number, hall.model_id) is None
+        assert signed.geometry_blobs(connection, [frame.number], hall.model_id) == {}
+        assert stored.refers_to(connection, "11" * 32)  # the other frame does
+        assert not stored.refers_to(connection, artifact)
+        told = connection.execute(select(events).where(events.c.kind == "frame.deleted")).all()
+        assert [(each.map, each.frame_id) for each in told] == [("hall", frame.id)]
+    with pytest.raises(UnknownFrame, match="was deleted before"):
+        delete(store, hall, frame)
+    with store.database.write() as connection:
+        stored.set_state(connection, frame.number, FrameState.FAILED, "late")
+        assert stored.find_frame(connection, hall, frame.id) == now
+    assert received("a").number > other.number
+
+
+def test_pages_follow_the_order_of_arrival(
+    store: Store, hall: MapRow, received: Received, indexed: Indexed
+) -> None:
+    frames = [received(str(i)) for i in range(5)]
+    indexed(frames[3])
+    with store.database.read() as connection:
+        first = stored.list_frames(connection, hall.number, 0, 2, None)
+        rest = stored.list_frames(connection, hall.number, first[-1].number, 9, None)
+        found = stored.list_frames(connection, hall.number, 0, 9, FrameState.INDEXED)
+        assert stored_maps.count_frames(connection, hall.number) == {"indexed": 1, "received": 4}
+        assert stored.count_states(connection) == {"indexed": 1, "received": 4}
+    assert [frame.number for frame in first + rest] == [frame.number for frame in frames]
+    assert [frame.number for frame in found] == [frames[3].number]
+
+
+def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(
+    store: Store, hall: MapRow, received: Received, indexed: Indexed
+) -> None:
+    with store.database.write() as connection:
+        other = stored_maps.add_map(connection, "other", "Other", hall.model_id)
+    mine, theirs = received("a", blob="11" * 32), received("a", other, blob="11" * 32)
+    indexed(mine)
+    indexed(theirs)
+    with store.database.write() as connection:
+        job = queue.enqueue(connection, "sign", mine.number)
+        kept = queue.enqueue(connection, "sign", theirs.number)
+        blobs = stored_maps.remove_map(connection, hall)
+    assert sorted(blobs) == sorted(["11" * 32, f"{mine.number:064d}"])
+    with store.database.read() as connection:
+        assert [row.name for row in stored_maps.list_maps(connection)] == ["other"]
+        assert stored.frames_of(connection, [mine.number, theirs.number]).keys() == {theirs.number}
+        assert queue.jobs_of(connection, [mine.number, theirs.number]) == {theirs.number: kept}
+        assert job.number != kept.number
+        assert stored.refers_to(connection, "11" * 32)
+        assert signed.stored_vector(connection, mine.number, hall.model_id) is None
+        assert signed.stored_vector(connection, theirs.number, hall.model_id) == bytes(
+            [theirs.number, 2, 3]
+        )
+        assert [e.kind for e in connection.execute(select(events).order_by(events.c.number))] == [
+            "map.created", "map.created", "map.deleted",
+        ]  # fmt: skip
+    with store.database.write() as connection:  # numbers are not given out twice
+        again = stored_maps.add_map(connection, "hall", None, hall.model_id)
+    assert again.number > other.number
+
+
+def test_a_key_is_shown_once_and_kept_as_a_hash(store: Store) -> None:
+    with store.database.write() as connection:
+        assert not stored_keys.any_key(connection)
+        secret = stored_keys.create_key(connection, "fleet")
+        other = stored_keys.create_key(connection, "dashboard")
+    assert secret.startswith("sp_")
+    assert len(secret) == 46
+    with pytest.raises(Conflict, match="a key named 'fleet'"), store.database.write() as connection:
+        stored_keys.create_key(connection, "fleet")
+    with store.database.read() as connection:
+        assert stored_keys.any_key(connection)
+        names = [stored_keys.key_name(connection, s) for s in (secret, other, secret[:-1], "")]
+        assert names == ["fleet", "dashboard", None, None]
+        rows = connection.execute(select(keys).order_by(keys.c.name.desc())).all()
+        assert [row.digest for row in rows] == [
+            hashlib.sha256(s.encode()).hexdigest() for s in (secret, other)
+        ]
+        told = connection.execute(select(events)).all()
+    assert [(each.kind, each.data) for each in told] == [
+        ("key.created", {"name": "fleet"}), ("key.created", {"name": "dashboard"}),
+    ]  # fmt: skip
+    assert secret not in repr(rows) + repr(told)

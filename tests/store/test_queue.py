@@ -1,0 +1,138 @@
+"""The queue: who gets which job, for how long, and what becomes of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+
+from sceneprint.errors import LostLease, UnknownJob
+from sceneprint.schemas import JobState
+from sceneprint.store import Store, queue
+from sceneprint.store.records import FrameRow, JobRow, MapRow
+from sceneprint.store.signatures import StoredSignature, index_frame
+from sceneprint.store.tables import signatures
+
+Queued = Callable[..., JobRow]
+Turned = Callable[..., None]
+
+
+def test_a_job_is_queued_as_it_should_be(store: Store, hand: Any, queued: Queued) -> None:
+    before = time.time()
+    job = queued("a", 3)
+    assert (job.kind, job.state, job.priority, job.attempts, job.token) == (
+        "sign", JobState.QUEUED, 3, 0, 0,
+    )  # fmt: skip
+    assert before <= job.run_after == job.created_at <= time.time()
+    assert (job.leased_until, job.worker, job.error, job.traceback) == (None,) * 4
+    assert (job.started_at, job.finished_at) == (None, None)
+    assert hand.row(job) == job
+    with store.database.read() as connection:
+        assert queue.jobs_of(connection, [job.frame_number]) == {job.frame_number: job}
+        assert queue.count_jobs(connection) == {"queued": 1}
+        with pytest.raises(UnknownJob, match="no job 'nobody'"):
+            queue.find_job(connection, "nobody")
+
+
+def test_what_matters_more_comes_first_and_of_equals_what_came_first(
+    store: Store, hand: Any, queued: Queued, turned: Turned
+) -> None:
+    jobs = [queued(str(i), priority) for i, priority in enumerate([0, 5, 0, 5, -1, 9])]
+    turned(jobs[2], run_after=1.0)  # waits longest, but came later than the first
+    order = [hand.taken().job.number - jobs[0].number for _ in jobs]
+    assert order == [5, 1, 3, 0, 2, 4]
+    assert hand.take() is None
+
+
+def test_a_claim_is_a_lease_with_a_token(store: Store, hand: Any, queued: Queued) -> None:
+    job = queued("a")
+    assert hand.due()
+    before = time.time()
+    held = hand.taken("host:7", 45.0)
+    after = time.time()
+    assert held.job == hand.row(job)
+    assert (held.job.state, held.job.worker, held.job.attempts) == (JobState.RUNNING, "host:7", 1)
+    assert (held.token, held.job.token) == (1, 1)
+    assert held.job.started_at is not None
+    assert before <= held.job.started_at <= after
+    assert held.job.leased_until == held.job.started_at + 45.0
+    assert not hand.due()
+    assert hand.take() is None
+
+
+def test_a_job_waits_for_its_time(store: Store, hand: Any, queued: Queued, turned: Turned) -> None:
+    job = queued("a")
+    turned(job, run_after=time.time() + 100)
+    assert not hand.due()
+    assert hand.take() is None
+    turned(job, run_after=time.time() - 0.001)
+    assert hand.due()
+    assert hand.taken().job.number == job.number
+
+
+def test_a_lease_that_is_over_is_given_to_another_with_a_greater_token(
+    store: Store, hand: Any, queued: Queued, turned: Turned
+) -> None:
+    job = queued("a")
+    first = hand.taken("first")
+    turned(job, leased_until=time.time() + 100)
+    assert hand.take("second") is None
+    turned(job, leased_until=time.time() - 0.001)
+    assert hand.due()
+    second = hand.taken("second")
+    assert (second.token, second.job.attempts, second.job.worker) == (2, 2, "second")
+    assert second.token > first.token
+    for late in (
+        lambda c: queue.finish(c, first, JobState.SUCCEEDED),
+        lambda c: queue.fail(c, first, "late", "late"),
+        lambda c: queue.renew(c, first, 9.0),
+        lambda c: queue.give_back(c, first),
+    ):
+        lost = pytest.raises(LostLease, match=f"{job.id} is no longer held")
+        with lost, store.database.write() as connection:
+            late(connection)
+        assert hand.row(job) == second.job
+
+
+def test_what_comes_late_leaves_nothing(
+    store: Store, hand: Any, hall: MapRow, received: Callable[..., FrameRow], turned: Turned
+) -> None:
+    frame = received("a")
+    with store.database.write() as connection:
+        job = queue.enqueue(connection, "sign", frame.number)
+    made = StoredSignature(hall.model_id, b"\1\2\3", "cd" * 32, [4, 2], [12, 2])
+    first = hand.taken("first")
+    turned(job, leased_until=1.0)
+    second = hand.taken("second")
+    for order in (1, -1):  # the effect before the end of the job, and after it
+        steps = (
+            lambda c: index_frame(c, frame, made),
+            lambda c: queue.finish(c, first, JobState.SUCCEEDED),
+        )
+        with pytest.raises(LostLease), store.database.write() as connection:
+            [step(connection) for step in steps[::order]]
+        with store.database.read() as connection:
+            assert connection.execute(select(signatures)).all() == []
+    with store.database.write() as connection:
+        queue.finish(connection, second, JobState.SUCCEEDED)
+        assert index_frame(connection, frame, made) == 1
+    assert hand.row(job).state == JobState.SUCCEEDED
+
+
+def test_renewing_extends_the_lease_and_nothing_else(
+    store: Store, hand: Any, queued: Queued, turned: Turned
+) -> None:
+    queued("a")
+    held = hand.taken("w", 10.0)
+    turned(held.job, leased_until=time.time() - 1)  # late, but nobody else came
+    before = time.time()
+    with store.database.write() as connection:
+        queue.renew(connection, held, 30.0)
+    now = hand.row(held.job)
+    assert now.leased_until is not None
+    assert before + 30.0 <= now.leased_until <= time.time() + 30.0
+    assert (now.token, now.attempts, now.state) == (1, 1, JobState.RUNNING)
+    assert hand.take() is None

@@ -1,0 +1,132 @@
+"""Files written whole: in which order, and what is left where it fails."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sceneprint.writing import sync_folder, write_durable, write_whole
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, bytes]]:
+    """What is synced and renamed, in order, with what the file held at that moment."""
+    seen: list[tuple[str, str, bytes]] = []
+    fsync, replace = os.fsync, os.replace
+
+    def recording_fsync(number: int) -> None:
+        name = Path(f"/proc/self/fd/{number}").readlink()
+        folder = stat.S_ISDIR(os.fstat(number).st_mode)
+        seen.append(("fsync", str(name), b"" if folder else name.read_bytes()))
+        fsync(number)
+
+    def recording_replace(source: Path, target: Path) -> None:
+        seen.append(("replace", str(target), Path(source).read_bytes()))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", recording_fsync)
+    monkeypatch.setattr(os, "replace", recording_replace)
+    return seen
+
+
+def test_a_durable_file_is_synced_before_its_name_and_the_name_after(
+    tmp_path: Path, calls: list[tuple[str, str, bytes]]
+) -> None:
+    folder = tmp_path / "new"
+    folder.mkdir()
+    write_durable(folder / "a", b"content" * 9000)
+    assert (folder / "a").read_bytes() == b"content" * 9000
+    assert [p.name for p in folder.iterdir()] == ["a"]
+    part = calls[0][1]
+    assert Path(part).parent == folder
+    assert part.endswith(".part")
+    assert calls == [
+        ("fsync", part, b"content" * 9000),  # flushed: all of it is there to be synced
+        ("replace", str(folder / "a"), b"content" * 9000),
+        ("fsync", str(folder), b""),
+        ("fsync", str(tmp_path), b""),
+    ]
+
+
+def test_a_folder_is_synced_through_a_descriptor_that_is_closed(
+    tmp_path: Path, calls: list[tuple[str, str, bytes]]
+) -> None:
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    sync_folder(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        sync_folder(tmp_path / "none")
+    assert calls == [("fsync", str(tmp_path), b"")]
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+@pytest.mark.parametrize("write", [write_whole, write_durable])
+def test_the_old_file_stays_until_the_new_one_is_whole(
+    tmp_path: Path, write: Callable[[Path, bytes], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a"
+    write(path, b"old")
+
+    def fail(*_: Any) -> None:
+        assert path.read_bytes() == b"old"
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        write(path, b"new")
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_name_that_cannot_be_made_durable_is_an_error(
+    tmp_path: Path, which: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "new"
+    folder.mkdir()
+    fsync = os.fsync
+    left = [which]
+
+    def fail(number: int) -> None:
+        if stat.S_ISDIR(os.fstat(number).st_mode):
+            if left[0] == 0:
+                raise OSError(errno.EIO, "Input/output error")
+            left[0] -= 1
+        fsync(number)
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="Input/output error") as caught:
+        write_durable(folder / "a", b"content")
+    assert (caught.value.errno, caught.value.filename) == (errno.EIO, str(folder / "a"))
+    assert not list(folder.glob(".*"))
+
+
+@pytest.mark.parametrize("write", [write_whole, write_durable])
+def test_an_interruption_leaves_nothing(
+    tmp_path: Path, write: Callable[[Path, bytes], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "a", b"content")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("write", [write_whole, write_durable])
+def test_a_folder_that_is_not_there_is_named(
+    tmp_path: Path, write: Callable[[Path, bytes], None]
+) -> None:
+    with pytest.raises(FileNotFoundError) as caught:
+        write(tmp_path / "none" / "a", b"content")
+    assert caught.value.filename == str(tmp_path / "none" / "a")
+    long = tmp_path / ("n" * 255)  # the longest name a file may have
+    write(long, b"content")
+    assert long.read_bytes() == b"content"
