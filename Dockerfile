@@ -1,0 +1,91 @@
+# One image for both parts: the service (`serve`, the default) and workers alone (`work`).
+# tests/test_container.py lints this file and runs its steps without a container engine.
+#
+#   docker compose up --build          service and workers, see docker-compose.yml
+#   docker build -t sceneprint . && docker run -p 127.0.0.1:8008:8008 -v data:/data sceneprint
+#
+# Beyond its own machine the service asks for a key, and from within a container every caller is
+# beyond it. The first key: docker compose exec service sceneprint keys --create NAME
+
+FROM python:3.11-slim-bookworm AS build
+
+# No cache: the layer would carry it. As an option here it holds for every step below.
+ENV PIP_NO_CACHE_DIR=1 \
+    PIP_DISABLE_PIP_VERSION_CHECK=1 \
+    PIP_ROOT_USER_ACTION=ignore
+
+WORKDIR /src
+
+# What changes seldom first, so that a change of code installs no dependency anew.
+COPY pyproject.toml requirements.txt ./
+
+# The lock holds the dev extra as well: it is a constraint here, what to install says pyproject.toml.
+# Without open3d: 0.9 GB with what it brings, and it wants libGL, libX11 and libusb. Only benchmarks
+# load it (an import contract in pyproject.toml keeps that true), and they are not in the image.
+# Without pip in the environment: the final stage installs nothing.
+RUN python -m venv --without-pip /opt/sceneprint && \
+    python -c "import tomllib; print(*(d for d in tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies'] if not d.startswith('open3d')), sep='\n')" > runtime.txt && \
+    python -m pip --python /opt/sceneprint install --quiet --constraint requirements.txt --requirement runtime.txt
+
+COPY README.md LICENSE ./
+COPY migrations migrations/
+COPY sceneprint sceneprint/
+COPY service service/
+COPY worker worker/
+
+# --no-deps: our own requirement of open3d is left unmet on purpose.
+RUN python -m pip install --quiet --constraint requirements.txt setuptools && \
+    python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir wheels . && \
+    python -m pip --python /opt/sceneprint install --quiet --no-deps wheels/sceneprint-*.whl
+
+
+FROM python:3.11-slim-bookworm
+
+LABEL org.opencontainers.image.title="sceneprint" \
+      org.opencontainers.image.description="Place recognition from pure geometry: service and workers" \
+      org.opencontainers.image.version="0.1.0" \
+      org.opencontainers.image.licenses="Apache-2.0"
+
+# OMP, OPENBLAS: our kernels want one thread each (see Makefile).
+# HOST: all addresses of the container; which of them the world reaches is published outside.
+ENV PATH=/opt/sceneprint/bin:$PATH \
+    PYTHONUNBUFFERED=1 \
+    PYTHONDONTWRITEBYTECODE=1 \
+    OMP_NUM_THREADS=1 \
+    OPENBLAS_NUM_THREADS=1 \
+    NUMBA_CACHE_DIR=/var/cache/sceneprint/numba \
+    SCENEPRINT_CACHE_DIR=/var/cache/sceneprint \
+    SCENEPRINT_DATA_DIR=/data \
+    SCENEPRINT_HOST=0.0.0.0 \
+    SCENEPRINT_PORT=8008
+
+# A fixed number, so that volumes keep their owner from image to image.
+RUN groupadd --gid 10001 sceneprint && \
+    useradd --uid 10001 --gid 10001 --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin sceneprint && \
+    mkdir -p /data /var/cache/sceneprint && \
+    chown 10001:10001 /data /var/cache/sceneprint
+
+COPY --from=build /opt/sceneprint /opt/sceneprint
+
+USER 10001:10001
+
+# Compile the kernels and build the pair tables now, as the user who runs them: numba uses a cache
+# folder only where it may write, so one that root made would be passed over, and every process
+# would compile for itself. On another kind of processor than this one the first use compiles
+# once more, into the same folder.
+RUN python -c "from sceneprint.cli.signer import prepare_presets; \
+    from sceneprint.settings import Settings; \
+    prepare_presets(Settings())"
+
+VOLUME ["/data"]
+EXPOSE 8008
+STOPSIGNAL SIGTERM
+
+# Of the service; docker-compose.yml has another for workers. The start may have to compile.
+HEALTHCHECK --interval=15s --timeout=5s --start-period=120s --retries=3 \
+    CMD ["python", "-c", "import http.client, os, sys; c = http.client.HTTPConnection('127.0.0.1', int(os.environ['SCENEPRINT_PORT']), timeout=3); c.request('GET', '/healthz'); sys.exit(c.getresponse().status != 200)"]
+
+# The command, not `python -m service`: the same image makes keys, signs and evaluates, and a
+# container of its own is complete, as `serve` starts workers beside the service.
+ENTRYPOINT ["sceneprint"]
+CMD ["serve"]

@@ -1,0 +1,680 @@
+"""The image and its composition are held to what they promise, without a container engine.
+
+Three ways: hadolint and the Compose schema read the files as they are written; rules of our own
+read what those do not know; and the steps of the image are run, each in turn, in a folder that
+stands for its file system. Every rule is shown a file that breaks it.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any, cast
+
+import httpx
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from sceneprint.models import PRESETS
+from sceneprint.settings import Settings
+from sceneprint.types import Frame
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCKERFILE = (ROOT / "Dockerfile").read_text()
+COMPOSE = (ROOT / "docker-compose.yml").read_text()
+IGNORE = (ROOT / ".dockerignore").read_text()
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+KNOWN_SETTINGS = {f"SCENEPRINT_{name.upper()}" for name in Settings.model_fields}
+
+
+# Reading a Dockerfile
+
+
+@dataclass(frozen=True)
+class Step:
+    """One instruction: which stage it is in (from 0), its name, flags, and the rest of it."""
+
+    stage: int
+    name: str
+    flags: tuple[str, ...]
+    rest: str
+
+    def words(self) -> list[str]:
+        """The rest as the exec form has it; a ValueError where it is in shell form."""
+        try:
+            found = json.loads(self.rest)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{self.name} is not in exec form: {self.rest}") from error
+        return cast(list[str], found)
+
+
+def steps_of(text: str) -> list[Step]:
+    """Instructions in their order, continued lines joined and comments left out."""
+    lines = (line for line in text.splitlines() if not line.lstrip().startswith("#"))
+    joined = re.sub(r"\\\n\s*", "", "\n".join(lines))
+    steps, stage = [], -1
+    for line in filter(str.strip, joined.splitlines()):
+        name, _, rest = line.strip().partition(" ")
+        stage += name.upper() == "FROM"
+        flags = re.match(r"(?:--\S+\s+)*", rest.lstrip())
+        assert flags is not None
+        rest = rest.lstrip()[flags.end() :]
+        steps.append(Step(stage, name.upper(), tuple(flags[0].split()), rest))
+    return steps
+
+
+def final(steps: list[Step]) -> list[Step]:
+    """Steps of the stage that becomes the image."""
+    return [step for step in steps if step.stage == steps[-1].stage]
+
+
+def only(steps: list[Step], name: str) -> Step:
+    """The one step of that name in the image's stage."""
+    found = [step for step in final(steps) if step.name == name]
+    if len(found) != 1:
+        raise ValueError(f"{len(found)} {name} in the last stage")
+    return found[0]
+
+
+def health_check(steps: list[Step]) -> list[str]:
+    """Command of the image's health check."""
+    step = only(steps, "HEALTHCHECK")
+    return Step(step.stage, "HEALTHCHECK", (), step.rest.removeprefix("CMD ")).words()
+
+
+def environment(steps: list[Step]) -> dict[str, str]:
+    """What ENV sets in the image's stage."""
+    pairs = [shlex.split(step.rest) for step in final(steps) if step.name == "ENV"]
+    return dict(pair.split("=", 1) for words in pairs for pair in words)
+
+
+def image_problems(text: str) -> list[str]:
+    """What our rules have against a Dockerfile that hadolint knows nothing about."""
+    steps, found = steps_of(text), []
+    for read in (
+        lambda: only(steps, "ENTRYPOINT").words(),
+        lambda: only(steps, "CMD").words(),
+        lambda: health_check(steps),
+        lambda: only(steps, "STOPSIGNAL"),
+    ):
+        try:
+            read()
+        except ValueError as error:
+            found.append(str(error))
+    users = [step.rest for step in final(steps) if step.name == "USER"]
+    if not users or not all(re.fullmatch(r"[1-9]\d*:[1-9]\d*", user) for user in users):
+        found.append("the image does not run as a fixed number other than root's")
+    names = [step.name for step in final(steps)]
+    if "USER" in names and not names.index("USER") < len(names) - 1 - names[::-1].index("RUN"):
+        found.append("what the last RUN makes is not the user's")
+    if re.search(
+        r"\b(apt-get|pip|gcc|make)\b", " ".join(s.rest for s in final(steps) if s.name == "RUN")
+    ):
+        found.append("the last stage installs or builds")
+    for step in steps:
+        if step.name == "FROM" and not re.fullmatch(
+            r"\S+:\d+\.\d+\S*-slim\S*( AS \w+)?", step.rest
+        ):
+            found.append(f"no slim base with its version: {step.rest}")
+        if step.name == "ADD":
+            found.append(f"ADD: {step.rest}")
+        if (
+            step.name == "RUN"
+            and "apt-get install" in step.rest
+            and "rm -rf /var/lib/apt/lists" not in step.rest
+        ):
+            found.append("lists of apt are left behind")
+    uncached = {s.stage for s in steps if s.name == "ENV" and "PIP_NO_CACHE_DIR=1" in s.rest}
+    if not {s.stage for s in steps if s.name == "RUN" and "pip" in s.rest} <= uncached:
+        found.append("pip keeps its cache in a layer")
+    if set(environment(steps)) - KNOWN_SETTINGS - {
+        "PATH", "PYTHONUNBUFFERED", "PYTHONDONTWRITEBYTECODE",
+        "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_CACHE_DIR",
+    }:  # fmt: skip
+        found.append("ENV sets what nothing reads")
+    return found
+
+
+def changed(text: str, old: str, new: str) -> str:
+    """The text with one part replaced, which must be there once: else nothing would be tried."""
+    assert text.count(old) == 1, f"{text.count(old)} of {old!r}"
+    return text.replace(old, new)
+
+
+# Lint
+
+
+def tool(name: str) -> str:
+    """A tool beside this Python; it comes with the dev extra."""
+    path = shutil.which(name, path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
+    if path is None:
+        pytest.fail(f"{name} is not installed: it belongs to the dev extra, run `make test`")
+    return path
+
+
+def hadolint(text: str) -> list[str]:
+    """Codes of what hadolint finds."""
+    done = subprocess.run(
+        [tool("hadolint"), "--no-color", "--format", "json", "-"],
+        input=text, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.stderr == ""
+    return sorted({str(found["code"]) for found in json.loads(done.stdout)})
+
+
+def test_hadolint_has_nothing_against_the_dockerfile() -> None:
+    assert hadolint(DOCKERFILE) == []
+
+
+LAST_FROM = "\n\nFROM python:3.11-slim-bookworm\n"
+
+
+@pytest.mark.parametrize(
+    ("code", "old", "new"),
+    [
+        ("DL3007", LAST_FROM, "\n\nFROM python:latest\n"),
+        ("DL3006", LAST_FROM, "\n\nFROM python\n"),
+        ("DL3020", "COPY migrations", "ADD migrations"),
+        ("DL3025", 'CMD ["serve"]', "CMD serve"),
+        ("DL3042", "PIP_NO_CACHE_DIR=1", "PIP_NO_INPUT=1"),
+        ("DL3009", "VOLUME", "RUN apt-get update\nVOLUME"),
+        ("DL3002", "USER 10001:10001", "USER root"),
+    ],
+)
+def test_hadolint_would_find(code: str, old: str, new: str) -> None:
+    assert code in hadolint(changed(DOCKERFILE, old, new))
+
+
+def test_our_rules_have_nothing_against_the_dockerfile() -> None:
+    assert image_problems(DOCKERFILE) == []
+
+
+@pytest.mark.parametrize(
+    ("problem", "old", "new"),
+    [
+        ("ENTRYPOINT is not in exec form", 'ENTRYPOINT ["sceneprint"]', "ENTRYPOINT sceneprint"),
+        ("CMD is not in exec form", 'CMD ["serve"]', "CMD serve"),
+        ("0 CMD in the last stage", 'CMD ["serve"]', ""),
+        ("HEALTHCHECK is not in exec form", 'CMD ["python", "-c"', 'CMD python -c "'),
+        ("0 HEALTHCHECK in the last stage", "HEALTHCHECK", "LABEL"),
+        ("0 STOPSIGNAL in the last stage", "STOPSIGNAL SIGTERM", ""),
+        ("the image does not run as", "USER 10001:10001", "USER root"),
+        ("the image does not run as", "USER 10001:10001", "USER sceneprint"),
+        ("the image does not run as", "USER 10001:10001\n", ""),
+        ("what the last RUN makes", 'USER 10001:10001\n\n', ""),
+        ("the last stage installs or builds", "VOLUME", "RUN apt-get update\nVOLUME"),
+        ("no slim base with its version", LAST_FROM, "\n\nFROM python:latest\n"),
+        ("no slim base with its version", LAST_FROM, "\n\nFROM python:3.11\n"),
+        ("ADD:", "COPY migrations", "ADD migrations"),
+        ("lists of apt are left behind", "WORKDIR", "RUN apt-get install x\nWORKDIR"),
+        ("pip keeps its cache", "PIP_NO_CACHE_DIR=1", "PIP_NO_INPUT=1"),
+        ("ENV sets what nothing reads", "SCENEPRINT_PORT=8008", "SCENEPRINT_PROT=8008"),
+    ],
+)  # fmt: skip
+def test_our_rules_would_find(problem: str, old: str, new: str) -> None:
+    text = changed(DOCKERFILE, old, new)
+    if problem == "what the last RUN makes":  # USER after the last RUN
+        text = changed(text, "VOLUME", "USER 10001:10001\nVOLUME")
+    assert [found for found in image_problems(text) if found.startswith(problem)] != []
+
+
+def test_the_image_says_what_it_is() -> None:
+    steps = steps_of(DOCKERFILE)
+    labels = dict(pair.split("=", 1) for pair in shlex.split(only(steps, "LABEL").rest))
+    told = {name.rpartition(".")[2]: value for name, value in labels.items()}
+    assert told["version"] == PROJECT["version"]
+    assert told["licenses"] == PROJECT["license"]
+    assert told["title"] == PROJECT["name"]
+    assert only(steps, "EXPOSE").rest == environment(steps)["SCENEPRINT_PORT"]
+    assert json.loads(only(steps, "VOLUME").rest) == [environment(steps)["SCENEPRINT_DATA_DIR"]]
+
+
+# What is sent to the builder
+
+
+def is_ignored(path: str, patterns: str = IGNORE) -> bool:
+    """Whether .dockerignore keeps a file from the builder; the last pattern that fits decides."""
+    ignored = False
+    parts = path.split("/")
+    for line in patterns.splitlines():
+        if line.strip() and not line.startswith("#"):
+            pattern = line.removeprefix("!").removeprefix("**/")
+            at_any_depth = line.startswith("**/")
+            heads = parts if at_any_depth else parts[:1]
+            if any(fnmatch(head, pattern) for head in heads):
+                ignored = not line.startswith("!")
+    return ignored
+
+
+def test_the_builder_gets_the_code_and_nothing_else() -> None:
+    for kept in ("sceneprint/presets/paper.safetensors", "migrations/script.py.mako", "LICENSE"):
+        assert not is_ignored(kept), kept
+    secret, compiled = (".env", "key.pem", ".git/config"), "sceneprint/__pycache__/types.pyc"
+    for left in (*secret, compiled, ".venv/bin/python", "tests/conftest.py", "out/figures.json"):
+        assert is_ignored(left), left
+
+
+def context_files() -> list[str]:
+    """What the builder is sent of a fresh checkout: no file that git does not know or would add."""
+    listed = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"],
+        cwd=ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert listed.returncode == 0, f"this needs a git checkout: {listed.stderr}"
+    paths = [path for path in listed.stdout.split("\0") if path and (ROOT / path).is_file()]
+    return [path for path in paths if not is_ignored(path)]
+
+
+# docker-compose.yml
+
+
+def composed(text: str = COMPOSE) -> dict[str, Any]:
+    """The composition, with its merge keys and anchors followed."""
+    return cast(dict[str, Any], YAML(typ="safe", pure=True).load(text))
+
+
+def defaults(value: str) -> str:
+    """What Compose makes of ${NAME:-default} where NAME is not set."""
+    return re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", value)
+
+
+def compose_problems(text: str) -> list[str]:
+    """What our rules have against a composition."""
+    document, found = composed(text), []
+    volumes = set(document.get("volumes", {}))
+    for name, part in document["services"].items():
+        for mount in part.get("volumes", []):
+            source, _, _ = mount.partition(":")
+            if source not in volumes:
+                found.append(f"{name}: volume {source} is not declared")
+        unknown = set(part.get("environment", {})) - KNOWN_SETTINGS
+        if unknown:
+            found.append(f"{name}: nothing reads {', '.join(sorted(unknown))}")
+        try:
+            own = {k: v for k, v in part["environment"].items() if k in KNOWN_SETTINGS}
+            Settings(**{k.removeprefix("SCENEPRINT_").lower(): v for k, v in own.items()})
+        except ValueError as error:
+            found.append(f"{name}: {error}")
+        found += [
+            f"{name}: {port} is not published to this machine alone"
+            for port in part.get("ports", [])
+            if not re.fullmatch(r"127\.0\.0\.1:\d+:\d+", defaults(port))
+        ]
+        for other, wish in part.get("depends_on", {}).items():
+            if other not in document["services"] or wish["condition"] != "service_healthy":
+                found.append(f"{name}: does not wait until {other} is healthy")
+        for key, want in (
+            ("read_only", True), ("init", True), ("cap_drop", ["ALL"]),
+            ("security_opt", ["no-new-privileges:true"]), ("restart", "unless-stopped"),
+        ):  # fmt: skip
+            if part.get(key) != want:
+                found.append(f"{name}: {key} is {part.get(key)!r}")
+        limits = part.get("deploy", {}).get("resources", {}).get("limits", {})
+        if set(limits) != {"cpus", "memory", "pids"}:
+            found.append(f"{name}: limits only {sorted(limits)}")
+        command = part.get("healthcheck", {}).get("test", ["CMD", "python", "-c", "0"])
+        if command[:3] != ["CMD", "python", "-c"] or not parses(command[3]):
+            found.append(f"{name}: the health check is no Python")
+    return found
+
+
+def parses(code: str) -> bool:
+    """Whether it is Python."""
+    try:
+        ast.parse(code)
+    except SyntaxError:
+        return False
+    return True
+
+
+PUBLISHED = "127.0.0.1:${SCENEPRINT_PUBLISHED_PORT:-8008}"
+
+
+def test_our_rules_have_nothing_against_the_composition() -> None:
+    assert compose_problems(COMPOSE) == []
+    assert set(composed()["services"]) == {"service", "worker"}
+
+
+@pytest.mark.parametrize(
+    ("problem", "old", "new"),
+    [
+        ("service: volume date is not declared", "- data:/data", "- date:/data"),
+        ("worker: volume cache is not declared", "\n  cache:\n", "\n"),
+        ("worker: nothing reads SCENEPRINT_WORKER", 'PRINT_WORKERS: "1"', 'PRINT_WORKER: "1"'),
+        ("worker: 1 validation error", 'SCENEPRINT_WORKERS: "1"', 'SCENEPRINT_WORKERS: "many"'),
+        ("service: 8008:8008 is not published to", PUBLISHED, "8008"),
+        ("service: 0.0.0.0:8008:8008 is not", PUBLISHED, "0.0.0.0:8008"),
+        ("worker: does not wait until service", "service_healthy", "service_started"),
+        ("service: read_only is False", "read_only: true", "read_only: false"),
+        ("worker: init is None", "  init: true\n", ""),
+        ("service: cap_drop is ['NET_RAW']", "- ALL", "- NET_RAW"),
+        ("service: security_opt is ['no-new", "privileges:true", "privileges:false"),
+        ("worker: restart is 'no'", "restart: unless-stopped", 'restart: "no"'),
+        ("service: limits only ['cpus', 'memory']", "          pids: 256\n", ""),
+        ("worker: the health check is no Python", "sys.exit(not any(", "sys.exit(not any"),
+    ],
+)  # fmt: skip
+def test_our_rules_would_find_in_a_composition(problem: str, old: str, new: str) -> None:
+    found = compose_problems(changed(COMPOSE, old, new))
+    assert [one for one in found if one.startswith(problem)] != [], found
+
+
+def by_schema(path: Path) -> subprocess.CompletedProcess[str]:
+    """What the schema of the Compose specification says; check-jsonschema brings a copy."""
+    command = [tool("check-jsonschema"), "--builtin-schema", "vendor.compose-spec", str(path)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+
+def test_the_composition_is_as_the_specification_has_it(tmp_path: Path) -> None:
+    done = by_schema(ROOT / "docker-compose.yml")
+    assert (done.returncode, done.stderr) == (0, "")
+    broken = tmp_path / "docker-compose.yml"
+    broken.write_text(changed(COMPOSE, "  init: true\n", "  initt: true\n"))
+    done = by_schema(broken)
+    assert done.returncode == 1
+    assert "'initt'" in done.stdout
+
+
+def test_the_two_parts_have_room_for_what_they_run() -> None:
+    steps = steps_of(DOCKERFILE)
+    service, worker = (composed()["services"][name] for name in ("service", "worker"))
+    assert service["image"] == worker["image"] == f"sceneprint:{PROJECT['version']}"
+    assert defaults(service["ports"][0]).endswith(f":{environment(steps)['SCENEPRINT_PORT']}")
+    assert service["environment"]["SCENEPRINT_WORKERS"] == "0"  # no worker is counted twice
+    assert "SCENEPRINT_WORKER_CONTAINERS" in worker["deploy"]["replicas"]
+    assert defaults(worker["deploy"]["replicas"]) == "1"
+    mounted = {mount.partition(":")[2] for mount in service["volumes"]}
+    env = environment(steps)
+    assert mounted == {env["SCENEPRINT_DATA_DIR"], env["SCENEPRINT_CACHE_DIR"]}
+    # a read-only root, and a cache folder that numba may write to: else it would not use it
+    assert Path(env["NUMBA_CACHE_DIR"]).is_relative_to(env["SCENEPRINT_CACHE_DIR"])
+
+
+def test_the_workers_health_check_tells_a_worker_from_itself(tmp_path: Path) -> None:
+    code = composed()["services"]["worker"]["healthcheck"]["test"][3]
+
+    def checked(*processes: list[str]) -> int:
+        shutil.rmtree(tmp_path / "proc", ignore_errors=True)
+        for number, words in enumerate(processes):
+            (tmp_path / f"proc/{number + 1}").mkdir(parents=True)
+            (tmp_path / f"proc/{number + 1}/cmdline").write_text("\0".join([*words, ""]))
+        there = changed(code, "'/proc'", repr(str(tmp_path / "proc")))
+        return subprocess.run([sys.executable, "-c", there], timeout=30).returncode
+
+    own = ["python", "-c", code]
+    watching = ["python", "/opt/sceneprint/bin/sceneprint", "work"]
+    spawned = ["python", "-c", "from multiprocessing.spawn import ...", "--multiprocessing-fork"]
+    assert checked(own, watching) == 1
+    assert checked(own, watching, spawned) == 0
+
+
+# The steps of the image, run
+
+
+#: Folders of the image that stand under a folder of the test instead.
+FOLDERS = ("/opt/sceneprint", "/var/cache/sceneprint", "/data", "/src")
+#: What only a container's root can do, and what it is done for is left out with it: the user.
+OF_ROOT = ("apt-get", "groupadd", "useradd", "chown")
+
+
+@dataclass
+class Image:
+    """What the steps of a Dockerfile have made, under a folder."""
+
+    root: Path
+    env: dict[str, str]
+    skipped: list[str] = field(default_factory=list)
+    ran: list[str] = field(default_factory=list)
+
+    def here(self, text: str) -> str:
+        """The text with the image's folders where they are now."""
+        return re.sub(rf"(?<![\w.])({'|'.join(FOLDERS)})(?![\w-])", rf"{self.root}\1", text)
+
+    def command(self, words: list[str]) -> list[str]:
+        """Words with their program found as the image would find it."""
+        program = shutil.which(words[0], path=self.env["PATH"])
+        assert program is not None, f"{words[0]} is not in the image"
+        return [program, *words[1:]]
+
+
+def parts_of(shell: str) -> list[str]:
+    """Commands of a line joined by &&, each as it is written."""
+    words = shlex.shlex(shell, posix=False, punctuation_chars="&")
+    words.whitespace_split, words.commenters = True, ""
+    parts: list[list[str]] = [[]]
+    for word in words:
+        parts.append([]) if word == "&&" else parts[-1].append(word)
+    return [" ".join(part) for part in parts]
+
+
+def test_commands_are_parted_where_the_shell_parts_them() -> None:
+    assert parts_of("a -b 'c && d' > e && f") == ["a -b 'c && d' > e", "f"]
+
+
+def base_environment(folder: Path) -> dict[str, str]:
+    """A fresh Python, as the base image has one; and how pip finds its index on this machine."""
+    done = subprocess.run([sys.executable, "-m", "venv", folder], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    kept = re.compile(r"HOME|LANG|TMPDIR|PIP_\w+|SSL_\w+|REQUESTS_\w+|\w+_proxy", re.IGNORECASE)
+    env = {name: value for name, value in os.environ.items() if kept.fullmatch(name)}
+    return {**env, "PATH": f"{folder}/bin:/usr/local/bin:/usr/bin:/bin"}
+
+
+def run_step(image: Image, shell: str, cwd: Path) -> None:
+    """Run what a RUN says, without what is root's."""
+    mine = [part for part in parts_of(shell) if part.split()[0] not in OF_ROOT]
+    image.skipped += [p.split()[0] for p in parts_of(shell) if p.split()[0] in OF_ROOT]
+    if mine:
+        image.ran.append(" && ".join(mine))
+        done = subprocess.run(
+            ["/bin/sh", "-c", image.here(image.ran[-1])],
+            cwd=cwd, env=image.env, capture_output=True, text=True, timeout=400,
+        )  # fmt: skip
+        assert done.returncode == 0, (
+            f"a step of the Dockerfile fails. Where pip found nothing to install, this test needs "
+            f"a package index (PIP_INDEX_URL, or a pip.conf).\n{image.ran[-1]}\n{done.stdout}"
+            f"{done.stderr}"
+        )
+
+
+def copy_step(image: Image, step: Step, files: list[str], cwd: Path) -> None:
+    """COPY from the checkout; from another stage it is there already, and must be."""
+    *sources, target = step.rest.split()
+    if step.flags:
+        assert sources == [target], "a stage's files lie where they were"
+        assert Path(image.here(target)).exists()
+        return
+    for source in sources:
+        chosen = [f for f in files if f == source or f.startswith(f"{source}/")]
+        assert chosen, f"COPY {source}: nothing of that name is sent to the builder"
+        for name in chosen:
+            to = cwd / target / (name.removeprefix(f"{source}/") if target.endswith("/") and
+                                 name != source else name)  # fmt: skip
+            to.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, to)
+
+
+def built(folder: Path) -> Image:
+    """Run every step of the Dockerfile, in their order."""
+    steps, files = steps_of(DOCKERFILE), context_files()
+    image = Image(folder / "root", {})
+    image.root.mkdir()
+    cwd = image.root
+    for step in steps:
+        if step.name == "FROM":
+            image.env, cwd = base_environment(folder / f"base{step.stage}"), image.root
+            if step.stage:  # what the stage before has not handed on is gone
+                handed = [s.rest.split()[0] for s in steps if s.stage == step.stage and s.flags
+                          and s.name == "COPY"]  # fmt: skip
+                for gone in set(FOLDERS) - set(handed):
+                    shutil.rmtree(image.here(gone), ignore_errors=True)
+        elif step.name == "ENV":
+            for pair in shlex.split(image.here(step.rest)):
+                name, _, value = pair.partition("=")
+                if name != "PIP_NO_CACHE_DIR":  # a download less; the rules above see to it
+                    image.env[name] = value.replace("$PATH", image.env["PATH"])
+        elif step.name == "WORKDIR":
+            cwd = Path(image.here(step.rest))
+            cwd.mkdir(parents=True)
+        elif step.name == "COPY":
+            copy_step(image, step, files, cwd)
+        elif step.name == "RUN":
+            run_step(image, step.rest, cwd)
+    return image
+
+
+@pytest.fixture(scope="module")
+def image(tmp_path_factory: pytest.TempPathFactory) -> Image:
+    """Made once for this file, in minutes; `--dist loadfile` keeps a file in one process."""
+    made = built(tmp_path_factory.mktemp("image"))
+    made.env["HOME"] = "/nonexistent"  # the user has none
+    return made
+
+
+def test_every_step_runs_but_what_is_roots(image: Image) -> None:
+    assert image.skipped == ["groupadd", "useradd", "chown"]
+    assert len(image.ran) == sum(step.name == "RUN" for step in steps_of(DOCKERFILE))
+
+
+def test_what_is_installed_is_the_lock_and_no_more(image: Image) -> None:
+    code = (
+        "import json; from importlib.metadata import distributions as d;"
+        "print(json.dumps({x.name.lower().replace('_', '-'): x.version for x in d()}))"
+    )
+    told = subprocess.run(
+        image.command(["python", "-c", code]), env=image.env, capture_output=True, text=True,
+        check=True, cwd=image.root,
+    )  # fmt: skip
+    there: dict[str, str] = json.loads(told.stdout)
+    assert there.pop("sceneprint") == PROJECT["version"]
+    lock = set(re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / "requirements.txt").read_text(), re.M))
+    assert set(there.items()) <= {(name.lower(), version) for name, version in lock}
+    wanted = {re.split(r"[<>=; ]", line)[0] for line in PROJECT["dependencies"]}
+    assert wanted - set(there) == {"open3d"}
+    assert {"pip", "setuptools", "pytest", "mypy", "ruff", "dash"} & set(there) == set()
+
+
+def test_kernels_are_compiled_and_tables_built(image: Image) -> None:
+    cache = Path(image.env["SCENEPRINT_CACHE_DIR"])
+    assert len(list(cache.glob("table-*.bin"))) == len(PRESETS)
+    assert len(machine_code(image)) > 20
+
+
+def machine_code(image: Image) -> set[str]:
+    """Files of compiled kernels."""
+    return {path.name for path in Path(image.env["NUMBA_CACHE_DIR"]).rglob("*.nbc")}
+
+
+@dataclass
+class Running:
+    """A process as a container would run it."""
+
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    def stop(self, number: signal.Signals, within_s: float) -> int:
+        """Its exit code once told to stop."""
+        self.process.send_signal(number)
+        return self.process.wait(within_s)
+
+
+@pytest.fixture
+def start(image: Image, tmp_path: Path) -> Iterator[Callable[[str, dict[str, str]], Running]]:
+    """Starts a part of the composition; whatever still runs at the end is killed."""
+    started: list[Running] = []
+    steps = steps_of(DOCKERFILE)
+
+    def begin(name: str, env: dict[str, str]) -> Running:
+        part = composed()["services"][name]
+        words = only(steps, "ENTRYPOINT").words() + part.get("command", only(steps, "CMD").words())
+        log = tmp_path / f"{name}.log"
+        with log.open("wb") as out:
+            process = subprocess.Popen(
+                image.command(words), env={**image.env, **part["environment"], **env},
+                cwd=image.root, stdout=out, stderr=out, start_new_session=True,
+            )  # fmt: skip
+        started.append(Running(process, log))
+        return started[-1]
+
+    yield begin
+    for running in started:
+        if running.process.poll() is None:
+            os.killpg(running.process.pid, signal.SIGKILL)
+            running.process.wait()
+
+
+def test_service_and_worker_run_as_composed(
+    image: Image, start: Callable[[str, dict[str, str]], Running], room_frames: tuple[Frame, ...],
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    steps, parts = steps_of(DOCKERFILE), composed()["services"]
+    compiled = machine_code(image)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = {"SCENEPRINT_PORT": str(free.getsockname()[1])}
+
+    def exits(words: list[str]) -> int:
+        env = {**image.env, **port}
+        return subprocess.run(image.command(words), env=env, timeout=30, cwd=image.root,
+                              capture_output=True).returncode  # fmt: skip
+
+    assert exits(health_check(steps)) == 1  # nobody is there
+    service = start("service", port)
+    until = time.monotonic() + 90
+    while exits(health_check(steps)) != 0:
+        assert service.process.poll() is None, service.log.read_text()
+        assert time.monotonic() < until, service.log.read_text()
+        time.sleep(0.3)
+
+    url = f"http://127.0.0.1:{port['SCENEPRINT_PORT']}/v1"
+    assert httpx.get(f"{url}/maps").status_code == 401
+    documented = set(re.findall(r"docker compose exec service (.+?) NAME", DOCKERFILE + COMPOSE))
+    assert documented == {"sceneprint keys --create"}
+    made = subprocess.run(
+        image.command([*documented.pop().split(), "robot"]), env=image.env, text=True,
+        capture_output=True, check=True, cwd=image.root,
+    )  # fmt: skip
+    headers = {"Authorization": f"Bearer {made.stdout.strip()}"}
+    with httpx.Client(base_url=url, headers=headers, timeout=90) as client:
+        assert client.post("/maps", json={"name": "hall"}).status_code == 201
+        worker = start("worker", port)
+        frame = room_frames[0]
+        lens, data = frame.intrinsics, tmp_path / "frame.npy"
+        np.save(data, frame.depth)
+        camera = {name: getattr(lens, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        added = client.post(
+            "/maps/hall/frames",
+            files={"frame": ("frame.npy", data.read_bytes())},
+            data={"meta": json.dumps({"intrinsics": camera})},
+            headers={"Prefer": "wait=60"},
+        )
+        assert (added.status_code, added.json()["state"]) == (201, "indexed"), added.text
+        found = client.post(
+            "/maps/hall/queries",
+            files={"frame": ("frame.npy", data.read_bytes())},
+            data={"meta": json.dumps({"intrinsics": camera})},
+        )
+        assert (found.status_code, found.json()["status"]) == (200, "found"), found.text
+    assert exits(parts["worker"]["healthcheck"]["test"][1:]) == 0
+
+    stop = signal.Signals[only(steps, "STOPSIGNAL").rest]
+    assert parts["service"]["stop_grace_period"] == "30s"
+    assert worker.stop(stop, 30) == 0, worker.log.read_text()
+    assert service.stop(stop, 30) == 0, service.log.read_text()
+    assert exits(health_check(steps)) == 1
+    # nothing was left to compile: no first frame waits for what the build could have done
+    assert machine_code(image) == compiled
