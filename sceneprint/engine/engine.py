@@ -207,7 +207,18 @@ class Engine:
     # keys
 
     def create_key(self, name: str) -> str:
-        """Make a key and return its secret; Conflict where there is one of that name."""
+        """Make a key and return its secret.
+
+        Raises
+        ------
+        InvalidRequest : the name is empty, too long or not printable.
+        Conflict : there is a key of that name.
+        """
+        if not (0 < len(name) <= 128 and name.isprintable()):
+            raise InvalidRequest(
+                f"{name!r:.80} is no name for a key. Take up to 128 printable characters.",
+                (("name", "not printable, empty or too long"),),
+            )
         with self.store.database.write() as connection:
             return stored_keys.create_key(connection, name)
 

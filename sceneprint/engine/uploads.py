@@ -8,10 +8,10 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.frames import columns, content_id, read_upload
 from sceneprint.errors import FrameConflict
-from sceneprint.schemas import Added, FrameMeta
+from sceneprint.schemas import Added, FrameMeta, FrameState
 from sceneprint.store import Store
 from sceneprint.store.events import tell
-from sceneprint.store.frames import add_frame, find_content, refers_to
+from sceneprint.store.frames import add_frame, find_content, refers_to, renew_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import enqueue, jobs_of
 from sceneprint.store.records import MapRow
@@ -23,7 +23,8 @@ _FIELDS = {"pose_parent": "pose.parent_frame"}
 def upload(store: Store, map_name: str, data: bytes, meta: FrameMeta) -> tuple[Added, bool]:
     """Take a frame into a map; it is safe when this returns, and signed soon after.
 
-    The same content with the same metadata is the frame that is there.
+    The same content with the same metadata is the frame that is there; one that failed is tried
+    again.
 
     Parameters
     ----------
@@ -35,7 +36,7 @@ def upload(store: Store, map_name: str, data: bytes, meta: FrameMeta) -> tuple[A
     Returns
     -------
     added : the frame and its job
-    new : False where it was there already
+    new : False where it was there already, and there is nothing to be done
 
     Raises
     ------
@@ -50,20 +51,27 @@ def upload(store: Store, map_name: str, data: bytes, meta: FrameMeta) -> tuple[A
     content, known = content_id(frame), columns(meta, frame)
     with store.database.read() as connection:
         there = _there(connection, find_map(connection, map_name), content, known)
-    while there is None:
+    if there is not None and there.state != FrameState.FAILED:
+        return there, False
+    while True:
         blob = store.blobs.put(data)
         with store.database.write() as connection:
             row = find_map(connection, map_name)
             there = _there(connection, row, content, known)  # another upload may have been first
-            if there is None and store.blobs.holds(blob):  # or a deletion have removed the blob
-                added = add_frame(
-                    connection,
-                    row.number,
-                    {"content_id": content, "blob": blob, "bytes": len(data), **known},
-                )
-                job = enqueue(connection, "sign", added.number)
-                tell(connection, "frame.received", row.name, added.id, job.id)
-                return Added(frame_id=added.id, job_id=job.id, state=added.state, reason=None), True
+            if there is not None and there.state != FrameState.FAILED:
+                break
+            if store.blobs.holds(blob):  # a deletion may have removed it
+                of_blob = {"blob": blob, "bytes": len(data)}
+                if there is None:
+                    values = {"content_id": content, **of_blob, **known}
+                    frame_row = add_frame(connection, row.number, values)
+                else:  # it broke down every time, and somebody asks for another
+                    frame_row = renew_frame(connection, there.frame_id, of_blob)
+                job = enqueue(connection, "sign", frame_row.number)
+                tell(connection, "frame.received", row.name, frame_row.id, job.id)
+                state = frame_row.state
+                return Added(frame_id=frame_row.id, job_id=job.id, state=state, reason=None), True
+    sweep(store, [blob])
     return there, False
 
 

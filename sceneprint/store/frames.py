@@ -29,6 +29,16 @@ def add_frame(connection: Connection, map_number: int, values: dict[str, Any]) -
     return _one(connection, frames.c.id == frame_id)
 
 
+def renew_frame(connection: Connection, frame_id: str, values: dict[str, Any]) -> FrameRow:
+    """Take a frame that failed as received once more, with its upload as it came now."""
+    connection.execute(
+        update(frames)
+        .where(frames.c.id == frame_id)
+        .values(state=FrameState.RECEIVED, reason=None, **values)
+    )
+    return _one(connection, frames.c.id == frame_id)
+
+
 def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
     """The frame of an id in a map, deleted ones too.
 

@@ -71,6 +71,14 @@ def test_a_frame_with_nothing_to_sign_is_rejected_with_the_reason(
     assert empty.get_job(added.job_id).state == JobState.FAILED
 
 
+def packed(data: bytes) -> bytes:
+    """The same pixels as another PNG."""
+    out = io.BytesIO()
+    Image.open(io.BytesIO(data)).save(out, "PNG", compress_level=0)
+    assert out.getvalue() != data
+    return out.getvalue()
+
+
 def test_a_frame_whose_blob_is_gone_is_tried_thrice_and_failed(
     empty: Engine, uploads: Any, told: Told, due_now: DueNow
 ) -> None:
@@ -99,6 +107,16 @@ def test_a_frame_whose_blob_is_gone_is_tried_thrice_and_failed(
     assert "DamagedBlob" in job.traceback
     assert "read_stored" in job.traceback
     assert told(empty) == ["map.created", "frame.received", "frame.failed"]
+    # sent once more, in another packing, it is tried once more: the same frame, another job
+    again, new = empty.add_frame("hall", packed(uploads[0].data), uploads[0].meta)
+    assert (again.frame_id, new, again.state) == (added.frame_id, True, FrameState.RECEIVED)
+    assert again.job_id != added.job_id
+    claimed = empty.claim("w")
+    assert claimed is not None
+    assert empty.run(claimed) == JobState.SUCCEEDED
+    frame = empty.get_frame("hall", added.frame_id)
+    assert (frame.state, frame.reason, frame.job_id) == (FrameState.INDEXED, None, again.job_id)
+    assert len(list(empty.store.blobs.digests())) == 2  # upload and artifact
     due_now(empty)
     assert empty.claim("w") is None
 

@@ -1,0 +1,244 @@
+"""What the service tests share: real servers in process groups of their own, frames, requests."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from sceneprint.datasets import write_depth_png
+from sceneprint.types import Floats32, Frame, Intrinsics
+
+BIN = Path(sys.executable).parent
+#: Processors are few and shared: what takes longer than this does not come.
+PATIENCE_S = 90.0
+
+
+def until(what: Callable[[], Any], seconds: float = PATIENCE_S) -> Any:
+    """The first true value of it."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        found = what()
+        if found:
+            return found
+        time.sleep(0.03)
+    raise AssertionError(f"{what} did not come true within {seconds:g} s")
+
+
+def members(group: int) -> list[int]:
+    """Processes of a group that still run."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                state, _, pgrp = (entry / "stat").read_text().rpartition(")")[2].split()[:3]
+            except (OSError, ValueError):
+                continue
+            if int(pgrp) == group and state != "Z":
+                found.append(int(entry.name))
+    return found
+
+
+@pytest.fixture(scope="session", name="until")
+def patience() -> Callable[..., Any]:
+    return until
+
+
+@dataclass
+class Server:
+    """A command of ours that serves, with all its children, and what it says."""
+
+    process: subprocess.Popen[str]
+    folder: Path
+    errors: Path
+    url: str = ""
+    client: httpx.Client = field(default_factory=lambda: httpx.Client(timeout=60, trust_env=False))
+
+    @property
+    def workers(self) -> list[int]:
+        """Worker processes: children that run our code."""
+        lines = {pid: Path(f"/proc/{pid}/cmdline") for pid in members(self.process.pid)}
+        return [pid for pid, line in lines.items() if b"spawn_main" in line.read_bytes()]
+
+    def log(self, message: str = "") -> list[dict[str, Any]]:
+        """Lines of standard error, or those with a message; each must be JSON."""
+        text = self.errors.read_text()
+        whole = text[: text.rfind("\n") + 1]
+        lines = [json.loads(line) for line in whole.splitlines()]
+        return [line for line in lines if not message or line["message"] == message]
+
+    def ready(self, workers: int = 1) -> None:
+        """Wait until that many workers have begun, in all."""
+        until(lambda: len(self.log("worker ready")) >= workers)
+
+    def tell(self, number: int) -> None:
+        """Send a signal to the command alone."""
+        self.process.send_signal(number)
+
+    def end(self, number: int | None = None) -> int:
+        """Exit code, after a signal if one is given."""
+        if number is not None:
+            self.tell(number)
+        return self.process.wait(PATIENCE_S)
+
+    def gone(self) -> None:
+        """Wait until no process of the group is left."""
+        until(lambda: not members(self.process.pid))
+
+    def kill(self) -> None:
+        """End all of it, whatever state it is in."""
+        self.client.close()
+        if members(self.process.pid):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+
+
+def promised(document: dict[str, Any], answer: httpx.Response) -> None:
+    """Hold an answer to the OpenAPI document: its status and its type are declared."""
+    method, path = answer.request.method.lower(), answer.request.url.path
+    for pattern, operations in document["paths"].items():
+        if method in operations and re.fullmatch(re.sub(r"\{\w+\}", "[^/]+", pattern), path):
+            responses = operations[method]["responses"]
+            assert str(answer.status_code) in responses, (method, pattern, answer.status_code)
+            kinds = responses[str(answer.status_code)].get("content", {})
+            kind = answer.headers.get("content-type", "").partition(";")[0]
+            assert not kinds or kind in kinds, (method, pattern, answer.status_code, kind)
+
+
+@pytest.fixture(scope="session")
+def begin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Server]]:
+    """Start `sceneprint serve` or another command; settings are given as for Settings."""
+    begun = []
+
+    def start(
+        *arguments: str, folder: Path | None = None, command: tuple[str, ...] | None = None,
+        wait: bool = True, **settings: object,
+    ) -> Server:  # fmt: skip
+        folder = folder or tmp_path_factory.mktemp("server")
+        errors = tmp_path_factory.mktemp("errors") / "stderr"
+        given = {f"SCENEPRINT_{name.upper()}": str(value) for name, value in settings.items()}
+        if command is None:
+            default = ("--port", "0", "--data", str(folder), "--workers", "1")
+            command = (str(BIN / "sceneprint"), "serve", *default)
+        with errors.open("w") as out:
+            process = subprocess.Popen(
+                [*command, *arguments], env=os.environ | given, stdout=subprocess.PIPE, stderr=out,
+                text=True, start_new_session=True,
+            )  # fmt: skip
+        server = Server(process, folder, errors)
+        begun.append(server)
+        if wait:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line.startswith("sceneprint: serving http://"), errors.read_text()
+            server.url = line.split()[-1]
+            server.client.base_url = httpx.URL(server.url)
+            document = server.client.get("/openapi.json").json()
+            server.client.event_hooks = {"response": [lambda answer: promised(document, answer)]}
+        return server
+
+    yield start
+    for server in begun:
+        server.kill()
+
+
+@pytest.fixture(scope="session")
+def served(begin: Callable[..., Server]) -> Server:
+    """One server for all tests that leave it as it was but for maps of their own."""
+    return begin()
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A frame as it is sent."""
+
+    png: bytes
+    camera: dict[str, float]
+    pose: list[list[float]] | None = None
+
+    def form(self, **meta: object) -> dict[str, Any]:
+        """Arguments of a request that uploads it."""
+        known = {"intrinsics": self.camera, **meta}
+        parts = {"frame": ("frame.png", self.png, "image/png")}
+        return {"files": parts, "data": {"meta": json.dumps(known)}}
+
+
+@pytest.fixture(scope="session")
+def shoot(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Shot]:
+    """A depth image of a camera as it is sent."""
+    path = tmp_path_factory.mktemp("png") / "frame.png"
+
+    def of(depth: Floats32, intrinsics: Intrinsics, pose: Any = None) -> Shot:
+        write_depth_png(path, depth, 1000.0)
+        names = ("width", "height", "fx", "fy", "cx", "cy")
+        return Shot(path.read_bytes(), {n: getattr(intrinsics, n) for n in names}, pose)
+
+    return of
+
+
+@pytest.fixture(scope="session")
+def shots(room_frames: tuple[Frame, ...], shoot: Callable[..., Shot]) -> list[Shot]:
+    """Three views of each of two rooms, with their poses."""
+    return [
+        shoot(one.depth, one.intrinsics, None if one.pose is None else one.pose.tolist())
+        for one in room_frames
+    ]
+
+
+@pytest.fixture(scope="session")
+def small_shots(room_frames: tuple[Frame, ...], shoot: Callable[..., Shot]) -> list[Shot]:
+    """96 small frames: every fourth sample from each of 16 corners of each of six views."""
+    found = []
+    for frame in room_frames:
+        k = frame.intrinsics
+        for place in range(16):
+            y, x = divmod(place, 4)
+            depth = np.ascontiguousarray(frame.depth[y::4, x::4])
+            lens = Intrinsics(160, 120, k.fx / 4, k.fy / 4, (k.cx - x) / 4, (k.cy - y) / 4)
+            found.append(shoot(depth, lens))
+    return found
+
+
+@pytest.fixture(scope="session")
+def make_map() -> Callable[..., str]:
+    """Make a map on a server; its path is returned."""
+
+    def make(server: Server, name: str, model: str = "compact") -> str:
+        made = server.client.post("/v1/maps", json={"name": name, "model": model})
+        assert made.status_code == 201, made.text
+        return f"/v1/maps/{name}"
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def refused() -> Callable[..., dict[str, Any]]:
+    """Check that an answer is a problem document and as we write them; return it."""
+
+    def check(answer: httpx.Response, status: int, kind: str, text: str = "") -> dict[str, Any]:
+        assert answer.status_code == status, answer.text
+        assert answer.headers["content-type"] == "application/problem+json"
+        problem: dict[str, Any] = answer.json()
+        assert (problem["status"], problem["type"]) == (status, f"/problems/{kind}"), problem
+        assert {"type", "title", "status", "detail", "instance"} <= set(problem)
+        assert problem["instance"] == f"/requests/{answer.headers['x-request-id']}"
+        assert text in problem["detail"]
+        for leak in ("Traceback", ".py", "/tmp", "/work", "site-packages", "sqlite", "SELECT"):
+            assert leak not in answer.text.replace(str(answer.request.url.path), ""), leak
+        return problem
+
+    return check

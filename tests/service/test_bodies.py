@@ -1,0 +1,197 @@
+"""Bodies: forms that are none, bodies that are too large, and callers that hang up."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+LIMIT = 100_000
+
+
+@pytest.fixture(scope="module")
+def narrow(begin, make_map):
+    """A server that takes few bytes, and no worker: what it stores stays as it came."""
+    server = begin("--workers", "0", upload_bytes=LIMIT)
+    make_map(server, "hall")
+    return server
+
+
+@pytest.fixture
+def wire(narrow) -> Iterator[socket.socket]:
+    """A connection on which anything can be said."""
+    address = httpx.URL(narrow.url)
+    with socket.create_connection((address.host, address.port), timeout=60) as opened:
+        yield opened
+
+
+def answer(wire: socket.socket) -> tuple[int, dict[str, str], bytes]:
+    """All that comes until the other side closes."""
+    data = b""
+    try:
+        while more := wire.recv(65536):
+            data += more
+    except ConnectionResetError:
+        pass  # it closed with bytes of ours unread
+    head, _, body = data.partition(b"\r\n\r\n")
+    first, *lines = head.decode().split("\r\n")
+    headers = dict(line.lower().split(": ", 1) for line in lines)
+    return int(first.split()[1]), headers, body
+
+
+def post(path: str, *headers: str) -> bytes:
+    lines = (f"POST {path} HTTP/1.1", "Host: a", *headers)
+    return "".join(f"{line}\r\n" for line in lines).encode() + b"\r\n"
+
+
+def part(name: str, content: bytes, file: str | None = None, end: bytes = b"\r\n") -> bytes:
+    named = "" if file is None else f'; filename="{file}"'
+    head = f'--x\r\nContent-Disposition: form-data; name="{name}"{named}\r\n\r\n'
+    return head.encode() + content + end
+
+
+CAMERA = {"width": 2, "height": 2, "fx": 2, "fy": 2, "cx": 0, "cy": 0}
+META = json.dumps({"intrinsics": CAMERA}).encode()
+FRAME, KNOWN, END = part("frame", b"abc", "a.png"), part("meta", META), b"--x--\r\n"
+X = "multipart/form-data; boundary=x"
+
+#: content type, body -> status, type, text of the detail
+FORMS = {
+    "no type": ("", b"abc", 415, "unsupported-type", "of no type"),
+    "text": ("text/plain", b"abc", 415, "unsupported-type", "'text/plain'"),
+    "urlencoded": ("application/x-www-form-urlencoded", b"a=b", 415, "unsupported-type",
+                   "multipart/form-data"),
+    "no boundary": ("multipart/form-data", b"abc", 400, "malformed-body", "boundary"),
+    "other boundary": ("multipart/form-data; boundary=y", FRAME + KNOWN + END, 400,
+                       "malformed-body", "cannot be parsed"),
+    "no form": (X, b"hello", 400, "malformed-body", "cannot be parsed"),
+    "nameless": (X, b'--x\r\nContent-Disposition: form-data\r\n\r\na\r\n' + END, 400,
+                 "malformed-body", "name"),
+    "two files": (X, FRAME + FRAME + KNOWN + END, 400, "malformed-body", "Too many files"),
+    "other file": (X, FRAME + part("more", b"a", "b") + END, 400, "malformed-body", "files"),
+    "long field": (X, FRAME + part("meta", b" " * 262_145) + END, 413, "too-large", "100000"),
+    "many fields": (X, FRAME + part("meta", b"{}") * 17 + END, 400, "malformed-body", "fields"),
+    "strange charset": (X + "; charset=undefined", FRAME + KNOWN + END, 400, "malformed-body",
+                        "cannot be parsed"),
+    "punycode": (X + "; charset=punycode", part("frame", b"a", "f") + END, 400,
+                 "malformed-body", "cannot be parsed"),
+    "empty": (X, b"", 422, "invalid-request", "no file part `frame`"),
+    "no parts": (X, END, 422, "invalid-request", "no file part `frame`"),
+    "no frame": (X, KNOWN + END, 422, "invalid-request", "no file part `frame`"),
+    "no meta": (X, FRAME + END, 422, "invalid-request", "no field `meta`"),
+    "frame as text": (X, part("frame", b"a") + KNOWN + END, 422, "invalid-request", "`frame`"),
+    "frame twice": (X, part("frame", b"a") + FRAME + KNOWN + END, 422, "invalid-request",
+                    "more than one"),
+    "meta twice": (X, FRAME + KNOWN + KNOWN + END, 422, "invalid-request", "'meta' more than once"),
+    "meta as file": (X, part("meta", META, "m") + part("frame", b"a") + END, 422,
+                     "invalid-request", "`frame`"),
+    "unknown part": (X, FRAME + KNOWN + part("colour", b"1") + END, 422, "invalid-request",
+                     "a part 'colour' that is not known"),
+    "meta is no JSON": (X, FRAME + part("meta", b"{") + END, 400, "malformed-body", "`meta`"),
+    "meta is no object": (X, FRAME + part("meta", b"[]") + END, 422, "invalid-request", "`meta`"),
+    "meta is empty": (X, FRAME + part("meta", b"") + END, 400, "malformed-body", "`meta`"),
+    "meta lacks all": (X, FRAME + part("meta", b"{}") + END, 422, "invalid-request",
+                       "intrinsics: Field required"),
+    "cut in meta": (X, FRAME + part("meta", b'{"a', end=b""), 422, "invalid-request", "`meta`"),
+    "cut in frame": (X, KNOWN + part("frame", b"ab", "a", b""), 422, "invalid-request", "`frame`"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_a_form_that_is_none_is_refused(narrow, refused, name):
+    kind_of, body, status, kind, text = FORMS[name]
+    headers = {"content-type": kind_of} if kind_of else {}
+    reply = narrow.client.post("/v1/maps/hall/frames", content=body, headers=headers)
+    refused(reply, status, kind, text)
+    assert kept(narrow.folder) == []
+
+
+def kept(folder: Path) -> list[Path]:
+    return [path for path in (folder / "blobs").rglob("*") if path.is_file()]
+
+
+def test_the_length_is_believed_before_a_byte_is_read(wire):
+    wire.sendall(post("/v1/maps/hall/frames", f"Content-Type: {X}", f"Content-Length: {LIMIT + 1}"))
+    status, headers, body = answer(wire)  # nothing of the body was sent, and it does not wait
+    assert (status, headers["connection"]) == (413, "close")
+    assert headers["content-type"] == "application/problem+json"
+    problem = json.loads(body)
+    assert (problem["status"], problem["type"]) == (413, "/problems/too-large")
+    assert "more than 100000 bytes" in problem["detail"]
+    assert problem["instance"] == f"/requests/{headers['x-request-id']}"
+
+
+@pytest.mark.parametrize("path", ["/v1/maps/hall/frames", "/v1/maps/hall/queries", "/v1/maps"])
+def test_a_stream_without_length_is_stopped_while_it_streams(narrow, wire, path):
+    kind = "application/json" if path == "/v1/maps" else X
+    wire.sendall(post(path, f"Content-Type: {kind}", "Transfer-Encoding: chunked"))
+    block = part("frame", b"a" * 8_000, "a", b"")
+    sent = 0
+    while sent <= LIMIT:  # and never the chunk that ends it
+        wire.sendall(b"%x\r\n" % len(block) + block + b"\r\n")
+        sent += len(block)
+    status, headers, body = answer(wire)
+    assert (status, headers["connection"]) == (413, "close")
+    assert json.loads(body)["type"] == "/problems/too-large"
+    assert narrow.client.get("/readyz").json()["frames"] == {}
+    assert kept(narrow.folder) == []
+
+
+def test_what_is_as_large_as_may_be_is_read(narrow, refused):
+    body = FRAME + KNOWN + END
+    body += b" " * (LIMIT - len(body))  # behind the end, and so without effect
+    headers = {"content-type": X}
+    full = narrow.client.post("/v1/maps/hall/frames", content=body, headers=headers)
+    refused(full, 422, "unreadable-frame", "neither PNG nor NPY")
+    streamed = narrow.client.post("/v1/maps/hall/frames", content=iter([body]), headers=headers)
+    refused(streamed, 422, "unreadable-frame", "neither PNG nor NPY")
+    over = narrow.client.post("/v1/maps/hall/frames", content=iter([body, b" "]), headers=headers)
+    refused(over, 413, "too-large")
+
+
+def test_a_caller_who_hangs_up_leaves_nothing_behind(narrow, wire, small_shots):
+    whole = part("meta", META) + part("frame", small_shots[0].png, "a.png") + END
+    head = post("/v1/maps/hall/frames", f"Content-Type: {X}", f"Content-Length: {len(whole)}")
+    wire.sendall(head + whole[: len(whole) // 2])
+    wire.close()
+    end = time.monotonic() + 60
+    while not [line for line in narrow.log("request") if line["status"] == 499]:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    assert kept(narrow.folder) == []
+    assert narrow.client.get("/readyz").json() | {"version": ""} == {
+        "status": "ready", "version": "", "frames": {}, "jobs": {},
+    }  # fmt: skip
+    assert narrow.log("request broke down") == []  # it is no fault of ours
+    assert [line for line in narrow.log() if line["level"] == "error"] == []
+
+
+def test_a_length_beyond_what_comes_is_waited_for_and_what_is_short_is_cut(narrow, wire):
+    body = FRAME + KNOWN + END
+    head = post("/v1/maps/hall/frames", f"Content-Type: {X}", f"Content-Length: {len(body) - 9}",
+                "Connection: close")  # fmt: skip
+    wire.sendall(head + body)
+    status, headers, told = answer(wire)
+    assert (status, json.loads(told)["type"]) == (422, "/problems/invalid-request")
+    assert headers["content-type"] == "application/problem+json"
+
+
+@pytest.mark.parametrize(
+    ("given", "kept_as_given"),
+    [("abc-1.2_Z", True), ("a" * 64, True), ("a" * 65, False), ("a b", False), ("", False)],
+)
+def test_a_request_keeps_the_id_it_came_with_where_it_is_one(narrow, given, kept_as_given):
+    reply = narrow.client.get("/v1/maps/nowhere", headers={"X-Request-Id": given})
+    own = reply.headers["x-request-id"]
+    assert (own == given) is kept_as_given
+    assert reply.json()["instance"] == f"/requests/{own}"
+    assert reply.headers["x-content-type-options"] == "nosniff"
+    noted = [line for line in narrow.log("request") if line["request_id"] == own]
+    assert {(line["method"], line["path"], line["status"]) for line in noted} == {
+        ("GET", "/v1/maps/nowhere", 404)
+    }

@@ -1,0 +1,105 @@
+"""The OpenAPI document; every other test's answers are held to it by `promised`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def document(served) -> dict[str, Any]:
+    found: dict[str, Any] = served.client.get("/openapi.json").json()
+    return found
+
+
+def references(part: Any) -> Iterator[str]:
+    if isinstance(part, dict):
+        if isinstance(part.get("$ref"), str):
+            yield part["$ref"]
+        for value in part.values():
+            yield from references(value)
+    elif isinstance(part, list):
+        for value in part:
+            yield from references(value)
+
+
+def operations(document: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any]]:
+    return {
+        (method, path): operation
+        for path, methods in document["paths"].items()
+        for method, operation in methods.items()
+    }
+
+
+def test_the_document_is_whole(document):
+    assert document["openapi"].startswith("3.1.")
+    assert document["info"]["title"] == "sceneprint"
+    found = set(references(document))
+    assert len(found) >= 20
+    for reference in found:
+        place: Any = document
+        for step in reference.removeprefix("#/").split("/"):
+            place = place[step]
+        assert isinstance(place, dict)
+    names = [operation["operationId"] for operation in operations(document).values()]
+    assert len(names) == len(set(names)) == 13
+    used = {reference.rpartition("/")[2] for reference in found}
+    assert set(document["components"]["schemas"]) == used  # nothing that nothing refers to
+
+
+def test_every_refusal_is_a_problem(document):
+    for place, operation in operations(document).items():
+        for status, response in operation["responses"].items():
+            if status >= "400":
+                kinds = response["content"]
+                assert list(kinds) == ["application/problem+json"], (place, status)
+                schema = kinds["application/problem+json"]["schema"]
+                assert schema == {"$ref": "#/components/schemas/Problem"}
+    required = document["components"]["schemas"]["Problem"]["required"]
+    assert set(required) >= {"type", "title", "status", "detail"}
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "statuses"),
+    [
+        ("post", "/v1/maps", {200, 201, 400, 401, 409, 413, 415, 422, 500, 503}),
+        ("get", "/v1/maps/{map_name}", {200, 401, 404, 500, 503}),
+        ("delete", "/v1/maps/{map_name}", {204, 401, 404, 500, 503}),
+        ("post", "/v1/maps/{map_name}/frames",
+         {200, 201, 202, 400, 401, 404, 409, 413, 415, 422, 500, 503}),
+        ("get", "/v1/maps/{map_name}/frames", {200, 401, 404, 422, 500, 503}),
+        ("post", "/v1/maps/{map_name}/queries",
+         {200, 400, 401, 404, 413, 415, 422, 500, 503}),
+        ("get", "/v1/jobs/{job_id}", {200, 401, 404, 500, 503}),
+    ],
+)  # fmt: skip
+def test_an_operation_declares_what_it_answers(document, method, path, statuses):
+    declared = operations(document)[method, path]["responses"]
+    assert {int(status) for status in declared} == statuses
+
+
+def test_bodies_that_are_read_by_hand_are_described(document):
+    schemas = document["components"]["schemas"]
+    assert "intrinsics" in schemas["FrameMeta"]["required"]
+    assert schemas["FrameMeta"]["additionalProperties"] is False
+    upload = operations(document)["post", "/v1/maps/{map_name}/frames"]["requestBody"]
+    assert list(upload["content"]) == ["multipart/form-data"]
+    form = upload["content"]["multipart/form-data"]["schema"]
+    assert (form["required"], sorted(form["properties"])) == (["frame", "meta"], ["frame", "meta"])
+    query = operations(document)["post", "/v1/maps/{map_name}/queries"]["requestBody"]
+    options = {"k", "stages", "exact", "seed"}
+    assert sorted(query["content"]) == ["application/json", "multipart/form-data"]
+    by_form = query["content"]["multipart/form-data"]["schema"]["properties"]
+    by_id = query["content"]["application/json"]["schema"]["properties"]
+    assert set(by_form) == {"frame", "meta"} | options
+    assert set(by_id) == {"frame_id"} | options
+    assert (by_form["k"]["minimum"], by_form["k"]["maximum"], by_form["k"]["default"]) == (1, 50, 5)
+    assert by_form["stages"]["type"] == "string"
+
+
+def test_keys_are_asked_for_below_v1_alone(document):
+    for (_, path), operation in operations(document).items():
+        assert ("security" in operation) is path.startswith("/v1/"), path
+    assert document["components"]["securitySchemes"]["HTTPBearer"]["scheme"] == "bearer"

@@ -1,0 +1,107 @@
+"""Faults of the machine under a running service: told without its secrets, and got over."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def shaken(begin, make_map, small_shots):
+    """A server whose store is about to be damaged, with one indexed frame."""
+    server = begin()
+    path = make_map(server, "hall")
+    for shot in small_shots[:2]:
+        sent = server.client.post(f"{path}/frames", **shot.form(), headers={"Prefer": "wait=60"})
+        assert sent.status_code == 201
+    return server
+
+
+def change(server, statement: str) -> None:
+    with closing(sqlite3.connect(server.folder / "sceneprint.db", timeout=30)) as database:
+        database.execute(statement)
+        database.commit()
+
+
+def test_a_database_that_vanishes_is_told_of_and_comes_back(shaken, small_shots, refused):
+    path = "/v1/maps/hall/frames"
+    change(shaken, "ALTER TABLE jobs RENAME TO away")
+    for answer in (
+        shaken.client.get("/readyz"),
+        shaken.client.get(path),
+        shaken.client.post(path, **small_shots[2].form()),
+    ):
+        refused(answer, 503, "unusable-store", "Its log says why")
+        assert answer.headers["retry-after"] == "1"
+        own = answer.headers["x-request-id"]
+        noted = [line for line in shaken.log("request failed") if line["request_id"] == own]
+        assert "no such table: jobs" in noted[0]["error"]  # to the operator all of it
+    assert shaken.client.get("/healthz").json()["status"] == "ok"
+    change(shaken, "ALTER TABLE away RENAME TO jobs")
+    assert shaken.client.get("/readyz").json()["status"] == "ready"
+    sent = shaken.client.post(path, **small_shots[2].form(), headers={"Prefer": "wait=60"})
+    assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
+    assert len(shaken.workers) == 1
+    assert shaken.log("worker died") == []
+
+
+def test_a_disk_that_takes_no_blobs_takes_no_frames(shaken, small_shots, refused):
+    blobs, away = shaken.folder / "blobs", shaken.folder / "away"
+    blobs.rename(away)
+    blobs.write_text("a file where the folder was")
+    before = shaken.client.get("/readyz").json()["frames"]
+    answer = shaken.client.post("/v1/maps/hall/frames", **small_shots[3].form())
+    refused(answer, 503, "unusable-store", "nothing was taken")
+    assert shaken.client.get("/readyz").json()["frames"] == before
+    blobs.unlink()
+    away.rename(blobs)
+    sent = shaken.client.post(
+        "/v1/maps/hall/frames", **small_shots[3].form(), headers={"Prefer": "wait=60"}
+    )
+    assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
+
+
+def test_one_damaged_artifact_costs_its_frame_and_not_the_answer(shaken, small_shots, refused):
+    frames = shaken.client.get("/v1/maps/hall/frames").json()["items"]
+    first = frames[0]["frame_id"]
+    with closing(sqlite3.connect(shaken.folder / "sceneprint.db")) as database:
+        asked = "SELECT geometry FROM signatures ORDER BY frame_number LIMIT 1"
+        (blob,) = database.execute(asked).fetchone()
+    artifact = shaken.folder / "blobs" / blob[:2] / blob
+    content = artifact.read_bytes()
+    artifact.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    answer = shaken.client.post("/v1/maps/hall/queries", **small_shots[1].form())
+    assert answer.status_code == 200
+    told = {match["frame_id"]: match["validation"] for match in answer.json()["matches"]}
+    assert told[first]["status"] == "skipped"
+    assert "is damaged" in told[first]["reason"]
+    assert answer.json()["status"] == "found"
+    own = shaken.client.post("/v1/maps/hall/queries", json={"frame_id": first})
+    refused(own, 500, "damaged-blob", "upload it again")
+    artifact.write_bytes(content)
+    own = shaken.client.post("/v1/maps/hall/queries", json={"frame_id": first})
+    assert (own.status_code, own.json()["status"]) == (200, "found")
+
+
+def test_what_nobody_thought_of_is_told_by_its_id_alone(shaken, refused):
+    change(shaken, "UPDATE maps SET model_id = model_id, created_at = 1e30")
+    answer = shaken.client.get("/v1/maps", headers={"X-Request-Id": "unheard-of"})
+    refused(answer, 500, "internal-error", "Please report it")
+    assert answer.headers["x-request-id"] == "unheard-of"
+    (noted,) = shaken.log("request broke down")
+    assert noted["request_id"] == "unheard-of"
+    assert "Traceback" in noted["traceback"]
+    (line,) = [one for one in shaken.log("request") if one["request_id"] == "unheard-of"]
+    assert (line["status"], line["method"], line["path"]) == (500, "GET", "/v1/maps")
+    counted = 'sceneprint_requests_total{method="GET",route="/v1/maps",status="500"} 1.0'
+    assert counted in shaken.client.get("/metrics").text
+
+
+def test_methods_that_are_none_make_no_figures_of_their_own(shaken):
+    for i in range(3):
+        assert shaken.client.request(f"BREW{i}", "/healthz").status_code == 405
+    text = shaken.client.get("/metrics").text
+    assert "BREW" not in text
+    assert 'method="other"' in text

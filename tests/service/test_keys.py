@@ -1,0 +1,112 @@
+"""Keys: asked for beyond this machine, made by a command, and stored nowhere."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BELOW = (
+    ("GET", "/v1/maps"),
+    ("GET", "/v1/jobs/a"),
+    ("DELETE", "/v1/maps/a"),
+    ("POST", "/v1/maps/a/frames"),
+    ("POST", "/v1/maps/a/queries"),
+)
+COMMAND = Path(sys.executable).parent / "sceneprint"
+
+
+def make(folder: Path, name: str) -> subprocess.CompletedProcess[str]:
+    arguments = [COMMAND, "keys", "--create", name, "--data", folder]
+    return subprocess.run(arguments, capture_output=True, text=True, timeout=90, check=False)
+
+
+@pytest.fixture(scope="module")
+def wide(begin):
+    return begin("--host", "0.0.0.0", "--workers", "0")
+
+
+@pytest.fixture(scope="module")
+def secret(wide) -> str:
+    done = make(wide.folder, "robot 7")
+    assert done.returncode == 0
+    assert done.stdout.startswith("sp_")
+    assert len(done.stdout.split()) == 1
+    assert done.stderr == "keep it: it is not stored, and cannot be shown again\n"
+    return done.stdout.strip()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def nearby(wide):
+    """The address that is printed is that of every interface; asked from here it is this one."""
+    assert wide.url.startswith("http://0.0.0.0:")
+    wide.client.base_url = wide.url.replace("0.0.0.0", "127.0.0.1")
+
+
+@pytest.mark.parametrize(
+    "shown",
+    [None, "Bearer", "Bearer sp_wrong", "Basic {}", "{}", "Bearer {}x", "Bearer \xe9"],
+)
+def test_without_its_key_nothing_below_v1_is_told(wide, secret, refused, shown):
+    headers = {} if shown is None else {"Authorization": shown.format(secret).encode("latin-1")}
+    for method, path in BELOW:
+        answer = wide.client.request(method, path, headers=headers)
+        refused(answer, 401, "key-required", "Authorization: Bearer KEY")
+        assert answer.headers["www-authenticate"] == "Bearer"
+    answer = wide.client.post("/v1/maps", json={"name": "a"}, headers=headers)
+    refused(answer, 401, "key-required")
+
+
+@pytest.mark.parametrize("scheme", ["Bearer", "bearer"])
+def test_with_a_key_all_is_open(wide, secret, scheme):
+    headers = {"Authorization": f"{scheme} {secret}"}
+    assert wide.client.get("/v1/maps", headers=headers).json() == {
+        "items": [], "next_cursor": None,
+    }  # fmt: skip
+    assert wide.client.get("/v1/maps").status_code == 401
+
+
+@pytest.mark.parametrize("path", ["/healthz", "/readyz", "/openapi.json"])
+def test_whether_it_lives_is_told_to_all(wide, path):
+    assert wide.client.get(path).status_code == 200
+
+
+def test_on_this_machine_alone_no_key_is_asked_for(served):
+    assert served.url.startswith("http://127.0.0.1:")
+    assert served.client.get("/v1/maps").status_code == 200
+    assert served.client.get("/v1/maps", headers={"Authorization": "Bearer no"}).status_code == 200
+
+
+def test_the_secret_is_in_no_file_and_no_line(wide, secret):
+    wide.client.get("/v1/maps", headers={"Authorization": f"Bearer {secret}"})
+    bare = secret.removeprefix("sp_").encode()
+    files = [path for path in wide.folder.rglob("*") if path.is_file()]
+    assert {"sceneprint.db", "sceneprint.db-wal"} <= {path.name for path in files}
+    for path in [*files, wide.errors]:
+        data = path.read_bytes()
+        assert all(bare[i : i + 16] not in data for i in range(len(bare) - 15)), path
+    assert any(b"robot 7" in path.read_bytes() for path in files)
+
+
+def test_a_name_is_given_once(wide, secret):
+    done = make(wide.folder, "robot 7")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        "sceneprint keys: There is a key named 'robot 7'. Choose another name.\n"
+    )
+    headers = {"Authorization": f"Bearer {secret}"}
+    assert wide.client.get("/v1/maps", headers=headers).status_code == 200
+
+
+@pytest.mark.parametrize("name", ["", "two\nlines", "x" * 129])
+def test_a_key_has_a_name_that_can_be_printed(name: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "sceneprint", "keys", "--create", name, "--data", str(tmp_path)],
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert "is no name for a key" in done.stderr

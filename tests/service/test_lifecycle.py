@@ -1,0 +1,180 @@
+"""A command that serves, from its first line to its last: signals, deaths, and what cannot be."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sqlite3
+import sys
+from contextlib import closing
+from datetime import datetime
+
+import pytest
+
+
+def rows(server, asked: str) -> list[tuple]:
+    with closing(sqlite3.connect(server.folder / "sceneprint.db", timeout=30)) as database:
+        return database.execute(asked).fetchall()
+
+
+def signing(server) -> bool:
+    return bool(rows(server, "SELECT 1 FROM jobs WHERE state = 'running'"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_told_to_stop_it_finishes_the_frame_in_hand(begin, make_map, shots, until, number):
+    server = begin()
+    server.ready()
+    path = make_map(server, "hall", model="paper")
+    for shot in shots[:4]:
+        assert server.client.post(f"{path}/frames", **shot.form()).status_code == 202
+    until(lambda: signing(server))
+    assert server.end(number) == 0
+    server.gone()
+    states = rows(server, "SELECT f.state, j.state, j.attempts FROM frames f JOIN jobs j"
+                          " ON j.frame_number = f.number ORDER BY f.number")  # fmt: skip
+    done = [one for one in states if one == ("indexed", "succeeded", 1)]
+    assert len(done) >= 1
+    assert states == done + [("received", "queued", 0)] * (4 - len(done))
+    for line in server.log():  # each line is JSON, to the last
+        assert datetime.fromisoformat(line["time"]).utcoffset() is not None
+        assert line["level"] in ("info", "warning")
+        assert line["message"]
+    assert len(server.log("worker stopped")) == 1
+    assert server.log("worker died") == []
+
+
+def test_to_interrupt_all_of_it_at_once_is_to_stop(begin):
+    server = begin()
+    server.ready()
+    os.killpg(server.process.pid, signal.SIGINT)  # as a terminal does
+    assert server.end() == 0
+    server.gone()
+    assert [line["logger"] for line in server.log() if line["level"] == "critical"] == []
+
+
+def test_workers_whose_service_was_killed_leave_by_themselves(begin):
+    server = begin("--workers", "2")
+    server.ready(2)
+    assert len(server.workers) == 2
+    assert server.end(signal.SIGKILL) == -signal.SIGKILL
+    server.gone()
+
+
+def test_a_worker_that_dies_is_replaced_and_its_frame_signed(begin, make_map, shots, until):
+    server = begin(lease_s=1)
+    server.ready()
+    path = make_map(server, "hall", model="paper")
+    sent = server.client.post(f"{path}/frames", **shots[0].form()).json()
+    until(lambda: signing(server))
+    (killed,) = server.workers
+    os.kill(killed, signal.SIGKILL)
+    until(
+        lambda: server.client.get(f"{path}/frames/{sent['frame_id']}").json()["state"] == "indexed"
+    )
+    job = server.client.get(f"/v1/jobs/{sent['job_id']}").json()
+    assert (job["state"], job["attempts"]) == ("succeeded", 2)
+    (died,) = server.log("worker died")
+    assert (died["pid"], died["code"]) == (killed, -signal.SIGKILL)
+    assert len(server.workers) == 1
+    assert server.workers != [killed]
+    assert server.end(signal.SIGTERM) == 0
+    server.gone()
+
+
+@pytest.fixture(scope="module")
+def newer(begin, tmp_path_factory):
+    """A data folder that a later version has written."""
+    folder = tmp_path_factory.mktemp("newer")
+    server = begin("--workers", "0", folder=folder)
+    assert server.end(signal.SIGTERM) == 0
+    with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
+        database.execute("UPDATE alembic_version SET version_num = 'from the future'")
+        database.commit()
+    return folder
+
+
+@pytest.mark.parametrize("what", ["sceneprint serve", "sceneprint work", "service", "worker"])
+def test_a_newer_store_is_refused_in_one_line(begin, newer, what):
+    command = {
+        "sceneprint serve": ("sceneprint", "serve", "--port", "0"),
+        "sceneprint work": ("sceneprint", "work"),
+        "service": ("service",),
+        "worker": ("worker",),
+    }[what]
+    server = begin(command=(sys.executable, "-m", *command), wait=False, data_dir=newer, port=0)
+    assert server.end() == 2
+    (line,) = server.errors.read_text().splitlines()
+    assert line.startswith(f"{what}: ")
+    assert "has schema from the future, which this version of sceneprint does not know" in line
+    assert server.process.stdout.read() == ""
+
+
+def refusal(begin, *arguments: str, folder=None) -> str:
+    server = begin(*arguments, folder=folder, wait=False)
+    assert server.end() == 2
+    (line,) = server.errors.read_text().splitlines()
+    assert server.process.stdout.read() == ""
+    server.gone()
+    return line
+
+
+def test_a_folder_that_cannot_be_made_is_refused_in_one_line(begin, tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    line = refusal(begin, folder=tmp_path / "file" / "data")
+    assert line.startswith(f"sceneprint serve: {tmp_path}/file/data/blobs: the folder cannot be")
+
+
+def test_a_file_that_is_no_database_is_refused_in_one_line(begin, tmp_path):
+    (tmp_path / "sceneprint.db").write_bytes(b"not a database " * 1000)
+    line = refusal(begin, folder=tmp_path)
+    assert "file is not a database" in line
+    assert (tmp_path / "sceneprint.db").read_bytes() == b"not a database " * 1000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("--port", "99999"), "The setting port is 99999"),
+        (("--workers", "257"), "The setting workers is 257"),
+        (("--host", "no.such.host.invalid"), "no.such.host.invalid:0 cannot be listened on"),
+    ],
+)
+def test_what_cannot_be_set_is_refused_in_one_line(begin, arguments, text):
+    assert text in refusal(begin, *arguments)
+
+
+def test_a_port_that_is_taken_is_refused_in_one_line(begin, served):
+    port = served.url.rpartition(":")[2]
+    line = refusal(begin, "--port", port)
+    assert line == (
+        f"sceneprint serve: 127.0.0.1:{port} cannot be listened on (Address already in use). "
+        "Choose another --port, 0 for a free one, or stop what holds it."
+    )
+    with socket.create_connection(("127.0.0.1", int(port))):
+        assert served.client.get("/healthz").status_code == 200
+
+
+def test_service_and_worker_alone_do_the_job_together(begin, make_map, small_shots, tmp_path):
+    given = {"data_dir": tmp_path, "port": 0, "workers": 1}
+    service = begin(command=(sys.executable, "-m", "service"), **given)
+    path = make_map(service, "hall")
+    sent = service.client.post(f"{path}/frames", **small_shots[0].form())
+    assert (sent.status_code, service.workers) == (202, [])
+    worker = begin(command=(sys.executable, "-m", "worker"), wait=False, **given)
+    waited = service.client.post(
+        f"{path}/frames", **small_shots[1].form(), headers={"Prefer": "wait=60"}
+    )
+    assert (waited.status_code, waited.json()["state"]) == (201, "indexed")
+    answer = service.client.post(f"{path}/queries", **small_shots[0].form()).json()
+    assert answer["matches"][0]["frame_id"] == sent.json()["frame_id"]
+    assert worker.end(signal.SIGTERM) == 0
+    worker.gone()
+    assert service.end(signal.SIGTERM) == 0
+    service.gone()
+    for server in (service, worker):
+        assert {line["level"] for line in server.log()} == {"info"}
+    interrupted = begin(command=(sys.executable, "-m", "service"), **given)
+    assert interrupted.end(signal.SIGINT) == 0
+    assert {line["level"] for line in interrupted.log()} == {"info"}

@@ -1,0 +1,215 @@
+"""Maps and frames over HTTP: made, sent, listed, deleted, against a running server."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from datetime import datetime
+
+import pytest
+
+
+def test_a_map_is_made_once_and_stays_as_it_was_made(served, refused):
+    first = served.client.post("/v1/maps", json={"name": "hall", "title": "The hall"})
+    again = served.client.post("/v1/maps", json={"name": "hall", "title": "The hall"})
+    assert (first.status_code, again.status_code) == (201, 200)
+    assert first.headers["location"] == "/v1/maps/hall" == again.headers["location"]
+    assert first.json() == again.json() == served.client.get("/v1/maps/hall").json()
+    made = first.json()
+    assert (made["name"], made["title"], made["frames"], made["revision"]) == (
+        "hall", "The hall", {}, 0,
+    )  # fmt: skip
+    assert made["model"] == f"paper-{made['model_id'][:12]}"
+    assert datetime.fromisoformat(made["created_at"]).utcoffset() is not None
+    for other in ({"title": "Another"}, {}, {"title": "The hall", "model": "compact"}):
+        answer = served.client.post("/v1/maps", json={"name": "hall", **other})
+        refused(answer, 409, "map-exists", "'hall' with another title or model")
+    assert served.client.get("/v1/maps/hall").json()["title"] == "The hall"
+    names = [one["name"] for one in served.client.get("/v1/maps").json()["items"]]
+    assert "hall" in names
+    assert names == sorted(names)
+
+
+@pytest.mark.parametrize("name", ["0", "a" * 63, "warehouse-2_b"])
+def test_a_slug_is_a_name(served, name):
+    assert served.client.post("/v1/maps", json={"name": name}).status_code == 201
+    assert served.client.delete(f"/v1/maps/{name}").status_code == 204
+
+
+@pytest.mark.parametrize(
+    "name", ["../x", "%2e%2e", "..", ".", "", "a" * 64, "-a", "_a", "A", "é", "a b", "a/b", "a\n"]
+)  # fmt: skip
+def test_what_is_no_slug_is_no_name(served, refused, name):
+    problem = refused(
+        served.client.post("/v1/maps", json={"name": name}), 422, "invalid-request", "name: "
+    )
+    assert [one["field"] for one in problem["errors"]] == ["name"]
+    assert name not in [one["name"] for one in served.client.get("/v1/maps").json()["items"]]
+
+
+def test_an_upload_is_safe_then_signed_and_the_same_one_is_there_already(
+    served, make_map, small_shots, refused
+):
+    path = make_map(served, "once")
+    shot = small_shots[0]
+    meta = {"robot": "r2", "session": "monday", "tags": ["a", "b"],
+            "captured_at": "2024-05-01T12:00:00.250+02:00"}  # fmt: skip
+    sent = served.client.post(f"{path}/frames", **shot.form(**meta))
+    assert sent.status_code == 202
+    added = sent.json()
+    assert added["state"] in ("received", "signing")
+    assert sent.headers["location"] == f"/v1/jobs/{added['job_id']}"
+    assert served.client.get(sent.headers["location"]).json()["frame_id"] == added["frame_id"]
+
+    waited = served.client.post(
+        f"{path}/frames", **small_shots[1].form(**meta), headers={"Prefer": "wait=50"}
+    )
+    assert waited.status_code == 201, waited.text
+    assert waited.headers["preference-applied"] == "wait=50"
+    assert waited.json()["state"] == "indexed"
+    assert waited.json()["frame_id"] != added["frame_id"]
+
+    again = served.client.post(f"{path}/frames", **shot.form(**meta))
+    assert again.status_code == 200
+    assert again.json() == {**added, "state": "indexed"}  # the one worker takes them in order
+    assert again.headers["location"] == sent.headers["location"]
+    for other, names in (
+        ({**meta, "robot": "d2"}, "robot"),
+        ({**meta, "tags": ["b", "a"], "session": None}, "session, tags"),
+        ({**meta, "captured_at": "2024-05-01T12:00:00.251+02:00"}, "captured_at"),
+    ):
+        answer = served.client.post(f"{path}/frames", **shot.form(**other))
+        text = f"Frame {added['frame_id']} has the same content, but other {names}."
+        refused(answer, 409, "frame-conflict", text)
+
+    frame = served.client.get(f"{path}/frames/{added['frame_id']}").json()
+    assert {key: frame[key] for key in ("robot", "session", "tags", "state", "bytes", "map")} == {
+        "robot": "r2", "session": "monday", "tags": ["a", "b"], "state": "indexed",
+        "bytes": len(shot.png), "map": "once",
+    }  # fmt: skip
+    assert frame["captured_at"] == "2024-05-01T10:00:00.250000Z"
+    assert frame["intrinsics"] == {**shot.camera, "distortion": []}
+    assert frame["job_id"] == added["job_id"]
+    job = served.client.get(f"/v1/jobs/{added['job_id']}").json()
+    assert (job["state"], job["attempts"], job["error"], job["map"]) == (
+        "succeeded", 1, None, "once",
+    )  # fmt: skip
+    assert job["created_at"] <= job["started_at"] <= job["finished_at"]
+    assert served.client.get(path).json()["frames"] == {"indexed": 2}
+
+
+@pytest.mark.parametrize(
+    "prefer", ["wait=0", "wait=-5", "respond-async", "awaited=9", "wait=x", "wait"]
+)
+def test_what_asks_for_no_wait_is_not_waited_for(served, small_shots, prefer):
+    served.client.post("/v1/maps", json={"name": "hurried", "model": "compact"})
+    numbers = {"wait=0": 0, "wait=-5": 1, "respond-async": 2, "awaited=9": 3, "wait=x": 4}
+    shot = small_shots[80 + numbers.get(prefer, 5)]
+    sent = served.client.post("/v1/maps/hurried/frames", **shot.form(), headers={"Prefer": prefer})
+    assert (sent.status_code, sent.headers.get("preference-applied")) == (202, None)
+
+
+def test_pages_hold_every_frame_once_and_in_order(served, make_map, small_shots, refused):
+    path = make_map(served, "pages")
+    sent = []
+    for shot in small_shots[:7]:
+        answer = served.client.post(
+            f"{path}/frames", **shot.form(), headers={"Prefer": "respond-async, wait=50"}
+        )
+        assert answer.status_code == 201
+        sent.append(answer.json()["frame_id"])
+    served.client.delete(f"{path}/frames/{sent[2]}")
+    kept = [one for one in sent if one != sent[2]]
+    found: list[str] = []
+    cursor, sizes = None, []
+    while cursor is not None or not sizes:
+        asked = {"limit": 3} if cursor is None else {"limit": 3, "cursor": cursor}
+        page = served.client.get(f"{path}/frames", params=asked).json()
+        found += [one["frame_id"] for one in page["items"]]
+        sizes.append(len(page["items"]))
+        cursor = page["next_cursor"]
+    assert (found, sizes) == (kept, [3, 3])
+
+    def of_state(state: str) -> list[str]:
+        page = served.client.get(f"{path}/frames", params={"state": state}).json()
+        return [one["frame_id"] for one in page["items"]]
+
+    assert of_state("indexed") == kept
+    assert of_state("deleted") == [sent[2]]
+    assert of_state("received") == of_state("rejected") == of_state("failed") == []
+    for wrong in ({"state": "lost"}, {"limit": 0}, {"limit": 1001}, {"cursor": "-1"},
+                  {"cursor": "१"}, {"cursor": "9" * 19}, {"cursor": ""}):  # fmt: skip
+        answer = served.client.get(f"{path}/frames", params=wrong)
+        problem = refused(answer, 422, "invalid-request")
+        assert [one["field"] for one in problem["errors"]] == list(wrong)
+
+
+def test_a_deleted_frame_is_found_no_more_and_may_come_again(
+    served, make_map, small_shots, refused
+):
+    path = make_map(served, "fleeting")
+    ids = []
+    for shot in small_shots[:3]:
+        sent = served.client.post(f"{path}/frames", **shot.form(), headers={"Prefer": "wait=50"})
+        ids.append(sent.json()["frame_id"])
+
+    def found() -> list[str]:
+        asked = small_shots[1].form()
+        asked["data"]["stages"] = "retrieve"
+        answer = served.client.post(f"{path}/queries", **asked)
+        return [one["frame_id"] for one in answer.json()["matches"]]
+
+    assert found()[0] == ids[1]
+    assert sorted(found()) == sorted(ids)
+    gone = served.client.delete(f"{path}/frames/{ids[1]}")
+    assert (gone.status_code, gone.content) == (204, b"")
+    assert sorted(found()) == sorted([ids[0], ids[2]])
+    told = served.client.get(f"{path}/frames/{ids[1]}").json()
+    assert (told["state"], told["content_id"]) == ("deleted", None)
+    refused(served.client.delete(f"{path}/frames/{ids[1]}"), 404, "unknown-frame", ids[1])
+    asked = {"frame_id": ids[1]}
+    answer = served.client.post(f"{path}/queries", json=asked)
+    problem = refused(answer, 422, "invalid-request", "is deleted")
+    assert problem["errors"] == [{"field": "frame_id", "reason": "is deleted"}]
+
+    back = served.client.post(
+        f"{path}/frames", **small_shots[1].form(), headers={"Prefer": "wait=50"}
+    )
+    assert back.status_code == 201
+    assert back.json()["frame_id"] not in ids
+    assert found()[0] == back.json()["frame_id"]
+
+
+def test_a_deleted_map_takes_all_with_it(
+    served, make_map: Callable[..., str], small_shots, refused
+):
+    path = make_map(served, "doomed")
+    sent = served.client.post(
+        f"{path}/frames", **small_shots[5].form(), headers={"Prefer": "wait=50"}
+    ).json()
+    assert served.client.delete(path).status_code == 204
+    answers = (
+        served.client.get(path),
+        served.client.delete(path),
+        served.client.get(f"{path}/frames"),
+        served.client.get(f"{path}/frames/{sent['frame_id']}"),
+        served.client.post(f"{path}/frames", **small_shots[5].form()),
+        served.client.post(f"{path}/queries", json={"frame_id": sent["frame_id"]}),
+    )
+    for answer in answers:
+        refused(answer, 404, "unknown-map", "There is no map 'doomed'")
+    refused(served.client.get(f"/v1/jobs/{sent['job_id']}"), 404, "unknown-job", sent["job_id"])
+    make_map(served, "doomed")  # of that name, and empty
+    asked = small_shots[5].form()
+    answer = served.client.post(f"{path}/queries", **asked).json()
+    assert (answer["status"], answer["matches"], answer["counts"]["map"]) == ("not_found", [], 0)
+    assert json.loads(asked["data"]["meta"])["intrinsics"]["width"] == 160
+
+
+@pytest.mark.parametrize("when", ["0001-01-01T00:00:00+14:00", "9999-12-31T23:59:59-14:00"])
+def test_a_time_that_is_none_in_utc_spoils_no_page(served, small_shots, refused, when):
+    served.client.post("/v1/maps", json={"name": "times", "model": "compact"})
+    sent = served.client.post("/v1/maps/times/frames", **small_shots[90].form(captured_at=when))
+    problem = refused(sent, 422, "invalid-request", "captured_at")
+    assert [one["field"] for one in problem["errors"]] == ["captured_at"]
+    assert served.client.get("/v1/maps/times/frames").json()["items"] == []

@@ -1,0 +1,121 @@
+"""More at once than can be worked on: some wait, the rest are asked to come back."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sqlite3
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+
+import httpx
+import pytest
+
+
+@pytest.fixture(scope="module")
+def busy(begin, make_map, small_shots):
+    """A server that works on one thing at a time, lets one wait, and has a map of two frames."""
+    server = begin(concurrency=1, waiting=1)
+    path = make_map(server, "hall")
+    for shot in small_shots[:2]:
+        sent = server.client.post(f"{path}/frames", **shot.form(), headers={"Prefer": "wait=60"})
+        assert sent.status_code == 201
+    return server
+
+
+def test_who_comes_too_many_is_sent_away_and_may_come_back(busy, shots, refused):
+    def ask(_: int) -> httpx.Response:
+        return busy.client.post("/v1/maps/hall/queries", **shots[0].form())
+
+    with ThreadPoolExecutor(13) as pool:
+        asked = [pool.submit(ask, i) for i in range(12)]
+        health = pool.submit(busy.client.get, "/healthz")
+        answers = [one.result() for one in asked]
+        assert health.result().json()["status"] == "ok"
+    kinds = sorted(answer.status_code for answer in answers)
+    assert set(kinds) == {200, 503}
+    assert kinds.count(200) >= 2  # one at work, one that waited
+    for answer in answers:
+        if answer.status_code == 503:
+            refused(answer, 503, "busy", "Come back in a second")
+            assert answer.headers["retry-after"] == "1"
+        else:
+            assert answer.json()["counts"]["map"] == 2
+    assert [ask(i).status_code for i in range(3)] == [200, 200, 200]  # and none is still held
+    assert [line for line in busy.log() if line["level"] == "error"] == []
+
+
+def test_as_many_wait_as_may_and_not_one_more(busy, until, refused):
+    """One is at work for as long as the test likes: its artifact comes through a pipe."""
+    with closing(sqlite3.connect(busy.folder / "sceneprint.db")) as database:
+        asked = "SELECT f.id, s.geometry FROM signatures s JOIN frames f ON f.number = frame_number"
+        frame_id, blob = database.execute(asked).fetchone()
+    path = busy.folder / "blobs" / blob[:2] / blob
+    content = path.read_bytes()
+    path.unlink()
+    os.mkfifo(path)
+
+    def ask() -> httpx.Response:
+        return busy.client.post("/v1/maps/hall/queries", json={"frame_id": frame_id})
+
+    def opened() -> int:
+        try:
+            return os.open(path, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError:
+            return 0  # nobody reads yet
+
+    with ThreadPoolExecutor(5) as pool:
+        asked = [pool.submit(ask)]
+        pipe = until(opened)
+        os.set_blocking(pipe, True)
+        try:
+            whole = path.with_suffix(".whole")
+            whole.write_bytes(content)
+            whole.replace(path)  # the others read a file
+            asked += [pool.submit(ask) for _ in range(4)]
+            until(lambda: sum(one.done() for one in asked) == 3)
+            for one in asked:
+                if one.done():
+                    refused(one.result(), 503, "busy")
+            os.write(pipe, content)
+        finally:
+            os.close(pipe)
+        assert sorted(one.result().status_code for one in asked) == [200, 200, 503, 503, 503]
+
+
+def test_who_hangs_up_while_waiting_has_sent_a_frame_nevertheless(busy, small_shots):
+    form = small_shots[7].form()
+    request = busy.client.build_request(
+        "POST", "/v1/maps/hall/frames", **form, headers={"Prefer": "wait=60"}
+    )
+    lines = [f"POST {request.url.path} HTTP/1.1".encode()]
+    lines += [key + b": " + value for key, value in request.headers.raw]
+    before = {one["frame_id"] for one in busy.client.get("/v1/maps/hall/frames").json()["items"]}
+    with socket.create_connection((request.url.host, request.url.port), timeout=60) as wire:
+        wire.sendall(b"\r\n".join(lines) + b"\r\n\r\n" + request.read())
+
+        def came() -> set[str]:
+            page = busy.client.get("/v1/maps/hall/frames").json()
+            return {one["frame_id"] for one in page["items"]} - before
+
+        while not came():
+            pass
+    (frame_id,) = came()
+    again = busy.client.post("/v1/maps/hall/frames", **form)
+    assert (again.status_code, again.json()["frame_id"]) == (200, frame_id)
+
+    def state() -> str:
+        return str(busy.client.get(f"/v1/maps/hall/frames/{frame_id}").json()["state"])
+
+    while state() in ("received", "signing"):
+        pass
+    assert state() == "indexed"
+    assert busy.client.get("/healthz").status_code == 200
+    assert [line for line in busy.log() if line["level"] == "error"] == []
+
+
+def test_where_none_may_wait_one_is_still_worked_on(begin, make_map, small_shots):
+    server = begin("--workers", "0", concurrency=1, waiting=0)
+    path = make_map(server, "hall")
+    sent = [server.client.post(f"{path}/frames", **shot.form()) for shot in small_shots[:3]]
+    assert [answer.status_code for answer in sent] == [202, 202, 202]

@@ -1,0 +1,238 @@
+"""What the service refuses, and how it says so: a table of requests that cannot be served."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+JSON = {"content-type": "application/json"}
+FORM = {"content-type": "multipart/form-data; boundary=x"}
+
+
+@pytest.fixture(scope="module")
+def hall(served, make_map) -> str:
+    return make_map(served, "refusals")
+
+
+def png(image: Image.Image) -> bytes:
+    out = io.BytesIO()
+    image.save(out, "PNG")
+    return out.getvalue()
+
+
+def npy(array: np.ndarray) -> bytes:
+    out = io.BytesIO()
+    np.save(out, array, allow_pickle=True)
+    return out.getvalue()
+
+
+COLOUR = png(Image.new("RGB", (160, 120), (9, 9, 9)))
+EIGHT = png(Image.new("L", (160, 120), 9))
+ZERO = png(Image.fromarray(np.zeros((120, 160), np.uint16)))
+
+#: bytes of the file -> type of the problem, text that the detail holds
+FILES = {
+    "empty": (b"", "unreadable-frame", "empty"),
+    "text": (b"hello", "unreadable-frame", "neither PNG nor NPY"),
+    "colour": (COLOUR, "unreadable-frame", "16-bit"),
+    "eight bits": (EIGHT, "unreadable-frame", "16-bit"),
+    "missing": (ZERO, "useless-frame", "All 19200 samples are missing"),
+    "NaN": (npy(np.full((120, 160), np.nan, np.float32)), "useless-frame", "are missing"),
+    "objects": (npy(np.array([[{"a": 1}]], object)), "unreadable-frame", "object"),
+    "integers": (npy(np.ones((120, 160), np.int64)), "unreadable-frame", "<i8"),
+    "three dimensions": (npy(np.ones((3, 4, 5), np.float32)), "unreadable-frame", "two dim"),
+    "other size": (npy(np.ones((120, 159), np.float32)), "invalid-intrinsics", "159 x 120"),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_that_is_no_depth_image_is_refused(served, hall, small_shots, refused, name):
+    data, kind, text = FILES[name]
+    for route in ("frames", "queries"):
+        form = small_shots[0].form() | {"files": {"frame": ("a", data)}}
+        refused(served.client.post(f"{hall}/{route}", **form), 422, kind, text)
+    assert served.client.get(f"{hall}/frames").json()["items"] == []
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_truncated_image_is_refused(served, hall, small_shots, refused, share):
+    data = small_shots[0].png[: int(len(small_shots[0].png) * share)]
+    form = small_shots[0].form() | {"files": {"frame": ("a.png", data)}}
+    refused(served.client.post(f"{hall}/frames", **form), 422, "unreadable-frame")
+
+
+TURN = {"x": 0, "y": 0, "z": 0}
+SKEW = [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+#: what is other in `meta` -> type of the problem, text of its detail, fields at fault
+META: dict[str, tuple[dict[str, Any], str, str, list[str]]] = {
+    "unknown": ({"colour": 1}, "invalid-request", "colour: Extra", ["colour"]),
+    "naive": ({"captured_at": "2024-05-01T12:00:00"}, "invalid-request", "timezone",
+              ["captured_at"]),
+    "scale 0": ({"depth_scale": 0}, "invalid-request", "greater than 0", ["depth_scale"]),
+    "scale": ({"depth_scale": 1e300}, "useless-frame", "are missing", []),
+    "control": ({"robot": "a\nb"}, "invalid-request", "robot", ["robot"]),
+    "long": ({"session": "a" * 129}, "invalid-request", "128", ["session"]),
+    "tags": ({"tags": ["a"] * 33}, "invalid-request", "32", ["tags"]),
+    "half a pose": ({"pose": {"parent_frame": "w", "translation": TURN}}, "invalid-request",
+                    "give translation and rotation, or matrix", ["pose"]),
+    "no parent": ({"pose": {"matrix": np.eye(4).tolist()}}, "invalid-request",
+                  "name its parent_frame", [""]),
+    "not rigid": ({"pose": {"parent_frame": "w", "matrix": SKEW}}, "invalid-pose", "rigid", []),
+    "quaternion": ({"pose": {"parent_frame": "w", "translation": TURN,
+                             "rotation": {**TURN, "w": 2}}}, "invalid-pose", "length 2", []),
+    "four errors": ({"a": 1, "b": 1, "c": 1, "d": 1}, "invalid-request", "(and 1 more)",
+                    ["a", "b", "c", "d"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", META)
+def test_metadata_that_cannot_be_is_refused(served, hall, small_shots, refused, name):
+    other, kind, text, fields = META[name]
+    for route in ("frames", "queries"):
+        answer = served.client.post(f"{hall}/{route}", **small_shots[0].form(**other))
+        problem = refused(answer, 422, kind, text)
+        assert [one["field"] for one in problem.get("errors", [])] == fields
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "kind"),
+    [
+        ("fx", "-5", "invalid-intrinsics"), ("fy", "0", "invalid-intrinsics"),
+        ("fx", "NaN", "invalid-request"), ("cx", "Infinity", "invalid-request"),
+        ("fx", "1e999", "invalid-request"), ("fx", "1e300", "invalid-intrinsics"),
+        ("width", "161", "invalid-intrinsics"), ("width", "65536", "invalid-request"),
+        ("cy", "-1e300", "invalid-intrinsics"), ("height", '"a"', "invalid-request"),
+    ],
+)  # fmt: skip
+def test_a_camera_that_is_none_is_refused(served, hall, small_shots, refused, field, value, kind):
+    form = small_shots[0].form()
+    camera = ", ".join(
+        f'"{key}": {value if key == field else known}'
+        for key, known in small_shots[0].camera.items()
+    )
+    form["data"]["meta"] = f'{{"intrinsics": {{{camera}}}}}'
+    problem = refused(served.client.post(f"{hall}/frames", **form), 422, kind)
+    fields = [one["field"] for one in problem.get("errors", [])]
+    assert fields == ([f"intrinsics.{field}"] if kind == "invalid-request" else [])
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"k": "0"}, "k"), ({"k": "51"}, "k"), ({"k": "x"}, "k"), ({"seed": "-1"}, "seed"),
+        ({"seed": str(2**32)}, "seed"), ({"exact": "maybe"}, "exact"),
+        ({"stages": "validate"}, "stages"), ({"stages": "retrieve,fly"}, "stages.1"),
+        ({"stages": "retrieve,validate,diversify"}, "stages"), ({"stages": ""}, "stages.0"),
+        ({"stages": "retrieve,retrieve"}, "stages"), ({"colour": "1"}, "colour"),
+        ({"frame_id": "1"}, "frame_id"),
+    ],
+)  # fmt: skip
+def test_a_question_that_cannot_be_asked_is_refused(
+    served, hall, small_shots, refused, options, field
+):
+    form = small_shots[0].form()
+    form["data"] |= options
+    problem = refused(served.client.post(f"{hall}/queries", **form), 422, "invalid-request")
+    assert [one["field"] for one in problem["errors"]] == [field]
+
+
+#: content of a query that is no form -> status, type, text
+BODIES = {
+    b"": (400, "malformed-body", "not JSON"), b"{": (400, "malformed-body", "not JSON"),
+    b"[]": (400, "malformed-body", "not a JSON object"),
+    b'{"frame_id": "\xff"}': (400, "malformed-body", "not JSON"),
+    b'{"frame_id": "\\ud800"}': (400, "malformed-body", "not JSON"),
+    b"[" * 5000: (400, "malformed-body", "not JSON"),
+    b'{"k": ' + b"9" * 5000 + b"}": (400, "malformed-body", "not JSON"),
+    b" " * (1 << 18) + b" ": (400, "malformed-body", "more than 262144 bytes"),
+    b"{}": (422, "invalid-request", "names no frame"),
+    b'{"frame_id": 7}': (422, "invalid-request", "names no frame"),
+    b'{"frame_id": "a", "k": 0}': (422, "invalid-request", "k: "),
+    b'{"frame_id": "a", "k": NaN}': (422, "invalid-request", "k: "),
+    b'{"frame_id": "a", "k": 1e999}': (422, "invalid-request", "k: "),
+    b'{"frame_id": "a", "stages": "retrieve"}': (422, "invalid-request", "stages: "),
+    b'{"frame_id": "a", "fly": 1}': (422, "invalid-request", "fly: "),
+    b'{"frame_id": "../a\\u0000"}': (404, "unknown-frame", "There is no frame"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("number", range(len(BODIES)))
+def test_json_that_asks_nothing_is_refused(served, hall, refused, number):
+    content, (status, kind, text) = list(BODIES.items())[number]
+    answer = served.client.post(f"{hall}/queries", content=content, headers=JSON)
+    refused(answer, status, kind, text)
+
+
+@pytest.mark.parametrize(
+    ("content", "headers", "status", "kind"),
+    [
+        (b"{", JSON, 400, "malformed-body"), (b'{"name": "\xff"}', JSON, 400, "malformed-body"),
+        (b"[" * 100_000, JSON, 400, "malformed-body"), (b"[]", JSON, 422, "invalid-request"),
+        (b"{}", JSON, 422, "invalid-request"), (b'{"name": 7}', JSON, 422, "invalid-request"),
+        (b'{"name": "a", "fly": 1}', JSON, 422, "invalid-request"),
+        (b'{"name": "a", "title": "\\ud800"}', JSON, 422, "invalid-request"),
+        (b'{"name": "a", "model": "big"}', JSON, 422, "invalid-request"),
+        (b'{"name": "a"}', {}, 415, "unsupported-type"), (b"", {}, 415, "unsupported-type"),
+        (b'{"name": "a"}', {"content-type": "text/plain"}, 415, "unsupported-type"),
+    ],
+)  # fmt: skip
+def test_a_map_that_cannot_be_is_refused(served, refused, content, headers, status, kind):
+    refused(served.client.post("/v1/maps", content=content, headers=headers), status, kind)
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status", "kind", "allow"),
+    [
+        ("GET", "/v1/maps/nowhere", 404, "unknown-map", None),
+        ("GET", "/v1/maps/nowhere/frames", 404, "unknown-map", None),
+        ("GET", "/v1/maps/refusals/frames/nobody", 404, "unknown-frame", None),
+        ("DELETE", "/v1/maps/refusals/frames/nobody", 404, "unknown-frame", None),
+        ("DELETE", "/v1/maps/nowhere", 404, "unknown-map", None),
+        ("GET", "/v1/jobs/nothing", 404, "unknown-job", None),
+        ("GET", "/v1/maps/%2e%2e", 404, "unknown-map", None),
+        ("GET", "/v1/maps/%2e%2e%2fx", 404, "not-found", None),
+        ("GET", "/v1/maps/%00", 404, "unknown-map", None),
+        ("GET", "/v1/maps/%ff", 404, "unknown-map", None),
+        ("GET", "/v1/maps/" + "a" * 5000, 404, "unknown-map", None),
+        ("GET", "/", 404, "not-found", None), ("GET", "/v2/maps", 404, "not-found", None),
+        ("GET", "/v1", 404, "not-found", None), ("GET", "/v1/../etc", 404, "not-found", None),
+        ("PUT", "/v1/maps", 405, "method-not-allowed", "GET, POST"),
+        ("PATCH", "/v1/maps/refusals", 405, "method-not-allowed", "DELETE, GET"),
+        ("GET", "/v1/maps/refusals/queries", 405, "method-not-allowed", "POST"),
+        ("BREW", "/healthz", 405, "method-not-allowed", "GET"),
+    ],
+)  # fmt: skip
+def test_what_is_not_there_is_said_so(served, hall, refused, method, path, status, kind, allow):
+    answer = served.client.request(method, served.url + path)
+    problem = refused(answer, status, kind)
+    assert answer.headers.get("allow") == allow
+    assert len(problem["detail"]) < 5300
+
+
+def test_a_frame_with_nothing_to_sign_is_rejected_with_its_reason(served, hall, small_shots):
+    far = npy(np.full((120, 160), 80.0, np.float32))
+    form = small_shots[0].form() | {"files": {"frame": ("far.npy", far)}}
+    sent = served.client.post(f"{hall}/frames", **form, headers={"Prefer": "wait=60"})
+    assert (sent.status_code, sent.json()["state"]) == (201, "rejected")
+    assert "their median is 80 m" in sent.json()["reason"]
+    frame = served.client.get(f"{hall}/frames/{sent.json()['frame_id']}").json()
+    job = served.client.get(sent.headers["location"]).json()
+    assert (frame["state"], frame["reason"]) == ("rejected", sent.json()["reason"])
+    assert (job["state"], job["attempts"], job["traceback"]) == ("failed", 1, None)
+    assert job["error"] == frame["reason"]
+    again = served.client.post(f"{hall}/frames", **form)
+    assert (again.status_code, again.json()) == (200, sent.json())
+    answer = served.client.post(f"{hall}/queries", json={"frame_id": frame["frame_id"]})
+    assert (answer.status_code, answer.json()["errors"]) == (
+        422, [{"field": "frame_id", "reason": "is rejected"}],
+    )  # fmt: skip
+    answer = served.client.post(f"{hall}/queries", **form)
+    assert (answer.status_code, answer.json()["type"]) == (422, "/problems/useless-frame")
+    served.client.delete(f"{hall}/frames/{frame['frame_id']}")
+    assert json.loads(form["data"]["meta"])["intrinsics"]["width"] == 160

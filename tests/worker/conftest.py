@@ -1,0 +1,180 @@
+"""What the worker tests share: two worker processes, and frames that come slowly."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.datasets import write_depth_png
+from sceneprint.engine import Engine
+from sceneprint.schemas import Added, CameraIntrinsics, FrameMeta, NewMap
+from sceneprint.settings import Settings
+
+LEASE_S = 0.5
+
+
+def until(what: Callable[[], Any]) -> Any:
+    """The first true value of it."""
+    end = time.monotonic() + 90
+    while time.monotonic() < end:
+        if found := what():
+            return found
+        time.sleep(0.02)
+    raise AssertionError("it did not come true")
+
+
+@dataclass
+class Crew:
+    """Two worker processes, a store, and this process as the service would be."""
+
+    engine: Engine
+    errors: Path
+    process: subprocess.Popen[bytes]
+
+    def log(self, message: str) -> list[dict[str, Any]]:
+        text = self.errors.read_text()
+        lines = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
+        return [line for line in lines if line["message"] == message]
+
+    def rows(self, asked: str) -> list[tuple[Any, ...]]:
+        with closing(sqlite3.connect(self.engine.settings.data_dir / "sceneprint.db")) as base:
+            return base.execute(asked).fetchall()
+
+    def change(self, statement: str) -> None:
+        with closing(sqlite3.connect(self.engine.settings.data_dir / "sceneprint.db")) as base:
+            base.execute("PRAGMA busy_timeout = 30000")
+            base.execute(statement)
+            base.commit()
+
+    def settled(self, map_name: str, count: int) -> None:
+        """Wait until all frames of a map are indexed."""
+        until(lambda: self.engine.get_map(map_name).frames == {"indexed": count})
+
+    @staticmethod
+    def until(what: Callable[[], Any]) -> Any:
+        """The first true value of it."""
+        return until(what)
+
+    def job(self, job_id: str, columns: str) -> tuple[Any, ...]:
+        (row,) = self.rows(f"SELECT {columns} FROM jobs WHERE id = '{job_id}'")
+        return row
+
+    def pid(self, job_id: str) -> int:
+        """Of the worker that holds, or held last, a job."""
+        (worker,) = self.job(job_id, "worker")
+        return int(worker.rpartition(":")[2]) if worker else 0
+
+    def signed(self, map_name: str) -> list[int]:
+        """How many signatures each frame of a map has."""
+        asked = (
+            "SELECT count(*) FROM signatures s JOIN frames f ON f.number = s.frame_number "
+            f"JOIN maps m ON m.number = f.map_number AND m.name = '{map_name}' GROUP BY f.number"
+        )
+        return [count for (count,) in self.rows(asked)]
+
+    def send(self, number: int) -> None:
+        """A signal to both workers."""
+        for line in self.log("worker ready"):
+            os.kill(int(line["worker"].rpartition(":")[2]), number)
+
+
+@pytest.fixture(scope="module")
+def frames(room_frames, tmp_path_factory) -> list[tuple[bytes, FrameMeta]]:
+    """Small frames of their own content: every fourth sample from another corner each."""
+    path, found = tmp_path_factory.mktemp("png") / "a.png", []
+    for number in range(64):
+        frame, (y, x) = room_frames[number // 16], divmod(number % 16, 4)
+        k = frame.intrinsics
+        write_depth_png(path, np.ascontiguousarray(frame.depth[y::4, x::4]), 1000.0)
+        lens = CameraIntrinsics(width=160, height=120, fx=k.fx / 4, fy=k.fy / 4,
+                                cx=(k.cx - x) / 4, cy=(k.cy - y) / 4)  # fmt: skip
+        found.append((path.read_bytes(), FrameMeta(intrinsics=lens)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def crew(tmp_path_factory) -> Iterator[Crew]:
+    folder = tmp_path_factory.mktemp("crew")
+    errors = tmp_path_factory.mktemp("errors") / "stderr"
+    with Engine(Settings(data_dir=folder, lease_s=LEASE_S)) as engine:
+        engine.create_map(NewMap(name="warm", model="compact"))
+        command = [Path(sys.executable).parent / "sceneprint", "work"]
+        with errors.open("wb") as out:
+            process = subprocess.Popen(
+                [*command, "--data", folder, "--workers", "2"], stderr=out, start_new_session=True,
+                env=os.environ | {"SCENEPRINT_LEASE_S": str(LEASE_S)},
+            )  # fmt: skip
+        crew = Crew(engine, errors, process)
+        try:
+            until(lambda: len(crew.log("worker ready")) == 2)
+            yield crew
+            process.terminate()
+            assert process.wait(60) == 0
+            assert len(crew.log("worker stopped")) == 2
+            assert crew.log("worker died") == []
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+
+
+@dataclass
+class Slow:
+    """A frame whose bytes come from a pipe, as from a disk that takes its time."""
+
+    added: Added
+    path: Path
+    pipe: Path
+    data: bytes
+
+    def give(self) -> None:
+        """Let the one that reads the pipe have all of it."""
+        opened = until(self._opened)
+        assert os.write(opened, self.data) == len(self.data)
+        os.close(opened)
+
+    def _opened(self) -> int:
+        try:
+            return os.open(self.pipe, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError:
+            return 0  # nobody reads yet
+
+    def mend(self) -> None:
+        """Let whoever reads from now on have a file."""
+        other = self.path.with_suffix(".mended")
+        other.write_bytes(self.data)
+        other.replace(self.path)
+
+
+@pytest.fixture
+def slow(crew, frames) -> Callable[[str, int], Slow]:
+    """Upload a frame whose blob is a pipe before any worker looks."""
+
+    def make(name: str, number: int) -> Slow:
+        crew.engine.create_map(NewMap(name=name, model="compact"))
+        crew.send(signal.SIGSTOP)
+        added, _ = crew.engine.add_frame(name, *frames[number])
+        ((blob,),) = crew.rows(f"SELECT blob FROM frames WHERE id = '{added.frame_id}'")
+        path = crew.engine.settings.blob_dir / blob[:2] / blob
+        path.unlink()
+        pipe = path.with_suffix(".pipe")
+        os.mkfifo(pipe)
+        path.hardlink_to(pipe)
+        crew.send(signal.SIGCONT)
+        until(lambda: crew.pid(added.job_id))
+        return Slow(added, path, pipe, frames[number][0])
+
+    return make

@@ -1,0 +1,103 @@
+"""Workers as processes: each frame signed once, whatever becomes of disk, database and workers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+from sceneprint.schemas import NewMap
+
+
+def test_two_workers_sign_each_frame_once(crew, frames):
+    crew.engine.create_map(NewMap(name="many", model="compact"))
+    added = [crew.engine.add_frame("many", *one)[0] for one in frames[:32]]
+    crew.settled("many", 32)
+    jobs = [crew.engine.get_job(one.job_id) for one in added]
+    assert {(job.state, job.error) for job in jobs} == {("succeeded", None)}
+    assert [job.attempts for job in jobs] == [1] * 32
+    assert len({crew.pid(one.job_id) for one in added}) == 2
+    assert crew.signed("many") == [1] * 32
+    assert crew.engine.get_map("many").revision == 32
+    lines = [line for line in crew.log("job succeeded") if line["map"] == "many"]
+    assert sorted(line["frame_id"] for line in lines) == sorted(one.frame_id for one in added)
+    assert {line["attempt"] for line in lines} == {1}
+
+
+def test_a_database_that_vanishes_for_a_moment_is_waited_for(crew, frames):
+    crew.engine.create_map(NewMap(name="shaken", model="compact"))
+    crew.change("ALTER TABLE jobs RENAME TO away")
+    crew.until(lambda: len(crew.log("the store does not answer")) >= 2)
+    crew.change("ALTER TABLE away RENAME TO jobs")
+    for one in frames[32:36]:
+        crew.engine.add_frame("shaken", *one)
+    crew.settled("shaken", 4)
+    assert "no such table: jobs" in crew.log("the store does not answer")[0]["error"]
+    assert len(crew.log("worker ready")) == 2  # the same two
+
+
+def test_a_job_that_takes_many_leases_is_kept_by_its_worker(crew, slow):
+    job = slow("patient", 40)
+    holder, job_id = crew.pid(job.added.job_id), job.added.job_id
+    (first,) = crew.job(job_id, "leased_until")
+    crew.until(
+        lambda: crew.job(job_id, "leased_until")[0] > first + 4 * crew.engine.settings.lease_s
+    )
+    assert crew.job(job_id, "state, attempts, token") == ("running", 1, 1)
+    job.give()
+    crew.settled("patient", 1)
+    assert crew.job(job_id, "state, attempts, token") == ("succeeded", 1, 1)
+    assert crew.pid(job_id) == holder
+    assert crew.signed("patient") == [1]
+    assert [one for one in crew.log("lease lost") if one["job_id"] == job_id] == []
+
+
+def test_a_worker_that_wakes_up_late_stores_nothing(crew, slow, frames):
+    job = slow("late", 41)
+    sleeper, job_id = crew.pid(job.added.job_id), job.added.job_id
+    os.kill(sleeper, signal.SIGSTOP)
+    try:
+        job.mend()
+        crew.settled("late", 1)
+        assert crew.job(job_id, "state, attempts, token") == ("succeeded", 2, 2)
+        other = crew.pid(job_id)
+        assert other != sleeper
+        ((indexed_at, revision),) = crew.rows(
+            f"SELECT indexed_at, revision FROM frames WHERE id = '{job.added.frame_id}'"
+        )
+    finally:
+        os.kill(sleeper, signal.SIGCONT)  # opens the file once more, and finds the mended one
+    (lost,) = crew.until(lambda: [one for one in crew.log("lease lost") if one["job_id"] == job_id])
+    assert (lost["attempt"], lost["level"]) == (1, "warning")
+    assert crew.job(job_id, "state, attempts, token") == ("succeeded", 2, 2)
+    assert crew.pid(job_id) == other
+    assert crew.signed("late") == [1]
+    assert crew.rows(
+        f"SELECT indexed_at, revision FROM frames WHERE id = '{job.added.frame_id}'"
+    ) == [(indexed_at, revision)]
+    crew.engine.add_frame("late", *frames[42])
+    crew.settled("late", 2)
+
+
+def test_a_frame_deleted_while_it_is_signed_stays_deleted(crew, slow):
+    job = slow("gone", 43)
+    crew.engine.delete_frame("gone", job.added.frame_id)
+    job.give()
+    crew.until(lambda: [o for o in crew.log("lease lost") if o["job_id"] == job.added.job_id])
+    assert crew.engine.get_map("gone").frames == {"deleted": 1}
+    assert crew.engine.get_job(job.added.job_id).state == "cancelled"
+    assert crew.signed("gone") == []
+
+
+def test_told_to_stop_workers_give_back_what_they_have_not_begun(crew, frames):
+    crew.engine.create_map(NewMap(name="stopped", model="compact"))
+    crew.send(signal.SIGSTOP)
+    added, _ = crew.engine.add_frame("stopped", *frames[44])
+    with crew.engine.store.database.write():  # who would claim it waits for this to end
+        crew.send(signal.SIGCONT)
+        time.sleep(1)
+        crew.process.terminate()  # before they do: it replaces nobody from now on
+        crew.send(signal.SIGTERM)
+    assert crew.process.wait(60) == 0
+    assert crew.job(added.job_id, "state, attempts, leased_until") == ("queued", 0, None)
+    assert crew.engine.get_frame("stopped", added.frame_id).state == "received"
