@@ -22,7 +22,7 @@ class AcceptanceParameters:
     residual_rad: float = math.radians(5.0)
     violation_weight: float = 5.0  #: evidence = overlap - this x violations
     evidence: float = 0.2  #: least
-    plane_overlap: float = 0.13  #: least
+    plane_overlap: float = 0.15  #: least
     strong: float = 0.3  #: evidence below which an accepted match is weak
     weak: float = 0.05  #: ambiguity from which on an accepted match is weak
     ambiguous: float = 0.14  #: ambiguity from which on nothing is accepted

@@ -36,7 +36,7 @@ def test_what_is_good_meets_no_objection() -> None:
         ({"overlap": 0.24}, {"overlap": 0.26}, "rejected", "1.0% lies where the other frame"),
         ({"overlap": 0.19}, {"overlap": 0.26}, "rejected", "only 19% of the surfaces"),
         ({"violations": 0.09}, {"violations": 0.07}, "rejected", "9.0% lies where"),
-        ({"plane_overlap": 0.12}, {"plane_overlap": 0.14}, "rejected", "mostly one plane (12%"),
+        ({"plane_overlap": 0.14}, {"plane_overlap": 0.16}, "rejected", "mostly one plane (14%"),
         ({"stiffness": 9e-6}, {"stiffness": 1.1e-5}, "ambiguous", "leaves a direction free"),
     ],
 )  # fmt: skip
