@@ -15,7 +15,7 @@ from sceneprint.errors import DatasetError
 #: Without split files: shares of each sequence that are the map, and that separate it.
 DATABASE_SHARE, GAP_SHARE = 0.60, 0.05
 #: Most frames of either, evenly spread, so that the demo takes minutes.
-MOST_DATABASE, MOST_QUERIES = 300, 150
+MOST_DATABASE, MOST_QUERIES = 300, 180
 
 
 @dataclass(frozen=True, eq=False)
