@@ -14,6 +14,7 @@
       x DamagedIndex            a cache file of the index that is missing or damaged
       x NotFound                there is no such map, frame or job
         - UnknownMap, UnknownFrame, UnknownJob
+      x UnknownKey              there is no key of that name
       x Conflict                the request contradicts what is there
         - MapExists             a map of that name, made otherwise
         - FrameConflict         the same content with other metadata
@@ -22,6 +23,8 @@
         - UnsupportedType       its body is of a type that is not read
         - TooLarge              its body is larger than the service takes
       x KeyRequired             the service asks for a key, and none or an unknown one was given
+      x Misdirected             the request is meant for another host than this machine
+      x ForeignOrigin           a page of another host sent the request
       x Busy                    as many requests wait as may; come back
       x StoreError
         - UnusableStore         the folder or database cannot be opened or written
@@ -38,6 +41,13 @@ A message says what happened, why, and what to do. Commands print it on one line
 and end with exit code 2. `ValueError` and `TypeError` stay what they are in Python:
 a mistake of the programmer who calls.
 """
+
+import re
+
+
+def kebab_case(name: str) -> str:
+    """The name of a class as it stands in the type of a problem: UnknownMap is unknown-map."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
 
 
 class SceneprintError(Exception):
@@ -104,6 +114,10 @@ class UnknownJob(NotFound):
     """There is no job of that id."""
 
 
+class UnknownKey(SceneprintError):
+    """There is no key of that name."""
+
+
 class Conflict(SceneprintError):
     """The request contradicts what is there."""
 
@@ -144,6 +158,14 @@ class TooLarge(InvalidRequest):
 
 class KeyRequired(SceneprintError):
     """The service asks for a key, and none or an unknown one was given."""
+
+
+class Misdirected(SceneprintError):
+    """The request is meant for another host than this machine."""
+
+
+class ForeignOrigin(SceneprintError):
+    """A page of another host sent the request."""
 
 
 class Busy(SceneprintError):

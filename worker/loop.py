@@ -58,8 +58,8 @@ def _loop(engine: Engine, name: str, stop: threading.Event, parent: int) -> None
             elif claimed is not None:
                 engine.run(claimed)
             if time.monotonic() - looked > UPKEEP_S:
+                looked = time.monotonic()  # also where it fails: frames go first
                 engine.publish_due()
-                looked = time.monotonic()
             if claimed is None:
                 # not all workers at the same moment
                 stop.wait(IDLE_S * random.uniform(0.5, 1.5))

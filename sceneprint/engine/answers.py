@@ -79,6 +79,7 @@ def answer(
     clock.spent["total"] = round(sum(clock.spent.values()), 2)
     with store.database.read() as connection:
         rows = frames_of(connection, ranking.indices[list(chosen)].tolist())
+    matches = [match for match in matches if match.index in rows]  # the rest was deleted meanwhile
     found = Found(row.name, ranking, selection, rows, unreadable, asked.frame)
     statuses = [match.validation.status for match in matches]
     return Answer(

@@ -12,11 +12,11 @@ import numpy as np
 
 from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.engine.frames import read_upload
-from sceneprint.errors import InvalidRequest
+from sceneprint.errors import DamagedBlob, InvalidRequest, UnknownFrame
 from sceneprint.pipeline import Signer, prepare, sign
 from sceneprint.schemas import FrameMeta, Query
 from sceneprint.store import Store
-from sceneprint.store.frames import find_frame
+from sceneprint.store.frames import find_frame, refers_to
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import geometry_blobs, stored_vector
 from sceneprint.types import Bytes, Geometry
@@ -80,7 +80,15 @@ def ask_stored(store: Store, map_name: str, frame_id: str, query: Query) -> Aske
         )
     geometry = None
     if "validate" in query.stages:
-        geometry = read_geometry(store.blobs.get(blobs[frame.number]))
+        try:
+            geometry = read_geometry(store.blobs.get(blobs[frame.number]))
+        except DamagedBlob:
+            with store.database.read() as connection:
+                if not refers_to(connection, blobs[frame.number]):
+                    raise UnknownFrame(
+                        f"Frame {frame_id} of map {map_name!r} was deleted while it was asked for."
+                    ) from None
+            raise
     own = (frame.number, frame.id)
     return Asked(np.frombuffer(vector, np.uint8), geometry, own, _since(start))
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from types import TracebackType
 
+from sceneprint.engine import keys, maps
 from sceneprint.engine import work as working
 from sceneprint.engine.answers import answer
 from sceneprint.engine.asking import Asked, ask_stored, ask_upload
@@ -13,9 +15,8 @@ from sceneprint.engine.upkeep import Upkeep
 from sceneprint.engine.uploads import sweep, upload
 from sceneprint.engine.warming import warm
 from sceneprint.engine.wire import tell_frames, tell_job, tell_map
-from sceneprint.errors import InvalidRequest, MapExists
-from sceneprint.models import PRESETS, read_model, write_model
-from sceneprint.pipeline import Signer
+from sceneprint.errors import InvalidRequest, ModelError, UnknownMap
+from sceneprint.models import PRESETS, read_model
 from sceneprint.schemas import (
     Added,
     Answer,
@@ -34,6 +35,9 @@ from sceneprint.store import frames as stored_frames
 from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import open_store, queue
+from sceneprint.store.records import MapRow
+
+log = logging.getLogger(__name__)
 
 
 class Engine:
@@ -68,9 +72,13 @@ class Engine:
         """Load code and tables of every model in use before the first request needs them."""
         with self.store.database.read() as connection:
             used = {row.model_id for row in stored_maps.list_maps(connection)}
-        signers = [self.signers(model_id) for model_id in used]
-        for signer in signers or [self.signers.of(read_model(PRESETS[0]))]:
-            warm(signer)
+        for model_id in used:
+            try:
+                warm(self.signers(model_id))
+            except ModelError as error:  # it costs the maps of this model, and no others
+                log.error("a model cannot be used", extra={"model": model_id, "error": str(error)})
+        if not used:
+            warm(self.signers.of(read_model(PRESETS[0])))
 
     def __enter__(self) -> Engine:
         return self
@@ -84,25 +92,8 @@ class Engine:
     # maps
 
     def create_map(self, new: NewMap) -> tuple[Map, bool]:
-        """Make a map, or find that it is there as wanted; the flag tells whether it is new.
-
-        Raises
-        ------
-        MapExists : there is one of that name with another title or model.
-        """
-        model = read_model(new.model)
-        with self.store.database.write() as connection:
-            there = {row.name: row for row in stored_maps.list_maps(connection)}.get(new.name)
-            if there is None:
-                stored_maps.keep_model(connection, model.id, model.name, write_model(model))
-                row = stored_maps.add_map(connection, new.name, new.title, model.id)
-                return tell_map(connection, row), True
-            if (there.title, there.model_id) != (new.title, model.id):
-                raise MapExists(
-                    f"There is a map {new.name!r} with another title or model. "
-                    "Use it as it is, delete it, or choose another name."
-                )
-            return tell_map(connection, there), False
+        """Make a map, or find it there as wanted; see `maps.create_map`."""
+        return maps.create_map(self.store, new)
 
     def list_maps(self) -> Page[Map]:
         """All maps by name."""
@@ -185,42 +176,44 @@ class Engine:
 
     def query_upload(self, map_name: str, data: bytes, meta: FrameMeta, query: Query) -> Answer:
         """Look a frame up that is not kept; see `ask_upload`."""
-        asked = ask_upload(data, meta, self._signer(map_name), query)
-        return self._answer(map_name, asked, query)
+        row = self._row(map_name)
+        return self._answer(row, ask_upload(data, meta, self.signers(row.model_id), query), query)
 
     def query_frame(self, map_name: str, frame_id: str, query: Query) -> Answer:
         """Look a frame of the map up among the others; see `ask_stored`."""
-        return self._answer(map_name, ask_stored(self.store, map_name, frame_id, query), query)
+        row = self._row(map_name)
+        self.signers(row.model_id)  # opened while no connection is held: a crowd would hold all
+        return self._answer(row, ask_stored(self.store, map_name, frame_id, query), query)
 
-    def _signer(self, map_name: str) -> Signer:
+    def _row(self, map_name: str) -> MapRow:
         with self.store.database.read() as connection:
-            model_id = stored_maps.find_map(connection, map_name).model_id
-        return self.signers(model_id)
+            return stored_maps.find_map(connection, map_name)
 
-    def _answer(self, map_name: str, asked: Asked, query: Query) -> Answer:
-        self._signer(map_name)  # opened while no connection is held: a crowd would hold them all
+    def _answer(self, asked_of: MapRow, asked: Asked, query: Query) -> Answer:
         with self.store.database.read() as connection:
-            row = stored_maps.find_map(connection, map_name)
+            row = stored_maps.find_map(connection, asked_of.name)
+            if row.number != asked_of.number:
+                raise UnknownMap(
+                    f"Map {row.name!r} was deleted and made anew while it was asked. Ask again."
+                )
             view = self._readers.view(connection, row)
         return answer(self.store, row, self.signers(row.model_id).model, view, asked, query)
 
     # keys
 
     def create_key(self, name: str) -> str:
-        """Make a key and return its secret.
+        """Make a key and return its secret; see `keys.create_key`."""
+        return keys.create_key(self.store, name)
 
-        Raises
-        ------
-        InvalidRequest : the name is empty, too long or not printable.
-        Conflict : there is a key of that name.
-        """
-        if not (0 < len(name) <= 128 and name.isprintable()):
-            raise InvalidRequest(
-                f"{name!r:.80} is no name for a key. Take up to 128 printable characters.",
-                (("name", "not printable, empty or too long"),),
-            )
+    def list_keys(self) -> list[tuple[str, float]]:
+        """Name of every key, and when it was made."""
+        with self.store.database.read() as connection:
+            return stored_keys.list_keys(connection)
+
+    def revoke_key(self, name: str) -> None:
+        """Let a key open nothing any more; UnknownKey where there is none."""
         with self.store.database.write() as connection:
-            return stored_keys.create_key(connection, name)
+            stored_keys.revoke_key(connection, name)
 
     def key_name(self, secret: str) -> str | None:
         """Name of the key with that secret, or None."""

@@ -58,7 +58,8 @@ def columns(meta: FrameMeta, frame: Frame) -> dict[str, Any]:
     """What of an upload's metadata is stored with it, by the columns of the table."""
     parent = None
     if meta.pose is not None:
-        parent = meta.pose.parent_frame or meta.session
+        own = meta.session if meta.robot is None else f"{meta.robot}/{meta.session}"
+        parent = meta.pose.parent_frame or own  # two robots may call their runs alike
     return {
         "intrinsics": meta.intrinsics.model_dump(),
         "depth_scale": meta.depth_scale,

@@ -6,8 +6,11 @@ it. What it hands out is a `View`, which never changes; catching up makes a new 
 
 from __future__ import annotations
 
+import logging
+import re
 import threading
 import time
+from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,11 +19,16 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection
 
 from sceneprint.engine.signers import Signers
-from sceneprint.index import Generation, Tail, newest
+from sceneprint.index import Generation, Tail, newest, newest_number
+from sceneprint.store.events import holds_anchor
 from sceneprint.store.records import MapRow
 from sceneprint.store.signatures import Change, changes_since
 from sceneprint.types import Bytes
 
+log = logging.getLogger(__name__)
+
+#: Memory of all tails above which maps that were not asked for long are forgotten.
+HELD_BYTES = 1 << 30
 #: Seconds between two looks for a newer generation while the tail is long.
 _LOOK_S = 1.0
 
@@ -50,27 +58,44 @@ def index_folder(indexes: Path, row: MapRow) -> Path:
     return indexes / f"{row.name}-{row.number}-{round(1e6 * row.created_at):x}"
 
 
+def is_index_folder(name: str) -> bool:
+    """Whether a folder is called as `index_folder` calls them."""
+    return re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,62}-\d+-[0-9a-f]+", name) is not None
+
+
+def trusted(connection: Connection, row: MapRow, found: Generation | None) -> Generation | None:
+    """A generation, unless the database was put back to a state before it, and went on."""
+    if found is None or found.revision > row.revision:
+        return None
+    return found if holds_anchor(connection, found.anchor) else None
+
+
 class Reader:
     """One map, searched by many threads.
 
     Parameters
     ----------
+    connection : of the database
     row : of the map
     folder : of its index
     length : bytes of a signature
     tail_frames : length of the tail from which on a newer generation is looked for
     """
 
-    def __init__(self, row: MapRow, folder: Path, length: int, tail_frames: int) -> None:
-        self._row, self._folder, self._length = row, folder, length
+    def __init__(
+        self, connection: Connection, row: MapRow, folder: Path, length: int, tail_frames: int
+    ) -> None:
+        self._folder, self._length = folder, length
         self._tail_frames, self._looked = tail_frames, 0.0
         self._lock = threading.Lock()
         self._tail = _Growing(length)
         self._dead: dict[int, int] = {}  # what was deleted after the generation, and when
-        found = newest(folder, row.model_id, length)
-        if found is not None and found.revision > row.revision:
-            found = None  # the database was put back to an earlier state
-        self._view = self._begin(found)
+        self._view = self._begin(trusted(connection, row, newest(folder, row.model_id, length)))
+
+    @property
+    def bytes_held(self) -> int:
+        """Memory of the tail."""
+        return self._tail.bytes_held
 
     def view(self, connection: Connection, row: MapRow) -> View:
         """The map as of the row's revision, or later."""
@@ -91,23 +116,30 @@ class Reader:
                 self._take(change)
         self._publish(view.generation, row.revision)
         if len(self._tail) >= self._tail_frames:
-            self._swap()
+            self._swap(connection, row)
 
     def _take(self, change: Change) -> None:
-        if change.vector is None:
+        if change.deleted:
             self._dead[change.number] = change.revision  # a newer generation may hold it
+        elif change.vector is None:
+            # one frame must not cost the others; a worker's log says it too
+            log.error("a damaged signature is passed over", extra={"frame_id": change.frame_id})
         elif change.number not in self._tail:  # an error may have ended the last time half way
             self._tail.append(change, np.frombuffer(change.vector, np.uint8))
 
-    def _swap(self) -> None:
+    def _swap(self, connection: Connection, row: MapRow) -> None:
         """Take a newer generation, if a worker has published one, and keep the rest as tail."""
         if time.monotonic() - self._looked < _LOOK_S:
             return
         self._looked = time.monotonic()
         view = self._view
-        found = newest(self._folder, self._row.model_id, self._length, known=view.generation)
-        own = 0 if view.generation is None else view.generation.number
-        if found is None or found.number <= own or found.revision > view.revision:
+        own = None if view.generation is None else view.generation.number
+        if newest_number(self._folder) == own:
+            return
+        found = newest(self._folder, row.model_id, self._length, known=view.generation)
+        since = 0 if view.generation is None else view.generation.revision
+        found = trusted(connection, row, found)
+        if found is None or not since < found.revision <= view.revision:
             return
         self._tail = self._tail.after(found.revision)
         self._dead = {n: deleted for n, deleted in self._dead.items() if deleted > found.revision}
@@ -132,7 +164,7 @@ class Readers:
     def __init__(self, signers: Signers, indexes: Path, tail_frames: int) -> None:
         self._signers, self._indexes, self._tail_frames = signers, indexes, tail_frames
         self._lock = threading.Lock()
-        self._open: dict[str, tuple[int, Reader]] = {}
+        self._open: OrderedDict[str, tuple[int, Reader]] = OrderedDict()
 
     def view(self, connection: Connection, row: MapRow) -> View:
         """A map as of the row's revision, or later."""
@@ -141,9 +173,16 @@ class Readers:
             if reader is None or number != row.number:  # a map of that name was made anew
                 length = self._signers(row.model_id).model.signature_bytes
                 folder = index_folder(self._indexes, row)
-                reader = Reader(row, folder, length, self._tail_frames)
+                reader = Reader(connection, row, folder, length, self._tail_frames)
                 self._open[row.name] = (row.number, reader)
+            self._open.move_to_end(row.name)
+            # the one that was asked longest ago first, and never the one that is asked now
+            while len(self._open) > 1 and self._bytes_held() > HELD_BYTES:
+                self._open.popitem(last=False)
         return reader.view(connection, row)
+
+    def _bytes_held(self) -> int:
+        return sum(reader.bytes_held for _, reader in self._open.values())
 
     def forget(self, name: str) -> None:
         """Give up what is held of a map that was deleted."""
@@ -166,6 +205,10 @@ class _Growing:
     def __contains__(self, key: int) -> bool:
         return key in self._places
 
+    @property
+    def bytes_held(self) -> int:
+        return self._rows.nbytes
+
     def append(self, change: Change, row: Bytes) -> None:
         n = len(self._places)
         if n == len(self._keys):  # views keep the old arrays
@@ -180,7 +223,7 @@ class _Growing:
         kept = _Growing(self._rows.shape[1])
         for key, place in self._places.items():
             if self._revisions[place] > revision:
-                change = Change(key, int(self._revisions[place]), b"")
+                change = Change(key, "", int(self._revisions[place]), None)
                 kept.append(change, self._rows[place])
         return kept
 

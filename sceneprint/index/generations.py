@@ -34,6 +34,7 @@ class Generation:
     model_id : of the model that signed them
     code : of the coarse index
     fitted_on : frames that the map had when the code was fitted
+    anchor : as given to `publish`
     segments : stored signatures, also of frames that are gone
     rows : (N,) int64, rising: the row of each frame, counted through all segments
     keys : (N,) int64 of the frames, none twice
@@ -45,6 +46,7 @@ class Generation:
     model_id: str
     code: Code
     fitted_on: int
+    anchor: str
     segments: tuple[Segment, ...]
     rows: NDArray[np.int64]
     keys: Keys
@@ -138,6 +140,7 @@ def _open(folder: Path, manifest: Manifest, verify: bool, known: Generation | No
         model_id=manifest.model_id,
         code=code,
         fitted_on=manifest.fitted_on,
+        anchor=manifest.anchor,
         segments=tuple(segments),
         rows=rows,
         keys=keys_of(segments)[rows],

@@ -35,6 +35,7 @@ class Manifest:
     dimension : D, bytes of a signature
     code_id : of the code
     fitted_on : frames that the map had when the code was fitted
+    anchor : what whoever published it will know the state of the database by
     files : (name, bytes) of every file, segments in the order of their rows; a name is a checksum
     """
 
@@ -44,6 +45,7 @@ class Manifest:
     dimension: int
     code_id: str
     fitted_on: int
+    anchor: str
     files: tuple[tuple[str, int], ...]
 
     def of_kind(self, kind: str) -> list[tuple[str, int]]:
@@ -55,7 +57,7 @@ def manifests(folder: Path) -> list[tuple[int, Path]]:
     """Number and path of every manifest in a folder, sound or not, the newest first."""
     try:
         found = [(_NAME.fullmatch(path.name), path) for path in folder.iterdir()]
-    except FileNotFoundError:
+    except OSError:  # a cache that cannot be read is none
         return []
     return sorted(((int(name[1]), path) for name, path in found if name), reverse=True)
 

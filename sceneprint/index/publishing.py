@@ -34,6 +34,7 @@ def publish(
     blocks: Iterable[Block],
     previous: Generation | None,
     drop: frozenset[int] = frozenset(),
+    anchor: str = "",
     seed: int = 0,
 ) -> Generation | None:
     """Publish the generation that follows `previous`.
@@ -50,6 +51,7 @@ def publish(
         a key that is there replaces the signature there. It is read once, and block by block.
     previous : the newest generation of the folder, or None to build from nothing
     drop : keys of frames that are no longer in the map
+    anchor : of the database's state; kept as it is, for whoever opens the generation to check
     seed : of the rows that the code is fitted on
 
     Returns
@@ -77,6 +79,7 @@ def publish(
             model_id=model_id,
             code=code,
             fitted_on=fitted_on,
+            anchor=anchor,
             segments=draft.segments,
             rows=draft.rows,
             keys=draft.keys,
@@ -131,6 +134,7 @@ def _write(folder: Path, generation: Generation) -> Path:
         dimension=generation.dimension,
         code_id=generation.code.id,
         fitted_on=generation.fitted_on,
+        anchor=generation.anchor,
         files=(*((each.name, each.size) for each in generation.segments), *written),
     )
     return write_manifest(folder, manifest)

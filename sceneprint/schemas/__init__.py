@@ -7,7 +7,6 @@ from sceneprint.schemas.base import Page, Problem
 from sceneprint.schemas.frames import (
     Added,
     CameraIntrinsics,
-    Deleted,
     Frame,
     FrameMeta,
     GivenPose,
@@ -34,7 +33,6 @@ __all__ = [
     "AnswerStatus",
     "CameraIntrinsics",
     "Counts",
-    "Deleted",
     "Frame",
     "FrameMeta",
     "FrameState",

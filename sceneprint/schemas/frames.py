@@ -47,7 +47,7 @@ class GivenPose(Given):
 
     parent_frame: Label | None = Field(
         default=None,
-        description="Poses are combined within one parent frame; default: the session's name.",
+        description="Poses are combined within one parent frame; default: ROBOT/SESSION, or the session.",
     )
     translation: GivenVector | None = None
     rotation: GivenQuaternion | None = None
@@ -106,12 +106,6 @@ class Added(Told):
     job_id: str = Field(description="The job that signs it: GET /v1/jobs/{job_id}.")
     state: FrameState
     reason: str | None = Field(default=None, description="Why it was rejected, or failed.")
-
-
-class Deleted(Told):
-    """What was removed."""
-
-    frames: int
 
 
 class Frame(Told):

@@ -82,7 +82,8 @@ def open_database(url: str) -> Database:
             event.listen(engine, "begin", _begin_sqlite)
         else:
             engine = create_engine(parsed, pool_pre_ping=True)
-    except (ArgumentError, ImportError) as error:  # the URL may hold a password
+    # ValueError: a port that is no number. The URL may hold a password
+    except (ArgumentError, ImportError, ValueError) as error:
         raise UnusableStore(
             f"{url.partition(':')[0]!r} is no database that can be opened ({error}). Set "
             "SCENEPRINT_DATABASE_URL to an SQLAlchemy URL, or leave it out for SQLite in the "

@@ -7,10 +7,10 @@ import secrets
 import time
 import uuid
 
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, delete, insert, select
 from sqlalchemy.exc import IntegrityError
 
-from sceneprint.errors import Conflict
+from sceneprint.errors import Conflict, UnknownKey
 from sceneprint.store.events import tell
 from sceneprint.store.tables import keys
 
@@ -47,9 +47,24 @@ def key_name(connection: Connection, secret: str) -> str | None:
     return found
 
 
-def any_key(connection: Connection) -> bool:
-    """Whether there is a key."""
-    return connection.execute(select(keys.c.id).limit(1)).first() is not None
+def list_keys(connection: Connection) -> list[tuple[str, float]]:
+    """Name of every key and when it was made, by name."""
+    rows = connection.execute(select(keys.c.name, keys.c.created_at).order_by(keys.c.name))
+    return [(row.name, row.created_at) for row in rows]
+
+
+def revoke_key(connection: Connection, name: str) -> None:
+    """Forget a key.
+
+    Raises
+    ------
+    UnknownKey : there is none of that name.
+    """
+    if connection.execute(delete(keys).where(keys.c.name == name)).rowcount != 1:
+        raise UnknownKey(
+            f"There is no key named {name!r:.80}. List them with `sceneprint keys --list`."
+        )
+    tell(connection, "key.revoked", name=name)
 
 
 def _digest(secret: str) -> str:

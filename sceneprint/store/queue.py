@@ -99,7 +99,9 @@ def claim(connection: Connection, worker: str, lease_s: float) -> Claim | None:
     number = connection.execute(
         select(jobs.c.number)
         .where(_due(now), jobs.c.attempts < MAXIMUM_ATTEMPTS)
-        .order_by(jobs.c.priority.desc(), jobs.c.number)
+        # what was tried before goes behind what was not: a frame that kills its worker, or a
+        # machine that dies again and again, must not hold up or use up the same job
+        .order_by(jobs.c.priority.desc(), jobs.c.attempts, jobs.c.number)
         .limit(1)
         .with_for_update(skip_locked=True)
     ).scalar()

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, func, insert, select, update
 
-from sceneprint.errors import DamagedBlob
 from sceneprint.schemas import FrameState
 from sceneprint.store.maps import next_revision
 from sceneprint.store.records import FrameRow, MapRow
@@ -37,11 +36,13 @@ class StoredSignature:
 
 @dataclass(frozen=True)
 class Change:
-    """A frame that was indexed or deleted; `vector` is None where it was deleted."""
+    """A frame that was indexed or deleted; `vector` is None where it was deleted, or is damaged."""
 
     number: int
+    frame_id: str
     revision: int
     vector: bytes | None
+    deleted: bool = False
 
 
 def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) -> int:
@@ -65,16 +66,11 @@ def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) 
 def changes_since(
     connection: Connection, row: MapRow, revision: int, limit: int = 256
 ) -> Iterator[list[Change]]:
-    """What was indexed and deleted after a revision, in order, in blocks of at most `limit`.
-
-    Raises
-    ------
-    DamagedBlob : a signature is not what was stored.
-    """
+    """What was indexed and deleted after a revision, in order, in blocks of at most `limit`."""
     while True:
         found = connection.execute(
-            select(frames.c.number, frames.c.revision, frames.c.state, signatures.c.vector,
-                   signatures.c.checksum)
+            select(frames.c.number, frames.c.id, frames.c.revision, frames.c.state,
+                   signatures.c.vector, signatures.c.checksum)
             .outerjoin(
                 signatures,
                 (signatures.c.frame_number == frames.c.number)
@@ -86,19 +82,18 @@ def changes_since(
         ).all()  # fmt: skip
         if not found:
             return
-        for one in found:
-            if one.state == FrameState.INDEXED and zlib.crc32(one.vector or b"") != one.checksum:
-                raise DamagedBlob(
-                    f"The signature of frame number {one.number} is damaged. Restore the data "
-                    "folder from a copy, or delete the frame and upload it again."
-                )
-        yield [
-            Change(
-                one.number, one.revision, one.vector if one.state == FrameState.INDEXED else None
-            )
-            for one in found
-        ]
+        yield [_change(*one) for one in found]
         revision = found[-1].revision
+
+
+def _change(
+    number: int, frame_id: str, revision: int, state: str, vector: bytes | None,
+    checksum: int | None,
+) -> Change:  # fmt: skip
+    if state == FrameState.DELETED:
+        return Change(number, frame_id, revision, None, deleted=True)
+    sound = vector is not None and zlib.crc32(vector) == checksum
+    return Change(number, frame_id, revision, vector if sound else None)
 
 
 def count_indexed(connection: Connection, map_number: int, revision: int) -> int:

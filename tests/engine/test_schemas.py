@@ -177,7 +177,7 @@ def test_a_frame_is_told_as_it_was_sent(
     assert frame.intrinsics == uploads[0].meta.intrinsics
     assert (frame.bytes, frame.map, frame.job_id) == (len(uploads[0].data), "hall", added.job_id)
     assert frame.pose is not None
-    assert (frame.pose.parent_frame, frame.pose.matrix) == ("night", EYE)
+    assert (frame.pose.parent_frame, frame.pose.matrix) == ("R2/night", EYE)
     assert frame.pose.child_frame == f"{frame.frame_id}.optical"
     assert frame.indexed_at is not None
     assert frame.received_at < frame.indexed_at

@@ -85,7 +85,7 @@ def test_no_kill_loses_what_was_acknowledged(begin, make_map, small_shots, tmp_p
             wanted = rng.randint(0, 3)
             until(lambda n=known + wanted: len(uploader.acknowledged) >= min(n, FRAMES))
             time.sleep(rng.uniform(0, 0.03))
-        else:  # some progress, however little: see the report on frames that are never finished
+        else:  # some progress, however little, or the run would never end
             before = done(tmp_path)
             received = int(rows(tmp_path, "SELECT count(*) FROM jobs")[0][0])
             goal = min(before + rng.randint(1, 8), received)

@@ -80,7 +80,7 @@ def test_success_forgets_the_errors_of_earlier_tries(
 def test_a_job_whose_workers_all_fell_silent_is_buried(
     store: Store, hand: Any, queued: Queued, turned: Turned
 ) -> None:
-    silent, lively = queued("a"), queued("b")
+    silent = queued("a")
     for attempt in range(1, 11):
         held = hand.taken()
         assert (held.job.number, held.job.attempts) == (silent.number, attempt)
@@ -90,7 +90,8 @@ def test_a_job_whose_workers_all_fell_silent_is_buried(
         if attempt < 10:
             with store.database.write() as connection:  # another may try
                 assert queue.bury(connection) == []
-    assert hand.taken().job.number == lively.number  # not an eleventh time
+    lively = queued("b")
+    assert hand.taken().job.number == lively.number  # and the other not an eleventh time
     assert hand.due()  # to be buried
     with store.database.write() as connection:
         (buried,) = queue.bury(connection)
@@ -101,6 +102,16 @@ def test_a_job_whose_workers_all_fell_silent_is_buried(
     assert not hand.due()
     with pytest.raises(LostLease), store.database.write() as connection:
         queue.finish(connection, held, JobState.SUCCEEDED)
+
+
+def test_what_was_tried_goes_behind_what_was_not(hand: Any, queued: Queued, turned: Turned) -> None:
+    """A machine that dies again and again does not use up the tries of the oldest job."""
+    first, second = queued("a"), queued("b")
+    assert hand.taken().job.number == first.number
+    turned(first, leased_until=time.time() - 1)
+    assert hand.taken().job.number == second.number
+    turned(second, leased_until=time.time() - 1)
+    assert hand.taken().job.number == first.number
 
 
 def test_silence_is_not_counted_as_breaking_down(hand: Any, queued: Queued, turned: Turned) -> None:
