@@ -128,7 +128,8 @@ def measure_all(n_frames: int, n_pairs: int) -> Rows:
     frames = real_frames(n_frames) or synthetic_frames(n_frames)
     pairs = real_pairs(recordings(), n_pairs) or synthetic_pairs(n_pairs)
     recording = recordings() / "7scenes" / "redkitchen"
-    served = service.measure(service.frames_of(recording if recording.is_dir() else None))
+    with service.frames_of(recording if recording.is_dir() else None) as served_frames:
+        served = service.measure(served_frames)
     pin_to_one_processor()  # the service above has all processors, as it would
     signers = {preset: open_signer(preset) for preset in PRESETS}
     return Rows(

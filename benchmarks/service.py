@@ -9,9 +9,11 @@ import argparse
 import statistics
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
+from multiprocessing.context import SpawnProcess
 from multiprocessing.sharedctypes import Synchronized
 from multiprocessing.synchronize import Event as EventType
 from pathlib import Path
@@ -31,6 +33,8 @@ from sceneprint.datasets import FrameReference, find_sequences
 CLIENTS, SECONDS = 4, 20.0
 #: Requests a second to /healthz.
 RATE = 50.0
+#: Seconds that a process of the load may take to end.
+END_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -121,30 +125,57 @@ def _healthz(url: str, seconds: float) -> tuple[float, float]:
 def _loaded(
     url: str, queries: Sequence[FrameReference], seconds: float
 ) -> tuple[tuple[float, float], float]:
-    """/healthz while clients query and a worker signs, and queries answered a second."""
+    """/healthz while clients query and a worker signs, and queries answered a second.
+
+    Raises
+    ------
+    RuntimeError : a process of the load died, and the figures would be of less.
+    """
     context = get_context("spawn")
     stop, done = context.Event(), context.Value("i", 0)
+    begun = [context.Event() for _ in range(CLIENTS)]
     load = [
-        context.Process(target=_query_on, args=(url, list(queries), stop, done))
-        for _ in range(CLIENTS)
+        context.Process(target=_query_on, args=(url, list(queries), stop, done, one))
+        for one in begun
     ]
     load.append(context.Process(target=_upload_on, args=(url, list(queries), stop)))
-    for one in load:
-        one.start()
-    while done.value < CLIENTS:  # until all are at work
-        time.sleep(0.1)
-    begin, counted = time.perf_counter(), done.value
-    figures = _healthz(url, seconds)
-    rate = (done.value - counted) / (time.perf_counter() - begin)
-    stop.set()
-    for one in load:
-        one.join()
+    try:
+        for one in load:
+            one.start()
+        for event in begun:  # until all are at work
+            while not event.wait(0.1):
+                _see_alive(load)
+        begin, counted = time.perf_counter(), done.value
+        figures = _healthz(url, seconds)
+        rate = (done.value - counted) / (time.perf_counter() - begin)
+        _see_alive(load)
+    finally:
+        _end(load, stop)
     return figures, rate
 
 
+def _see_alive(load: Sequence[SpawnProcess]) -> None:
+    codes = [one.exitcode for one in load if not one.is_alive()]
+    if codes:
+        raise RuntimeError(f"{len(codes)} of {len(load)} processes of the load died: {codes}")
+
+
+def _end(load: Sequence[SpawnProcess], stop: EventType) -> None:
+    """Let all end, and end those that do not."""
+    stop.set()
+    until = time.monotonic() + END_S
+    for one in load:
+        if one.pid is not None:  # it was started
+            one.join(max(until - time.monotonic(), 0.0))
+            if one.is_alive():
+                one.terminate()
+                one.join()
+
+
 def _query_on(
-    url: str, frames: Sequence[FrameReference], stop: EventType, done: Synchronized[int]
-) -> None:
+    url: str, frames: Sequence[FrameReference], stop: EventType, done: Synchronized[int],
+    begun: EventType,
+) -> None:  # fmt: skip
     with Client(url) as client:
         while not stop.is_set():
             for frame in frames:
@@ -153,6 +184,7 @@ def _query_on(
                 client.query("bench", frame)
                 with done.get_lock():
                     done.value += 1
+                begun.set()
 
 
 def _upload_on(url: str, frames: Sequence[FrameReference], stop: EventType) -> None:
@@ -187,20 +219,16 @@ def table(f: ServiceFigures) -> list[str]:
     ]
 
 
-def frames_of(dataset: Path | None, most: int = 320) -> list[FrameReference]:
-    """Frames of a data set, or of a synthetic building, evenly thinned."""
-    folder = dataset or _building()
-    found = [frame for sequence in find_sequences(folder) for frame in sequence.frames]
-    return found[:: max(len(found) // most, 1)][:most]
-
-
-def _building() -> Path:
-    import tempfile
-
-    folder = Path(tempfile.mkdtemp(prefix="sceneprint-bench-"))
-    for _ in tqdm(write_building(folder, 6), "synthetic rooms", 6, disable=None):
-        pass
-    return folder
+@contextmanager
+def frames_of(dataset: Path | None, most: int = 320) -> Iterator[list[FrameReference]]:
+    """Frames of a data set, or of a synthetic building that is gone afterwards, evenly thinned."""
+    with TemporaryDirectory(prefix="sceneprint-bench-") as temporary:
+        if dataset is None:
+            dataset = Path(temporary) / "building"
+            for _ in tqdm(write_building(dataset, 6), "synthetic rooms", 6, disable=None):
+                pass
+        found = [frame for sequence in find_sequences(dataset) for frame in sequence.frames]
+        yield found[:: max(len(found) // most, 1)][:most]
 
 
 def main() -> int:
@@ -209,7 +237,8 @@ def main() -> int:
     parser.add_argument("dataset", type=Path, nargs="?")
     parser.add_argument("--frames", type=int, default=320)
     options = parser.parse_args()
-    print(*table(measure(frames_of(options.dataset, options.frames))), sep="\n")
+    with frames_of(options.dataset, options.frames) as frames:
+        print(*table(measure(frames)), sep="\n")
     return 0
 
 

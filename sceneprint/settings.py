@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
 from pathlib import Path
 
@@ -15,6 +16,16 @@ from sceneprint.models import default_cache_dir
 def default_data_dir() -> Path:
     """Where a user's maps are kept unless told otherwise."""
     return Path(platformdirs.user_data_dir("sceneprint", appauthor=False))
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a name or address, without port or brackets, is only ever this machine."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 class Settings(BaseSettings):

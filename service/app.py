@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -14,8 +13,8 @@ from pydantic.json_schema import models_json_schema
 
 from sceneprint import __version__
 from sceneprint.engine import Engine
-from sceneprint.schemas import FrameMeta, Problem
-from sceneprint.settings import Settings
+from sceneprint.schemas import FrameMeta, NewMap, Problem
+from sceneprint.settings import Settings, is_loopback
 from service import problems
 from service.context import Context, Gate, key_holder
 from service.metrics import Metrics
@@ -38,7 +37,7 @@ def create_app(settings: Settings) -> FastAPI:
     ----------
     settings : see Settings; callers must show a key unless it listens on a loopback address
     """
-    figures = Metrics()
+    figures, alone = Metrics(), is_loopback(settings.host)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -46,7 +45,7 @@ def create_app(settings: Settings) -> FastAPI:
         try:
             await to_thread.run_sync(engine.warm)
             gate = Gate(settings.concurrency, settings.waiting)
-            app.state.context = Context(engine, gate, figures, not is_loopback(settings.host))
+            app.state.context = Context(engine, gate, figures, keys=not alone)
             yield
         finally:
             await to_thread.run_sync(engine.close)
@@ -60,19 +59,9 @@ def create_app(settings: Settings) -> FastAPI:
     app.include_router(v1)
     app.include_router(health.router)
     problems.install(app)
-    app.add_middleware(Around, limit=settings.upload_bytes, metrics=figures)
+    app.add_middleware(Around, limit=settings.upload_bytes, metrics=figures, alone=alone)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach an address."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
@@ -83,7 +72,8 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
         )
         template = "#/components/schemas/{model}"
         _, own = models_json_schema(
-            [(FrameMeta, "validation"), (Problem, "serialization")], ref_template=template
+            [(FrameMeta, "validation"), (NewMap, "validation"), (Problem, "serialization")],
+            ref_template=template,
         )
         schemas = document.setdefault("components", {}).setdefault("schemas", {})
         for name, schema in own["$defs"].items():

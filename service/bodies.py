@@ -14,7 +14,13 @@ from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException
 
-from sceneprint.errors import InvalidRequest, MalformedBody, UnsupportedType
+from sceneprint.errors import (
+    InvalidRequest,
+    MalformedBody,
+    TooLarge,
+    UnsupportedType,
+    UnusableStore,
+)
 from sceneprint.schemas import FrameMeta
 from service.problems import invalid
 
@@ -53,6 +59,7 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
     UnsupportedType : no form.
     MalformedBody : a form that cannot be parsed.
     InvalidRequest : a part is missing or unknown, or `meta` is not as it should be.
+    UnusableStore : the machine has no room to keep it until it is read.
     """
     if media_type(request) != FORM:
         raise UnsupportedType(
@@ -65,6 +72,11 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
         raise MalformedBody(
             f"The form cannot be parsed ({getattr(error, 'detail', error)}). Send a file part "
             "`frame` and a field `meta`, with a boundary as in RFC 7578."
+        ) from error
+    except OSError as error:  # what is too large for memory is spooled to a file meanwhile
+        raise UnusableStore(
+            f"An upload cannot be kept in the folder of temporary files ({error}). Make room "
+            "there, or name another folder in TMPDIR."
         ) from error
     try:
         known = {"frame", "meta", *fields}
@@ -88,25 +100,26 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
         await form.close()
 
 
-async def read_json(request: Request) -> dict[str, Any]:
-    """A JSON object.
+async def read_json(request: Request) -> Any:
+    """What the body is as JSON.
 
     Raises
     ------
-    MalformedBody : no JSON object, or one that is far too large.
+    MalformedBody : no JSON.
+    TooLarge : more than anyone has to say; no more of it is read.
     """
     body = bytearray()
     async for chunk in request.stream():
         body += chunk
         if len(body) > FIELD_BYTES:
-            raise MalformedBody(f"The JSON has more than {FIELD_BYTES} bytes. Send an object.")
+            raise TooLarge(
+                f"The JSON has more than {FIELD_BYTES} bytes, the most that is taken. Send only "
+                "the fields in /docs."
+            )
     try:
-        value = from_json(bytes(body))  # unlike `json`, no text that is not Unicode
+        return from_json(bytes(body))  # unlike `json`, no text that is not Unicode
     except ValueError as error:
         raise MalformedBody(f"The body is not JSON ({error}). Send a JSON object.") from error
-    if not isinstance(value, dict):
-        raise MalformedBody("The body is not a JSON object. Send an object.")
-    return value
 
 
 def _meta(text: str | None) -> FrameMeta:

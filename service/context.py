@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Annotated, TypeVar, cast
 
@@ -24,26 +25,35 @@ class Gate:
     Parameters
     ----------
     running : at once
-    waiting : at most
+    waiting : at most, be it for their bodies or for their turn
     """
 
     def __init__(self, running: int, waiting: int) -> None:
         self._limiter = anyio.CapacityLimiter(running)
-        self._waiting = waiting
+        self._places = running + waiting
+        self._taken = 0
 
-    async def run(self, do: Callable[[], T]) -> T:
-        """Do it in a thread, off the event loop.
+    @asynccontextmanager
+    async def place(self) -> AsyncIterator[None]:
+        """A place inside. Take it before the body is read: who is sent away has spooled nothing.
 
         Raises
         ------
-        Busy : as many wait as may.
+        Busy : as many are inside as may.
         """
-        seen = self._limiter.statistics()
-        if seen.borrowed_tokens >= seen.total_tokens and seen.tasks_waiting >= self._waiting:
+        if self._taken >= self._places:
             raise Busy(
                 "The service is working on as many uploads and queries as it lets wait. "
                 "Come back in a second."
             )
+        self._taken += 1
+        try:
+            yield
+        finally:
+            self._taken -= 1
+
+    async def run(self, do: Callable[[], T]) -> T:
+        """Do it in a thread, off the event loop, when it is its turn; for who has a place."""
         return await to_thread.run_sync(do, limiter=self._limiter)
 
 

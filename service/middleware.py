@@ -1,4 +1,4 @@
-"""Around every request: its id, its size, its time."""
+"""Around every request: its id, whom it is for, its size, its time."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import uuid
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.hosts import stranger
 from service.metrics import Metrics
-from service.problems import problem
+from service.problems import problem, status_of
 
 log = logging.getLogger(__name__)
 
@@ -27,17 +28,18 @@ class _TooLargeWhileStreaming(Exception):
 
 
 class Around:
-    """Gives each request an id, stops bodies that are too large while they stream, and notes it.
+    """Gives each request an id, sends strangers away, stops too large bodies, and notes it.
 
     Parameters
     ----------
     app : the application
     limit : bytes of a body
     metrics : to count in
+    alone : whether only this machine is served; then by any other name it is not
     """
 
-    def __init__(self, app: ASGIApp, limit: int, metrics: Metrics) -> None:
-        self._app, self._limit, self._metrics = app, limit, metrics
+    def __init__(self, app: ASGIApp, limit: int, metrics: Metrics, alone: bool) -> None:
+        self._app, self._limit, self._metrics, self._alone = app, limit, metrics, alone
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One request."""
@@ -73,8 +75,14 @@ class Around:
             await send(message)
 
         length = headers.get(b"content-length", b"")
+        unwelcome = stranger(scope["headers"]) if self._alone else None
         try:
-            if length.isdigit() and len(length) < 19 and int(length) > self._limit:
+            if unwelcome is not None:
+                kind = type(unwelcome).__name__
+                told = problem(request_id, kind, status_of(unwelcome), str(unwelcome))
+                told.headers["Connection"] = "close"  # what is still coming is not read
+                await told(scope, receive, answered)
+            elif length.isdigit() and len(length) < 19 and int(length) > self._limit:
                 too_large = True  # said beforehand: not a byte is read
             else:
                 await self._app(scope, counted, answered)

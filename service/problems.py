@@ -29,6 +29,8 @@ STATUSES: dict[type[errors.SceneprintError], int] = {
     errors.UnsupportedType: 415,
     errors.TooLarge: 413,
     errors.KeyRequired: 401,
+    errors.Misdirected: 421,
+    errors.ForeignOrigin: 403,
     errors.Busy: 503,
     errors.UnusableStore: 503,
     errors.SceneprintError: 500,
@@ -36,6 +38,8 @@ STATUSES: dict[type[errors.SceneprintError], int] = {
 #: Seconds after which to come back, where a status says that this may help.
 RETRY_AFTER_S = {503: "1"}
 MEDIA_TYPE = "application/problem+json"
+#: Most fields at fault that a problem lists, and most characters of the place of one.
+MOST_FIELDS, PLACE = 20, 80
 
 
 def status_of(error: errors.SceneprintError) -> int:
@@ -45,7 +49,7 @@ def status_of(error: errors.SceneprintError) -> int:
 
 def type_of(name: str) -> str:
     """The type of a problem: the error's name in kebab-case."""
-    return "/problems/" + re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
+    return f"/problems/{errors.kebab_case(name)}"
 
 
 def problem(
@@ -54,7 +58,7 @@ def problem(
     """A problem document as a response."""
     document: dict[str, Any] = {
         "type": type_of(name),
-        "title": re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).capitalize(),
+        "title": errors.kebab_case(name).replace("-", " ").capitalize(),
         "status": status,
         "detail": detail,
         "instance": f"/requests/{request_id}",
@@ -69,7 +73,8 @@ def problem(
 
 def invalid(error: ValidationError, what: str) -> errors.InvalidRequest:
     """What pydantic found, in our words."""
-    return _invalid([dict(one) for one in error.errors(include_url=False)], what)
+    found = error.errors(include_url=False, include_context=False, include_input=False)
+    return _invalid([dict(one) for one in found], what)
 
 
 def declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -77,7 +82,7 @@ def declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"description": HTTPStatus(status).phrase, "content": content}
-        for status in (*statuses, 401, 500, 503)
+        for status in (*statuses, 401, 403, 421, 500, 503)
     }
 
 
@@ -100,21 +105,11 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def _validation(request: Request, error: RequestValidationError) -> JSONResponse:
-        if any(one["type"] == "json_invalid" for one in error.errors()):
-            detail = "The body is not JSON. Send one JSON object."
-            return problem(_id(request), "MalformedBody", 400, detail)
-        kind = request.headers.get("content-type", "").partition(";")[0].strip()
-        if kind != "application/json" and any(one["loc"] == ("body",) for one in error.errors()):
-            detail = f"The body is {kind or 'of no type'!r:.80}. Send JSON as application/json."
-            return problem(_id(request), "UnsupportedType", 415, detail)
         ours = _invalid([dict(one) for one in error.errors()], "The request")
         return problem(_id(request), "InvalidRequest", 422, str(ours), ours.fields)
 
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> JSONResponse:
-        if error.status_code == 400:  # FastAPI's own word on bytes that are not even text
-            detail = "The body is not JSON. Send one JSON object."
-            return problem(_id(request), "MalformedBody", 400, detail)
         name = HTTPStatus(error.status_code).phrase.title().replace(" ", "")
         detail = f"{request.method} {request.url.path}: {error.detail}. See /docs."
         answer = problem(_id(request), name, error.status_code, detail)
@@ -139,13 +134,15 @@ def install(app: FastAPI) -> None:
 def _invalid(found: Sequence[dict[str, Any]], what: str) -> errors.InvalidRequest:
     fields = tuple(
         (
-            ".".join(str(part) for part in one["loc"] if part not in ("body", "query")),
+            ".".join(str(part) for part in one["loc"] if part != "query")[:PLACE],
             one["msg"].removeprefix("Value error, "),
         )
-        for one in found
+        for one in found[:MOST_FIELDS]  # a caller may invent more without end
     )
     first = "; ".join(f"{place or 'it'}: {reason}" for place, reason in fields[:3])
-    more = f" (and {len(fields) - 3} more)" if len(fields) > 3 else ""
+    more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
+    if len(found) > MOST_FIELDS:
+        more = f" (and {len(found) - 3} more; {MOST_FIELDS} of {len(found)} are listed)"
     return errors.InvalidRequest(
         f"{what} is not as it should be: {first}{more}. See /docs for its fields.", fields
     )

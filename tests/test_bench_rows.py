@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import multiprocessing
+import signal
 import sys
+import tempfile
+import time
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -17,6 +22,7 @@ from benchmarks.encode import Clock, EncodeFigures, open3d, points_of
 from benchmarks.machine import Machine
 from benchmarks.pairs import FramePair, pairs_among, real_pairs, synthetic_pairs
 from sceneprint.cli.demo_building import write_building
+from sceneprint.datasets import Camera, write_depth_png, write_intrinsics
 from sceneprint.errors import MissingDependency
 from sceneprint.geometry.diversity import diversify
 from sceneprint.geometry.retrieval import distances, pairwise_distances, rank
@@ -187,7 +193,8 @@ def test_page_and_json_hold_every_row() -> None:
 def test_service_and_library_do_the_same_work(tmp_path: Path) -> None:
     """`measure` compares every answer with the library's; here on a room of the demo."""
     assert len(list(write_building(tmp_path / "building", 1))) == 1
-    found = service.measure(service.frames_of(tmp_path / "building", 12), 2, seconds=1.0)
+    with service.frames_of(tmp_path / "building", 12) as frames:
+        found = service.measure(frames, 2, seconds=1.0)
     assert (found.frames, found.queries) == (10, 2)
     assert list(found.stages) == [
         "decode", "sign, with geometry", "retrieve", "diversify", "validate"
@@ -195,6 +202,40 @@ def test_service_and_library_do_the_same_work(tmp_path: Path) -> None:
     assert found.ratio > 0
     assert 0 < found.idle[0] <= found.idle[1]
     assert 0 < found.loaded[0] <= found.loaded[1]
+
+
+def test_a_building_of_its_own_is_gone_afterwards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(folder: Path, rooms: int) -> Iterator[None]:
+        folder.mkdir()
+        write_intrinsics(folder, Camera(CAMERA, 1000.0, along_ray=False))
+        for i in range(rooms):
+            write_depth_png(folder / f"{i}.png", wall().depth, 1000.0)
+            yield
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(service, "write_building", write)
+    with service.frames_of(None, most=3) as frames:
+        assert [frame.path.name for frame in frames] == ["0.png", "2.png", "4.png"]
+        assert frames[0].path.is_relative_to(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_load_that_dies_ends_the_measurement() -> None:
+    with pytest.raises(RuntimeError, match=r"of 5 processes of the load died: \[1"):
+        service._loaded("no address", [], seconds=1.0)
+    assert multiprocessing.active_children() == []
+
+
+def test_a_load_that_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service, "END_S", 0.1)
+    context = multiprocessing.get_context("spawn")
+    stop = context.Event()
+    stuck, never_started = (context.Process(target=time.sleep, args=(99,)) for _ in range(2))
+    stuck.start()
+    service._end([stuck, never_started], stop)
+    assert (stop.is_set(), stuck.exitcode) == (True, -signal.SIGTERM)
 
 
 def test_a_search_from_a_shortlist_is_compared_with_the_scan_of_all() -> None:

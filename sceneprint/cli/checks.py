@@ -7,18 +7,17 @@ import shutil
 import sqlite3
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from sceneprint import __version__
+from sceneprint.cli.checks_database import database
+from sceneprint.cli.findings import Finding
 
 if TYPE_CHECKING:
     from sceneprint.settings import Settings
-
-Verdict = Literal["ok", "note", "WRONG"]
 
 #: The oldest SQLite with all that the store asks for (UPDATE ... RETURNING).
 OLDEST_SQLITE = (3, 35, 0)
@@ -34,23 +33,6 @@ OPEN3D_LIBRARIES = {
 }
 
 
-@dataclass(frozen=True)
-class Finding:
-    """What one look has shown.
-
-    Parameters
-    ----------
-    verdict : ok; note: something optional is missing, or will be made when it is needed; WRONG:
-        something needed is not there
-    subject : what was looked at
-    text : what is there, and what to do
-    """
-
-    verdict: Verdict
-    subject: str
-    text: str
-
-
 def machine(settings: Settings) -> Iterator[Finding]:
     """Findings about this machine.
 
@@ -63,7 +45,7 @@ def machine(settings: Settings) -> Iterator[Finding]:
     yield _kernels()
     yield from _tables(settings.cache_dir)
     yield from _folder(settings.data_dir)
-    yield _database(settings)
+    yield database(settings)
     yield _embree()
     yield _open3d()
 
@@ -129,56 +111,6 @@ def _folder(data_dir: Path) -> Iterator[Finding]:
         yield Finding("WRONG", "disk", f"{text}. Make room, or uploads will be refused.")
     else:
         yield Finding("note" if free < LITTLE_FREE else "ok", "disk", text)
-
-
-def _database(settings: Settings) -> Finding:
-    from sqlalchemy.exc import SQLAlchemyError
-
-    path = settings.data_dir / "sceneprint.db"
-    if settings.database_url is None and not path.is_file():
-        return Finding("ok", "database", "none yet; the first use makes it")
-    try:
-        return _schema(settings, path)
-    except (SQLAlchemyError, ImportError) as error:
-        reason = str(getattr(error, "orig", None) or error).splitlines()[0]
-        text = f"cannot be opened ({reason}). Check SCENEPRINT_DATABASE_URL, or the data folder."
-        return Finding("WRONG", "database", text)
-
-
-def _schema(settings: Settings, path: Path) -> Finding:
-    """Compare the schema with the one of this version; the database is not touched."""
-    from alembic.config import Config
-    from alembic.migration import MigrationContext
-    from alembic.script import ScriptDirectory
-    from sqlalchemy import create_engine, make_url
-
-    import migrations
-
-    config = Config()
-    config.set_main_option("script_location", str(Path(migrations.__file__).parent))
-    scripts = ScriptDirectory.from_config(config)
-    head, known = scripts.get_current_head(), {one.revision for one in scripts.walk_revisions()}
-    connect: Callable[[], sqlite3.Connection] = lambda: sqlite3.connect(  # noqa: E731
-        f"{path.absolute().as_uri()}?mode=ro", uri=True
-    )
-    url = make_url(settings.database)
-    engine = (
-        create_engine("sqlite://", creator=connect)
-        if settings.database_url is None
-        else create_engine(url)
-    )
-    try:
-        with engine.connect() as connection:
-            found = MigrationContext.configure(connection).get_current_revision()
-    finally:
-        engine.dispose()
-    place = f"{url!r}, schema {found}"
-    if found == head:
-        return Finding("ok", "database", place)
-    if found is None or found in known:
-        return Finding("note", "database", f"{place}; the next use brings it to {head}")
-    text = f"{place}: a later version of sceneprint wrote it. Use that version, or another folder."
-    return Finding("WRONG", "database", text)
 
 
 def _embree() -> Finding:

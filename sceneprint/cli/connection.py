@@ -6,11 +6,10 @@ import argparse
 import os
 from typing import TYPE_CHECKING
 
+from sceneprint.client.client import DEFAULT_URL
+
 if TYPE_CHECKING:
     from sceneprint.client import Client
-
-#: Of the service that `sceneprint serve` runs.
-DEFAULT_URL = "http://127.0.0.1:8008"
 
 
 def add_service_options(command: argparse.ArgumentParser) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -12,6 +13,7 @@ from tqdm import tqdm
 
 from sceneprint.cli.choosing import choose_frames
 from sceneprint.cli.numbers import positive
+from sceneprint.cli.signals import ended_by_signals
 from sceneprint.models import PRESETS
 from sceneprint.settings import Settings
 
@@ -48,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
     from sceneprint.client import Client
 
     options.out.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix="sceneprint-demo-") as temporary:
+    with ended_by_signals(), TemporaryDirectory(prefix="sceneprint-demo-") as temporary:
         folder = Path(temporary)
         choice = choose_frames(options.dataset or _building(folder / "building", options.rooms))
         prepare_presets(Settings())
@@ -69,7 +71,8 @@ def run(options: argparse.Namespace) -> int:
 def _building(folder: Path, rooms: int) -> Path:
     from sceneprint.cli.demo_building import write_building
 
-    made = write_building(folder, rooms)
-    for _ in tqdm(made, total=rooms, desc="synthetic building", unit="room", disable=None):
-        pass
+    # closed before the folder is removed, however this ends: its processes write there
+    with closing(write_building(folder, rooms)) as made:
+        for _ in tqdm(made, total=rooms, desc="synthetic building", unit="room", disable=None):
+            pass
     return folder

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
@@ -18,7 +18,7 @@ WALK, TEN, MAP, QUERIES = 100, 10, (0, 2, 4), (7, 8)
 DEPTH_SCALE = 1000.0
 
 
-def write_building(folder: Path, rooms: int) -> Iterator[None]:
+def write_building(folder: Path, rooms: int) -> Generator[None]:
     """Write rooms in 7-Scenes layout with split files, and yield after each.
 
     Parameters

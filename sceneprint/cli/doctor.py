@@ -8,9 +8,11 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from sceneprint import __version__
-from sceneprint.cli.checks import Finding, machine
-from sceneprint.cli.connection import DEFAULT_URL, add_service_options, one_line, open_client
+from sceneprint.cli.checks import machine
+from sceneprint.cli.connection import add_service_options, one_line, open_client
+from sceneprint.cli.findings import Finding
 from sceneprint.cli.serve import add_data_option, settings_of
+from sceneprint.client.client import DEFAULT_URL
 from sceneprint.errors import KeyRequired, SceneprintError, Unreachable
 
 if TYPE_CHECKING:
@@ -39,7 +41,8 @@ def run(options: argparse.Namespace) -> int:
     for finding in (*_all(options),):
         print(f"{finding.verdict:5}  {finding.subject:16}  {one_line(finding.text)}", flush=True)
         wrong += finding.verdict == "WRONG"
-    print(f"{wrong} things are wrong" if wrong else "all that is needed is fine")
+    things = "1 thing is wrong" if wrong == 1 else f"{wrong} things are wrong"
+    print(things if wrong else "all that is needed is fine")
     return 2 if wrong else 0
 
 

@@ -47,12 +47,20 @@ def add_to(commands: Any) -> None:
     )
     command.add_argument("map", metavar="MAP", help="made where missing")
     command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
-    command.add_argument("--robot", metavar="NAME", help="who took the frames")
+    command.add_argument(
+        "--robot", metavar="NAME", help="who took the frames, and whose the poses' frame is"
+    )
     command.add_argument(
         "--session", metavar="NAME", help="in which run (default: the sequence's name)"
     )
     command.add_argument(
         "--tag", action="append", default=[], metavar="TAG", help="may be given several times"
+    )
+    command.add_argument(
+        "--parent-frame",
+        metavar="NAME",
+        help="what all poses lead to: poses of several uploads are combined where they share it "
+        "(default: the name of the scene's folder, with --robot ROBOT/SCENE)",
     )
     command.add_argument("--no-pose", action="store_true", help="leave known poses out")
     command.add_argument(
@@ -77,7 +85,7 @@ def add_to(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Upload; returns 2 where a frame was not indexed."""
-    found = list(_found(options.paths, options.every))
+    found = list(_found(options.paths, options.every, one_frame=options.parent_frame is not None))
     tally, start, stalled = Tally(), time.perf_counter(), False
     with open_client(options) as client:
         _see_to_map(client, options)
@@ -96,8 +104,15 @@ def run(options: argparse.Namespace) -> int:
     return 2 if tally.errors or stalled else 0
 
 
-def _found(paths: list[Path], every: int) -> Iterator[tuple[Sequence, FrameReference]]:
+def _found(
+    paths: list[Path], every: int, *, one_frame: bool
+) -> Iterator[tuple[Sequence, FrameReference]]:
     """Frames with their sequences.
+
+    Parameters
+    ----------
+    paths, every : as given
+    one_frame : whether all poses lead to one frame, as the user says
 
     Raises
     ------
@@ -108,11 +123,12 @@ def _found(paths: list[Path], every: int) -> Iterator[tuple[Sequence, FrameRefer
         for sequence in find_sequences(path):
             shared = sequence.parent_frame != sequence.name
             place = (sequence.folder.parent if shared else sequence.folder).resolve()
-            if places.setdefault(sequence.parent_frame, place) != place:
+            if places.setdefault(sequence.parent_frame, place) != place and not one_frame:
                 raise DatasetError(
                     f"{path}: Another place is called {sequence.parent_frame} too, "
                     f"{places[sequence.parent_frame]}, and poses of the two would be mixed. "
-                    "Upload a folder above both, or rename one."
+                    "Upload a folder above both, rename one, or where poses of both lead to one "
+                    "frame, name it with --parent-frame."
                 )
             for reference in sequence.frames[::every]:
                 yield sequence, reference
@@ -169,9 +185,17 @@ def _send(
         session=options.session or _session(sequence),
         tags=options.tag,
         with_pose=not options.no_pose,
-        parent_frame=sequence.parent_frame,
+        parent_frame=_parent_frame(options, sequence),
     )
     return client.add(options.map, reference, meta)
+
+
+def _parent_frame(options: argparse.Namespace, sequence: Sequence) -> str:
+    """What poses lead to: folders of two robots may share a name, and their poses no frame."""
+    if options.parent_frame is not None:
+        return str(options.parent_frame)
+    own = sequence.parent_frame
+    return own if options.robot is None else f"{options.robot}/{own}"
 
 
 def _session(sequence: Sequence) -> str:

@@ -5,7 +5,6 @@ response  --refusal-->  SceneprintError
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
@@ -52,7 +51,7 @@ def not_ours(response: httpx.Response) -> errors.Refused:
 def _kinds() -> dict[str, type[errors.SceneprintError]]:
     """The classes of the tree by the last part of a problem's `type`."""
     return {
-        re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower(): kind
+        errors.kebab_case(name): kind
         for name, kind in vars(errors).items()
         if isinstance(kind, type)
         and issubclass(kind, errors.SceneprintError)

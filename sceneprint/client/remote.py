@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 import re
 import time
@@ -28,6 +27,7 @@ from sceneprint.schemas import (
     Page,
     Query,
 )
+from sceneprint.settings import is_loopback
 
 Record = TypeVar("Record", bound=BaseModel)
 
@@ -68,7 +68,7 @@ class Remote:
                 base_url=self._url,
                 headers=headers,
                 timeout=timeout_s,
-                trust_env=not _is_here(parsed.host),  # no proxy stands before this machine
+                trust_env=not is_loopback(parsed.host),  # no proxy stands before this machine
             )
         except (httpx.InvalidURL, UnicodeEncodeError, ValueError) as error:
             raise Unreachable(
@@ -232,10 +232,3 @@ def _part(name: str, what: str, error: type[SceneprintError]) -> str:
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
         raise error(f"There is no {what} {name!r:.80}. Check the name.")
     return name
-
-
-def _is_here(host: str) -> bool:
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

@@ -47,7 +47,7 @@ class GivenPose(Given):
 
     parent_frame: Label | None = Field(
         default=None,
-        description="Poses are combined within one parent frame; default: ROBOT/SESSION, or the session.",
+        description="Poses are combined within one parent frame; default: ROBOT/SESSION.",
     )
     translation: GivenVector | None = None
     rotation: GivenQuaternion | None = None

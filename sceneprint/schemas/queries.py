@@ -31,6 +31,17 @@ class Query(Given):
         default=0, ge=0, lt=2**32, description="Of the random choices; the answer echoes it."
     )
 
+    @field_validator("stages", mode="before", json_schema_input_type=str | tuple[Stage, ...])
+    @classmethod
+    def _from_text(cls, stages: object) -> object:
+        """As a form and a command line give them: one text with commas."""
+        if isinstance(stages, str):
+            return [one.strip() for one in stages.split(",")]
+        if isinstance(stages, list | tuple):
+            return stages
+        # pydantic would speak of tuples, as Python does
+        raise ValueError("give a list of stages, or a text with commas between them")
+
     @field_validator("stages")
     @classmethod
     def _in_order(cls, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:

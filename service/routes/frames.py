@@ -17,8 +17,10 @@ from service.problems import declared
 
 router = APIRouter(prefix="/maps/{map_name}/frames", tags=["frames"])
 
-#: Longest time to wait for a worker, seconds, and the pause between two looks.
-LONGEST_WAIT_S, PAUSE_S = 60.0, 0.03
+#: Longest time to wait for a worker, seconds.
+LONGEST_WAIT_S = 60.0
+#: Pause between two looks, seconds: short at first, as most frames are signed at once.
+FIRST_PAUSE_S, LONGEST_PAUSE_S, GROWTH = 0.03, 0.5, 1.5
 
 BODY: dict[str, Any] = {
     "required": True,
@@ -63,7 +65,7 @@ async def add_frame(
     ] = None,
 ) -> Added:
     """Take a frame into a map. When this answers, the frame is safe; a worker signs it next."""
-    async with uploaded(request) as upload:
+    async with here.gate.place(), uploaded(request) as upload:
         added, is_new = await here.gate.run(
             lambda: here.engine.add_frame(map_name, upload.file.read(), upload.meta)
         )
@@ -72,7 +74,7 @@ async def add_frame(
         wait_s = _wait(prefer)
         if wait_s > 0:
             response.headers["Preference-Applied"] = f"wait={wait_s:g}"
-            added = await _settled(here, map_name, added, wait_s)
+            added = await _settled(request, here, map_name, added, wait_s)
         is_over = added.state not in (FrameState.RECEIVED, FrameState.SIGNING)
         response.status_code = 201 if is_over else 202
     else:
@@ -110,11 +112,20 @@ def _wait(prefer: str | None) -> float:
     return min(float(found[1]), LONGEST_WAIT_S) if found else 0.0
 
 
-async def _settled(here: Context, map_name: str, added: Added, wait_s: float) -> Added:
-    """The frame once nothing more will happen to it, or as it is after the wait."""
-    until = time.monotonic() + wait_s
-    while added.state in (FrameState.RECEIVED, FrameState.SIGNING) and time.monotonic() < until:
-        await anyio.sleep(PAUSE_S)  # holds no thread meanwhile
+async def _settled(
+    request: Request, here: Context, map_name: str, added: Added, wait_s: float
+) -> Added:
+    """The frame once nothing more will happen to it, or as it is after the wait.
+
+    Who has hung up is not waited for.
+    """
+    until, pause = time.monotonic() + wait_s, FIRST_PAUSE_S
+    while added.state in (FrameState.RECEIVED, FrameState.SIGNING):
+        left = until - time.monotonic()
+        if left <= 0 or await request.is_disconnected():
+            break
+        await anyio.sleep(min(pause, left))  # holds no thread meanwhile
+        pause = min(pause * GROWTH, LONGEST_PAUSE_S)
         frame = await to_thread.run_sync(here.engine.get_frame, map_name, added.frame_id)
         added = added.model_copy(update={"state": frame.state, "reason": frame.reason})
     return added

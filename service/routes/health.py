@@ -27,7 +27,7 @@ class Readiness(Health):
     jobs: dict[str, int]
 
 
-@router.get("/healthz")
+@router.get("/healthz", responses=declared())
 async def healthz() -> Health:
     """Answers while the process lives, whatever else it does."""
     return Health(status="ok", version=__version__)
@@ -40,7 +40,7 @@ def readyz(here: Here) -> Readiness:
     return Readiness(status="ready", version=__version__, frames=frames, jobs=jobs)
 
 
-@router.get("/metrics", response_class=Response)
+@router.get("/metrics", response_class=Response, responses=declared())
 def metrics(here: Here) -> Response:
     """Figures for Prometheus."""
     return Response(here.metrics.text(*here.engine.counts()), media_type=CONTENT_TYPE_LATEST)

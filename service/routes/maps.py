@@ -2,21 +2,43 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Response
+from typing import Any
 
+from anyio import to_thread
+from fastapi import APIRouter, Request, Response
+from pydantic import ValidationError
+
+from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint.schemas import Map, NewMap, Page
+from service.bodies import media_type, read_json
 from service.context import Here
-from service.problems import declared
+from service.problems import declared, invalid
 
 router = APIRouter(prefix="/maps", tags=["maps"])
 
 
+BODY: dict[str, Any] = {
+    "required": True,
+    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewMap"}}},
+}
+
+
 @router.post(
-    "", status_code=201, responses={200: {"model": Map}, **declared(400, 409, 413, 415, 422)}
+    "",
+    status_code=201,
+    responses={200: {"model": Map}, **declared(400, 409, 413, 415, 422)},
+    openapi_extra={"requestBody": BODY},
 )
-def create_map(new: NewMap, here: Here, response: Response) -> Map:
+async def create_map(request: Request, here: Here, response: Response) -> Map:
     """Make a map. One that is there as wanted is answered with 200."""
-    made, is_new = here.engine.create_map(new)
+    # read by hand: FastAPI would read and parse all of it before it asks for a key
+    if media_type(request) != "application/json":
+        raise UnsupportedType(
+            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
+            "application/json."
+        )
+    new = _new(await read_json(request))
+    made, is_new = await to_thread.run_sync(here.engine.create_map, new)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/maps/{made.name}"
     return made
@@ -38,3 +60,15 @@ def get_map(map_name: str, here: Here) -> Map:
 def delete_map(map_name: str, here: Here) -> None:
     """Remove a map with all that is in it, for good."""
     here.engine.delete_map(map_name)
+
+
+def _new(given: object) -> NewMap:
+    if not isinstance(given, dict):
+        raise InvalidRequest(
+            "The map is not as it should be: it is no JSON object. See /docs for its fields.",
+            (("", "not an object"),),
+        )
+    try:
+        return NewMap.model_validate(given)
+    except ValidationError as error:
+        raise invalid(error, "The map") from error

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from fastapi import APIRouter, Request
 from pydantic import ValidationError
 
-from sceneprint.errors import InvalidRequest, UnsupportedType
+from sceneprint.errors import InvalidRequest, MalformedBody, UnsupportedType
 from sceneprint.schemas import Answer, Query
 from service.bodies import FORM, media_type, read_json, uploaded
-from service.context import Here
+from service.context import Context, Here
 from service.problems import declared, invalid
 from service.routes.frames import BODY as FRAME
 
@@ -25,8 +26,7 @@ def _body() -> dict[str, Any]:
     options = Query.model_json_schema()["properties"]
     stages = {"type": "string", "default": "retrieve,diversify,validate"}
     of_form = {**options, "stages": options["stages"] | stages}
-    for keyword in ("items", "prefixItems"):
-        of_form["stages"].pop(keyword, None)
+    of_form["stages"].pop("anyOf")  # text or a list; a form has only text
     by_id = {"frame_id": {"type": "string", "description": "A frame of the map."}, **options}
     return {
         "required": True,
@@ -47,9 +47,18 @@ async def ask(map_name: str, request: Request, here: Here) -> Answer:
 
     An uploaded frame is not kept. A frame of the map does not find itself.
     """
+    async with here.gate.place():
+        answer = await _asked(map_name, request, here)
+    here.metrics.answer(answer)
+    return answer
+
+
+async def _asked(map_name: str, request: Request, here: Context) -> Answer:
     engine = here.engine
     if media_type(request) == "application/json":
         given = await read_json(request)
+        if not isinstance(given, dict):
+            raise MalformedBody("The body is not a JSON object. Send an object.")
         frame_id = given.pop("frame_id", None)
         if not isinstance(frame_id, str):
             raise InvalidRequest(
@@ -57,26 +66,20 @@ async def ask(map_name: str, request: Request, here: Here) -> Answer:
                 (("frame_id", "missing"),),
             )
         query = _query(given)
-        answer = await here.gate.run(lambda: engine.query_frame(map_name, frame_id, query))
-    elif media_type(request) == FORM:
+        return await here.gate.run(lambda: engine.query_frame(map_name, frame_id, query))
+    if media_type(request) == FORM:
         async with uploaded(request, *_OPTIONS) as upload:
-            fields: dict[str, Any] = dict(upload.fields)
-            if "stages" in fields:
-                fields["stages"] = [one.strip() for one in fields["stages"].split(",")]
-            query = _query(fields)
-            answer = await here.gate.run(
+            query = _query(upload.fields)
+            return await here.gate.run(
                 lambda: engine.query_upload(map_name, upload.file.read(), upload.meta, query)
             )
-    else:
-        raise UnsupportedType(
-            f"The body is {media_type(request) or 'of no type'!r:.80}. Send a frame as {FORM}, or "
-            "the id of one as application/json."
-        )
-    here.metrics.answer(answer)
-    return answer
+    raise UnsupportedType(
+        f"The body is {media_type(request) or 'of no type'!r:.80}. Send a frame as {FORM}, or "
+        "the id of one as application/json."
+    )
 
 
-def _query(fields: dict[str, Any]) -> Query:
+def _query(fields: Mapping[str, Any]) -> Query:
     try:
         return Query.model_validate(fields)
     except ValidationError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
@@ -9,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import SecretStr
 
 from sceneprint import __version__
 from sceneprint.cli import checks, connection, doctor
-from sceneprint.cli.checks import Finding
+from sceneprint.cli.findings import Finding
 from sceneprint.client import Client, Status
 from sceneprint.datasets import find_sequences
 from sceneprint.geometry import counting
@@ -94,6 +96,76 @@ def test_databases_of_other_versions(tmp_path: Path) -> None:
         connection.execute("DELETE FROM alembic_version")
     connection.close()
     assert found_in(settings)["database"].verdict == "note"
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("sceneprint.db*"))}
+
+
+def test_looking_at_a_database_changes_nothing(tmp_path: Path) -> None:
+    """One that was closed, one that is in use, one whose process was killed, and a copy of that."""
+    path, killed, copy = (tmp_path / one / "sceneprint.db" for one in ("data", "killed", "copy"))
+    Client.embedded(path.parent).close()
+    settings = Settings(data_dir=path.parent, database_url=None)
+
+    def look(where: Path = path) -> str:
+        before, used = content(where.parent), where is path and path.with_suffix(".db-wal").exists()
+        url = None if where is path else SecretStr(f"sqlite:///{where}")
+        verdict = found_in(settings.model_copy(update={"database_url": url}))["database"].verdict
+        after = content(where.parent)
+        if used:  # threads of one process share the index of the log, and note what they read
+            assert before.pop("sceneprint.db-shm")
+            assert after.pop("sceneprint.db-shm")
+        assert after == before
+        return verdict
+
+    assert list(content(path.parent)) == ["sceneprint.db"]
+    assert look() == "ok"
+    with sqlite3.connect(path) as writer:
+        writer.execute("PRAGMA wal_autocheckpoint = 0")
+        writer.execute("UPDATE alembic_version SET version_num = '9999'")
+        writer.commit()
+        assert look() == "WRONG"  # what is in the log only is seen too
+        shutil.copytree(path.parent, killed.parent)
+        writer.execute("DELETE FROM alembic_version")
+        writer.commit()
+        assert look() == "note"
+    writer.close()
+    assert sorted(content(killed.parent)) == [f"sceneprint.db{end}" for end in ("", "-shm", "-wal")]
+    assert look(killed) == "WRONG"
+    copy.parent.mkdir()
+    for end in ("", "-wal"):
+        shutil.copy(f"{killed}{end}", f"{copy}{end}")
+    assert look(copy) == "note"
+
+
+@pytest.mark.parametrize(
+    ("url", "verdict", "said"),
+    [
+        ("sqlite:////{tmp}/x.db", "ok", "none yet; {tmp}/x.db will be made by the first use"),
+        ("sqlite:///file:{tmp}/x%20y.db?uri=true", "ok", "{tmp}/x y.db will be made"),
+        ("sqlite:////{tmp}/none/x.db", "WRONG", "the folder of {tmp}/none/x.db is missing"),
+        ("sqlite://", "WRONG", "is in memory"),
+        ("sqlite:///file:x?mode=memory&uri=true", "WRONG", "is in memory"),
+        ("postgresql://me:p@ss:hidden@host/db", "WRONG", "its port is no number"),
+        ("nonsense", "WRONG", "not an SQLAlchemy URL"),
+        ("nosuch://host/db", "WRONG", "cannot be opened (Can't load plugin"),
+    ],
+)
+def test_addresses_of_databases(
+    sceneprint: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    url: str, verdict: str, said: str,
+) -> None:  # fmt: skip
+    monkeypatch.setenv("SCENEPRINT_DATABASE_URL", url.format(tmp=str(tmp_path).lstrip("/")
+        if url.startswith("sqlite:////") else tmp_path))  # fmt: skip
+    done = sceneprint("doctor", "--data", tmp_path, expect=2 if verdict == "WRONG" else 0)
+    (line,) = [one for one in done.stdout.splitlines() if one[7:].startswith("database ")]
+    assert line.startswith(verdict)
+    assert said.format(tmp=tmp_path) in line
+    assert "hidden" not in done.stdout + done.stderr  # half of a password
+    last = "1 thing is wrong" if verdict == "WRONG" else "all that is needed is fine"
+    assert done.stdout.splitlines()[-1] == last
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_a_machine_may_lack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

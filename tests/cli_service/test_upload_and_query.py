@@ -50,7 +50,7 @@ def test_what_was_uploaded_is_there(house: str, service_url: str, rooms: Path) -
     files = sorted(path.stat().st_size for path in rooms.glob("room-0/*/*.png"))
     assert [one.bytes for one in frames[:3]] == files
     parents = {None if one.pose is None else one.pose.parent_frame for one in frames}
-    assert parents == {"room-0", "room-1"}
+    assert parents == {"r1/room-0", "r1/room-1"}  # another robot's room-0 may be another place
 
 
 def test_uploading_again_changes_nothing(sceneprint: Run, house: str, rooms: Path) -> None:
@@ -99,6 +99,23 @@ def test_upload_without_waiting(sceneprint: Run, service_url: str, rooms: Path) 
         assert {job.state for job in client.wait(ids, timeout_s=60)} == {"succeeded"}
 
 
+def test_poses_lead_to_the_frame_that_is_named(
+    sceneprint: Run, service_url: str, rooms: Path, tmp_path: Path
+) -> None:
+    """Without a robot to the scene's; the same name for two places only where it is asked for."""
+    other = tmp_path / "room-0"
+    shutil.copytree(rooms / "room-1", other)
+    without = ("--no-wait", "--every", 3)
+    sceneprint("upload", "named", rooms / "room-0", *without)
+    sceneprint("upload", "named", other, "--robot", "r2", *without)
+    one = ("--parent-frame", "hall", "--robot", "r1", *without)
+    sceneprint("upload", "together", rooms / "room-0", other, *one)
+    with Client(service_url) as client:
+        for name, expected in (("named", ["r2/room-0", "room-0"]), ("together", ["hall", "hall"])):
+            poses = [frame.pose for frame in client.frames(name)]
+            assert sorted(pose.parent_frame for pose in poses if pose is not None) == expected
+
+
 def test_upload_refuses_what_would_mix(
     sceneprint: Run, house: str, rooms: Path, tmp_path: Path
 ) -> None:
@@ -110,6 +127,7 @@ def test_upload_refuses_what_would_mix(
     shutil.copytree(rooms / "room-0", other)
     done = sceneprint("upload", house, rooms / "room-0", other, expect=2)
     assert "Another place is called room-0 too" in done.stderr
+    assert "name it with --parent-frame" in done.stderr
     assert done.stdout == ""
 
 
@@ -152,7 +170,7 @@ def test_a_query_is_told_in_a_table(sceneprint: Run, house: str, rooms: Path) ->
     assert [float(value) for value in first.groups()[:3]] == pytest.approx([0, 0, 0], abs=2e-3)
     assert [float(value) for value in first.groups()[3:]] == pytest.approx(there[:3, 3], abs=2e-3)
     found = re.match(
-        r"  at (\S+) (\S+) (\S+) m in room-0, rotation .* matches agree, spread", place
+        r"  at (\S+) (\S+) (\S+) m in r1/room-0, rotation .* matches agree, spread", place
     )
     assert found is not None, place
     assert [float(value) for value in found.groups()] == pytest.approx(there[:3, 3], abs=0.05)

@@ -62,7 +62,7 @@ def test_a_frame_from_upload_to_deletion(
     assert (job.state, job.frame_id, job.attempts) == (JobState.SUCCEEDED, added.frame_id, 1)
     again, new = client.add(map_name, reference)
     assert (again.frame_id, again.state, new) == (added.frame_id, FrameState.INDEXED, False)
-    with pytest.raises(FrameConflict, match=r"other robot, tags\."):
+    with pytest.raises(FrameConflict, match=r"other robot, tags, pose\.parent_frame\."):
         client.upload(map_name, reference, meta_of(reference, robot="r2", tags=["b"]))
     assert client.map(map_name).frames["indexed"] == 1
     client.delete_frame(map_name, added.frame_id)

@@ -109,6 +109,8 @@ def test_what_was_deleted_by_a_try_without_answer_is_deleted(scripted: Make) -> 
         ("unsupported-type", 415, errors.UnsupportedType),
         ("too-large", 413, errors.TooLarge),
         ("key-required", 401, errors.KeyRequired),
+        ("misdirected", 421, errors.Misdirected),
+        ("foreign-origin", 403, errors.ForeignOrigin),
         ("damaged-blob", 500, errors.DamagedBlob),
         ("refused", 418, errors.Refused),
         ("method-not-allowed", 405, errors.Refused),

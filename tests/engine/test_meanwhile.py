@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ from sqlalchemy import select
 
 from sceneprint.engine import Engine, answers, readers, upkeep
 from sceneprint.engine.asking import ask_stored
-from sceneprint.errors import DamagedBlob
+from sceneprint.errors import DamagedBlob, UnknownMap
+from sceneprint.matches import associate
 from sceneprint.schemas import NewMap, Query
 from sceneprint.store.tables import frames, signatures
 
@@ -92,10 +94,43 @@ def test_a_frame_deleted_after_it_was_asked_for_is_answered(
     empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work_off(empty)
     (name,) = ids(empty)
+    row = empty._row("hall")
     asked = ask_stored(empty.store, "hall", name, Query())
     empty.delete_frame("hall", name)
-    answer = empty._answer("hall", asked, Query())
+    answer = empty._answer(row, asked, Query())
     assert (answer.status, answer.matches, answer.counts.map) == ("not_found", [], 0)
+
+
+def test_a_map_made_anew_while_it_was_asked_is_not_answered_for(
+    empty: Engine, uploads: Any, work_off: Any, ids: Ids
+) -> None:
+    empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    work_off(empty)
+    row = empty._row("hall")
+    asked = ask_stored(empty.store, "hall", ids(empty)[0], Query())
+    empty.delete_map("hall")
+    empty.create_map(NewMap(name="hall", model="paper"))  # whose signatures are longer
+    with pytest.raises(UnknownMap, match="made anew while it was asked"):
+        empty._answer(row, asked, Query())
+
+
+def test_matches_that_are_deleted_while_they_are_validated_are_not_found(
+    empty: Engine, uploads: Any, work_off: Any, ids: Ids, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    work_off(empty)
+    (name,) = ids(empty)
+
+    def then_delete(*arguments: Any) -> Any:
+        found = associate(*arguments)
+        assert [match.validation.status for match in found] == ["accepted"]
+        empty.delete_frame("hall", name)
+        return found
+
+    monkeypatch.setattr(answers, "associate", then_delete)
+    answer = empty.query_upload("hall", uploads[0].data, uploads[0].meta, Query())
+    assert (answer.status, answer.matches, answer.location) == ("not_found", [], None)
+    assert (answer.counts.validated, answer.counts.accepted) == (0, 0)
 
 
 def test_maps_are_never_mixed(full: Engine, uploads: Any, work_off: Any) -> None:
@@ -136,15 +171,20 @@ def test_queries_beside_deletions_and_publishing_see_one_state(
     threads = [threading.Thread(target=work, args=(seen,)) for seen in sizes]
     for thread in threads:
         thread.start()
-    for i, name in enumerate(reversed(names[4:])):
-        builder.delete_frame("hall", name)
-        if i == 3:
-            assert builder.publish_due() == 1
-    while not all(seen and seen[-1] == 3 for seen in sizes) and not raised:
-        over.wait(0.01)
-    over.set()
-    for thread in threads:
-        thread.join()
+    try:  # the threads end, whatever fails: they would keep the process alive
+        for i, name in enumerate(reversed(names[4:])):
+            builder.delete_frame("hall", name)
+            if i == 3:
+                assert builder.publish_due() == 1
+        deadline = time.monotonic() + 60
+        while not all(seen and seen[-1] == 3 for seen in sizes) and not raised:
+            last = [seen[-1:] for seen in sizes]
+            assert time.monotonic() < deadline, f"readers see {last} frames, not 3 each"
+            over.wait(0.01)
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
     assert raised == []
     for seen in sizes:
         assert seen == sorted(seen, reverse=True)

@@ -45,7 +45,7 @@ def answer(wire: socket.socket) -> tuple[int, dict[str, str], bytes]:
 
 
 def post(path: str, *headers: str) -> bytes:
-    lines = (f"POST {path} HTTP/1.1", "Host: a", *headers)
+    lines = (f"POST {path} HTTP/1.1", "Host: localhost", *headers)
     return "".join(f"{line}\r\n" for line in lines).encode() + b"\r\n"
 
 
@@ -185,13 +185,14 @@ def test_a_length_beyond_what_comes_is_waited_for_and_what_is_short_is_cut(narro
     ("given", "kept_as_given"),
     [("abc-1.2_Z", True), ("a" * 64, True), ("a" * 65, False), ("a b", False), ("", False)],
 )
-def test_a_request_keeps_the_id_it_came_with_where_it_is_one(narrow, given, kept_as_given):
+def test_a_request_keeps_the_id_it_came_with_where_it_is_one(narrow, until, given, kept_as_given):
     reply = narrow.client.get("/v1/maps/nowhere", headers={"X-Request-Id": given})
     own = reply.headers["x-request-id"]
     assert (own == given) is kept_as_given
     assert reply.json()["instance"] == f"/requests/{own}"
     assert reply.headers["x-content-type-options"] == "nosniff"
-    noted = [line for line in narrow.log("request") if line["request_id"] == own]
+    # written once the answer has been sent
+    noted = until(lambda: [line for line in narrow.log("request") if line["request_id"] == own])
     assert {(line["method"], line["path"], line["status"]) for line in noted} == {
         ("GET", "/v1/maps/nowhere", 404)
     }

@@ -64,20 +64,20 @@ def test_every_refusal_is_a_problem(document):
 @pytest.mark.parametrize(
     ("method", "path", "statuses"),
     [
-        ("post", "/v1/maps", {200, 201, 400, 401, 409, 413, 415, 422, 500, 503}),
-        ("get", "/v1/maps/{map_name}", {200, 401, 404, 500, 503}),
-        ("delete", "/v1/maps/{map_name}", {204, 401, 404, 500, 503}),
-        ("post", "/v1/maps/{map_name}/frames",
-         {200, 201, 202, 400, 401, 404, 409, 413, 415, 422, 500, 503}),
-        ("get", "/v1/maps/{map_name}/frames", {200, 401, 404, 422, 500, 503}),
-        ("post", "/v1/maps/{map_name}/queries",
-         {200, 400, 401, 404, 413, 415, 422, 500, 503}),
-        ("get", "/v1/jobs/{job_id}", {200, 401, 404, 500, 503}),
+        ("post", "/v1/maps", {200, 201, 400, 409, 413, 415, 422}),
+        ("get", "/v1/maps/{map_name}", {200, 404}),
+        ("delete", "/v1/maps/{map_name}", {204, 404}),
+        ("post", "/v1/maps/{map_name}/frames", {200, 201, 202, 400, 404, 409, 413, 415, 422}),
+        ("get", "/v1/maps/{map_name}/frames", {200, 404, 422}),
+        ("post", "/v1/maps/{map_name}/queries", {200, 400, 404, 413, 415, 422}),
+        ("get", "/v1/jobs/{job_id}", {200, 404}),
+        ("get", "/healthz", {200}),
+        ("get", "/metrics", {200}),
     ],
 )  # fmt: skip
 def test_an_operation_declares_what_it_answers(document, method, path, statuses):
     declared = operations(document)[method, path]["responses"]
-    assert {int(status) for status in declared} == statuses
+    assert {int(status) for status in declared} == statuses | {401, 403, 421, 500, 503}
 
 
 def test_bodies_that_are_read_by_hand_are_described(document):
@@ -97,6 +97,13 @@ def test_bodies_that_are_read_by_hand_are_described(document):
     assert set(by_id) == {"frame_id"} | options
     assert (by_form["k"]["minimum"], by_form["k"]["maximum"], by_form["k"]["default"]) == (1, 50, 5)
     assert by_form["stages"]["type"] == "string"
+    assert {"items", "anyOf"} & set(by_form["stages"]) == set()
+    assert [one["type"] for one in by_id["stages"]["anyOf"]] == ["string", "array"]
+    made = operations(document)["post", "/v1/maps"]["requestBody"]
+    assert (made["required"], list(made["content"])) == (True, ["application/json"])
+    schema = made["content"]["application/json"]["schema"]
+    assert schema == {"$ref": "#/components/schemas/NewMap"}
+    assert schemas["NewMap"]["required"] == ["name"]
 
 
 def test_keys_are_asked_for_below_v1_alone(document):

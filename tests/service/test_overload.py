@@ -83,7 +83,7 @@ def test_as_many_wait_as_may_and_not_one_more(busy, until, refused):
         assert sorted(one.result().status_code for one in asked) == [200, 200, 503, 503, 503]
 
 
-def test_who_hangs_up_while_waiting_has_sent_a_frame_nevertheless(busy, small_shots):
+def test_who_hangs_up_while_waiting_has_sent_a_frame_nevertheless(busy, until, small_shots):
     form = small_shots[7].form()
     request = busy.client.build_request(
         "POST", "/v1/maps/hall/frames", **form, headers={"Prefer": "wait=60"}
@@ -98,17 +98,14 @@ def test_who_hangs_up_while_waiting_has_sent_a_frame_nevertheless(busy, small_sh
             page = busy.client.get("/v1/maps/hall/frames").json()
             return {one["frame_id"] for one in page["items"]} - before
 
-        while not came():
-            pass
-    (frame_id,) = came()
+        (frame_id,) = until(came)
     again = busy.client.post("/v1/maps/hall/frames", **form)
     assert (again.status_code, again.json()["frame_id"]) == (200, frame_id)
 
     def state() -> str:
         return str(busy.client.get(f"/v1/maps/hall/frames/{frame_id}").json()["state"])
 
-    while state() in ("received", "signing"):
-        pass
+    until(lambda: state() not in ("received", "signing"))
     assert state() == "indexed"
     assert busy.client.get("/healthz").status_code == 200
     assert [line for line in busy.log() if line["level"] == "error"] == []

@@ -87,11 +87,11 @@ def test_a_view_is_found_with_its_pose(served, rooms, moved):
     truth = np.array(moved.pose)  # the same sensor at the same place
     T, in_map = matrix(best["transform"]), matrix(best["pose_in_map"])
     np.testing.assert_allclose(in_map, truth @ T, atol=1e-9)  # pose of the match, then T
-    assert best["pose_in_map"]["parent_frame"] == "room 0"
+    assert best["pose_in_map"]["parent_frame"] == "r1/room 0"
     for pose in (in_map, matrix(answer["location"]["pose"])):
         metres, degrees = apart(truth, pose)
         assert (metres < 0.05, degrees < 5) == (True, True), (metres, degrees)
-    assert answer["location"]["pose"]["parent_frame"] == "room 0"
+    assert answer["location"]["pose"]["parent_frame"] == "r1/room 0"
     counts = answer["counts"]
     accepted = sum(m["validation"]["status"] == "accepted" for m in answer["matches"])
     assert (counts["map"], counts["compared"], counts["ranked"]) == (4, 4, 4)
@@ -158,6 +158,13 @@ def test_stages_and_k_are_as_asked(served, rooms, moved):
     assert [match["selected"] for match in diverse["matches"]] == [True] * 3
     assert diverse["matches"][0]["diversity_gain"] == 1.0
     assert (diverse["counts"]["selected"], diverse["counts"]["validated"]) == (3, 0)
+    told = []
+    for stages in ("retrieve, diversify", ["retrieve", "diversify"]):  # JSON takes text as well
+        body = {"frame_id": rooms["ids"][0], "k": 2, "stages": stages}
+        reply = served.client.post(f"{rooms['path']}/queries", json=body)
+        assert (reply.status_code, reply.json()["counts"]["selected"]) == (200, 2)
+        told.append(timeless(reply.json()))
+    assert told[0] == told[1]
     checked = asked(served, rooms, moved, stages="retrieve,validate", k=1)
     assert checked["counts"]["accepted"] == 1
     assert checked["counts"]["selected"] == 0

@@ -150,13 +150,18 @@ BODIES = {
     b'{"frame_id": "\\ud800"}': (400, "malformed-body", "not JSON"),
     b"[" * 5000: (400, "malformed-body", "not JSON"),
     b'{"k": ' + b"9" * 5000 + b"}": (400, "malformed-body", "not JSON"),
-    b" " * (1 << 18) + b" ": (400, "malformed-body", "more than 262144 bytes"),
+    b" " * (1 << 18) + b" ": (413, "too-large", "more than 262144 bytes"),
     b"{}": (422, "invalid-request", "names no frame"),
     b'{"frame_id": 7}': (422, "invalid-request", "names no frame"),
     b'{"frame_id": "a", "k": 0}': (422, "invalid-request", "k: "),
     b'{"frame_id": "a", "k": NaN}': (422, "invalid-request", "k: "),
     b'{"frame_id": "a", "k": 1e999}': (422, "invalid-request", "k: "),
-    b'{"frame_id": "a", "stages": "retrieve"}': (422, "invalid-request", "stages: "),
+    b'{"frame_id": "a", "stages": "retrieve"}': (404, "unknown-frame", "There is no frame"),
+    b'{"frame_id": "a", "stages": "fly, retrieve"}': (
+        422, "invalid-request", "stages.0: Input should be 'retrieve', 'diversify' or 'validate'."),
+    b'{"frame_id": "a", "stages": "validate"}': (422, "invalid-request", "begins with retrieve"),
+    b'{"frame_id": "a", "stages": 7}': (422, "invalid-request", "stages: give a list of stages, "),
+    b'{"frame_id": "a", "stages": null}': (422, "invalid-request", "or a text with commas"),
     b'{"frame_id": "a", "fly": 1}': (422, "invalid-request", "fly: "),
     b'{"frame_id": "../a\\u0000"}': (404, "unknown-frame", "There is no frame"),
 }  # fmt: skip
@@ -167,6 +172,7 @@ def test_json_that_asks_nothing_is_refused(served, hall, refused, number):
     content, (status, kind, text) = list(BODIES.items())[number]
     answer = served.client.post(f"{hall}/queries", content=content, headers=JSON)
     refused(answer, status, kind, text)
+    assert "tuple" not in answer.text  # callers need not know Python
 
 
 @pytest.mark.parametrize(
@@ -176,7 +182,8 @@ def test_json_that_asks_nothing_is_refused(served, hall, refused, number):
         (b"[" * 100_000, JSON, 400, "malformed-body"), (b"[]", JSON, 422, "invalid-request"),
         (b"{}", JSON, 422, "invalid-request"), (b'{"name": 7}', JSON, 422, "invalid-request"),
         (b'{"name": "a", "fly": 1}', JSON, 422, "invalid-request"),
-        (b'{"name": "a", "title": "\\ud800"}', JSON, 422, "invalid-request"),
+        (b'{"name": "a", "title": "\\ud800"}', JSON, 400, "malformed-body"),
+        (b"", JSON, 400, "malformed-body"), (b" " * (1 << 18) + b" ", JSON, 413, "too-large"),
         (b'{"name": "a", "model": "big"}', JSON, 422, "invalid-request"),
         (b'{"name": "a"}', {}, 415, "unsupported-type"), (b"", {}, 415, "unsupported-type"),
         (b'{"name": "a"}', {"content-type": "text/plain"}, 415, "unsupported-type"),

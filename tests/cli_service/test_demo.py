@@ -1,0 +1,180 @@
+"""`sceneprint demo` from start to end, and that it leaves nothing however it ends."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sceneprint.cli import served
+from sceneprint.cli.choosing import choose_frames
+from sceneprint.cli.demo_map import fill
+from sceneprint.cli.served import serving
+from sceneprint.cli.signals import ended_by_signals
+from sceneprint.client import Client
+from sceneprint.datasets import read_pose, write_pose
+from sceneprint.errors import ServiceError, Unreachable
+from sceneprint.schemas import JobState
+
+
+@pytest.fixture
+def demo(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
+    """Starts the demo with a temporary folder of its own."""
+    (tmp_path / "tmp").mkdir()
+
+    def start(*arguments: object) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-m", "sceneprint", "demo", "--workers", "1",
+             "--out", str(tmp_path / "out"), *map(str, arguments)],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, "TMPDIR": str(tmp_path / "tmp"), "PYTHONUNBUFFERED": "1"},
+        )  # fmt: skip
+
+    return start
+
+
+def environment_of(process: Path) -> bytes:
+    try:
+        return (process / "environ").read_bytes()
+    except OSError:  # gone, or another user's
+        return b""
+
+
+def processes_with(temporary: Path) -> list[Path]:
+    """Processes that were started with that temporary folder."""
+    mark = f"TMPDIR={temporary}".encode()
+    return [p for p in Path("/proc").glob("[0-9]*") if mark in environment_of(p)]
+
+
+def leaves_nothing(temporary: Path) -> None:
+    deadline = time.monotonic() + 10  # a resource tracker ends after its parent
+    while (left := processes_with(temporary)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert left == []
+    assert list(temporary.iterdir()) == []
+
+
+def test_demo_goes_the_whole_way_and_leaves_nothing(
+    demo: Callable[..., subprocess.Popen[str]], tmp_path: Path, rooms: Path
+) -> None:
+    process = demo("--dataset", rooms)
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    service, uploaded, queries, head, *lines = out.splitlines()
+    assert re.match(r"service: http://127\.0\.0\.1:\d+, an empty folder, 1 worker", service)
+    assert uploaded.startswith("map: 4 of 4 frames uploaded, signed and indexed in ")
+    assert queries.startswith("queries: 2: ")
+    assert head.split()[:4] == ["first", "answer", "within", "5cm/5deg"]
+    assert [line.split()[0] for line in lines[:5]] == ["R", "VR", "DR", "VDR", "pose"]
+    assert lines[-1].startswith("next: `sceneprint serve`")
+    leaves_nothing(tmp_path / "tmp")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("stage", ["building", "serving"])
+def test_demo_that_is_stopped_leaves_nothing(
+    demo: Callable[..., subprocess.Popen[str]], tmp_path: Path, rooms: Path, stage: str,
+    number: signal.Signals,
+) -> None:  # fmt: skip
+    temporary = tmp_path / "tmp"
+    process = demo(*(("--dataset", rooms) if stage == "serving" else ("--rooms", 2)))
+    assert process.stdout is not None
+    if stage == "serving":
+        assert process.stdout.readline().startswith("service: ")
+    else:
+        deadline = time.monotonic() + 60
+        while not any(temporary.glob("sceneprint-demo-*/building/*")):
+            assert time.monotonic() < deadline, "no building is begun"
+            time.sleep(0.01)
+    process.send_signal(number)
+    process.send_signal(number)  # as `make` does: it passes on what the terminal has sent before
+    _, err = process.communicate(timeout=120)
+    assert (process.returncode, err) == (130, "sceneprint demo: stopped\n")
+    leaves_nothing(temporary)
+
+
+def test_demo_needs_frames_for_the_map_and_to_look_up(
+    demo: Callable[..., subprocess.Popen[str]], rooms: Path
+) -> None:
+    process = demo("--dataset", rooms / "room-0/seq-01/frame-000000.depth.png")
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert len(err.splitlines()) == 1
+    assert "has 1 frames for the map and 0 to look up" in err
+
+
+@pytest.fixture
+def twice(rooms: Path, tmp_path: Path) -> Path:
+    """A sequence whose first depth frame comes twice, with two poses; 5 frames, 3 of the map."""
+    folder = tmp_path / "twice"
+    shutil.copytree(rooms / "room-0" / "seq-01", folder)
+    for ours, of in ((1, 0), (3, 1), (4, 2)):
+        for end in ("depth.png", "pose.txt"):
+            source = rooms / "room-0" / "seq-01" / f"frame-{of:06d}.{end}"
+            shutil.copy(source, folder / f"frame-{ours:06d}.{end}")
+    pose = read_pose(folder / "frame-000000.pose.txt")
+    pose[0, 3] += 1.0
+    write_pose(folder / "frame-000001.pose.txt", np.asarray(pose))
+    return folder
+
+
+def test_what_comes_twice_is_left_out_once(
+    twice: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    choice = choose_frames(twice)
+    assert len(choice.database) == 3
+    with Client.embedded(tmp_path / "data") as client:
+        known = fill(client, "compact", choice)
+    assert len(known) == 2
+    said = capsys.readouterr()
+    assert re.search(r"left out: .*frame-00000[01]: Frame \w+ has the same content", said.out)
+    assert "map: 2 of 3 frames uploaded" in said.out
+
+
+def test_frames_that_are_not_signed_in_time_end_it(
+    rooms: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited = [SimpleNamespace(state=one) for one in (JobState.SUCCEEDED, JobState.RUNNING)]
+    monkeypatch.setattr(Client, "wait", lambda *_, **__: waited)
+    with Client.embedded(tmp_path) as client, pytest.raises(ServiceError, match="1 of 2 frames"):
+        fill(client, "compact", choose_frames(rooms))
+
+
+def test_signals_that_are_ignored_stay_so_and_others_are_given_back() -> None:
+    before = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGHUP)]
+    try:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as `nohup` does
+        with ended_by_signals():
+            signal.raise_signal(signal.SIGHUP)
+        with pytest.raises(KeyboardInterrupt), ended_by_signals():
+            signal.raise_signal(signal.SIGTERM)
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        for number, handler in zip((signal.SIGTERM, signal.SIGHUP), before, strict=True):
+            signal.signal(number, handler)
+
+
+def test_a_service_that_says_nothing_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In place of Python, something that never says that it serves, nor ends."""
+    silent = tmp_path / "silent"
+    silent.write_text(f"#!/bin/sh\necho $$ >{tmp_path}/pid\nprintf 'sceneprint: '\nexec sleep 99\n")
+    silent.chmod(0o700)
+    monkeypatch.setattr(sys, "executable", str(silent))
+    monkeypatch.setattr(served, "START_S", 0.5)
+    with pytest.raises(Unreachable, match=r"did not start within 0\.5 s"), serving(tmp_path, 1):
+        pass
+    assert not Path("/proc", (tmp_path / "pid").read_text().strip()).exists()

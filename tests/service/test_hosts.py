@@ -1,0 +1,83 @@
+"""A service for its own machine alone is not reached through another's page or name."""
+
+from __future__ import annotations
+
+import socket
+
+import httpx
+import pytest
+
+from sceneprint.settings import is_loopback
+
+HERE = ["localhost", "LocalHost", "127.0.0.1", "127.8.9.10", "[::1]", "[0:0:0:0:0:0:0:1]"]
+ELSEWHERE = [
+    "evil.example", "127.0.0.1.evil.example", "localhost.evil.example", "192.168.1.7", "0.0.0.0",
+    "[fe80::1]", "[::]", "127.0.0.1@evil.example", "evil.example:80:8008", "::1", "[::1",
+    "2130706433", "localhost,evil.example", "", ":8008", "\xe9",
+]  # fmt: skip
+PATHS = ["/healthz", "/readyz", "/metrics", "/openapi.json", "/docs", "/v1/maps", "/v1/nothing"]
+
+
+@pytest.mark.parametrize("port", ["", ":8008", ":1"])
+@pytest.mark.parametrize("host", HERE)
+def test_by_its_own_names_it_answers_on_any_port(served, host, port):
+    assert served.client.get("/v1/maps", headers={"Host": host + port}).status_code == 200
+    given = {"Host": host + port, "Origin": f"http://{host}{port}"}
+    assert served.client.get("/v1/maps", headers=given).status_code == 200
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_by_another_name_nothing_is_told(served, refused, path):
+    answer = served.client.get(path, headers={"Host": "evil.example:8008"})
+    problem = refused(answer, 421, "misdirected", "for the host 'evil.example:8008'")
+    assert (problem["title"], answer.headers["connection"]) == ("Misdirected", "close")
+    answer = served.client.get(path, headers={"Origin": "https://evil.example"})
+    refused(answer, 403, "foreign-origin", "A page of 'https://evil.example'")
+
+
+@pytest.mark.parametrize("host", ELSEWHERE)
+def test_what_only_looks_like_a_name_of_ours_is_none(served, refused, host):
+    given = {"Host": host.encode("latin-1")}
+    refused(served.client.get("/v1/maps", headers=given), 421, "misdirected")
+    for origin in (f"http://{host}", host):
+        given = {"Origin": origin.encode("latin-1")}
+        refused(served.client.get("/v1/maps", headers=given), 403, "foreign-origin")
+
+
+@pytest.mark.parametrize("origin", ["null", "file://", "//localhost/x"])
+def test_a_page_without_a_host_is_a_strangers(served, refused, origin):
+    refused(served.client.get("/v1/maps", headers={"Origin": origin}), 403, "foreign-origin")
+
+
+def test_a_page_makes_nothing_and_its_body_is_not_waited_for(served, refused):
+    given = {"Origin": "http://evil.example", "Content-Type": "application/json"}
+    answer = served.client.post("/v1/maps", content=b'{"name": "stolen"}', headers=given)
+    refused(answer, 403, "foreign-origin")
+    refused(served.client.get("/v1/maps/stolen"), 404, "unknown-map")
+    address = httpx.URL(served.url)
+    head = b"POST /v1/maps HTTP/1.1\r\nHost: evil.example\r\nContent-Length: 99\r\n\r\n"
+    with socket.create_connection((address.host, address.port), timeout=60) as wire:
+        wire.sendall(head)  # and nothing of the body
+        assert wire.recv(65536).startswith(b"HTTP/1.1 421 ")
+
+
+def test_an_old_client_that_names_no_host_is_no_browser(served):
+    address = httpx.URL(served.url)
+    with socket.create_connection((address.host, address.port), timeout=60) as wire:
+        wire.sendall(b"GET /healthz HTTP/1.0\r\n\r\n")
+        assert wire.recv(65536).startswith(b"HTTP/1.1 200 ")
+
+
+def test_where_keys_are_asked_for_any_name_will_do(begin, refused):
+    wide = begin("--host", "0.0.0.0", "--workers", "0")
+    wide.client.base_url = wide.url.replace("0.0.0.0", "127.0.0.1")
+    for given in ({"Host": "map.example"}, {"Origin": "https://map.example"}):
+        assert wide.client.get("/healthz", headers=given).status_code == 200
+        refused(wide.client.get("/v1/maps", headers=given), 401, "key-required")
+
+
+def test_a_loopback_host_is_told_by_name_or_address():
+    here = ["localhost", "LOCALHOST", "127.0.0.1", "127.1.2.3", "::1"]
+    assert [host for host in here if not is_loopback(host)] == []
+    others = ["", "0.0.0.0", "::", "10.0.0.1", "localhost.evil", "127.0.0.1:80", "[::1]", "x"]
+    assert [host for host in others if is_loopback(host)] == []

@@ -1,0 +1,214 @@
+"""What is read of a request and when: nothing before its key and its place, and never too much.
+
+The application runs in this process, and a test hands it the body piece by piece.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import json
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from tempfile import SpooledTemporaryFile
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import starlette.formparsers
+from fastapi import FastAPI
+
+from sceneprint.schemas import Added
+from sceneprint.settings import Settings
+from service.app import create_app
+from service.routes import frames
+
+JSON, FORM = "application/json", "multipart/form-data; boundary=x"
+#: The beginning of a form whose file is larger than is kept in memory, and its end.
+HEAD = b'--x\r\nContent-Disposition: form-data; name="frame"; filename="a"\r\n\r\n' + bytes(1 << 21)
+END = b"\r\n--x--\r\n"
+
+
+class Asked:
+    """One request that is being answered, and how many pieces of its body were asked for."""
+
+    def __init__(self, app: FastAPI, path: str, kind: str, pieces: list[bytes]) -> None:
+        self.read, self.status, self.body = 0, 0, b""
+        self._pieces, self.more = pieces, asyncio.Event()
+        self.more.set()
+        headers = [(b"host", b"localhost"), (b"content-type", kind.encode())]
+        scope = {
+            "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST",
+            "scheme": "http", "path": path, "raw_path": path.encode(), "query_string": b"",
+            "headers": headers, "server": ("localhost", 80), "client": ("127.0.0.1", 9),
+        }  # fmt: skip
+        self._done: Awaitable[None] = asyncio.ensure_future(app(scope, self._receive, self._send))
+
+    async def _receive(self) -> dict[str, Any]:
+        self.read += 1
+        piece = self._pieces.pop(0)
+        if not self._pieces:
+            await self.more.wait()  # the last piece comes when the test lets it
+        return {"type": "http.request", "body": piece, "more_body": bool(self._pieces)}
+
+    async def _send(self, message: Any) -> None:
+        self.status = message.get("status", self.status)
+        self.body += message.get("body", b"")
+
+    async def answer(self) -> dict[str, Any]:
+        """What it is answered with."""
+        await self._done
+        found: dict[str, Any] = json.loads(self.body)
+        return found
+
+    async def problem(self) -> dict[str, Any]:
+        """What it is refused with."""
+        found = await self.answer()
+        assert found["status"] == self.status
+        return found
+
+
+@pytest.fixture
+def inside(tmp_path: Path) -> Iterator[Callable[..., Any]]:
+    """Runs a test's coroutine with an application of these settings."""
+
+    def run(test: Callable[[FastAPI], Awaitable[Any]], **settings: Any) -> Any:
+        app = create_app(Settings(data_dir=tmp_path, **settings))
+
+        async def whole() -> Any:
+            async with app.router.lifespan_context(app):
+                return await test(app)
+
+        return asyncio.run(whole())
+
+    return run
+
+
+@pytest.mark.parametrize("path", ["/v1/maps", "/v1/maps/a/frames", "/v1/maps/a/queries"])
+def test_without_a_key_not_a_byte_is_read(inside, path):
+    async def test(app: FastAPI) -> None:
+        for kind in (JSON, FORM):
+            asked = Asked(app, path, kind, [b"[" * 1000])
+            assert (await asked.problem())["type"] == "/problems/key-required"
+            assert asked.read == 0
+
+    inside(test, host="0.0.0.0")
+
+
+@pytest.mark.parametrize("path", ["/v1/maps", "/v1/maps/a/queries"])
+def test_of_json_no_more_is_read_than_anyone_has_to_say(inside, path):
+    async def test(app: FastAPI) -> None:
+        asked = Asked(app, path, JSON, [b" " * (1 << 16)] * 100)
+        problem = await asked.problem()
+        assert (problem["status"], problem["type"]) == (413, "/problems/too-large")
+        assert asked.read == 5  # four pieces are 256 KiB
+
+    inside(test)
+
+
+def test_a_map_is_made_off_the_event_loop(inside, monkeypatch):
+    async def test(app: FastAPI) -> None:
+        engine, threads = app.state.context.engine, []
+        make = engine.create_map
+
+        def noted(new: Any) -> Any:
+            threads.append(threading.current_thread())
+            return make(new)
+
+        monkeypatch.setattr(engine, "create_map", noted)
+        asked = Asked(app, "/v1/maps", JSON, [b'{"name": "hall"}'])
+        assert (await asked.answer())["name"] == "hall"
+        assert asked.status == 201
+        assert [one is threading.main_thread() for one in threads] == [False]
+
+    inside(test)
+
+
+def test_at_most_twenty_fields_are_listed(inside):
+    async def test(app: FastAPI) -> None:
+        wrong = {f"x{i}": 1 for i in range(300)} | {"y" * 999: 1, "name": "a"}
+        problem = await Asked(app, "/v1/maps", JSON, [json.dumps(wrong).encode()]).problem()
+        assert [one["field"] for one in problem["errors"]] == [f"x{i}" for i in range(20)]
+        assert "(and 298 more; 20 of 301 are listed)" in problem["detail"]
+        few = {f"x{i}": 1 for i in range(19)} | {"y" * 999: 1, "name": "a"}
+        problem = await Asked(app, "/v1/maps", JSON, [json.dumps(few).encode()]).problem()
+        assert [len(one["field"]) for one in problem["errors"]][18:] == [3, 80]
+        assert "(and 17 more). See" in problem["detail"]
+
+    inside(test)
+
+
+def test_uploads_that_are_still_read_take_places(inside):
+    async def test(app: FastAPI) -> None:
+        path = "/v1/maps/a/frames"
+        slow = [Asked(app, path, FORM, [HEAD, END]) for _ in range(3)]
+        for one in slow:
+            one.more.clear()
+        while sum(one.read for one in slow) < 6:
+            await asyncio.sleep(0.01)
+        for kind in ("frames", "queries"):
+            late = Asked(app, f"/v1/maps/a/{kind}", FORM, [HEAD, END])
+            assert (await late.problem())["type"] == "/problems/busy"
+            assert late.read == 0  # and so nothing is spooled
+        by_id = Asked(app, "/v1/maps/a/queries", JSON, [b'{"frame_id": "a"}'])
+        assert ((await by_id.problem())["status"], by_id.read) == (503, 0)
+        for one in slow:
+            one.more.set()
+            assert (await one.problem())["detail"].startswith("The form has no field `meta`.")
+        for _ in range(4):  # all places are free again
+            after = Asked(app, "/v1/maps/a/queries", JSON, [b'{"frame_id": "a"}'])
+            assert (await after.problem())["type"] == "/problems/unknown-map"
+
+    inside(test, concurrency=1, waiting=2)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.ENOENT])
+def test_where_there_is_no_room_to_read_nothing_is_taken(inside, monkeypatch, caplog, number):
+    class Full(SpooledTemporaryFile[bytes]):
+        def write(self, data: Any) -> int:
+            raise OSError(number, "no room in /the/folder")
+
+    monkeypatch.setattr(starlette.formparsers, "SpooledTemporaryFile", Full)
+
+    async def test(app: FastAPI) -> None:
+        for _ in range(3):  # each gives its place back
+            asked = Asked(app, "/v1/maps/a/frames", FORM, [HEAD, END])
+            problem = await asked.problem()
+            assert (problem["status"], problem["type"]) == (503, "/problems/unusable-store")
+            assert "folder" not in problem["detail"]
+
+    inside(test, concurrency=1, waiting=0)
+    told = [one for one in caplog.records if one.message == "request failed"]
+    assert ["no room in /the/folder" in str(vars(one)["error"]) for one in told] == [True] * 3
+
+
+@pytest.mark.parametrize(
+    ("hung_up_after", "looks"), [(3, [0.03, 0.045, 0.0675]), (0, []), (99, None)]
+)
+def test_a_wait_looks_less_and_less_often_and_ends_with_its_caller(
+    monkeypatch, hung_up_after, looks
+):
+    pauses: list[float] = []
+    clock = SimpleNamespace(monotonic=lambda: sum(pauses))
+
+    async def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+
+    async def is_disconnected() -> bool:
+        return len(pauses) >= hung_up_after
+
+    monkeypatch.setattr(frames, "time", clock)
+    monkeypatch.setattr(frames.anyio, "sleep", sleep)
+    frame = SimpleNamespace(state="received", reason=None)
+    here: Any = SimpleNamespace(engine=SimpleNamespace(get_frame=lambda *_: frame))
+    request: Any = SimpleNamespace(is_disconnected=is_disconnected)
+    added = Added(frame_id="f", job_id="j", state="received", reason=None)
+    settled = asyncio.run(frames._settled(request, here, "m", added, 10.0))
+    assert settled.state == "received"
+    if looks is not None:
+        assert pauses == pytest.approx(looks)
+    else:  # it waits for all of the time, and never longer than half a second at once
+        assert sum(pauses) == pytest.approx(10.0)
+        assert pauses == sorted(pauses[:-1]) + pauses[-1:]
+        assert (max(pauses), len(pauses) < 30) == (0.5, True)
