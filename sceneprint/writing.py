@@ -37,16 +37,7 @@ def write_whole(path: Path, data: bytes) -> None:
     ------
     OSError : it cannot be written; nothing is left behind.
     """
-    part = _beside(path)
-    try:
-        part.write_bytes(data)
-        os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise type(error)(error.errno, error.strerror, str(path)) from error
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    _put(path, data, durable=False)
 
 
 def write_durable(path: Path, data: bytes) -> None:
@@ -59,17 +50,23 @@ def write_durable(path: Path, data: bytes) -> None:
 
     Raises
     ------
-    OSError : it cannot be written; nothing is left behind.
+    OSError : it cannot be written, and nothing is left behind; or the folder cannot be synced, and
+        the file is there, but might not survive.
     """
+    _put(path, data, durable=True)
+    sync_folder(path.parent)
+    sync_folder(path.parent.parent)  # in which the folder itself may be new
+
+
+def _put(path: Path, data: bytes, *, durable: bool) -> None:
     part = _beside(path)
     try:
         with part.open("wb") as file:
             file.write(data)
-            file.flush()
-            os.fsync(file.fileno())  # before its name: a name must never lead to half a file
+            if durable:  # before its name: a name must never lead to half a file
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
-        sync_folder(path.parent)
-        sync_folder(path.parent.parent)  # in which the folder itself may be new
     except OSError as error:
         part.unlink(missing_ok=True)
         raise type(error)(error.errno, error.strerror, str(path)) from error
@@ -79,10 +76,17 @@ def write_durable(path: Path, data: bytes) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder survive the loss of power."""
+    """Make the names in a folder survive the loss of power.
+
+    Raises
+    ------
+    OSError : it cannot; names the folder.
+    """
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(folder)) from error
     finally:
         os.close(descriptor)
 
