@@ -70,15 +70,12 @@ async def add_frame(
             lambda: here.engine.add_frame(map_name, upload.file.read(), upload.meta)
         )
     response.headers["Location"] = f"/v1/jobs/{added.job_id}"
-    if is_new:
-        wait_s = _wait(prefer)
-        if wait_s > 0:
-            response.headers["Preference-Applied"] = f"wait={wait_s:g}"
-            added = await _settled(request, here, map_name, added, wait_s)
-        is_over = added.state not in (FrameState.RECEIVED, FrameState.SIGNING)
-        response.status_code = 201 if is_over else 202
-    else:
-        response.status_code = 200
+    wait_s = _wait(prefer)
+    if wait_s > 0:
+        response.headers["Preference-Applied"] = f"wait={wait_s:g}"
+        added = await _settled(request, here, map_name, added, wait_s)
+    is_over = added.state not in (FrameState.RECEIVED, FrameState.SIGNING)
+    response.status_code = 200 if not is_new else 201 if is_over else 202
     return added
 
 

@@ -116,3 +116,15 @@ def test_where_none_may_wait_one_is_still_worked_on(begin, make_map, small_shots
     path = make_map(server, "hall")
     sent = [server.client.post(f"{path}/frames", **shot.form()) for shot in small_shots[:3]]
     assert [answer.status_code for answer in sent] == [202, 202, 202]
+
+
+def test_waiting_for_a_frame_that_is_there_and_not_signed_yet(begin, make_map, small_shots):
+    """Sent again by a robot that lost the first answer, it is waited for all the same."""
+    server = begin("--workers", "0")
+    path, shot = make_map(server, "waits"), small_shots[0]
+    first = server.client.post(f"{path}/frames", **shot.form())
+    assert (first.status_code, first.headers.get("preference-applied")) == (202, None)
+    again = server.client.post(f"{path}/frames", headers={"Prefer": "wait=1"}, **shot.form())
+    assert (again.status_code, again.headers["preference-applied"]) == (200, "wait=1")
+    assert again.json() == first.json()
+    assert again.json()["state"] == "received"
