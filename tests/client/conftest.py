@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -33,11 +34,13 @@ UPLOAD_BYTES = 2 << 20
 def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """One service with one worker for all tests; each uses maps of its own."""
     data = tmp_path_factory.mktemp("service")
-    with pytest.MonkeyPatch.context() as patch, (data / "log").open("wb") as log:
-        patch.setenv("SCENEPRINT_UPLOAD_BYTES", str(UPLOAD_BYTES))
+    with (data / "log").open("wb") as log:
         arguments = ["serve", "--port", "0", "--data", str(data), "--workers", "1"]
         process = subprocess.Popen(
-            [sys.executable, "-m", "sceneprint", *arguments], stdout=subprocess.PIPE, stderr=log
+            [sys.executable, "-m", "sceneprint", *arguments],
+            env={**os.environ, "SCENEPRINT_UPLOAD_BYTES": str(UPLOAD_BYTES)},  # its alone
+            stdout=subprocess.PIPE,
+            stderr=log,
         )
         try:
             assert process.stdout is not None
