@@ -13,7 +13,7 @@ import time
 import uuid
 from dataclasses import dataclass
 
-from sqlalchemy import Connection, and_, func, insert, or_, select, update
+from sqlalchemy import ColumnElement, Connection, and_, func, insert, or_, select, update
 
 from sceneprint.errors import LostLease, UnknownJob
 from sceneprint.schemas import JobState
@@ -214,7 +214,7 @@ def count_jobs(connection: Connection) -> dict[str, int]:
     return {row[0]: row[1] for row in rows}
 
 
-def _due(now: float):  # type: ignore[no-untyped-def]
+def _due(now: float) -> ColumnElement[bool]:
     waiting = and_(jobs.c.state == JobState.QUEUED, jobs.c.run_after <= now)
     silent = and_(jobs.c.state == JobState.RUNNING, jobs.c.leased_until < now)
     return or_(waiting, silent)
