@@ -94,14 +94,16 @@ def run(store: Store, signers: Signers, work: Work, lease_s: float) -> JobState 
         _store(store, work, made)
         state = JobState.SUCCEEDED
     except LostLease as error:
-        if made is not None:
-            sweep(store, [made.geometry])
         log.warning("lease lost", extra=_about(work, error=str(error)))
-        return None
+        state = None
     except FrameError as error:
         state = _reject(store, work, error)
     except Exception as error:
         state = _break(store, work, error)
+    if made is not None and state != JobState.SUCCEEDED:
+        sweep(store, [made.geometry])  # nothing came to refer to it
+    if state is None:
+        return None
     milliseconds = round(1e3 * (time.perf_counter() - start), 1)
     log.info("job %s", state, extra=_about(work, state=state, milliseconds=milliseconds))
     return state
@@ -139,7 +141,14 @@ def _store(store: Store, work: Work, made: StoredSignature) -> None:
 def _reject(store: Store, work: Work, error: FrameError) -> JobState | None:
     """A frame that holds nothing to sign: it would hold nothing the next time either."""
     reason = str(error).removeprefix(f"{work.frame.id}: ")
-    return _end(store, work, JobState.FAILED, FrameState.REJECTED, reason)
+    try:
+        with store.database.write() as connection:
+            queue.finish(connection, work.claim, JobState.FAILED, reason)
+            set_state(connection, work.frame.number, FrameState.REJECTED, reason)
+            tell(connection, "frame.rejected", work.map.name, work.frame.id, work.claim.job.id)
+    except LostLease:
+        return None
+    return JobState.FAILED
 
 
 def _break(store: Store, work: Work, error: Exception) -> JobState | None:
@@ -156,19 +165,6 @@ def _break(store: Store, work: Work, error: Exception) -> JobState | None:
             set_state(connection, work.frame.number, after, reason if dead else None)
             if dead:
                 tell(connection, "frame.failed", work.map.name, work.frame.id, work.claim.job.id)
-    except LostLease:
-        return None
-    return state
-
-
-def _end(
-    store: Store, work: Work, state: JobState, after: FrameState, reason: str
-) -> JobState | None:
-    try:
-        with store.database.write() as connection:
-            queue.finish(connection, work.claim, state, reason)
-            set_state(connection, work.frame.number, after, reason)
-            tell(connection, f"frame.{after}", work.map.name, work.frame.id, work.claim.job.id)
     except LostLease:
         return None
     return state

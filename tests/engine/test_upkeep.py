@@ -6,15 +6,17 @@ import shutil
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine, readers
+from sceneprint.engine import Engine, answers, readers
 from sceneprint.engine import engine as engines
 from sceneprint.errors import UnreadableModel
+from sceneprint.index import search
 from sceneprint.schemas import JobState, NewMap, Query
 from sceneprint.store.tables import models
 
@@ -130,3 +132,23 @@ def test_a_model_that_cannot_be_read_costs_its_maps_alone(
     assert fresh.query_upload("hall", uploads[0].data, uploads[0].meta, ALL).counts.map == 1
     with pytest.raises(UnreadableModel):
         fresh.query_upload("old", uploads[0].data, uploads[0].meta, ALL)
+
+
+@pytest.mark.parametrize(
+    ("whole", "exact", "compared"), [(12, False, 12), (11, True, 12), (11, False, 3)]
+)
+def test_a_shortlist_is_taken_in_large_maps_alone_and_where_exactness_is_not_asked_for(
+    signed_folder: Path, tmp_path: Path, make_engine: Make, uploads: Any,
+    monkeypatch: pytest.MonkeyPatch, whole: int, exact: bool, compared: int,
+) -> None:  # fmt: skip
+    shutil.copytree(signed_folder, tmp_path / "data")
+    engine = make_engine(tmp_path / "data", tail_frames=1)
+    assert engine.publish_due() == 1
+    monkeypatch.setattr(answers, "search", partial(search, shortlist=3))
+    monkeypatch.setattr(answers, "ranking_size", lambda n: min(n, 3))
+    monkeypatch.setattr(answers, "WHOLE", whole)
+    query = Query(stages=("retrieve",), k=3, exact=exact)
+    answer = engine.query_upload("hall", uploads[4].data, uploads[4].meta, query)
+    assert (answer.counts.map, answer.counts.compared) == (12, compared)
+    assert (answer.exact, answer.index_generation) == (compared == 12, 1)
+    assert answer.matches[0].distance == 0

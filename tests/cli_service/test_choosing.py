@@ -1,0 +1,65 @@
+"""Which frames the demo keeps, and which it looks up."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sceneprint.cli.choosing import choose_frames
+from sceneprint.datasets import write_depth_png
+from sceneprint.errors import DatasetError
+
+
+def sequence(folder: Path, frames: int) -> None:
+    """Frames that are named and never read."""
+    folder.mkdir(parents=True)
+    write_depth_png(folder / "frame-000000.depth.png", np.ones((2, 2), np.float32), 1000.0)
+    content = (folder / "frame-000000.depth.png").read_bytes()
+    for i in range(1, frames):
+        (folder / f"frame-{i:06d}.depth.png").write_bytes(content)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    camera = {"width": 2, "height": 2, "fx": 1, "fy": 1, "cx": 0, "cy": 0}
+    (scene / "intrinsics.json").write_text(json.dumps(camera))
+    return scene
+
+
+def numbers(chosen: list) -> list[int]:
+    return [int(one.reference.name[-6:]) for one in chosen]
+
+
+def test_without_split_files_the_first_60_percent_are_the_map_and_5_are_left_out(
+    scene: Path,
+) -> None:
+    sequence(scene / "seq-01", 100)
+    choice = choose_frames(scene)
+    assert numbers(choice.database) == list(range(60))
+    assert numbers(choice.queries) == list(range(65, 100))
+    assert {(one.parent, one.session) for one in choice.queries} == {("scene", "seq-01")}
+
+
+def test_long_sequences_are_thinned_evenly(scene: Path) -> None:
+    sequence(scene / "seq-01", 1000)
+    choice = choose_frames(scene)
+    assert numbers(choice.database) == list(range(0, 600, 2))  # 300 at most
+    assert numbers(choice.queries) == list(range(650, 1000, 2))  # 180 at most
+
+
+def test_split_files_decide_where_they_are(scene: Path) -> None:
+    sequence(scene / "seq-01", 3)
+    sequence(scene / "seq-02", 2)
+    (scene / "TrainSplit.txt").write_text("sequence2\n")
+    (scene / "TestSplit.txt").write_text("sequence1\n")
+    choice = choose_frames(scene)
+    assert {one.session for one in choice.database} == {"seq-02"}
+    assert (len(choice.database), len(choice.queries)) == (2, 3)
+    (scene / "TestSplit.txt").unlink()
+    with pytest.raises(DatasetError, match="has 2 frames for the map and 0 to look up"):
+        choose_frames(scene)
