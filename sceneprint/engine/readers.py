@@ -54,13 +54,17 @@ class View:
 
 
 def index_folder(indexes: Path, row: MapRow) -> Path:
-    """Where the index of a map is: never that of another map, which may have had its name."""
-    return indexes / f"{row.name}-{row.number}-{round(1e6 * row.created_at):x}"
+    """Where the index of a map is: never that of another map, which may have had its name.
+
+    And never that of another model, whose signatures are not comparable.
+    """
+    made = f"{row.number}-{round(1e6 * row.created_at):x}"
+    return indexes / f"{row.name}-{made}-{row.model_id[:12]}"
 
 
 def is_index_folder(name: str) -> bool:
     """Whether a folder is called as `index_folder` calls them."""
-    return re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,62}-\d+-[0-9a-f]+", name) is not None
+    return re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,62}-\d+-[0-9a-f]+(-[0-9a-f]{12})?", name) is not None
 
 
 def trusted(connection: Connection, row: MapRow, found: Generation | None) -> Generation | None:

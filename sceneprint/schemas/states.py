@@ -13,6 +13,7 @@ class FrameState(StrEnum):
     INDEXED = "indexed"
     REJECTED = "rejected"
     FAILED = "failed"
+    REDUNDANT = "redundant"
     DELETED = "deleted"
 
     @property
@@ -48,6 +49,7 @@ _OF_FRAMES = {
     FrameState.INDEXED: "Signed, and found by queries from now on.",
     FrameState.REJECTED: "Nothing in it can be signed; `reason` says why. Trying again is no use.",
     FrameState.FAILED: "Signing broke down again and again; the job has the traceback.",
+    FrameState.REDUNDANT: "Not kept, as asked: the map has this place; `reason` names the frame.",
     FrameState.DELETED: "Removed on request, and found by no query.",
 }
 

@@ -14,7 +14,7 @@ from sceneprint.schemas import FrameState
 from sceneprint.store.events import tell
 from sceneprint.store.maps import next_revision
 from sceneprint.store.records import FrameRow, MapRow, frame_row
-from sceneprint.store.tables import frames, signatures
+from sceneprint.store.tables import frame_tags, frames, signatures
 
 
 def add_frame(connection: Connection, map_number: int, values: dict[str, Any]) -> FrameRow:
@@ -26,7 +26,11 @@ def add_frame(connection: Connection, map_number: int, values: dict[str, Any]) -
             **values,
         )
     )  # fmt: skip
-    return _one(connection, frames.c.id == frame_id)
+    row = _one(connection, frames.c.id == frame_id)
+    named = [{"frame_number": row.number, "tag": tag} for tag in sorted(set(row.tags))]
+    if named:
+        connection.execute(insert(frame_tags), named)
+    return row
 
 
 def renew_frame(connection: Connection, frame_id: str, values: dict[str, Any]) -> FrameRow:
@@ -146,9 +150,10 @@ def delete_frame(connection: Connection, row: MapRow, frame: FrameRow) -> list[s
 
 
 def refers_to(connection: Connection, blob: str) -> bool:
-    """Whether a frame that is not deleted, or a signature, refers to a blob."""
+    """Whether a frame that is kept, or a signature, refers to a blob."""
     of_frame = select(frames.c.number).where(
-        frames.c.blob == blob, frames.c.state != FrameState.DELETED
+        frames.c.blob == blob,
+        frames.c.state.not_in((FrameState.DELETED, FrameState.REDUNDANT)),
     )
     of_artifact = select(signatures.c.frame_number).where(signatures.c.geometry == blob)
     return any(connection.execute(one.limit(1)).first() for one in (of_frame, of_artifact))

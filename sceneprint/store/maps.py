@@ -9,7 +9,7 @@ from sqlalchemy import Connection, delete, func, insert, select, update
 from sceneprint.errors import UnknownMap
 from sceneprint.store.events import tell
 from sceneprint.store.records import MapRow, map_row
-from sceneprint.store.tables import frames, jobs, maps, models, signatures
+from sceneprint.store.tables import frame_tags, frames, jobs, maps, models, signatures
 
 
 def find_map(connection: Connection, name: str) -> MapRow:
@@ -88,6 +88,7 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     referred = list(blobs)
     connection.execute(delete(signatures).where(signatures.c.frame_number.in_(own)))
     connection.execute(delete(jobs).where(jobs.c.frame_number.in_(own)))
+    connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(own)))
     connection.execute(delete(frames).where(frames.c.map_number == row.number))
     connection.execute(delete(maps).where(maps.c.number == row.number))
     tell(connection, "map.deleted", row.name)

@@ -18,6 +18,7 @@ class MapRow:
     name: str
     title: str | None
     model_id: str
+    next_model_id: str | None
     revision: int
     created_at: float
 
@@ -43,6 +44,10 @@ class FrameRow:
     tags: list[str]
     pose_parent: str | None
     pose: list[list[float]] | None
+    pose_x: float | None
+    pose_y: float | None
+    pose_z: float | None
+    novelty: float | None
     received_at: float
     indexed_at: float | None
     revision: int | None
@@ -56,6 +61,7 @@ class JobRow:
     id: str
     kind: str
     frame_number: int
+    model_id: str | None
     state: JobState
     priority: int
     attempts: int

@@ -48,6 +48,7 @@ maps = Table(
     Column("name", String(63), nullable=False, unique=True),
     Column("title", String(200)),
     Column("model_id", String(64), ForeignKey("models.id"), nullable=False),
+    Column("next_model_id", String(64)),  # its frames are being signed with this one as well
     # counts what changes for searching; set on a frame in the commit that indexes or deletes it
     Column("revision", Integer, nullable=False),
     Column("created_at", Float, nullable=False),
@@ -74,14 +75,29 @@ frames = Table(
     Column("tags", JSON, nullable=False),
     Column("pose_parent", String(128)),
     Column("pose", JSON(none_as_null=True)),  # T_parent_sensor, 4 rows of 4
+    Column("pose_x", Float),  # its translation, metres, to be searched for
+    Column("pose_y", Float),
+    Column("pose_z", Float),
+    Column("novelty", Float),  # kept only if the nearest frame is farther, as a share of d0
     Column("received_at", Float, nullable=False),
     Column("indexed_at", Float),
     Column("revision", Integer),
     UniqueConstraint("map_number", "content_id"),
     Index(None, "map_number", "revision"),
     Index(None, "map_number", "number"),
+    Index(None, "map_number", "session"),
+    Index(None, "map_number", "captured_at"),
     Index(None, "blob"),
     sqlite_autoincrement=True,
+)
+
+#: `frames.tags` once more, a row each, to be searched for.
+frame_tags = Table(
+    "frame_tags",
+    metadata,
+    Column("frame_number", Integer, ForeignKey("frames.number"), primary_key=True),
+    Column("tag", String(128), primary_key=True),
+    Index(None, "tag", "frame_number"),
 )
 
 signatures = Table(
@@ -104,6 +120,7 @@ jobs = Table(
     Column("id", String(32), nullable=False, unique=True),
     Column("kind", String(16), nullable=False),
     Column("frame_number", Integer, ForeignKey("frames.number"), nullable=False),
+    Column("model_id", String(64)),  # to sign with; null: the map's own
     Column("state", String(16), nullable=False),
     Column("priority", Integer, nullable=False),
     Column("attempts", Integer, nullable=False),

@@ -24,7 +24,7 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.records import MapRow
 from sceneprint.store.tables import metadata
 
-TABLES = ["events", "frames", "jobs", "keys", "maps", "models", "signatures"]
+TABLES = ["events", "frame_tags", "frames", "jobs", "keys", "maps", "models", "signatures"]
 
 OPENS = """
 from sceneprint.store import open_database
@@ -90,7 +90,7 @@ def test_opening_again_changes_nothing(url: str, store: Store, hall: MapRow) -> 
 def test_four_processes_may_migrate_one_empty_database_at_once(
     url: str, tmp_path: Path, race: Callable[..., list[Any]]
 ) -> None:
-    assert race(OPENS, 4, url) == [["0001"]] * 4
+    assert race(OPENS, 4, url) == [["0002"]] * 4
     with closing(sqlite3.connect(tmp_path / "truth.db")) as connection:
         assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
         names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()

@@ -1,0 +1,62 @@
+"""Databases of earlier versions, brought to the present schema with what is in them."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+from sceneprint.schemas import FrameState
+from sceneprint.store import open_database
+from sceneprint.store.frames import frame_of
+from sceneprint.store.tables import frame_tags
+
+#: What version 0001 stored of three frames: with tags and pose, with neither, with a tag twice.
+POSE = [[1.0, 0.0, 0.0, 1.5], [0.0, 1.0, 0.0, -2.5], [0.0, 0.0, 1.0, 3.25], [0.0, 0.0, 0.0, 1.0]]
+FRAMES = [(["door", "lit"], POSE), ([], None), (["door", "door"], None)]
+
+
+def an_old_database(path: Path) -> None:
+    """A database as migration 0001 left it."""
+    from alembic import command
+    from alembic.config import Config
+    from sqlalchemy import create_engine
+
+    import migrations
+
+    config = Config()
+    config.set_main_option("script_location", str(Path(migrations.__file__).parent))
+    engine = create_engine(f"sqlite:///{path}")
+    with engine.begin() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, "0001")
+    engine.dispose()
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("INSERT INTO models VALUES ('m', 'compact', x'00', 1.0)")
+        connection.execute(
+            "INSERT INTO maps (number, name, model_id, revision, created_at) "
+            "VALUES (1, 'hall', 'm', 0, 1.0)"
+        )
+        for number, (tags, pose) in enumerate(FRAMES, 1):
+            connection.execute(
+                "INSERT INTO frames (number, id, map_number, state, blob, bytes, intrinsics, "
+                "depth_scale, depth_along_ray, tags, pose, received_at) "
+                "VALUES (?, ?, 1, 'received', 'b', 1, '{}', 1000, 0, ?, ?, 1.0)",
+                (number, f"f{number}", json.dumps(tags), pose and json.dumps(pose)),
+            )
+
+
+def test_what_is_searched_for_is_filled_in_from_what_was_stored(tmp_path: Path) -> None:
+    an_old_database(tmp_path / "truth.db")
+    database = open_database(f"sqlite:///{tmp_path / 'truth.db'}")
+    with database.read() as connection:
+        tags = connection.execute(frame_tags.select().order_by(*frame_tags.c)).all()
+        rows = [frame_of(connection, number) for number in (1, 2, 3)]
+    database.close()
+    assert tags == [(1, "door"), (1, "lit"), (3, "door")]
+    assert [(row.pose_x, row.pose_y, row.pose_z) for row in rows] \
+        == [(1.5, -2.5, 3.25), (None, None, None), (None, None, None)]  # fmt: skip
+    assert rows[0].pose == POSE
+    assert {row.state for row in rows} == {FrameState.RECEIVED}
+    assert {row.novelty for row in rows} == {None}
