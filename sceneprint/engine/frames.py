@@ -70,10 +70,6 @@ def columns(meta: FrameMeta, frame: Frame) -> dict[str, Any]:
         "tags": meta.tags,
         "pose_parent": parent,
         "pose": None if frame.pose is None else frame.pose.tolist(),
-        **{
-            f"pose_{axis}": None if frame.pose is None else float(frame.pose[i, 3])
-            for i, axis in enumerate("xyz")
-        },
     }
 
 

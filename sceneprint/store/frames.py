@@ -19,11 +19,12 @@ from sceneprint.store.tables import frame_tags, frames, signatures
 
 def add_frame(connection: Connection, map_number: int, values: dict[str, Any]) -> FrameRow:
     """Insert a frame as received; `values` are its columns but number, id, state and times."""
-    frame_id = uuid.uuid4().hex
+    frame_id, pose = uuid.uuid4().hex, values["pose"]
+    place = {} if pose is None else {f"pose_{axis}": pose[i][3] for i, axis in enumerate("xyz")}
     connection.execute(
         insert(frames).values(
             id=frame_id, map_number=map_number, state=FrameState.RECEIVED, received_at=time.time(),
-            **values,
+            **values, **place,
         )
     )  # fmt: skip
     row = _one(connection, frames.c.id == frame_id)

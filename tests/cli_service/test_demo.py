@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,9 +28,10 @@ from sceneprint.schemas import JobState
 
 
 @pytest.fixture
-def demo(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
-    """Starts the demo with a temporary folder of its own."""
+def demo(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts the demo with a temporary folder of its own, its signals as a terminal leaves them."""
     (tmp_path / "tmp").mkdir()
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # these tests may run under `nohup`
 
     def start(*arguments: object) -> subprocess.Popen[str]:
         return subprocess.Popen(
@@ -40,7 +41,8 @@ def demo(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
             env={**os.environ, "TMPDIR": str(tmp_path / "tmp"), "PYTHONUNBUFFERED": "1"},
         )  # fmt: skip
 
-    return start
+    yield start
+    signal.signal(signal.SIGHUP, before)
 
 
 def environment_of(process: Path) -> bytes:
