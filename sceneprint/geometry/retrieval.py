@@ -14,20 +14,13 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.scanning import scan
 from sceneprint.types import Bytes, Floats
 
 Ints64 = NDArray[np.int64]
 
 #: "l1": the paper's, sum |x - y|; "l2": squared Euclidean, sum (x - y)^2, an integer as well.
 Metric = Literal["l1", "l2"]
-
-#: Bytes summed in 32 bits before they move to 64: the last power of 2 of which 255^2 each fit.
-BLOCK = 32768
-
-#: Bytes of queries that stay in a core's cache while the database streams past them, and bytes
-#: of one signature below which calls would cost more than sums.
-QUERIES_IN_CACHE, SHORTEST_TILE = 262144, 4096
 
 #: A ranking takes this share of a map, and no fewer and no more than these.
 RANKING_SHARE, SMALLEST_RANKING, LARGEST_RANKING = 0.4, 50, 200
@@ -52,47 +45,9 @@ class Ranking:
         return len(self.indices)
 
 
-@kernel
-def _absolute(a: Bytes, b: Bytes) -> int:
-    """Sum of |a - b| over at most BLOCK bytes."""
-    total = np.int32(0)
-    for i in range(len(a)):
-        # the magnitude of 32 bits added to 32 bits, and no other form, becomes psadbw
-        d = np.int32(np.int32(a[i]) - np.int32(b[i]))
-        total = np.int32(total + abs(d))
-    return int(total)
-
-
-@kernel
-def _squares(a: Bytes, b: Bytes) -> int:
-    """Sum of (a - b)^2 over at most BLOCK bytes."""
-    total = np.int32(0)
-    for i in range(len(a)):
-        d = np.int32(np.int32(a[i]) - np.int32(b[i]))
-        total = np.int32(total + np.int32(d * d))  # becomes pmaddwd
-    return int(total)
-
-
-@kernel
-def _scan(
-    queries: Bytes, database: Bytes, squared: bool, half: bool, tile: int, result: Ints64
-) -> None:
-    """Add to result (Q, N); with `half` only where the row of the database comes later."""
-    n = queries.shape[1]
-    for start in range(0, n, tile):
-        for row in range(len(database)):
-            stored = database[row, start : start + tile]
-            for q in range(row if half else len(queries)):
-                asked = queries[q, start : start + tile]
-                total = 0
-                for low in range(0, len(stored), BLOCK):
-                    # slices start at 0: a loop from `low` would not be vectorised
-                    a, b = asked[low : low + BLOCK], stored[low : low + BLOCK]
-                    total += _squares(a, b) if squared else _absolute(a, b)
-                result[q, row] += total
-
-
-def distances(query: Bytes, database: Bytes, metric: Metric = "l1") -> Ints64:
+def distances(
+    query: Bytes, database: Bytes, metric: Metric = "l1", rows: Ints64 | None = None
+) -> Ints64:
     """Distances -s(X, Y) of one signature to many: Sec. III-C.
 
     Parameters
@@ -100,19 +55,27 @@ def distances(query: Bytes, database: Bytes, metric: Metric = "l1") -> Ints64:
     query : (n,) uint8
     database : (N, n) uint8
     metric : "l1", the paper's, or "l2", squared Euclidean
+    rows : (r,) of the database that are compared, where they are; all of them if not given
 
     Returns
     -------
-    (N,) int64, in units of a byte ("l2": of a byte squared); exact
+    (N,) or (r,) int64, in units of a byte ("l2": of a byte squared); exact
 
     Raises
     ------
-    ValueError : the lengths differ, the arrays are not of bytes, or there is no such metric.
+    ValueError : the lengths differ, the arrays are not of bytes, there is no such metric, or no
+        such row.
     """
     if query.ndim != 1:
         raise ValueError(f"signatures of {query.shape} and {database.shape[1:]} bytes")
-    row: Ints64 = cross_distances(query[None], database, metric)[0]
-    return row
+    _check(query[None], database, metric)
+    if rows is not None:
+        if rows.ndim != 1 or rows.dtype.kind not in "iu":
+            raise ValueError(f"{rows.dtype} {rows.shape}, not numbers of rows")
+        if len(rows) and not 0 <= rows.min() <= rows.max() < len(database):
+            raise ValueError(f"rows {rows.min()} to {rows.max()} of {len(database)} signatures")
+    found: Ints64 = _distances(query[None], database, metric, rows)[0]
+    return found
 
 
 def cross_distances(queries: Bytes, database: Bytes, metric: Metric = "l1") -> Ints64:
@@ -135,7 +98,7 @@ def cross_distances(queries: Bytes, database: Bytes, metric: Metric = "l1") -> I
     ValueError : see `distances`.
     """
     _check(queries, database, metric)
-    return _distances(queries, database, metric, half=False)
+    return _distances(queries, database, metric)
 
 
 def pairwise_distances(signatures: Bytes, metric: Metric = "l1") -> Ints64:
@@ -155,7 +118,7 @@ def pairwise_distances(signatures: Bytes, metric: Metric = "l1") -> Ints64:
     ValueError : see `distances`.
     """
     _check(signatures, signatures, metric)
-    above = _distances(signatures, signatures, metric, half=True)
+    above = np.triu(_distances(signatures, signatures, metric, half=True), 1)
     return above + above.T
 
 
@@ -168,12 +131,16 @@ def _check(queries: Bytes, database: Bytes, metric: Metric) -> None:
         raise ValueError(f"metric {metric!r}, not one of {get_args(Metric)}")
 
 
-def _distances(queries: Bytes, database: Bytes, metric: Metric, half: bool) -> Ints64:
-    result = np.zeros((len(queries), len(database)), np.int64)
-    tile = max(QUERIES_IN_CACHE // max(len(queries), 1), SHORTEST_TILE)
+def _distances(
+    queries: Bytes,
+    database: Bytes,
+    metric: Metric,
+    rows: Ints64 | None = None,
+    half: bool = False,
+) -> Ints64:
+    rows = np.arange(len(database)) if rows is None else np.ascontiguousarray(rows, np.int64)
     queries, database = np.ascontiguousarray(queries), np.ascontiguousarray(database)
-    _scan(queries, database, metric == "l2", half, tile, result)
-    return result
+    return scan(queries, database, rows, squared=metric == "l2", half=half)
 
 
 def similarity(distances: Ints64, unrelated_distance: float) -> Floats:

@@ -133,6 +133,28 @@ def test_any_memory_layout(metric: Metric) -> None:
     assert cross_distances(wide, read_only, metric).tolist() == oracle(wide, big, metric)
 
 
+@pytest.mark.parametrize("metric", METRICS)
+def test_some_rows_are_compared_where_they_are(metric: Metric) -> None:
+    query, database = random_bytes(6, 1, 1000)[0], random_bytes(7, 50, 1000)
+    database.flags.writeable = False
+    whole = distances(query, database, metric)
+    for rows in ([3, 4, 5, 6, 7, 8], [49, 0, 13, 13, 2], [49], []):
+        wanted = np.array(rows, np.int64)
+        found = distances(query, database, metric, wanted)
+        assert found.tolist() == whole[wanted].tolist()
+        assert found.dtype == np.int64
+    # of any layout and width of integer
+    assert distances(query, database, metric, np.arange(50)[::7]).tolist() == whole[::7].tolist()
+    short = np.arange(50, dtype=np.int16)
+    assert distances(query, database, metric, short).tolist() == whole.tolist()  # type: ignore[arg-type]
+    for rows in ([0, 50], [-1, 3], [2**40]):
+        with pytest.raises(ValueError, match="of 50 signatures"):
+            distances(query, database, metric, np.array(rows, np.int64))
+    for strange in (np.array([0.0, 1.0]), np.array([[0, 1]]), np.array([True, False])):
+        with pytest.raises(ValueError, match="not numbers of rows"):
+            distances(query, database, metric, strange)
+
+
 def test_inputs_are_left_alone() -> None:
     queries, database = random_bytes(4, 2, 100), random_bytes(5, 3, 100)
     before = queries.copy(), database.copy()
