@@ -14,15 +14,12 @@ from numpy.typing import NDArray
 
 from sceneprint.geometry.retrieval import distances
 from sceneprint.index.generations import Generation
-from sceneprint.index.keys import Keys
-from sceneprint.index.segments import blocks_of, gather
+from sceneprint.index.keys import Keys, Places
 from sceneprint.index.tails import Tail, check_lengths
 from sceneprint.types import Bytes
 
 #: Frames that the codes propose.
-SHORTLIST = 1000
-#: Bytes gathered at once: few calls, and little memory for each of many threads.
-_GATHERED = 4 << 20
+SHORTLIST = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +50,7 @@ def search(
     size: int,
     *,
     dead: frozenset[int] = frozenset(),
+    among: Keys | None = None,
     exact: bool = False,
     shortlist: int = SHORTLIST,
 ) -> Hits:
@@ -65,9 +63,10 @@ def search(
     tail : frames newer than that; where a frame is in both, this one counts
     size : of the answer; all frames where there are fewer
     dead : keys of frames that were deleted since
-    exact : compare every frame
-    shortlist : frames that the codes propose, raised to `size`; a generation that has no more is
-        compared whole
+    among : keys of the frames that may be found, where not all may; others are no matter
+    exact : compare every frame, of those that may be found
+    shortlist : frames that the codes propose, raised to `size`; where no more may be found in the
+        generation, they are all compared
 
     Raises
     ------
@@ -76,44 +75,49 @@ def search(
     if query.ndim != 1 or query.dtype != np.uint8 or size < 0 or shortlist < 1:
         raise ValueError(f"{size} of {shortlist} for a query {query.dtype} {query.shape}")
     check_lengths(len(query), generation, tail)
-    query = np.array(query)  # writable and whole: one compiled kernel serves all queries
     gone = np.fromiter(dead, np.int64, len(dead))
-    alive = np.flatnonzero(~np.isin(tail.keys, gone))
-    keys, found, whole = tail.keys[alive], distances(query, tail.signatures)[alive], True
+    alive = np.flatnonzero(_free(tail, gone, among))
+    keys, found, whole = tail.keys[alive], distances(query, tail.signatures, rows=alive), True
     if generation is not None and len(generation):
-        excluded = generation.places.of(np.concatenate([gone, tail.keys]))
-        excluded = np.unique(excluded[excluded >= 0])
+        free = _free(generation, np.concatenate([gone, tail.keys]), among)
+        positions = np.flatnonzero(free)
         proposed = max(shortlist, size)
-        whole = exact or len(generation) - len(excluded) <= proposed
-        if whole:
-            positions = np.delete(np.arange(len(generation)), excluded)
-            own = _scan(query, generation)[positions]
-        else:
+        whole = exact or len(positions) <= proposed
+        if not whole:
             code = generation.code.encode(query[None])[0]
-            positions = np.sort(generation.coarse.nearest(code, proposed, excluded))
-            own = _compare(query, generation, positions)
+            nearest = generation.coarse.nearest(code, proposed, np.flatnonzero(~free))
+            positions = np.sort(nearest)
         keys = np.concatenate([keys, generation.keys[positions]])
-        found = np.concatenate([found, own])
-    nearest = _nearest(keys, found, size)
-    return Hits(keys[nearest], found[nearest], whole, len(keys))
+        found = np.concatenate([found, _compare(query, generation, positions)])
+    first = _nearest(keys, found, size)
+    return Hits(keys[first], found[first], whole, len(keys))
 
 
-def _scan(query: Bytes, generation: Generation) -> NDArray[np.int64]:
-    """Distances (N,) to all frames; rows of frames that are gone are read in passing."""
-    scanned = [distances(query, segment.signatures) for segment in generation.segments]
-    result: NDArray[np.int64] = np.concatenate(scanned)[generation.rows]
-    return result
+def _free(part: Generation | Tail, gone: Keys, among: Keys | None) -> NDArray[np.bool_]:
+    """Which frames of a part may be found: those among the given ones that are not gone."""
+    free = np.full(len(part), among is None)
+    if among is not None:
+        free[_known(part.places, among)] = True
+    free[_known(part.places, gone)] = False
+    return free
+
+
+def _known(places: Places, keys: Keys) -> NDArray[np.int64]:
+    at = places.of(keys)
+    return at[at >= 0]
 
 
 def _compare(
     query: Bytes, generation: Generation, positions: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Distances (r,) to frames at rising positions."""
+    """Distances (r,) to frames at rising positions, where they are mapped: no copies."""
     rows = generation.rows[positions]
+    starts = np.cumsum([0, *map(len, generation.segments)])
+    edges = np.searchsorted(rows, starts)
     return np.concatenate(
         [
-            distances(query, gather(generation.segments, some))
-            for some in blocks_of(rows, len(query), _GATHERED)
+            distances(query, segment.signatures, rows=rows[edges[i] : edges[i + 1]] - starts[i])
+            for i, segment in enumerate(generation.segments)
         ]
     )
 

@@ -124,7 +124,7 @@ def test_a_shortlist_is_compared_exactly_and_says_so(
     assert (longer.exact, longer.compared, len(longer)) == (False, 220, 120)
     asked = search(query, generation, tail, 10, shortlist=50, exact=True)
     assert (answer(asked), asked.exact) == (answer(whole), True)
-    assert SHORTLIST == 1000
+    assert SHORTLIST == 500
 
 
 def test_a_shortlist_is_full_however_many_are_gone(published: Publish, walk: Walk) -> None:
@@ -208,7 +208,7 @@ def test_mistakes_are_refused(published: Publish, walk: Walk) -> None:
     for wrong in (query[None], query.astype(np.int16)):
         with pytest.raises(ValueError, match="for a query"):
             search(wrong, generation, empty, 1)
-    with pytest.raises(ValueError, match="-1 of 1000"):
+    with pytest.raises(ValueError, match="-1 of 500"):
         search(query, generation, empty, -1)
     with pytest.raises(ValueError, match="1 of 0"):
         search(query, generation, empty, 1, shortlist=0)
