@@ -12,12 +12,15 @@
         - ModelMismatch         signatures or artifacts of two models were compared
       x UnreadableGeometry      a geometry artifact that is missing, damaged or of another schema
       x DamagedIndex            a cache file of the index that is missing or damaged
+      x BusyIndex               another process is building this index
       x NotFound                there is no such map, frame or job
         - UnknownMap, UnknownFrame, UnknownJob
       x UnknownKey              there is no key of that name
       x Conflict                the request contradicts what is there
         - MapExists             a map of that name, made otherwise
         - FrameConflict         the same content with other metadata
+        - JobOver               a job that is over cannot be cancelled
+        - CannotRetry           a job that cannot be tried again
       x InvalidRequest          a field of a request is missing, unknown or out of its range
         - MalformedBody         its body cannot be parsed at all
         - UnsupportedType       its body is of a type that is not read
@@ -28,9 +31,15 @@
       x Busy                    as many requests wait as may; come back
       x StoreError
         - UnusableStore         the folder or database cannot be opened or written
+          - StoreFull           the disk has no room for what should be stored
+          - ReadOnlyStore       the folder or database may be read, and not written
+          - StoreLocked         another process has kept the database from writers for long
         - NewerSchema           a later version of sceneprint wrote it
         - DamagedBlob           stored bytes are missing or are not those that were stored
+        - DamagedSignature      a stored signature's checksum does not fit
         - LostLease             the job has been given to another worker
+        - SnapshotError         a snapshot cannot be taken, or not be restored there
+          - DamagedSnapshot     its bytes are not those that were written
       x ServiceError            what a client is told by, or of, a service
         - Unreachable           no answer came
         - Refused               the answer is a problem document
@@ -98,6 +107,10 @@ class DamagedIndex(SceneprintError):
     """A cache file of the index is missing or damaged."""
 
 
+class BusyIndex(SceneprintError):
+    """Another process is building this index."""
+
+
 class NotFound(SceneprintError):
     """What a request names is not there."""
 
@@ -128,6 +141,14 @@ class MapExists(Conflict):
 
 class FrameConflict(Conflict):
     """The map has a frame of the same content with other metadata."""
+
+
+class JobOver(Conflict):
+    """The job is over, and cannot be cancelled any more."""
+
+
+class CannotRetry(Conflict):
+    """The job is not over, its frame has a later one, or there is nothing to try again."""
 
 
 class InvalidRequest(SceneprintError):
@@ -180,6 +201,18 @@ class UnusableStore(StoreError):
     """The folder or database cannot be opened or written."""
 
 
+class StoreFull(UnusableStore):
+    """The disk has no room for what should be stored."""
+
+
+class ReadOnlyStore(UnusableStore):
+    """The folder or database may be read, and not written."""
+
+
+class StoreLocked(UnusableStore):
+    """Another process has kept the database from all other writers for long."""
+
+
 class NewerSchema(StoreError):
     """A later version of sceneprint wrote the database."""
 
@@ -188,8 +221,20 @@ class DamagedBlob(StoreError):
     """Stored bytes are missing, or are not those that were stored."""
 
 
+class DamagedSignature(StoreError):
+    """A stored signature has not the bytes that were stored."""
+
+
 class LostLease(StoreError):
     """The job's lease ran out, and it has been given to another worker."""
+
+
+class SnapshotError(StoreError):
+    """A snapshot cannot be taken, or cannot be restored there."""
+
+
+class DamagedSnapshot(SnapshotError):
+    """The bytes of a snapshot are not those that were written."""
 
 
 class ServiceError(SceneprintError):

@@ -58,6 +58,19 @@ def write_durable(path: Path, data: bytes) -> None:
     sync_folder(path.parent.parent)  # in which the folder itself may be new
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder where it is missing, and those above it; they survive the loss of power.
+
+    Raises
+    ------
+    OSError : it cannot be made, or is a file.
+    """
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for made in missing:
+        sync_folder(made.parent)
+
+
 def _put(path: Path, data: bytes, *, durable: bool) -> None:
     part = _beside(path)
     try:

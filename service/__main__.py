@@ -19,7 +19,7 @@ def main() -> int:
     # uvicorn handles both signals while it runs, and raises them again at the end
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        run(Settings(), lambda url: print(f"sceneprint: serving {url}", flush=True))  # noqa: T201
+        run(Settings(), lambda url, _: print(f"sceneprint: serving {url}", flush=True))  # noqa: T201
     except (SceneprintError, ValidationError) as error:
         print(f"service: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201
         return 2

@@ -13,7 +13,7 @@ from pydantic.json_schema import models_json_schema
 
 from sceneprint import __version__
 from sceneprint.engine import Engine
-from sceneprint.schemas import FrameMeta, NewMap, Problem
+from sceneprint.schemas import Filter, FrameMeta, NewMap, Problem
 from sceneprint.settings import Settings, is_loopback
 from service import problems
 from service.context import Context, Gate, key_holder
@@ -44,8 +44,8 @@ def create_app(settings: Settings) -> FastAPI:
         engine = await to_thread.run_sync(Engine, settings)
         try:
             await to_thread.run_sync(engine.warm)
-            gate = Gate(settings.concurrency, settings.waiting)
-            app.state.context = Context(engine, gate, figures, keys=not alone)
+            gate, uploads = (Gate(settings.concurrency, settings.waiting) for _ in range(2))
+            app.state.context = Context(engine, gate, uploads, figures, keys=not alone)
             yield
         finally:
             await to_thread.run_sync(engine.close)
@@ -72,7 +72,12 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
         )
         template = "#/components/schemas/{model}"
         _, own = models_json_schema(
-            [(FrameMeta, "validation"), (NewMap, "validation"), (Problem, "serialization")],
+            [
+                (FrameMeta, "validation"),
+                (Filter, "validation"),
+                (NewMap, "validation"),
+                (Problem, "serialization"),
+            ],
             ref_template=template,
         )
         schemas = document.setdefault("components", {}).setdefault("schemas", {})

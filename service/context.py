@@ -64,11 +64,14 @@ class Context:
     Parameters
     ----------
     engine, gate, metrics : see there
+    uploads : the gate of uploads, which wait for the disk and for other writers: of their own, so
+        that no query waits behind them
     keys : whether callers must show one
     """
 
     engine: Engine
     gate: Gate
+    uploads: Gate
     metrics: Metrics
     keys: bool
 

@@ -32,11 +32,26 @@ STATUSES: dict[type[errors.SceneprintError], int] = {
     errors.Misdirected: 421,
     errors.ForeignOrigin: 403,
     errors.Busy: 503,
+    errors.StoreFull: 507,
     errors.UnusableStore: 503,
     errors.SceneprintError: 500,
 }
-#: Seconds after which to come back, where a status says that this may help.
-RETRY_AFTER_S = {503: "1"}
+#: Seconds after which to come back: at once where others are in the way, later where a person is
+#: needed first.
+RETRY_AFTER_S = {503: "1", 507: "30"}
+LATER_S: dict[type[errors.SceneprintError], str] = {errors.ReadOnlyStore: "60"}
+#: What is told of a store that cannot be used: its errors name folders, which are the operator's.
+_LOG = "Its log says more under the request's id."
+UNUSABLE: dict[type[errors.SceneprintError], str] = {
+    errors.StoreFull: "The service's disk is full, and nothing was taken; queries of what is "
+    f"stored go on. {_LOG} Free some space there, and send it again.",
+    errors.ReadOnlyStore: "The service's store is read-only, and nothing was taken; queries of "
+    f"what is stored go on. {_LOG} Make the data folder writable there, and start it again.",
+    errors.StoreLocked: "Another process has been writing to the service's store for long, and "
+    f"nothing was taken; queries go on. {_LOG} Come back later.",
+    errors.UnusableStore: "The service cannot use its store at the moment, and nothing was taken. "
+    "Its log says why under the request's id. Come back later.",
+}
 MEDIA_TYPE = "application/problem+json"
 #: Most fields at fault that a problem lists, and most characters of the place of one.
 MOST_FIELDS, PLACE = 20, 80
@@ -82,7 +97,7 @@ def declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"description": HTTPStatus(status).phrase, "content": content}
-        for status in (*statuses, 401, 403, 421, 500, 503)
+        for status in (*statuses, 401, 403, 421, 500, 503, 507)
     }
 
 
@@ -96,12 +111,12 @@ def install(app: FastAPI) -> None:
             log.error("request failed", extra={"request_id": _id(request), "error": str(error)})
         fields = error.fields if isinstance(error, errors.InvalidRequest) else ()
         detail = str(error)
-        if isinstance(error, errors.UnusableStore):  # names folders, which are the operator's
-            detail = (
-                "The service cannot use its store at the moment, and nothing was taken. Its log "
-                "says why under the request's id. Come back later."
-            )
-        return problem(_id(request), type(error).__name__, status, detail, fields)
+        if isinstance(error, errors.UnusableStore):
+            detail = next(UNUSABLE[kind] for kind in type(error).__mro__ if kind in UNUSABLE)
+        answer = problem(_id(request), type(error).__name__, status, detail, fields)
+        if type(error) in LATER_S:
+            answer.headers["Retry-After"] = LATER_S[type(error)]
+        return answer
 
     @app.exception_handler(RequestValidationError)
     async def _validation(request: Request, error: RequestValidationError) -> JSONResponse:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 import sys
 from collections.abc import Callable
@@ -12,6 +13,8 @@ from sceneprint.engine import Engine
 from sceneprint.errors import UnusableStore
 from sceneprint.settings import Settings
 from service.app import create_app
+
+log = logging.getLogger(__name__)
 
 #: Seconds that requests in flight may take after the signal to stop.
 GRACE_S = 20
@@ -39,19 +42,25 @@ def listen(settings: Settings) -> socket.socket:
     return listening
 
 
-def run(settings: Settings, ready: Callable[[str], None]) -> None:
+def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     """Serve until SIGINT or SIGTERM.
 
     Parameters
     ----------
     settings : see Settings
-    ready : called with the service's address once it answers
+    ready : called once it answers, with its address, and whether its store is read-only
 
     Raises
     ------
     UnusableStore, NewerSchema : the store cannot be opened, or the address not listened on.
     """
-    Engine(settings).close()  # uvicorn would make a traceback of what cannot be opened
+    with Engine(settings) as engine:  # uvicorn would make a traceback of what cannot be opened
+        read_only = engine.store.database.read_only
+    if read_only:
+        log.warning(
+            "the store is read-only: queries are answered, and nothing is taken or signed",
+            extra={"data": str(settings.data_dir)},
+        )
     # a thread that computes gives way to the event loop after this long, not after 5 ms
     sys.setswitchinterval(0.001)
     listening = listen(settings)
@@ -66,7 +75,7 @@ def run(settings: Settings, ready: Callable[[str], None]) -> None:
         timeout_keep_alive=30,
         limit_concurrency=1000,
     )
-    _Server(config, lambda: ready(url)).run(sockets=[listening])
+    _Server(config, lambda: ready(url, read_only)).run(sockets=[listening])
 
 
 class _Server(uvicorn.Server):

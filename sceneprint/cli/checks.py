@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import errno
+import os
 import shutil
 import sqlite3
 import sys
@@ -99,8 +101,21 @@ def _tables(cache_dir: Path) -> Iterator[Finding]:
 
 def _folder(data_dir: Path) -> Iterator[Finding]:
     there = _nearest(data_dir)
-    if not _may_write(data_dir):
-        text = f"{data_dir} cannot be written. Check its permissions, or name another with --data."
+    why = _unwritable(data_dir)
+    if why == errno.ENOSPC:
+        text = f"{data_dir} is on a full disk. Free some space: until then nothing is taken."
+        yield Finding("WRONG", "data folder", text)
+    elif why is not None and (data_dir / "sceneprint.db").is_file():
+        text = (
+            f"{data_dir} is read-only ({os.strerror(why)}): `sceneprint serve` answers queries of "
+            "it, and takes nothing. Make it writable, or name another with --data."
+        )
+        yield Finding("WRONG", "data folder", text)
+    elif why is not None:
+        text = (
+            f"{data_dir} cannot be written ({os.strerror(why)}). Check its permissions, or name "
+            "another with --data."
+        )
         yield Finding("WRONG", "data folder", text)
     else:
         text = f"{data_dir} can be written" if there == data_dir else f"{data_dir} can be made"
@@ -143,8 +158,15 @@ def _nearest(folder: Path) -> Path:
 
 def _may_write(folder: Path) -> bool:
     """Whether a file can be made in the folder, or where the folder is missing, above it."""
+    return _unwritable(folder) is None
+
+
+def _unwritable(folder: Path) -> int | None:
+    """Why no file can be made there, as `errno`; None where one can."""
     try:  # tried, as permissions say little of read-only disks and to root; leaves no trace
-        with tempfile.TemporaryFile(dir=_nearest(folder)):
-            return True
-    except OSError:
-        return False
+        with tempfile.TemporaryFile(dir=_nearest(folder)) as file:
+            file.write(b"x")  # a full disk may still have room for a name
+            file.flush()
+        return None
+    except OSError as error:
+        return error.errno or errno.EIO

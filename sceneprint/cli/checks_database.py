@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -67,7 +68,18 @@ def _sqlite(settings: Settings, url: URL) -> Finding:
     def connect() -> sqlite3.Connection:
         return sqlite3.connect(f"{path.as_uri()}?mode=ro&{how}", uri=True)
 
-    return _schema(create_engine(url, creator=connect, poolclass=NullPool))
+    found = _schema(create_engine(url, creator=connect, poolclass=NullPool))
+    # a folder that may not be written is a finding of its own
+    if (
+        found.verdict != "WRONG"
+        and os.access(path.parent, os.W_OK)
+        and not os.access(path, os.W_OK)
+    ):
+        text = (
+            f"{path} may be read and not written, so that nothing is taken. Check its permissions."
+        )
+        return _wrong(text)
+    return found
 
 
 def _server(url: URL) -> Finding:

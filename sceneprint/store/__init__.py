@@ -11,6 +11,7 @@ from pathlib import Path
 
 from sceneprint.store.blobs import Blobs
 from sceneprint.store.database import Database, open_database
+from sceneprint.store.sealed import is_sealed
 
 __all__ = ["Blobs", "Database", "Store", "open_database", "open_store"]
 
@@ -24,7 +25,7 @@ class Store:
 
 
 def open_store(url: str, blobs: Path) -> Store:
-    """Open both, made where missing.
+    """Open both, made where missing; beside a database that may be read alone nothing is made.
 
     Parameters
     ----------
@@ -35,5 +36,5 @@ def open_store(url: str, blobs: Path) -> Store:
     ------
     UnusableStore, NewerSchema : see `open_database`.
     """
-    kept = Blobs(blobs)
+    kept = Blobs(blobs, make=not is_sealed(url))  # the data folder is made with it
     return Store(open_database(url), kept)

@@ -14,13 +14,15 @@ from typing import Any
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, Engine, create_engine, event, make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, OperationalError
+from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, event, make_url
+from sqlalchemy.exc import ArgumentError
 
-from sceneprint.errors import NewerSchema, UnusableStore
+from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
+from sceneprint.store.faults import explained
+from sceneprint.store.sealed import Sealed, sealed_file
 
-#: Seconds a writer waits for another before it gives up.
-BUSY_S = 30.0
+#: Seconds a writer waits for another, and waits after somebody has waited so long in vain.
+BUSY_S, HELD_S = 10.0, 0.1
 #: Alembic keeps the migration that runs in a variable of its module.
 _migrating = threading.Lock()
 
@@ -31,30 +33,79 @@ class Database:
     Parameters
     ----------
     engine : of SQLAlchemy
+    sealed : where the file may be read alone
     """
 
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
+    def __init__(self, engine: Engine, sealed: Sealed | None = None) -> None:
+        self._engine, self._sealed = engine, sealed
+        # of SQLite's writers of this process one asks for its lock, and the others wait here:
+        # each of them would keep a connection from the readers
+        self._turn = threading.Lock()
+        self._held = False  # by another process, for longer than anybody should wait
 
     @property
     def is_sqlite(self) -> bool:
         """Whether one writer at a time holds the whole database."""
         return self._engine.dialect.name == "sqlite"
 
+    @property
+    def read_only(self) -> bool:
+        """Whether it may be read alone, and every `write` raises ReadOnlyStore."""
+        return self._sealed is not None
+
+    def require_writable(self) -> None:
+        """See that it may be written.
+
+        Raises
+        ------
+        ReadOnlyStore : it may be read alone.
+        """
+        if self._sealed is not None:
+            raise self._sealed.refusal()
+
     @contextmanager
     def read(self) -> Iterator[Connection]:
         """A transaction that sees one state and changes nothing."""
-        with _explained(self._engine), self._engine.connect() as connection:
+        before = None if self._sealed is None else self._sealed.state()
+        with explained(self._engine), self._engine.connect() as connection:
             yield connection
+            if self._sealed is not None:
+                self._sealed.check(before)
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
-        """A transaction that is committed at the end, or leaves no trace where it raises."""
-        options: dict[str, Any] = {"sceneprint_write": True}
-        with _explained(self._engine), self._engine.connect() as connection:
-            writing = connection.execution_options(**options)
-            with writing.begin():
-                yield writing
+        """A transaction that is committed at the end, or leaves no trace where it raises.
+
+        Raises
+        ------
+        ReadOnlyStore : it may be read alone.
+        StoreLocked : another process writes for longer than BUSY_S; who comes after that waits
+            for HELD_S only, until somebody gets through.
+        StoreFull : the disk has no room.
+        UnusableStore : it cannot be written for another reason.
+        """
+        self.require_writable()
+        if not self.is_sqlite:
+            with explained(self._engine), self._engine.begin() as connection:
+                yield connection
+            return
+        if not self._turn.acquire(timeout=HELD_S if self._held else BUSY_S):
+            raise StoreLocked(
+                f"{self._engine.url!r}: other writers of this process have waited for long, and "
+                "nothing was stored. Come back later."
+            )
+        try:
+            with explained(self._engine), self._engine.connect() as connection:
+                options: dict[str, Any] = {"sceneprint_write": HELD_S if self._held else BUSY_S}
+                writing = connection.execution_options(**options)
+                with writing.begin():
+                    self._held = False
+                    yield writing
+        except StoreLocked:
+            self._held = True
+            raise
+        finally:
+            self._turn.release()
 
     def close(self) -> None:
         """Give all connections back."""
@@ -64,24 +115,20 @@ class Database:
 def open_database(url: str) -> Database:
     """Open a database and bring it to the schema of this version.
 
+    A SQLite file that may not be written is opened for reading.
+
     Parameters
     ----------
     url : of SQLAlchemy
 
     Raises
     ------
-    UnusableStore : no such database, or it cannot be opened or written.
+    UnusableStore : no such database, or it cannot be opened.
+    ReadOnlyStore : it may be read alone, and an earlier version wrote it.
     NewerSchema : a later version of sceneprint wrote it; nothing is touched.
     """
     try:
-        parsed = make_url(url)
-        if parsed.get_backend_name() == "sqlite":
-            # SQLite waits for a writer itself, fairly enough; readers never wait in WAL
-            engine = create_engine(parsed, connect_args={"timeout": BUSY_S}, pool_size=16)
-            event.listen(engine, "connect", _configure_sqlite)
-            event.listen(engine, "begin", _begin_sqlite)
-        else:
-            engine = create_engine(parsed, pool_pre_ping=True)
+        database, engine = _opened(make_url(url))
     # ValueError: a port that is no number. The URL may hold a password
     except (ArgumentError, ImportError, ValueError) as error:
         raise UnusableStore(
@@ -89,7 +136,6 @@ def open_database(url: str) -> Database:
             "SCENEPRINT_DATABASE_URL to an SQLAlchemy URL, or leave it out for SQLite in the "
             "data folder."
         ) from error
-    database = Database(engine)
     try:
         _migrate(database, engine)
     except BaseException:
@@ -98,22 +144,57 @@ def open_database(url: str) -> Database:
     return database
 
 
+def _opened(url: URL) -> tuple[Database, Engine]:
+    if url.get_backend_name() != "sqlite":
+        engine = create_engine(url, pool_pre_ping=True)
+        return Database(engine), engine
+    path, sealed = sealed_file(url), None
+    if path is not None:
+        sealed = Sealed(path)
+        # each transaction opens the file in the way that is right then
+        engine = create_engine(url, creator=sealed.connect, poolclass=NullPool)
+    else:
+        # SQLite waits for a writer itself, fairly enough; readers never wait in WAL
+        engine = create_engine(url, connect_args={"timeout": BUSY_S}, pool_size=16)
+    event.listen(engine, "connect", _configure_sqlite if sealed is None else _configure_sealed)
+    event.listen(engine, "begin", _begin_sqlite)
+    return Database(engine, sealed), engine
+
+
 def _configure_sqlite(connection: Any, _record: Any) -> None:
     connection.isolation_level = None  # transactions begin where `_begin_sqlite` says
     for pragma in (
         "journal_mode = WAL",
         "synchronous = FULL",  # a commit that was acknowledged survives the power
         "foreign_keys = ON",
-        f"busy_timeout = {int(1000 * BUSY_S)}",
+        f"busy_timeout = {_milliseconds(BUSY_S)}",
         "cache_size = -32000",
     ):
         connection.execute(f"PRAGMA {pragma}").close()
 
 
+def _configure_sealed(connection: Any, _record: Any) -> None:
+    connection.isolation_level = None
+
+
 def _begin_sqlite(connection: Connection) -> None:
+    wait_s: float | None = connection.get_execution_options().get("sceneprint_write")
+    if wait_s is None:
+        connection.exec_driver_sql("BEGIN")
+        return
     # a reader that turns writer half way would fail where another wrote in between
-    writing = connection.get_execution_options().get("sceneprint_write")
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
+    if wait_s == BUSY_S:
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+        return
+    connection.exec_driver_sql(f"PRAGMA busy_timeout = {_milliseconds(wait_s)}")
+    try:
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+    finally:
+        connection.exec_driver_sql(f"PRAGMA busy_timeout = {_milliseconds(BUSY_S)}")
+
+
+def _milliseconds(seconds: float) -> int:
+    return int(1000 * seconds)
 
 
 def _migrate(database: Database, engine: Engine) -> None:
@@ -125,8 +206,14 @@ def _migrate(database: Database, engine: Engine) -> None:
     scripts = ScriptDirectory.from_config(config)
     head, known = scripts.get_current_head(), {s.revision for s in scripts.walk_revisions()}
     with database.read() as connection:
-        if _current(connection, known, engine) == head:
-            return
+        current = _current(connection, known, engine)
+    if current == head:
+        return
+    if database.read_only:
+        raise ReadOnlyStore(
+            f"{engine.url!r} has schema {current}, this version needs {head}, and the file is "
+            "read-only. Open it once where it may be written, or use the version that wrote it."
+        )
     with database.write() as connection:  # another process may have been first
         if _current(connection, known, engine) != head:
             from alembic import command
@@ -144,21 +231,3 @@ def _current(connection: Connection, known: set[str], engine: Engine) -> str | N
             "know: a later one wrote it. Use that version, or another data folder."
         )
     return current
-
-
-@contextmanager
-def _explained(engine: Engine) -> Iterator[None]:
-    """Say which database a fault of the machine is about."""
-    try:
-        yield
-    except OperationalError as error:
-        raise UnusableStore(
-            f"{engine.url!r}: {error.orig}. Check that the database is there, that it may be "
-            "written, and that the disk has room."
-        ) from error
-    except DBAPIError as error:
-        if "malformed" in str(error.orig) or "not a database" in str(error.orig):
-            raise UnusableStore(
-                f"{engine.url!r}: {error.orig}. Restore the data folder from a copy."
-            ) from error
-        raise

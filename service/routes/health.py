@@ -21,8 +21,9 @@ class Health(BaseModel):
 
 
 class Readiness(Health):
-    """The service can work."""
+    """The service can work; `read_only`: it answers, and takes nothing."""
 
+    read_only: bool
     frames: dict[str, int]
     jobs: dict[str, int]
 
@@ -37,7 +38,10 @@ async def healthz() -> Health:
 def readyz(here: Here) -> Readiness:
     """Answers while the database does; 503 while it does not."""
     frames, jobs = here.engine.counts()
-    return Readiness(status="ready", version=__version__, frames=frames, jobs=jobs)
+    read_only = here.engine.store.database.read_only
+    return Readiness(
+        status="ready", version=__version__, read_only=read_only, frames=frames, jobs=jobs
+    )
 
 
 @router.get("/metrics", response_class=Response, responses=declared())

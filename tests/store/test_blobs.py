@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from sceneprint.errors import DamagedBlob, UnusableStore
+from sceneprint.errors import DamagedBlob, ReadOnlyStore, StoreFull, UnusableStore
 from sceneprint.store import Blobs
 
 DIGEST = hashlib.sha256(b"depth").hexdigest()
@@ -133,7 +133,7 @@ def test_a_file_where_a_folder_should_be_is_said(tmp_path: Path) -> None:
     place.write_bytes(b"")  # a file where the folder should be
     with pytest.raises(UnusableStore, match="Check the folder and its permissions"):
         blobs.put(b"depth")
-    with pytest.raises(UnusableStore, match=r"the folder cannot be made .*--data"):
+    with pytest.raises(UnusableStore, match=r"the folder cannot be made \(Not a directory\)"):
         Blobs(place / "below")
 
 
@@ -166,12 +166,20 @@ def test_a_blob_may_be_put_and_removed_at_once(blobs: Blobs, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("number", "advice"),
-    [(errno.ENOSPC, "Free some space."), (errno.EDQUOT, "Free some space."),
-     (errno.EROFS, "Check the folder and its permissions.")],
-)  # fmt: skip
+    ("number", "kind", "advice"),
+    [
+        (errno.ENOSPC, StoreFull, "The disk is full: free some space."),
+        (errno.EDQUOT, StoreFull, "The disk is full: free some space."),
+        (errno.EROFS, ReadOnlyStore, "It is read-only: make it writable, or name another folder."),
+        (errno.EIO, UnusableStore, "Check the folder and its permissions."),
+    ],
+)
 def test_what_to_do_depends_on_what_failed(
-    blobs: Blobs, monkeypatch: pytest.MonkeyPatch, number: int, advice: str
+    blobs: Blobs,
+    monkeypatch: pytest.MonkeyPatch,
+    number: int,
+    kind: type[UnusableStore],
+    advice: str,
 ) -> None:
     def fail(_: int) -> None:
         raise OSError(number, os.strerror(number))
@@ -179,6 +187,7 @@ def test_what_to_do_depends_on_what_failed(
     monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(UnusableStore) as caught:
         blobs.put(b"depth")
+    assert caught.type is kind
     assert str(caught.value).endswith(f"cannot be written ({os.strerror(number)}). {advice}")
     assert not blobs.holds(DIGEST)
 

@@ -170,8 +170,7 @@ def test_a_folder_that_may_not_be_written_says_so() -> None:
     assert len(told) == 3
     assert "the folder cannot be made (Permission denied)" in told[0]
     assert "unable to open database file" in told[1]
-    assert "truth.db" not in told[2]
-    assert "that it may be written" in told[2]
+    assert told[2] == "opened"  # to be read
 
 
 def test_a_damaged_page_is_said(url: str, store: Store, tmp_path: Path) -> None:

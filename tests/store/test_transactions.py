@@ -11,7 +11,7 @@ import pytest
 from sqlalchemy import Connection, insert, select, text, update
 from sqlalchemy.exc import IntegrityError
 
-from sceneprint.errors import UnusableStore
+from sceneprint.errors import StoreFull
 from sceneprint.store import Store
 from sceneprint.store.maps import find_map, next_revision
 from sceneprint.store.records import MapRow
@@ -41,7 +41,7 @@ def test_every_connection_of_the_pool_is_configured(store: Store) -> None:
                 for name in ("journal_mode", "synchronous", "foreign_keys", "busy_timeout")
             }
             assert found == {
-                "journal_mode": "wal", "synchronous": 2, "foreign_keys": 1, "busy_timeout": 30_000,
+                "journal_mode": "wal", "synchronous": 2, "foreign_keys": 1, "busy_timeout": 10_000,
             }  # fmt: skip
 
 
@@ -79,7 +79,7 @@ def test_a_full_disk_is_said_and_leaves_nothing(store: Store, hall: MapRow) -> N
         for _ in range(9):
             connection.execute(insert(events).values(at=0.0, kind="x", data={"a": "b" * 4000}))
 
-    full = pytest.raises(UnusableStore, match=r"is full.*disk has room")
+    full = pytest.raises(StoreFull, match=r"disk is full.*Free some space")
     with full, store.database.write() as connection:
         fill(connection)
     with store.database.read() as connection:

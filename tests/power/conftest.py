@@ -1,0 +1,259 @@
+"""A disk that loses power: what our own files may look like afterwards, by the letter of POSIX.
+
+The code under test writes real files in a real folder. An audit hook and `os.fsync` tell in which
+order; from that log this makes the folders that may be left after every step:
+
+* what a file holds is sure as of its last fsync; later writes may be there, in part, or not at all
+* a name that was made, changed or removed is sure once its folder was synced after that; before,
+  each such change may be there or not, whatever became of the others
+* a rename within one folder is one change; from one folder to another it is two
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import stat
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+#: One change of a folder: names and what they lead to from now on, None where to nothing.
+Change = dict[str, int | None]
+
+
+@dataclass
+class Inode:
+    """A file or a folder: as programs see it, and as the disk has it for sure."""
+
+    is_folder: bool
+    seen: bytes = b""
+    sure: bytes = b""
+    names: dict[str, int] = field(default_factory=dict)
+    sure_names: dict[str, int] = field(default_factory=dict)
+    pending: list[Change] = field(default_factory=list)
+
+
+class Disk:
+    """The log of one folder, as the states that the disk went through.
+
+    Parameters
+    ----------
+    root : the folder; what is in it now is durable
+    deaf : "files" or "folders": whose fsyncs this disk does not do, to see that somebody notices
+    """
+
+    def __init__(self, root: Path, deaf: str = "") -> None:
+        self.root, self.deaf = root.resolve(), deaf
+        self.inodes: dict[int, Inode] = {}
+        self.states: list[tuple[str, dict[int, Inode]]] = []
+        self._ids: dict[int, int] = {}  # of files that have a name now: numbers are given out again
+        self._top = self._new(self.root.stat().st_ino, is_folder=True)
+        self._look()
+        for inode in self.inodes.values():
+            inode.sure, inode.sure_names, inode.pending = inode.seen, dict(inode.names), []
+        self._keep("begin")
+
+    def _new(self, real: int, *, is_folder: bool) -> int:
+        self._ids[real] = len(self.inodes)
+        self.inodes[self._ids[real]] = Inode(is_folder)
+        return self._ids[real]
+
+    def mark(self, what: str) -> None:
+        """Note that something happened elsewhere, such as a commit."""
+        self._look()
+        self._keep(what)
+
+    def synced(self, descriptor: int) -> None:
+        """After an fsync."""
+        found = os.fstat(descriptor)
+        self._look()
+        if found.st_ino not in self._ids or found.st_dev != self.root.stat().st_dev:
+            return
+        inode = self.inodes[self._ids[found.st_ino]]
+        if stat.S_ISDIR(found.st_mode):
+            if self.deaf != "folders":
+                inode.sure_names, inode.pending = dict(inode.names), []
+            self._keep("sync folder")
+        else:
+            if self.deaf != "files":
+                inode.sure = inode.seen
+            self._keep("sync file")
+
+    def about_to(self, event: str) -> None:
+        """Before a call that opens, renames or removes: see what was done until now."""
+        self._look()
+        self._keep(f"before {event}")
+
+    def _look(self) -> None:
+        """Bring what programs see up to date with the real folder."""
+        found: dict[int, dict[str, int]] = {}
+        named = {self.root.stat().st_ino}
+        for place, _, _ in os.walk(self.root):
+            own = found[self._ids[Path(place).stat().st_ino]] = {}
+            with os.scandir(place) as entries:
+                for each in entries:
+                    real, is_folder = each.inode(), each.is_dir()
+                    at = self._ids.get(real)
+                    if at is None:
+                        at = self._new(real, is_folder=is_folder)
+                    own[each.name] = at
+                    named.add(real)
+                    if not is_folder:
+                        self.inodes[at].seen = Path(each.path).read_bytes()
+        self._ids = {real: at for real, at in self._ids.items() if real in named}
+        for folder, names in found.items():
+            inode, changes = self.inodes[folder], []
+            gone = {name: at for name, at in inode.names.items() if names.get(name) != at}
+            for name, at in names.items():
+                if inode.names.get(name) != at:  # together with the name that it had here before
+                    before = {old: None for old in gone if gone[old] == at and old != name}
+                    changes.append({**before, name: at})
+            moved = {old for change in changes for old in change}
+            inode.pending += [*changes, *({name: None} for name in gone if name not in moved)]
+            inode.names = names
+
+    def _keep(self, what: str) -> None:
+        self.states.append((what, deepcopy(self.inodes)))
+
+    def crashes(self, seeds: int = 3) -> Iterator[tuple[int, str, dict[str, bytes | None]]]:
+        """What may be left after each step: nothing unsure, all of it, and subsets.
+
+        Yields
+        ------
+        step : number of the state
+        what : the step, and what was kept
+        tree : content by path, None for a folder; what was yielded at that step is not again
+        """
+        for step, (what, inodes) in enumerate(self.states):
+            known: list[dict[str, bytes | None]] = []
+            ways: list[tuple[str, Callable[[], bool], Callable[[Inode], bytes]]] = [
+                ("nothing unsure", lambda: False, lambda one: one.sure),
+                ("all", lambda: True, lambda one: one.seen),
+                ("names alone", lambda: True, lambda one: one.sure),
+                ("names and zeros", lambda: True, _zeros),
+            ]
+            for seed in range(seeds):
+                rng = random.Random(1000 * step + seed)
+                ways.append((f"seed {seed}", *_at_random(rng)))
+            for how, keeps, content in ways:
+                tree: dict[str, bytes | None] = {}
+                self._left(inodes, self._top, "", keeps, content, tree)
+                if tree not in known:
+                    known.append(tree)
+                    yield step, f"{what}: {how}", tree
+
+    def _left(
+        self, inodes: dict[int, Inode], number: int, path: str, keeps: Callable[[], bool],
+        content: Callable[[Inode], bytes], tree: dict[str, bytes | None],
+    ) -> None:  # fmt: skip
+        names: dict[str, int] = dict(inodes[number].sure_names)
+        for change in inodes[number].pending:
+            if keeps():
+                names = {k: v for k, v in {**names, **change}.items() if v is not None}
+        for name, at in sorted(names.items()):
+            inode, place = inodes[at], f"{path}{name}"
+            if inode.is_folder:
+                tree[place] = None
+                self._left(inodes, at, f"{place}/", keeps, content, tree)
+            else:
+                tree[place] = content(inode)
+
+
+def _zeros(inode: Inode) -> bytes:
+    return inode.seen if inode.sure == inode.seen else bytes(len(inode.seen))
+
+
+def _at_random(rng: random.Random) -> tuple[Callable[[], bool], Callable[[Inode], bytes]]:
+    def content(inode: Inode) -> bytes:
+        if inode.sure == inode.seen:
+            return inode.seen
+        kept = rng.choice((0, rng.randrange(len(inode.seen) + 1), len(inode.seen)))
+        return rng.choice((inode.sure, inode.seen[:kept]))
+
+    return lambda: rng.random() < 0.5, content
+
+
+_EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate")
+#: The one that listens; a hook cannot be taken away again.
+_listening: list[Disk] = []
+
+
+@pytest.fixture(scope="session")
+def _hooked() -> None:
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        if event not in _EVENTS or not _listening:
+            return
+        disk = _listening.pop()  # it opens files itself
+        try:
+            if event == "open" and not arguments[2] & (os.O_CREAT | os.O_TRUNC):
+                return
+            places = [os.fsdecode(one) for one in arguments if isinstance(one, str | bytes)]
+            if any(Path(place).absolute().is_relative_to(disk.root) for place in places):
+                disk.about_to(event)
+        finally:
+            _listening.append(disk)
+
+    sys.addaudithook(hook)
+
+
+Recording = Callable[..., Any]
+
+
+@pytest.fixture
+def recorded(_hooked: None, monkeypatch: pytest.MonkeyPatch) -> Recording:
+    """`with recorded(folder) as disk:` records what this thread does to files in a folder."""
+    fsync, fdatasync = os.fsync, os.fdatasync
+
+    def listen(after: Callable[[int], None]) -> Callable[[Any], None]:
+        def sync(file: Any) -> None:
+            number = file if isinstance(file, int) else file.fileno()
+            after(number)
+            if _listening:
+                disk = _listening.pop()
+                try:
+                    disk.synced(number)
+                finally:
+                    _listening.append(disk)
+
+        return sync
+
+    monkeypatch.setattr(os, "fsync", listen(fsync))
+    monkeypatch.setattr(os, "fdatasync", listen(fdatasync))
+
+    @contextmanager
+    def record(root: Path, deaf: str = "") -> Iterator[Disk]:
+        assert not _listening
+        disk = Disk(root, deaf)
+        _listening.append(disk)
+        try:
+            yield disk
+        finally:
+            _listening.clear()
+            disk.mark("end")
+
+    return record
+
+
+@pytest.fixture
+def after_crash(tmp_path: Path) -> Callable[[dict[str, bytes | None]], Path]:
+    """Make the folder that a crash left; each has a new name, as files may be mapped."""
+    made = iter(range(1_000_000))
+
+    def make(tree: dict[str, bytes | None]) -> Path:
+        root = tmp_path / f"crashed-{next(made)}"
+        root.mkdir()
+        for name, content in tree.items():  # folders before what is in them
+            if content is None:
+                (root / name).mkdir()
+            else:
+                (root / name).write_bytes(content)
+        return root
+
+    return make

@@ -1,0 +1,290 @@
+"""The order of our own fsyncs: whatever a loss of power drops, what was promised is there.
+
+SQLite's files are SQLite's business (synchronous = FULL); here are blobs and the index.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from sqlalchemy import Connection, event
+
+from sceneprint import writing
+from sceneprint.engine import Engine
+from sceneprint.index import Generation, Tail, newest, publish, signatures_of
+from sceneprint.index import publishing as index_publishing
+from sceneprint.schemas import CameraIntrinsics, FrameMeta, JobState, NewMap
+from sceneprint.settings import Settings
+from sceneprint.store import Blobs
+from sceneprint.types import Bytes
+
+LENGTH = 64
+Recorded = Callable[..., Any]
+AfterCrash = Callable[[dict[str, bytes | None]], Path]
+
+
+def test_what_a_disk_may_drop(tmp_path: Path, recorded: Recorded) -> None:
+    """The model itself, against POSIX by hand."""
+    root = tmp_path / "disk"
+    root.mkdir()
+    (root / "old").write_bytes(b"old")
+    with recorded(root) as disk:
+        (root / "sub").mkdir()
+        with (root / "sub" / "part").open("wb") as file:
+            file.write(b"content")
+            file.flush()
+            os.fsync(file.fileno())
+        disk.mark("file synced")
+        (root / "sub" / "part").replace(root / "sub" / "whole")
+        (root / "old").unlink()
+        disk.mark("renamed")
+        writing.sync_folder(root / "sub")
+        disk.mark("sub synced")
+        writing.sync_folder(root)
+    left: dict[str, list[dict[str, bytes | None]]] = {}
+    for _, what, tree in disk.crashes(seeds=20):
+        left.setdefault(what.partition(":")[0], []).append(tree)
+
+    old: dict[str, bytes | None] = {"old": b"old"}
+    sub: dict[str, bytes | None] = {"sub": None}
+    part, whole = {**sub, "sub/part": b"content"}, {**sub, "sub/whole": b"content"}
+
+    def either(*trees: dict[str, bytes | None]) -> list[dict[str, bytes | None]]:
+        return sorted(trees, key=repr)
+
+    def all_of(what: str) -> list[dict[str, bytes | None]]:
+        return sorted(left[what], key=repr)
+
+    assert all_of("begin") == [old]
+    assert all_of("file synced") == either(old, old | sub, old | part)
+    # a rename of a name that is not sure yet may be there without the making of it
+    named = [{}, sub, part, whole]
+    assert all_of("renamed") == either(*named, *({**old, **one} for one in named))
+    assert all_of("sub synced") == either({}, old, whole, old | whole)
+    assert all_of("end") == [whole]
+
+
+@pytest.fixture
+def lost_blobs(
+    recorded: Recorded, after_crash: AfterCrash, tmp_path: Path
+) -> Callable[[str], set[str]]:
+    """Put blobs on a disk, and say which promises a loss of power breaks."""
+    first, second = b"depth" * 300, b"another frame" * 100
+
+    def run(deaf: str) -> set[str]:
+        root = tmp_path / f"disk-{deaf}"
+        root.mkdir()
+        contents = {hashlib.sha256(one).hexdigest(): one for one in (first, second)}
+        with recorded(root, deaf) as disk:
+            promised: list[tuple[int, set[str]]] = [(0, set())]
+            blobs = Blobs(root / "data" / "blobs")
+            for data in (first, second, first):
+                digest = blobs.put(data)
+                disk.mark("put")
+                promised.append((len(disk.states) - 1, promised[-1][1] | {digest}))
+            disk.mark("removing")  # its rows are gone: from here on nothing is promised
+            blobs.remove(digest)
+            promised.append((len(disk.states) - 1, promised[-1][1] - {digest}))
+        broken = set()
+        for step, what, tree in disk.crashes():
+            found = {Path(name).name: data for name, data in tree.items() if data is not None}
+            held = {name: data for name, data in found.items() if not name.endswith(".part")}
+            if any(contents[name] != data for name, data in held.items()):
+                broken.add("a name with another content")
+            due = next(names for begun, names in reversed(promised) if begun <= step)
+            if due - held.keys():
+                broken.add("a blob that is gone")
+            kept = Blobs(after_crash(tree) / "data" / "blobs")
+            for digest in held:
+                if held[digest] == contents[digest]:
+                    assert kept.get(digest) == contents[digest], what
+        return broken
+
+    return run
+
+
+def test_a_blob_that_was_put_survives(lost_blobs: Callable[[str], set[str]]) -> None:
+    assert lost_blobs("") == set()
+
+
+def test_who_does_not_sync_blobs_is_found_out(lost_blobs: Callable[[str], set[str]]) -> None:
+    assert lost_blobs("files") == {"a name with another content"}
+    assert lost_blobs("folders") == {"a blob that is gone"}
+
+
+def test_no_commit_refers_to_a_blob_that_may_be_lost(
+    tmp_path: Path, recorded: Recorded, small_upload: tuple[bytes, FrameMeta]
+) -> None:
+    """Upload, signing and deletion as they are: with every commit the blobs it refers to."""
+    referred = (
+        "SELECT blob FROM frames WHERE state != 'deleted' UNION SELECT geometry FROM signatures"
+    )
+    root = tmp_path / "data" / "blobs"
+    commits: list[tuple[int, set[str]]] = []
+    with Engine(Settings(data_dir=tmp_path / "data", database_url=None)) as engine:
+        engine.create_map(NewMap(name="hall", model="compact"))
+        with recorded(root) as disk:
+
+            def note(connection: Connection) -> None:  # before SQLite is asked to commit
+                rows = {row[0] for row in connection.exec_driver_sql(referred)}
+                disk.mark("commit")
+                commits.append((len(disk.states) - 1, rows))
+
+            database = engine.store.database._engine
+            event.listen(database, "commit", note)
+            added, _ = engine.add_frame("hall", *small_upload)
+            work = engine.claim("w")
+            assert work is not None
+            assert engine.run(work) == JobState.SUCCEEDED
+            event.remove(database, "commit", note)
+            before_deletion = len(disk.states)
+            engine.delete_frame("hall", added.frame_id)
+    assert [len(rows) for _, rows in commits] == sorted(len(rows) for _, rows in commits)
+    assert len(commits[-1][1]) == 2  # the upload and its artifact
+    checked = 0
+    for step, what, tree in disk.crashes():
+        if step >= before_deletion:
+            break
+        rows = next((names for begun, names in reversed(commits) if begun <= step), set())
+        whole = {
+            Path(name).name
+            for name, data in tree.items()
+            if data is not None and hashlib.sha256(data).hexdigest() == Path(name).name
+        }
+        assert rows <= whole, what
+        checked += bool(rows)
+    assert checked > 10
+
+
+def signatures_at(keys: NDArray[np.int64]) -> Bytes:
+    return np.stack([np.random.default_rng(k).integers(0, 256, LENGTH, np.uint8) for k in keys])
+
+
+#: Keys that each generation adds, and those it drops: a first, an appended, a refit that has
+#: doubled, one of deletions that rewrites the segments, an appended.
+STEPS = (
+    (range(20), frozenset()),
+    (range(20, 26), frozenset({3})),
+    (range(26, 60), frozenset()),
+    (range(60, 62), frozenset(range(5, 50))),
+    (range(62, 70), frozenset()),
+)
+
+
+def expected(number: int) -> list[int]:
+    """Keys of a generation, by hand."""
+    keys: list[int] = []
+    for new, dropped in STEPS[:number]:
+        keys = [key for key in [*keys, *new] if key not in dropped]
+    return keys
+
+
+def publish_step(folder: Path, number: int, previous: Generation | None) -> Generation:
+    new, dropped = STEPS[number - 1]
+    keys = np.array(new)
+    made = publish(
+        folder, model_id="model", revision=10 * number, blocks=[(keys, signatures_at(keys))],
+        previous=previous, drop=dropped,
+    )  # fmt: skip
+    assert made is not None
+    return made
+
+
+def read(folder: Path) -> Generation | None:
+    """The newest generation, which holds just what it should."""
+    found = newest(folder, "model", LENGTH, verify=True)
+    if found is not None:
+        number = found.revision // 10
+        assert found.keys.tolist() == expected(number)
+        stored = signatures_of(found.keys, found, Tail.empty(LENGTH))
+        np.testing.assert_array_equal(stored, signatures_at(found.keys))
+        assert len(found.coarse) == len(found.keys)
+    return found
+
+
+@pytest.fixture
+def lost_generations(
+    recorded: Recorded, after_crash: AfterCrash, tmp_path: Path
+) -> Callable[..., set[str]]:
+    """Publish five generations, and say which promises a loss of power breaks."""
+
+    def run(deaf: str = "", steps: int = len(STEPS)) -> set[str]:
+        root = tmp_path / f"index-{deaf}"
+        root.mkdir()
+        done: list[int] = [0]  # the state after which each generation was published
+        with recorded(root, deaf) as disk:
+            previous = None
+            for number in range(1, steps + 1):
+                previous = publish_step(root / "map", number, previous)
+                disk.mark("published")
+                done.append(len(disk.states) - 1)
+        broken, seen, looked_at = set(), set(), set()
+        for step, what, tree in disk.crashes(seeds=2):
+            published = max(number for number, begun in enumerate(done) if begun <= step)
+            if (published, frozenset(tree.items())) in looked_at:
+                continue
+            looked_at.add((published, frozenset(tree.items())))
+            folder = after_crash(tree) / "map"
+            found = read(folder)
+            number = 0 if found is None else found.revision // 10
+            if number not in (published, published + 1):
+                broken.add(f"{number or 'none'} after {published} ({what})")
+            if what.endswith("nothing unsure") and number < steps and number == published:
+                again = publish_step(folder, number + 1, found)  # and it goes on from there
+                assert read(folder) is not None
+                assert again.revision == 10 * (number + 1)
+            seen.add((published, number))
+        if not broken:  # in every stretch some crashes keep the old one, and some the new one
+            assert seen >= {(n, n) for n in range(steps)} | {(n, n + 1) for n in range(steps)}
+        return broken
+
+    return run
+
+
+def test_a_generation_that_was_published_survives(
+    lost_generations: Callable[..., set[str]],
+) -> None:
+    assert lost_generations() == set()
+
+
+@pytest.mark.parametrize("deaf", ["files", "folders"])
+def test_who_does_not_sync_an_index_is_found_out(
+    deaf: str, lost_generations: Callable[..., set[str]]
+) -> None:
+    broken = lost_generations(deaf, steps=2)
+    assert {one.partition(" (")[0] for one in broken} >= {"none after 1"}
+
+
+def test_old_generations_removed_too_early_are_found_out(
+    lost_generations: Callable[..., set[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = index_publishing._write
+
+    def remove_first(folder: Path, generation: Generation) -> Path:
+        for path in folder.glob("*.json"):
+            path.unlink()
+        return write(folder, generation)
+
+    monkeypatch.setattr(index_publishing, "_write", remove_first)
+    assert any(one.startswith("none after 1") for one in lost_generations(steps=2))
+
+
+@pytest.fixture(scope="module")
+def small_upload(room_frames: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    from sceneprint.datasets import write_depth_png
+
+    path = tmp_path_factory.mktemp("png") / "a.png"
+    frame = room_frames[0]
+    k = frame.intrinsics
+    write_depth_png(path, np.ascontiguousarray(frame.depth[::4, ::4]), 1000.0)
+    camera = CameraIntrinsics(
+        width=160, height=120, fx=k.fx / 4, fy=k.fy / 4, cx=k.cx / 4, cy=k.cy / 4
+    )
+    return path.read_bytes(), FrameMeta(intrinsics=camera)

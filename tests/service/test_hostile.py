@@ -1,0 +1,322 @@
+"""A machine that misbehaves under a running service: it answers what it can, and loses nothing."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from sceneprint.cli import checks
+from sceneprint.engine import Engine
+from sceneprint.schemas import FrameMeta, NewMap
+from sceneprint.settings import Settings
+
+BIN = Path(sys.executable).parent
+#: Largest file that a process may write from now on, where no disk can be mounted: less than the
+#: log of the database or a frame, more than our own logs.
+NARROW = 1 << 17
+WAIT = {"Prefer": "wait=60"}
+
+
+def pending(server) -> dict[str, int]:
+    return dict(server.client.get("/readyz").json()["jobs"])
+
+
+def members(server) -> list[int]:
+    return [server.process.pid, *server.workers]
+
+
+class Mounted:
+    """A service whose data folder is a disk of its own, of 24 MB."""
+
+    kinds = (507, "store-full", "30", "The service's disk is full, and nothing was taken")
+
+    def __init__(self, server) -> None:
+        self.server = server
+        self.folder = Path(f"/proc/{server.process.pid}/root{server.folder}")
+
+    def fill(self) -> None:
+        with (self.folder / "ballast").open("wb", buffering=0) as file:
+            try:
+                while True:
+                    file.write(bytes(1 << 16))
+            except OSError:
+                pass
+            try:
+                while True:
+                    file.write(bytes(512))
+            except OSError:
+                pass
+
+    def free(self) -> None:
+        (self.folder / "ballast").unlink()
+
+
+class Limited:
+    """A service whose processes may write no large file; no privilege is needed for that."""
+
+    kinds = (503, "unusable-store", "1", "nothing was taken")
+
+    def __init__(self, server) -> None:
+        self.server, self.folder = server, server.folder
+
+    def _limit(self, size: int) -> None:
+        for pid in members(self.server):
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+
+    def fill(self) -> None:
+        self._limit(NARROW)
+
+    def free(self) -> None:
+        self._limit(resource.RLIM_INFINITY)
+
+
+def mountable() -> tuple[str, ...] | None:
+    """How to get a namespace in which a disk can be mounted."""
+    if shutil.which("unshare") is None:
+        return None
+    for how in (("-m",), ("-U", "-r", "-m")):
+        tried = ["unshare", *how, "mount", "-t", "tmpfs", "tmpfs", "/mnt"]
+        if subprocess.run(tried, capture_output=True, check=False).returncode == 0:
+            return how
+    return None
+
+
+MOUNT = "mount -t tmpfs -o size=24m tmpfs $0 && exec $1 serve --port 0 --data $0 --workers 1"
+
+
+@pytest.fixture(params=[Mounted, Limited])
+def narrow(request, begin, tmp_path):
+    if request.param is Limited:
+        return Limited(begin(folder=tmp_path / "data", lease_s=3))
+    how = mountable()
+    if how is None:
+        pytest.skip("no disk can be mounted here; the other case needs none")
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    script = ("sh", "-c", MOUNT, str(folder), str(BIN / "sceneprint"))
+    return Mounted(begin(folder=folder, command=("unshare", *how, *script), lease_s=3))
+
+
+def tree(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_full_disk_takes_nothing_and_costs_nothing(
+    narrow, make_map, shots, small_shots, refused, until, tmp_path
+):
+    server = narrow.server
+    path = make_map(server, "hall")
+    sent = server.client.post(f"{path}/frames", **shots[0].form(), headers=WAIT)
+    assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
+    (worker,) = server.workers
+    os.kill(worker, signal.SIGSTOP)
+    waiting = server.client.post(f"{path}/frames", **shots[1].form())
+    assert waiting.status_code == 202
+    before = server.client.get("/readyz").json()
+    narrow.fill()
+    blobs = tree(narrow.folder / "blobs")
+    status, kind, retry, said = narrow.kinds
+    for shot in (shots[2], small_shots[0]):  # too large for a blob; for the database alone
+        answer = server.client.post(f"{path}/frames", **shot.form())
+        refused(answer, status, kind, said)
+        assert answer.headers["retry-after"] == retry
+    assert tree(narrow.folder / "blobs") == blobs  # no blob without a row, no part
+    assert server.client.get("/readyz").json() == before
+    found = server.client.post(f"{path}/queries", json={"frame_id": sent.json()["frame_id"]})
+    assert found.status_code == 200
+    asked = server.client.post(f"{path}/queries", **shots[0].form())
+    assert (asked.status_code, asked.json()["status"]) == (200, "found")
+    os.kill(worker, signal.SIGCONT)
+    until(lambda: len(server.log("the store does not answer")) >= 2)
+    assert server.client.get("/healthz").status_code == 200
+    job = server.client.get(f"/v1/jobs/{waiting.json()['job_id']}").json()
+    assert job["state"] in ("queued", "running")
+    assert tree(narrow.folder / "blobs") == blobs
+    if isinstance(narrow, Mounted):
+        look = checks.machine(Settings(data_dir=narrow.folder, database_url=None))
+        told = {one.subject: one for one in look}
+        assert told["data folder"].verdict == told["disk"].verdict == "WRONG"
+        assert "is on a full disk. Free some space" in told["data folder"].text
+    narrow.free()
+    until(lambda: pending(server) == {"succeeded": 2})  # of itself
+    assert server.workers == [worker]
+    late = server.client.post(f"{path}/frames", **shots[2].form(), headers=WAIT)
+    assert (late.status_code, late.json()["state"]) == (201, "indexed")
+    copy = tmp_path / "copy.db"  # SQLite would look for the path in our own namespace
+    for end in ("", "-wal"):
+        shutil.copy(narrow.folder / f"sceneprint.db{end}", f"{copy}{end}")
+    with closing(sqlite3.connect(copy)) as database:
+        assert database.execute("SELECT max(failures) FROM jobs").fetchone() == (0,)
+        assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+
+
+@pytest.fixture(scope="module")
+def kept(begin, make_map, small_shots):
+    """A service with three indexed frames, that works on one thing at a time and lets few wait."""
+    server = begin(concurrency=1, waiting=2)
+    path = make_map(server, "hall")
+    for shot in small_shots[:3]:
+        sent = server.client.post(f"{path}/frames", **shot.form(), headers=WAIT)
+        assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
+    return server
+
+
+def test_another_process_that_keeps_writing_stops_uploads_alone(kept, small_shots, refused, until):
+    path = "/v1/maps/hall"
+
+    def upload(i: int) -> object:
+        return kept.client.post(f"{path}/frames", **small_shots[i].form())
+
+    with closing(sqlite3.connect(kept.folder / "sceneprint.db", timeout=30)) as writer:
+        writer.execute("PRAGMA busy_timeout = 30000")
+        writer.isolation_level = None
+        writer.execute("BEGIN IMMEDIATE")
+        with ThreadPoolExecutor(4) as pool:
+            sent = [pool.submit(upload, i) for i in (8, 9, 10, 11)]
+            until(lambda: any(one.done() for one in sent))  # all places of uploads are taken
+            asked = kept.client.post(f"{path}/queries", **small_shots[0].form())
+            assert (asked.status_code, asked.json()["status"]) == (200, "found")
+            for address in ("/healthz", "/readyz", "/metrics", path, f"{path}/frames"):
+                assert kept.client.get(address).status_code == 200
+            answers = [one.result() for one in sent]
+            for answer in answers:
+                assert (answer.status_code, answer.headers["retry-after"]) == (503, "1")
+            kinds = sorted(answer.json()["type"].rpartition("/")[2] for answer in answers)
+            assert kinds == ["busy", *["store-locked"] * 3]
+        refused(upload(11), 503, "store-locked", "nothing was taken")
+        deleted = kept.client.delete(f"{path}/frames/none")
+        refused(deleted, 503, "store-locked")
+        writer.execute("ROLLBACK")
+    assert kept.client.get("/readyz").json()["frames"] == {"indexed": 3}
+    assert [upload(i).status_code for i in (8, 9, 10)] == [202, 202, 202]
+    until(lambda: kept.client.get("/readyz").json()["frames"] == {"indexed": 6})
+    assert kept.log("worker died") == []
+
+
+def test_two_services_on_one_folder(kept, begin, small_shots):
+    """What was taken by one is found by the other, though neither tells it."""
+    other = begin("--workers", "0", folder=kept.folder)
+    path = "/v1/maps/hall"
+    for number, (one, two) in enumerate([(kept, other), (other, kept)], start=20):
+        form = small_shots[number].form()
+        sent = one.client.post(f"{path}/frames", **form, headers=WAIT)
+        assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
+        again = two.client.post(f"{path}/frames", **form)
+        assert (again.status_code, again.json()["frame_id"]) == (200, sent.json()["frame_id"])
+        asked = two.client.post(f"{path}/queries", **form)
+        assert asked.json()["matches"][0]["frame_id"] == sent.json()["frame_id"]
+        assert asked.json()["matches"][0]["distance"] == 0
+    assert other.end(signal.SIGTERM) == 0
+    assert kept.client.get("/readyz").json()["status"] == "ready"
+
+
+#: Permissions hold for root as well: PR_CAPBSET_DROP, CAP_DAC_OVERRIDE.
+HELD = """
+import ctypes, os, sys
+assert os.getuid() or ctypes.CDLL(None).prctl(24, 1, 0, 0, 0) == 0
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+BOUND = "mount --bind $0 $0 && mount -o remount,bind,ro $0 && exec $1 $2 --data $0 ${3:+--port $3}"
+
+
+@pytest.fixture(scope="module")
+def stored(small_shots, tmp_path_factory) -> Path:
+    """A data folder of four indexed frames, closed."""
+    folder = tmp_path_factory.mktemp("stored") / "data"
+    with Engine(Settings(data_dir=folder, database_url=None)) as engine:
+        engine.create_map(NewMap(name="hall", model="compact"))
+        for shot in small_shots[:4]:
+            meta = FrameMeta.model_validate({"intrinsics": shot.camera})
+            engine.add_frame("hall", shot.png, meta)
+        while (work := engine.claim("w")) is not None:
+            engine.run(work)
+    return folder
+
+
+@pytest.fixture(params=["mounted", "permissions"])
+def sealed(request, stored) -> Iterator[Callable[..., tuple[str, ...]]]:
+    """The words before a command that may read the folder and not write it."""
+    sceneprint = str(BIN / "sceneprint")
+    if request.param == "mounted":
+        how = mountable()
+        if how is None:
+            pytest.skip("nothing can be mounted here; the other case needs none")
+        yield lambda *command: (
+            "unshare",
+            *how,
+            "sh",
+            "-c",
+            BOUND,
+            str(stored),
+            sceneprint,
+            *command,
+        )
+        return
+    for path in (stored, *stored.rglob("*")):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    start = (sys.executable, "-c", HELD, sceneprint)
+    yield lambda name, *port: (
+        *start, name, "--data", str(stored), *(("--port", *port) if port else ())
+    )  # fmt: skip
+    for path in (stored, *stored.rglob("*")):
+        path.chmod(0o755 if path.is_dir() else 0o644)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_read_only_folder_is_served_as_it_is(sealed, stored, begin, small_shots, refused):
+    before = contents(stored)
+    server = begin(command=sealed("serve", "0"), workers=1)
+    path = "/v1/maps/hall"
+    ready = server.client.get("/readyz").json()
+    assert (ready["status"], ready["read_only"], ready["frames"]) == ("ready", True, {"indexed": 4})
+    assert len(server.log("the store is read-only: queries are answered, and nothing is taken or "
+                          "signed")) == 1  # fmt: skip
+    asked = server.client.post(f"{path}/queries", **small_shots[1].form())
+    assert (asked.status_code, asked.json()["status"]) == (200, "found")
+    frames = server.client.get(f"{path}/frames").json()["items"]
+    assert len(frames) == 4
+    for answer in (
+        server.client.post(f"{path}/frames", **small_shots[9].form()),
+        server.client.delete(f"{path}/frames/{frames[0]['frame_id']}"),
+        server.client.post("/v1/maps", json={"name": "other"}),
+    ):
+        refused(answer, 503, "read-only-store", "Make the data folder writable")
+        assert answer.headers["retry-after"] == "60"
+    again = server.client.post(f"{path}/frames", **small_shots[0].form())
+    assert (again.status_code, again.json()["state"]) == (200, "indexed")  # nothing to be done
+    assert server.workers == []
+    assert server.end(signal.SIGTERM) == 0
+    assert contents(stored) == before
+
+
+@pytest.mark.parametrize("sealed", ["permissions"], indirect=True)
+def test_workers_and_doctor_say_that_a_folder_is_read_only(sealed, stored):
+    before = contents(stored)
+    given = os.environ | {"SCENEPRINT_WORKERS": "1"}
+    done = subprocess.run(
+        sealed("work"), env=given, capture_output=True, text=True, timeout=90, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("sceneprint work: ")
+    assert "is read-only: it is read, and nothing can be stored" in line
+    done = subprocess.run(sealed("doctor"), capture_output=True, text=True, timeout=90, check=False)
+    assert done.returncode == 2
+    (line,) = [one for one in done.stdout.splitlines() if one.startswith("WRONG")]
+    assert "is read-only" in line
+    assert "`sceneprint serve` answers queries of it, and takes nothing" in line
+    assert contents(stored) == before

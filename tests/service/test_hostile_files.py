@@ -1,0 +1,212 @@
+"""Files that are missing, damaged or of another version, under processes that need them."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sceneprint.client import Client
+from sceneprint.engine import Engine
+from sceneprint.errors import NewerSchema, UnusableStore
+from sceneprint.schemas import FrameMeta, FrameState, JobState, NewMap, Query
+from sceneprint.settings import Settings
+
+BIN = Path(sys.executable).parent
+HALL = "/v1/maps/hall"
+NEAREST = {"stages": ["retrieve"], "k": 9, "exact": True}
+
+
+def opened(folder: Path, **more: object) -> Engine:
+    return Engine(Settings.model_validate({"data_dir": folder, "database_url": None, **more}))
+
+
+def meta_of(shot: Any) -> FrameMeta:
+    return FrameMeta.model_validate({"intrinsics": shot.camera})
+
+
+@pytest.fixture(scope="module")
+def stored(small_shots, tmp_path_factory) -> Path:
+    """A folder whose map has two generations, of three and of six frames, and three frames more."""
+    folder = tmp_path_factory.mktemp("stored") / "data"
+    with opened(folder, tail_frames=2) as engine:
+        engine.create_map(NewMap(name="hall", model="compact"))
+        for number, shot in enumerate(small_shots[:9]):
+            engine.add_frame("hall", shot.png, meta_of(shot))
+            work = engine.claim("w")
+            assert work is not None
+            assert engine.run(work) == JobState.SUCCEEDED
+            if number in (2, 5):
+                assert engine.publish_due() == 1
+    assert len(list(folder.glob("index/hall-*/*.json"))) == 2
+    return folder
+
+
+@pytest.fixture
+def folder(stored, tmp_path) -> Path:
+    """A copy, to be damaged."""
+    return Path(shutil.copytree(stored, tmp_path / "data"))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def found(answer: dict[str, Any]) -> list[tuple[str, int]]:
+    return [(match["frame_id"], match["distance"]) for match in answer["matches"]]
+
+
+def nearest(server, frame_id: str) -> dict[str, Any]:
+    answer = server.client.post(f"{HALL}/queries", json={"frame_id": frame_id, **NEAREST})
+    assert answer.status_code == 200, answer.text
+    return dict(answer.json())
+
+
+def test_an_index_that_is_damaged_changes_no_answer(folder, tmp_path, begin):
+    """Each file of the newest generation while a service uses it, and at its next start."""
+    with opened(folder, index_dir=tmp_path / "none") as engine:  # by the database alone
+        frames = [frame.frame_id for frame in engine.list_frames("hall").items[::4]]
+        right = [
+            found(engine.query_frame("hall", one, Query.model_validate(NEAREST)).model_dump())
+            for one in frames
+        ]
+    assert [len(matches) for matches in right] == [8, 8, 8]
+    server = begin("--workers", "0", folder=folder)
+    assert nearest(server, frames[0])["index_generation"] == 2
+    newest, _ = sorted(folder.glob("index/hall-*/*.json"), reverse=True)
+    older = {path.name: path.read_bytes() for path in newest.parent.iterdir() if path.is_file()}
+    for kind in ("json", "faiss", "rows", "code", "segment"):
+        for path in newest.parent.glob(f"*.{kind}"):
+            other = path.with_suffix(".other")  # a mapped file is replaced: it is never changed
+            other.write_bytes(bytes(len(older[path.name])))
+            other.replace(path)
+        assert [found(nearest(server, one)) for one in frames] == right, kind
+    assert server.end(signal.SIGTERM) == 0
+    server = begin("--workers", "0", folder=folder)
+    answers = [nearest(server, one) for one in frames]
+    assert [found(answer) for answer in answers] == right
+    assert {answer["index_generation"] for answer in answers} == {0}
+    told = [line["message"] for line in server.log() if line["level"] == "warning"]
+    assert any(newest.name in one for one in told)
+    server.end(signal.SIGTERM)
+    for name, data in older.items():  # all but the newest manifest and what FAISS had
+        if name != newest.name and not name.endswith(".faiss"):
+            (newest.parent / name).write_bytes(data)
+    with opened(folder) as engine:
+        answer = engine.query_frame("hall", frames[0], Query.model_validate(NEAREST))
+        assert (found(answer.model_dump()), answer.index_generation) == (right[0], 0)
+    for name, data in older.items():
+        if name != newest.name:
+            (newest.parent / name).write_bytes(data)
+    with opened(folder) as engine:
+        answer = engine.query_frame("hall", frames[0], Query.model_validate(NEAREST))
+        assert (found(answer.model_dump()), answer.index_generation) == (right[0], 1)
+
+
+def test_blobs_that_are_missing_cost_what_needs_them(folder, begin, small_shots, refused):
+    server = begin("--workers", "0", folder=folder)
+    frames = [one["frame_id"] for one in server.client.get(f"{HALL}/frames").json()["items"]]
+    asked = "SELECT s.geometry FROM signatures s JOIN frames f ON f.number = s.frame_number"
+    with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
+        (blob,) = database.execute(f"{asked} WHERE f.id = '{frames[0]}'").fetchone()
+    (folder / "blobs" / blob[:2] / blob).unlink()
+    answer = server.client.post(f"{HALL}/queries", **small_shots[1].form()).json()
+    told = {match["frame_id"]: match["validation"] for match in answer["matches"]}
+    assert told[frames[0]]["status"] == "skipped"
+    assert "No such file" in told[frames[0]]["reason"]
+    assert (answer["status"], told[frames[1]]["status"]) == ("found", "accepted")
+    own = server.client.post(f"{HALL}/queries", json={"frame_id": frames[0]})
+    refused(own, 500, "damaged-blob", "Restore the data folder from a copy")
+    assert nearest(server, frames[0])["counts"]["compared"] == 8  # without the stage that needs it
+
+    (folder / "blobs").rename(folder / "away")
+    answer = server.client.post(f"{HALL}/queries", **small_shots[1].form())
+    assert (answer.status_code, answer.json()["status"]) == (200, "not_found")
+    assert {match["validation"]["status"] for match in answer.json()["matches"]} == {"skipped"}
+    assert server.client.get(f"{HALL}/frames/{frames[2]}").json()["state"] == "indexed"
+    sent = server.client.post(f"{HALL}/frames", **small_shots[20].form())
+    refused(sent, 503, "unusable-store", "nothing was taken")
+    assert not (folder / "blobs").exists()  # a disk that was unmounted comes back, with its blobs
+    (folder / "away").rename(folder / "blobs")
+    assert server.client.post(f"{HALL}/frames", **small_shots[20].form()).status_code == 202
+
+
+def test_an_upload_that_is_missing_fails_after_its_tries(folder, small_shots):
+    shot = small_shots[30]
+    with opened(folder) as engine:
+        added, _ = engine.add_frame("hall", shot.png, meta_of(shot))
+        with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
+            asked = f"SELECT blob FROM frames WHERE id = '{added.frame_id}'"
+            (blob,) = database.execute(asked).fetchone()
+            (folder / "blobs" / blob[:2] / blob).unlink()
+            states = []
+            for _ in range(3):
+                work = engine.claim("w")
+                assert work is not None
+                states.append(engine.run(work))
+                database.execute("UPDATE jobs SET run_after = 0")  # no test waits for the next try
+                database.commit()
+        assert states == [JobState.QUEUED, JobState.QUEUED, JobState.DEAD]
+        frame = engine.get_frame("hall", added.frame_id)
+        assert frame.state == FrameState.FAILED
+        assert f"The blob {blob[:12]} cannot be read (No such file or directory)" in frame.reason
+        again, new = engine.add_frame("hall", shot.png, meta_of(shot))
+        assert (again.frame_id, new) == (added.frame_id, True)
+        work = engine.claim("w")
+        assert work is not None
+        assert engine.run(work) == JobState.SUCCEEDED
+
+
+def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(stored, folder, tmp_path, small_shots):
+    """The blob cannot be written, and the database can: no fault of the frame's."""
+    shot = small_shots[30]
+    artifact, asked = "", "SELECT geometry FROM signatures ORDER BY frame_number DESC LIMIT 1"
+    with opened(Path(shutil.copytree(stored, tmp_path / "trial"))) as engine:
+        engine.add_frame("hall", shot.png, meta_of(shot))
+        work = engine.claim("w")
+        assert work is not None
+        assert engine.run(work) == JobState.SUCCEEDED
+        with closing(sqlite3.connect(tmp_path / "trial" / "sceneprint.db")) as database:
+            (artifact,) = database.execute(asked).fetchone()
+    with opened(folder) as engine:
+        added, _ = engine.add_frame("hall", shot.png, meta_of(shot))
+        place = folder / "blobs" / artifact[:2]
+        if place.exists():
+            place.rename(folder / "away")
+        place.write_bytes(b"a file where the folder should be")
+        for _ in range(4):  # more often than a frame may break down
+            work = engine.claim("w")
+            assert work is not None
+            with pytest.raises(UnusableStore):
+                engine.run(work)
+            assert engine.get_frame("hall", added.frame_id).state == FrameState.RECEIVED
+            assert engine.get_job(added.job_id).attempts == 0
+        place.unlink()
+        work = engine.claim("w")
+        assert work is not None
+        assert engine.run(work) == JobState.SUCCEEDED
+
+
+@pytest.mark.parametrize("command", ["serve", "work"])
+def test_the_folder_of_a_later_version_is_left_alone(command, folder):
+    with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
+        database.execute("UPDATE alembic_version SET version_num = '9999'")
+        database.commit()
+    before = contents(folder)
+    start = [BIN / "sceneprint", command, "--data", folder]
+    done = subprocess.run(start, capture_output=True, text=True, timeout=90, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"sceneprint {command}: ")
+    assert "has schema 9999, which this version of sceneprint does not know" in line
+    assert line.endswith("Use that version, or another data folder.")
+    with pytest.raises(NewerSchema):
+        Client.embedded(folder)
+    assert contents(folder) == before

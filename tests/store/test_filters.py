@@ -1,0 +1,128 @@
+"""Which frames pass a filter, in the database; tests/engine/test_filters.py has the oracle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from sqlalchemy import Connection, event, update
+
+from sceneprint.schemas import Filter, FrameState
+from sceneprint.store import Store
+from sceneprint.store.filters import Taken, passing
+from sceneprint.store.frames import delete_frame, set_state
+from sceneprint.store.maps import add_map
+from sceneprint.store.records import FrameRow, MapRow
+from sceneprint.store.tables import frames
+
+Received = Callable[..., FrameRow]
+NOBODY = Taken(None, None, None)
+
+
+def found(store: Store, row: MapRow, taken: Taken = NOBODY, **wanted: Any) -> list[int]:
+    with store.database.read() as connection:
+        return sorted(passing(connection, row.number, Filter(**wanted), taken).tolist())
+
+
+@pytest.fixture
+def indexed(store: Store, received: Received) -> Callable[..., FrameRow]:
+    """Insert a frame as queries find it."""
+
+    def add(content: str, **given: Any) -> FrameRow:
+        frame = received(content, **given)
+        with store.database.write() as connection:
+            connection.execute(
+                update(frames).where(frames.c.number == frame.number).values(state="indexed")
+            )
+        return frame
+
+    return add
+
+
+def test_only_indexed_frames_of_the_map_pass(
+    store: Store, hall: MapRow, indexed: Received, received: Received
+) -> None:
+    kept = [indexed(f"kept {i}", tags=["a"], robot="r1") for i in range(12)]
+    with store.database.write() as connection:
+        attic = add_map(connection, "attic", None, hall.model_id)
+    other = indexed("other", row=attic, tags=["a"], robot="r1")
+    for state in FrameState:
+        if state != FrameState.INDEXED:
+            frame = received(state, tags=["a"], robot="r1")
+            with store.database.write() as connection:
+                set_state(connection, frame.number, state)
+    with store.database.write() as connection:
+        delete_frame(connection, hall, kept[0])
+    numbers = [frame.number for frame in kept[1:]]
+    for wanted in ({}, {"tags": ["a"]}, {"robot": "r1"}, {"exclude_frames": [kept[0].id]}):
+        assert found(store, hall, **wanted) == numbers  # two digits and more, too
+    assert found(store, attic) == [other.number]
+    assert found(store, hall, robot="r2") == []
+    with store.database.read() as connection:
+        nobody = passing(connection, 99, Filter(), NOBODY)
+    assert (nobody.dtype, nobody.shape) == ("int64", (0,))
+
+
+def test_own_session_is_that_of_the_robot(store: Store, hall: MapRow, indexed: Received) -> None:
+    """Named: by robot, session and time of a frame; the query is r1 in s at 100, 10 s away."""
+    made = {
+        given: indexed(str(given), robot=given[0], session=given[1], captured_at=given[2]).number
+        for given in [
+            ("r1", "s", 89.9), ("r1", "s", 90.0), ("r1", "s", 110.0), ("r1", "s", 110.1),
+            ("r1", "s", None), ("r1", "t", 100.0), ("r1", None, 100.0), ("r2", "s", 100.0),
+            (None, "s", 100.0), (None, "s", 200.0), ("r2", "s", None),
+        ]
+    }  # fmt: skip
+    away = [("r1", "s", 89.9), ("r1", "s", 110.1), ("r1", "t", 100.0), ("r1", None, 100.0),
+            (None, "s", 200.0)]  # fmt: skip
+    of_r2 = [("r2", "s", 100.0), ("r2", "s", None)]
+    asked = Taken("r1", "s", 100.0)
+    assert found(store, hall, asked, not_within_s=10) == sorted(made[o] for o in away + of_r2)
+    # a query that names no robot may be any robot's
+    asked = Taken(None, "s", 100.0)
+    assert found(store, hall, asked, not_within_s=10) == sorted(made[o] for o in away)
+    with pytest.raises(ValueError, match="no session"):
+        found(store, hall, NOBODY, not_within_s=10)
+
+
+@contextmanager
+def plans(connection: Connection) -> Iterator[list[str]]:
+    """How SQLite goes about every statement."""
+    told: list[str] = []
+
+    def explain(_: Any, cursor: Any, statement: str, parameters: Any, *__: Any) -> None:
+        cursor.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)
+        told.extend(row[3] for row in cursor.fetchall())
+
+    event.listen(connection, "before_cursor_execute", explain)
+    yield told
+    event.remove(connection, "before_cursor_execute", explain)
+
+
+BOX = {"min": {"x": 0, "y": 0, "z": 0}, "max": {"x": 1, "y": 1, "z": 1}}
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        {"robot": "r1"},
+        {"session": "s"},
+        {"captured_after": "2026-11-16T09:30:00Z"},
+        {"tags": ["a", "b"]},
+        {"not_within_s": 5},
+        {"region": {"parent_frame": "p", **BOX}},
+        {"exclude_frames": ["a"]},
+    ],
+)
+def test_no_filter_reads_other_maps(store: Store, hall: MapRow, wanted: dict[str, Any]) -> None:
+    with store.database.read() as connection, plans(connection) as told:
+        passing(connection, hall.number, Filter.model_validate(wanted), Taken("r1", "s", 1.0))
+    assert told
+    assert all("SEARCH" in step or "LIST SUBQUERY" in step for step in told), told
+    assert not any("TEMP B-TREE" in step for step in told), told
+    if "session" in wanted:
+        assert any("session=?" in step for step in told), told
+    if "tags" in wanted:
+        assert sum("tag=?" in step for step in told) == 2

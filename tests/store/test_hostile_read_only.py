@@ -1,0 +1,200 @@
+"""A database that may be read and not written: read rightly, or not at all."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from sqlalchemy import create_engine, text
+
+from sceneprint.errors import UnusableStore
+from sceneprint.store import open_database, open_store
+from sceneprint.store.database import Database
+from sceneprint.store.sealed import Sealed
+
+#: A reader without the right to write, that does what it reads on standard input; permissions
+#: hold for root as well: PR_CAPBSET_DROP, CAP_DAC_OVERRIDE.
+READER = """
+import ctypes, os, sys
+if len(sys.argv) == 2:
+    assert os.getuid() or ctypes.CDLL(None).prctl(24, 1, 0, 0, 0) == 0
+    os.execv(sys.executable, [sys.executable, "-c", os.environ["READER"], *sys.argv[1:], "held"])
+from pathlib import Path
+from sqlalchemy import text
+from sceneprint.errors import SceneprintError
+from sceneprint.store import open_store
+folder = Path(sys.argv[1])
+store = None
+for line in sys.stdin:
+    try:
+        if store is None:
+            store = open_store(f"sqlite:///{folder}/a.db", folder / "blobs")
+            assert store.database.read_only
+        if line == "write\\n":
+            with store.database.write():
+                print("written")
+        with store.database.read() as connection:
+            found = connection.execute(text("SELECT sum(number) FROM events")).scalar()
+        print(found, sorted(os.listdir(folder)), flush=True)
+    except SceneprintError as error:
+        print(f"{type(error).__name__}: {error}", flush=True)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[Path]:
+    """A database with one row, closed, and read-only for who has no special rights."""
+    folder = tmp_path / "data"
+    folder.mkdir()
+    open_database(f"sqlite:///{folder}/a.db").close()
+    add(folder)
+    folder.chmod(0o555)
+    yield folder
+    folder.chmod(0o755)
+
+
+def insert(connection: sqlite3.Connection) -> None:
+    connection.execute("INSERT INTO events (at, kind, data) VALUES (0, 'x', '{}')")
+    connection.commit()
+
+
+def add(folder: Path) -> None:
+    with closing(sqlite3.connect(folder / "a.db")) as connection:
+        insert(connection)
+
+
+class Reader:
+    """The process that may only read."""
+
+    def __init__(self, folder: Path) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", READER, str(folder)], text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ | {"READER": READER},
+        )  # fmt: skip
+
+    def ask(self, what: str = "read") -> str:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(f"{what}\n")
+        self.process.stdin.flush()
+        return self.process.stdout.readline().strip()
+
+
+@pytest.fixture
+def reader(folder: Path) -> Iterator[Reader]:
+    """Started when a test asks it first; what it says is that of one process."""
+    made = Reader(folder)
+    yield made
+    with made.process:
+        assert made.process.stdin is not None
+        made.process.stdin.close()
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="another user must write what this one may only read")
+def test_who_may_only_read_sees_what_others_write(folder: Path, reader: Reader) -> None:
+    assert reader.ask() == "1 ['a.db']"
+    assert reader.ask("write").startswith("ReadOnlyStore: ")
+    writer = sqlite3.connect(folder / "a.db")
+    insert(writer)  # into the log
+    assert reader.ask() == "3 ['a.db', 'a.db-shm', 'a.db-wal']"
+    insert(writer)
+    assert reader.ask() == "6 ['a.db', 'a.db-shm', 'a.db-wal']"
+    writer.close()
+    assert reader.ask() == "6 ['a.db']"
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="another user must write what this one may only read")
+def test_a_log_that_was_left_is_read_or_refused(folder: Path, reader: Reader) -> None:
+    """As after the power was lost, with and without the index of the log."""
+    with closing(sqlite3.connect(folder / "a.db")) as writer:
+        insert(writer)
+        left = {end: (folder / f"a.db{end}").read_bytes() for end in ("", "-wal", "-shm")}
+    for end, data in left.items():
+        (folder / f"a.db{end}").write_bytes(data)
+    assert reader.ask() == "3 ['a.db', 'a.db-shm', 'a.db-wal']"
+    (folder / "a.db-shm").unlink()
+    told = reader.ask()  # the row in the log must not be overlooked
+    assert told.startswith("UnusableStore: ")
+    assert "was not closed, and on a read-only disk it cannot be recovered" in told
+    (folder / "a.db-wal").write_bytes(b"")
+    assert reader.ask() == "1 ['a.db', 'a.db-wal']"  # all that the file itself holds
+
+
+def test_a_file_that_changes_while_it_is_read_is_not_believed(folder: Path) -> None:
+    """It is read without locks, as unchanging; somebody writes it after all."""
+    folder.chmod(0o755)
+    sealed = Sealed(folder / "a.db")
+    engine = create_engine(f"sqlite:///{folder}/a.db", creator=sealed.connect)
+    database = Database(engine, sealed)
+
+    def total(meanwhile: Callable[[], None]) -> int:
+        with database.read() as connection:
+            meanwhile()
+            return int(connection.execute(text("SELECT sum(number) FROM events")).scalar_one())
+
+    assert total(lambda: None) == 1
+    with pytest.raises(UnusableStore, match=r"was written by somebody else.*Ask again"):
+        total(lambda: add(folder))
+    database.close()  # who asks again, has it opened again
+    assert total(lambda: None) == 3
+    database.close()
+
+
+def without_rights() -> None:
+    """For a child about to begin: permissions hold for root as well."""
+    ctypes.CDLL(None).prctl(24, 1, 0, 0, 0)
+
+
+OPENS = """
+import sys
+from pathlib import Path
+from sceneprint.errors import SceneprintError
+from sceneprint.store import open_store
+folder = Path(sys.argv[1])
+try:
+    open_store(f"sqlite:///{folder}/a.db", folder / "blobs").database.close()
+    print("opened")
+except SceneprintError as error:
+    print(f"{type(error).__name__}: {error}")
+"""
+
+
+@pytest.mark.parametrize(
+    ("schema", "said"),
+    [
+        ("0001", "ReadOnlyStore: sqlite:///{folder}/a.db has schema 0001, this version needs"),
+        ("9999", "NewerSchema: sqlite:///{folder}/a.db has schema 9999, which this version"),
+    ],
+)
+def test_another_schema_on_a_read_only_folder_is_left_alone(
+    folder: Path, schema: str, said: str
+) -> None:
+    folder.chmod(0o755)
+    with closing(sqlite3.connect(folder / "a.db")) as connection:
+        connection.execute("UPDATE alembic_version SET version_num = ?", (schema,))
+        connection.commit()
+    folder.chmod(0o555)
+    before = (folder / "a.db").read_bytes()
+    done = subprocess.run(
+        [sys.executable, "-c", OPENS, str(folder)], capture_output=True, text=True, check=True,
+        preexec_fn=without_rights if os.getuid() == 0 else None,
+    )  # fmt: skip
+    assert done.stdout.startswith(said.format(folder=folder)), done.stdout
+    assert (folder / "a.db").read_bytes() == before
+    assert [path.name for path in folder.iterdir()] == ["a.db"]
+
+
+def test_a_folder_that_may_be_written_is_opened_for_writing(folder: Path) -> None:
+    folder.chmod(0o755)
+    store = open_store(f"sqlite:///{folder}/a.db", folder / "blobs")
+    store.database.require_writable()
+    assert not store.database.read_only
+    store.database.close()
+    assert (folder / "blobs").is_dir()
