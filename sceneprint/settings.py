@@ -56,8 +56,15 @@ class Settings(BaseSettings):
     upload_bytes: int = Field(default=72 << 20, ge=1024)
     #: Seconds after which a silent worker loses its job.
     lease_s: float = Field(default=60.0, ge=0.1, le=3600)
+    #: Longest time for one job, seconds; a worker that takes longer hangs, and is ended.
+    job_s: float = Field(default=120.0, ge=1, le=3600)
+    #: Memory that a worker may take for its work, bytes, beyond what it has when it is ready;
+    #: 0 for no limit. What needs more fails, and no other process is killed for it.
+    worker_bytes: int = Field(default=2 << 30, ge=0)
     #: Frames newer than the index above which a worker publishes a new one.
     tail_frames: int = Field(default=1000, ge=1, le=100_000)
+    #: Seconds after which a worker reads all index files again, to see that they are sound.
+    scrub_s: float = Field(default=3600.0, ge=1, le=31_536_000)
 
     @property
     def database(self) -> str:
@@ -74,6 +81,11 @@ class Settings(BaseSettings):
     def blob_dir(self) -> Path:
         """Folder of uploads and geometry artifacts."""
         return self.data_dir / "blobs"
+
+    @property
+    def bell_dir(self) -> Path:
+        """Folder of what wakes waiting workers."""
+        return self.data_dir / "bells"
 
     @property
     def indexes(self) -> Path:

@@ -18,7 +18,8 @@ def main() -> int:
     log_as_json()
     try:
         settings = Settings()
-        Engine(settings).close()  # what cannot be opened is said once, and not by every worker
+        with Engine(settings) as engine:  # what is wrong is said once, and not by every worker
+            engine.store.database.require_writable()
         run(settings)
     except (SceneprintError, ValidationError) as error:
         print(f"worker: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201

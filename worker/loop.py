@@ -3,66 +3,119 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import os
 import random
-import signal
 import socket
-import threading
 import time
 
 from sceneprint.engine import Engine
 from sceneprint.errors import SceneprintError
 from sceneprint.logs import log_as_json
 from sceneprint.settings import Settings
+from sceneprint.store.bell import Listener
+from worker.limits import Stop, limit_memory
+from worker.traces import Trace
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two looks at an empty queue, and between two looks at the indexes.
-IDLE_S, UPKEEP_S = 0.1, 5.0
+#: Shortest pause before another look at a queue that had nothing, and the longest: for jobs of
+#: which no bell tells, as those that another machine queued.
+SHORTEST_S, LONGEST_S = 0.05, 2.0
+#: Seconds between two looks at the indexes, and after one for which there was no memory.
+UPKEEP_S, POOR_S = 5.0, 300.0
 #: A robot that waits for an answer goes before a frame that waits to be signed.
 NICENESS = 5
 #: Seconds to wait where the database does not answer.
 TROUBLE_S = 2.0
 
 
-def work(settings: Settings, parent: int) -> None:
+def work(settings: Settings, parent: int, trace: Trace) -> None:
     """Work until told to stop, or until the process that started this one is gone.
 
-    SIGTERM and SIGINT let the frame in hand be finished first.
+    SIGTERM and SIGINT let the frame in hand be finished first. An error that nobody raised on
+    purpose ends the process too, in good order: the next try has a fresh one.
 
     Parameters
     ----------
     settings : see Settings
     parent : process id of the one that started this
+    trace : for what it reads when this process dies
     """
     log_as_json()
     os.nice(NICENESS)
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
-    with Engine(settings) as engine:
+    trace.watch()
+    stop = Stop()
+    with Engine(settings) as engine, engine.bell.listen() as listener:
         engine.warm()
-        name = f"{socket.gethostname()}:{os.getpid()}"
-        log.info("worker ready", extra={"worker": name})
-        _loop(engine, name, stop, parent)
-    log.info("worker stopped", extra={"worker": name})
+        limit_memory(settings.worker_bytes)
+        worker = Worker(engine, listener, trace, stop)
+        log.info("worker ready", extra={"worker": worker.name})
+        while not (stop.asked or worker.unsound) and os.getppid() == parent:
+            worker.turn()
+    log.info("worker stopped", extra={"worker": worker.name})
+    if worker.unsound:
+        logging.shutdown()
+        os._exit(0)  # at once: taking it down in order takes a second, and may crash
 
 
-def _loop(engine: Engine, name: str, stop: threading.Event, parent: int) -> None:
-    looked = 0.0
-    while not stop.is_set() and os.getppid() == parent:  # nobody's child is nobody's worker
+class Worker:
+    """What one process has at hand.
+
+    Parameters
+    ----------
+    engine, trace, stop : see there
+    listener : of the engine's bell
+    """
+
+    def __init__(self, engine: Engine, listener: Listener, trace: Trace, stop: Stop) -> None:
+        self._engine, self._listener, self._trace, self._stop = engine, listener, trace, stop
+        self.name = f"{socket.gethostname()}:{os.getpid()}"
+        self.unsound = False  # an error came that nobody raised on purpose
+        # frames first: where publishing kills every worker, each still signs for a while
+        self._upkeep_at = time.monotonic() + UPKEEP_S
+        starter = multiprocessing.parent_process()
+        self._wakers = (stop.descriptor, -1 if starter is None else int(starter.sentinel))
+
+    def turn(self) -> None:
+        """Do a job, look after the indexes if it is time, or wait where there is none to do."""
         try:
-            claimed = engine.claim(name)
-            if claimed is not None and stop.is_set():
-                engine.put_back(claimed)
-            elif claimed is not None:
-                engine.run(claimed)
-            if time.monotonic() - looked > UPKEEP_S:
-                looked = time.monotonic()  # also where it fails: frames go first
-                engine.publish_due()
-            if claimed is None:
-                # not all workers at the same moment
-                stop.wait(IDLE_S * random.uniform(0.5, 1.5))
+            found = self._work()
+            if time.monotonic() > self._upkeep_at and not self.unsound:
+                self._publish()
+            if not found:
+                self._listener.wait(self._pause(), *self._wakers)
         except SceneprintError as error:
             log.error("the store does not answer", extra={"error": str(error)})
-            stop.wait(TROUBLE_S)
+            self._stop.wait(TROUBLE_S)
+
+    def _work(self) -> bool:
+        """Do a job; whether there was one."""
+        claimed = self._engine.claim(self.name)
+        if claimed is None:
+            return False
+        if self._stop.asked:
+            self._engine.put_back(claimed)
+            return True
+        held = claimed.claim
+        with self._trace.job(held.job.id, held.token, self._engine.settings.job_s):
+            self._engine.run(claimed, self._break)
+        return True
+
+    def _break(self) -> None:
+        self.unsound = True
+
+    def _publish(self) -> None:
+        self._upkeep_at = time.monotonic() + UPKEEP_S  # also where it fails: frames go first
+        try:
+            self._engine.publish_due()
+        except MemoryError:  # the next process would have no more
+            log.error("no memory to publish an index; set SCENEPRINT_WORKER_BYTES higher")
+            self._upkeep_at = time.monotonic() + POOR_S
+
+    def _pause(self) -> float:
+        """Seconds until there may be something to do, if nobody rings."""
+        due, now = self._engine.next_due(), time.time()
+        left = LONGEST_S if due is None else min(due - now, LONGEST_S)
+        left = min(left, self._upkeep_at - time.monotonic())
+        return max(left, SHORTEST_S * random.uniform(1, 2))  # not all workers at the same moment

@@ -15,15 +15,15 @@ from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, Connection, and_, func, insert, or_, select, update
 
-from sceneprint.errors import LostLease, UnknownJob
+from sceneprint.errors import JobOver, LostLease, UnknownJob
 from sceneprint.schemas import JobState
 from sceneprint.store.records import JobRow, job_row
 from sceneprint.store.tables import jobs
 
 #: Tries that broke down before a job is dead.
 MAXIMUM_FAILURES = 3
-#: Tries in all before it is. More, as a worker that fell silent may have died of something else:
-#: a machine that is restarted again and again must not cost a frame.
+#: Tries in all before it is. More, as a worker that fell silent or was killed may have died of
+#: something else: a machine that is restarted again and again must not cost a frame.
 MAXIMUM_ATTEMPTS = 10
 #: Seconds before the second try; each further one waits four times as long.
 BACKOFF_S = 2.0
@@ -41,13 +41,17 @@ class Claim:
         return self.job.token
 
 
-def enqueue(connection: Connection, kind: str, frame_number: int, priority: int = 0) -> JobRow:
-    """Queue a job, in the transaction that stores what it is about."""
+def enqueue(
+    connection: Connection, kind: str, frame_number: int, priority: int = 0,
+    model_id: str | None = None,
+) -> JobRow:  # fmt: skip
+    """Queue a job, in the transaction that stores what it is about; `model_id`: see the table."""
     job_id = uuid.uuid4().hex
     now = time.time()
     connection.execute(
         insert(jobs).values(
-            id=job_id, kind=kind, frame_number=frame_number, state=JobState.QUEUED,
+            id=job_id, kind=kind, frame_number=frame_number, model_id=model_id,
+            state=JobState.QUEUED,
             priority=priority, attempts=0, failures=0, token=0, run_after=now, created_at=now,
         )
     )  # fmt: skip
@@ -70,12 +74,38 @@ def find_job(connection: Connection, job_id: str) -> JobRow:
     return job_row(row)
 
 
+def last_of(
+    connection: Connection, kind: str, frame_number: int, model_id: str | None = None
+) -> JobRow | None:
+    """The latest job of a kind, and for a model, of a frame."""
+    row = connection.execute(
+        select(jobs)
+        .where(
+            jobs.c.frame_number == frame_number, jobs.c.kind == kind,
+            jobs.c.model_id.is_(None) if model_id is None else jobs.c.model_id == model_id,
+        )
+        .order_by(jobs.c.number.desc())
+        .limit(1)
+    ).mappings().first()  # fmt: skip
+    return None if row is None else job_row(row)
+
+
 def jobs_of(connection: Connection, frame_numbers: list[int]) -> dict[int, JobRow]:
-    """The latest job of each frame."""
+    """The latest job of each frame that is to have it indexed, not those that sign it again."""
     rows = connection.execute(
-        select(jobs).where(jobs.c.frame_number.in_(frame_numbers)).order_by(jobs.c.number)
+        select(jobs)
+        .where(jobs.c.frame_number.in_(frame_numbers), jobs.c.kind == "sign")
+        .order_by(jobs.c.number)
     ).mappings()
     return {row["frame_number"]: job_row(row) for row in rows}
+
+
+def next_due(connection: Connection) -> float | None:
+    """When the next job can be claimed if nobody touches any, seconds since 1970; costs no lock."""
+    waiting = select(func.min(jobs.c.run_after)).where(jobs.c.state == JobState.QUEUED)
+    silent = select(func.min(jobs.c.leased_until)).where(jobs.c.state == JobState.RUNNING)
+    times = [connection.execute(one).scalar() for one in (waiting, silent)]
+    return min((time for time in times if time is not None), default=None)
 
 
 def has_due(connection: Connection) -> bool:
@@ -171,16 +201,22 @@ def fail(connection: Connection, held: Claim, error: str, traceback: str) -> Job
     ------
     LostLease : as `renew`.
     """
-    failures = held.job.failures + 1
+    # not as it was claimed: an earlier worker may have died over the job since
+    known = select(jobs.c.failures).where(jobs.c.number == held.job.number)
+    failures = (connection.execute(known).scalar() or 0) + 1
     if failures >= MAXIMUM_FAILURES or held.job.attempts >= MAXIMUM_ATTEMPTS:
         finish(connection, held, JobState.DEAD, error, traceback)
         return JobState.DEAD
-    wait = BACKOFF_S * 4.0 ** (failures - 1)
     _hold(
         connection, held, state=JobState.QUEUED, error=error, traceback=traceback,
-        failures=failures, leased_until=None, run_after=time.time() + wait,
+        failures=failures, leased_until=None, run_after=time.time() + pause_s(failures),
     )  # fmt: skip
     return JobState.QUEUED
+
+
+def pause_s(failures: int) -> float:
+    """Seconds before the next try of a job that broke down so often."""
+    return BACKOFF_S * 4.0 ** (failures - 1)
 
 
 def give_back(connection: Connection, held: Claim) -> None:
@@ -194,6 +230,22 @@ def give_back(connection: Connection, held: Claim) -> None:
         connection, held, state=JobState.QUEUED, attempts=held.job.attempts - 1,
         leased_until=None, worker=None,
     )  # fmt: skip
+
+
+def cancel(connection: Connection, job: JobRow) -> None:
+    """Cancel a job; a worker that is at it learns so when it brings its result.
+
+    Raises
+    ------
+    JobOver : there is nothing left to cancel.
+    """
+    if job.state.over:
+        raise JobOver(f"Job {job.id} is {job.state}: {job.state.sentence} Nothing is left to do.")
+    connection.execute(
+        update(jobs)
+        .where(jobs.c.number == job.number)
+        .values(state=JobState.CANCELLED, finished_at=time.time(), leased_until=None)
+    )
 
 
 def cancel_of(connection: Connection, frame_number: int) -> None:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,9 +26,9 @@ from sceneprint.settings import Settings
 LEASE_S = 0.5
 
 
-def until(what: Callable[[], Any]) -> Any:
+def until(what: Callable[[], Any], seconds: float = 90) -> Any:
     """The first true value of it."""
-    end = time.monotonic() + 90
+    end = time.monotonic() + seconds
     while time.monotonic() < end:
         if found := what():
             return found
@@ -64,9 +64,9 @@ class Crew:
         until(lambda: self.engine.get_map(map_name).frames == {"indexed": count})
 
     @staticmethod
-    def until(what: Callable[[], Any]) -> Any:
+    def until(what: Callable[[], Any], seconds: float = 90) -> Any:
         """The first true value of it."""
-        return until(what)
+        return until(what, seconds)
 
     def job(self, job_id: str, columns: str) -> tuple[Any, ...]:
         (row,) = self.rows(f"SELECT {columns} FROM jobs WHERE id = '{job_id}'")
@@ -105,30 +105,42 @@ def frames(room_frames, tmp_path_factory) -> list[tuple[bytes, FrameMeta]]:
     return found
 
 
-@pytest.fixture(scope="module")
-def crew(tmp_path_factory) -> Iterator[Crew]:
-    folder = tmp_path_factory.mktemp("crew")
-    errors = tmp_path_factory.mktemp("errors") / "stderr"
-    with Engine(Settings(data_dir=folder, lease_s=LEASE_S)) as engine:
-        engine.create_map(NewMap(name="warm", model="compact"))
-        command = [Path(sys.executable).parent / "sceneprint", "work"]
-        with errors.open("wb") as out:
-            process = subprocess.Popen(
-                [*command, "--data", folder, "--workers", "2"], stderr=out, start_new_session=True,
-                env=os.environ | {"SCENEPRINT_LEASE_S": str(LEASE_S)},
-            )  # fmt: skip
-        crew = Crew(engine, errors, process)
-        try:
-            until(lambda: len(crew.log("worker ready")) == 2)
-            yield crew
-            process.terminate()
-            assert process.wait(60) == 0
-            assert len(crew.log("worker stopped")) == 2
-            assert crew.log("worker died") == []
-        finally:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
+@pytest.fixture(scope="session")
+def hire(tmp_path_factory) -> Callable[..., AbstractContextManager[Crew]]:
+    """Run a command that keeps two workers, on a store of its own with the map `warm`."""
+
+    @contextmanager
+    def run(command: list[str], **settings: object) -> Iterator[Crew]:
+        folder = tmp_path_factory.mktemp("crew")
+        errors = tmp_path_factory.mktemp("errors") / "stderr"
+        given = {"data_dir": folder, "workers": 2, **settings}
+        names = {f"SCENEPRINT_{name.upper()}": str(value) for name, value in given.items()}
+        with Engine(Settings.model_validate(given)) as engine:
+            engine.create_map(NewMap(name="warm", model="compact"))
+            with errors.open("wb") as out:
+                process = subprocess.Popen(
+                    command, stderr=out, start_new_session=True, env=os.environ | names
+                )
+            crew = Crew(engine, errors, process)
+            try:
+                until(lambda: len(crew.log("worker ready")) == 2)
+                yield crew
+            finally:
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def crew(hire) -> Iterator[Crew]:
+    with hire([f"{Path(sys.executable).parent}/sceneprint", "work"], lease_s=LEASE_S) as crew:
+        yield crew
+        crew.process.terminate()
+        assert crew.process.wait(60) == 0
+        assert len(crew.log("worker stopped")) == 2
+        assert crew.log("worker died") == []
 
 
 @dataclass

@@ -24,6 +24,18 @@ def test_two_workers_sign_each_frame_once(crew, frames):
     assert {line["attempt"] for line in lines} == {1}
 
 
+def test_frames_of_a_greater_priority_are_signed_first(crew, frames):
+    crew.engine.create_map(NewMap(name="ranked", model="compact"))
+    crew.send(signal.SIGSTOP)
+    order = [-10, 0, 3, 0, 10, 3]
+    jobs = [crew.engine.add_frame("ranked", *frames[46 + i], order[i])[0].job_id for i in range(6)]
+    crew.send(signal.SIGCONT)
+    crew.settled("ranked", 6)
+    assert [crew.engine.get_job(job).priority for job in jobs] == order
+    begun = sorted(range(6), key=lambda i: crew.job(jobs[i], "started_at"))
+    assert begun == [4, 2, 5, 1, 3, 0]
+
+
 def test_a_database_that_vanishes_for_a_moment_is_waited_for(crew, frames):
     crew.engine.create_map(NewMap(name="shaken", model="compact"))
     crew.change("ALTER TABLE jobs RENAME TO away")

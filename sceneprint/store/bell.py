@@ -1,0 +1,130 @@
+"""The bell: who commits a job wakes the workers that wait, as SQLite tells nobody.
+
+Every waiting worker makes a FIFO in a folder, and who rings writes one byte to each. It is a hint
+and never the truth: where none can be made, or the other is on another machine, workers look
+again after a while. So nothing here raises, and no upload fails for it.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import stat
+import time
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+#: Seconds after which a FIFO that nobody reads is removed, and between two signs of life.
+STALE_S, ALIVE_S = 300.0, 60.0
+#: Longest wait of a worker that has no FIFO, seconds.
+DEAF_S = 0.25
+#: Longest wait that the system knows of, milliseconds.
+MOST_MS = 2**31 - 1
+
+
+class Bell:
+    """A folder of FIFOs.
+
+    Parameters
+    ----------
+    folder : made by the first who listens
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def ring(self) -> None:
+        """Wake who waits; after the commit, so that they find what they are woken for."""
+        try:
+            names = os.listdir(self._folder)  # noqa: PTH208  (a path for each would cost)
+        except OSError:
+            return  # nobody has ever listened
+        for name in names:
+            self._ring(self._folder / name)
+
+    @contextmanager
+    def listen(self) -> Iterator[Listener]:
+        """Be woken from now on; what is rung before the wait begins ends it at once."""
+        listener = Listener(self._folder)
+        try:
+            yield listener
+        finally:
+            listener.close()
+
+    def _ring(self, path: Path) -> None:
+        try:
+            opened = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+        except OSError:  # nobody reads it: just made, or left behind by the dead
+            with suppress(OSError):
+                if path.is_fifo() and time.time() - path.stat().st_mtime > STALE_S:
+                    path.unlink()
+            return
+        try:
+            if stat.S_ISFIFO(os.fstat(opened).st_mode):
+                with suppress(OSError):  # full: it is awake, or about to be
+                    os.write(opened, b"!")
+        finally:
+            os.close(opened)
+
+
+class Listener:
+    """One FIFO, open; made by `Bell.listen`."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
+        self._fifo = -1
+        self._alive = 0.0
+        self._open()
+
+    def wait(self, timeout_s: float, *others: int) -> bool:
+        """Until it rings, one of other descriptors is readable, or the time is over.
+
+        Returns
+        -------
+        whether it rang
+        """
+        if self._fifo < 0:
+            timeout_s = min(timeout_s, DEAF_S)
+        waiting = select.poll()
+        for descriptor in (self._fifo, *others):
+            if descriptor >= 0:
+                waiting.register(descriptor, select.POLLIN)
+        found = waiting.poll(min(max(1e3 * timeout_s, 0.0), MOST_MS))
+        rung = any(descriptor == self._fifo for descriptor, _ in found)
+        if rung:
+            with suppress(BlockingIOError):
+                while os.read(self._fifo, 4096):
+                    pass
+        if time.monotonic() - self._alive > ALIVE_S:
+            self._stay()
+        return rung
+
+    def close(self) -> None:
+        """Listen no more."""
+        with suppress(OSError):
+            self._path.unlink()
+        if self._fifo >= 0:
+            os.close(self._fifo)
+            self._fifo = -1
+
+    def _open(self) -> None:
+        self._alive = time.monotonic()
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            os.mkfifo(self._path, 0o600)
+            # to write as well: without a writer it would be at its end, and always readable
+            self._fifo = os.open(self._path, os.O_RDWR | os.O_NONBLOCK)
+        except OSError:
+            self._fifo = -1
+
+    def _stay(self) -> None:
+        """Show that the FIFO is not left behind; one that was removed is made anew."""
+        self._alive = time.monotonic()
+        try:
+            os.utime(self._path)
+        except OSError:
+            self.close()
+            self._open()

@@ -1,0 +1,50 @@
+"""Jobs whose workers died over them.
+
+Who started the workers sees one die at once, and need not wait for its lease to run out.
+"""
+
+from __future__ import annotations
+
+import time
+
+from sqlalchemy import Connection, select, update
+
+from sceneprint.schemas import JobState
+from sceneprint.store import queue
+from sceneprint.store.records import JobRow, job_row
+from sceneprint.store.tables import jobs
+
+
+def fail_of_dead(
+    connection: Connection, job_id: str, token: int, error: str, traceback: str, *, counts: bool
+) -> JobRow | None:
+    """Take a job from a worker that died over it: queued for another try, or dead.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    job_id, token : of the dead worker's claim
+    error, traceback : what is known of its death
+    counts : whether the job may have been the cause; if not, it is an attempt and no failure
+
+    Returns
+    -------
+    job : as it is now; None where the death changes nothing: the job is over, or is another
+        worker's, who took it when the lease of this one ran out, and may still do it
+    """
+    row = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().first()
+    if row is None or JobState(row["state"]).over:
+        return None
+    held = row["token"] == token and row["state"] == JobState.RUNNING
+    if not held and (row["token"] == token or not counts):
+        return None
+    failures = row["failures"] + counts
+    known = {"failures": failures, "error": error, "traceback": traceback}
+    if failures >= queue.MAXIMUM_FAILURES or (held and row["attempts"] >= queue.MAXIMUM_ATTEMPTS):
+        known |= {"state": JobState.DEAD, "leased_until": None, "finished_at": time.time()}
+    elif held:
+        again = time.time() + queue.pause_s(max(failures, 1))
+        known |= {"state": JobState.QUEUED, "leased_until": None, "run_after": again}
+    change = update(jobs).where(jobs.c.number == row["number"]).values(**known).returning(jobs)
+    now = job_row(connection.execute(change).mappings().one())
+    return None if now.state == JobState.RUNNING else now

@@ -1,0 +1,100 @@
+"""`sceneprint jobs` against a real service."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from sceneprint.cli import main
+from sceneprint.client import Client
+from sceneprint.engine import Engine
+from sceneprint.settings import Settings
+
+Run = Callable[..., tuple[str, str]]
+
+
+@pytest.fixture
+def dead(
+    sceneprint: Run, data_folder: Path, rooms: Path, service_url: str
+) -> Iterator[tuple[str, str]]:
+    """Jobs of a map of two frames: one as if it had broken down too often, and one done."""
+    sceneprint("upload", "jobs", rooms / "room-0", "--every", 2, "--priority", -3)
+    with Client(service_url) as client, Engine(Settings(data_dir=data_folder)) as engine:
+        (job, other) = [one for one in client.jobs() if one.map == "jobs"][:2]
+        with engine.store.database.write() as connection:
+            connection.exec_driver_sql(
+                "UPDATE jobs SET state = 'dead', error = 'it hung', traceback = 'Trace' "
+                f"WHERE id = '{job.job_id}'"
+            )
+            connection.exec_driver_sql(
+                "DELETE FROM signatures WHERE frame_number = "
+                f"(SELECT number FROM frames WHERE id = '{job.frame_id}')"
+            )
+            connection.exec_driver_sql(
+                f"UPDATE frames SET state = 'failed' WHERE id = '{job.frame_id}'"
+            )
+        yield job.job_id, other.job_id
+        client.delete_map("jobs")
+
+
+def test_dead_jobs_are_listed_and_tried_again(
+    sceneprint: Run, dead: tuple[str, str], service_url: str
+) -> None:
+    (said, _) = sceneprint("jobs", "--state", "dead")
+    head, line = said.splitlines()
+    assert head.split() == ["job", "state", "prio", "tries", "created", "map", "error"]
+    assert line.split()[:4] == [dead[0], "dead", "-3", "1"]
+    assert line.endswith("  jobs  it hung")
+    (said, _) = sceneprint("jobs", "--state", "dead", "--json")
+    assert json.loads(said)["traceback"] == "Trace"
+    (said, _) = sceneprint("jobs", "--retry-dead")
+    first, last = said.splitlines()
+    assert first.endswith(" of map jobs, queued")
+    assert last == "1 jobs are tried again, 0 cannot be"
+    again = first.split()[1]
+    with Client(service_url) as client:
+        (job,) = client.wait([again], timeout_s=60)
+        assert job.state == "succeeded"
+    (said, _) = sceneprint("jobs", "--retry-dead")  # it is history now
+    assert said == "0 jobs are tried again, 0 cannot be\n"
+    (said, _) = sceneprint("jobs", "--json")
+    ids = [json.loads(line)["job_id"] for line in said.splitlines()]
+    assert ids[:3] == [again, *dead]
+
+
+def test_what_has_lost_its_upload_cannot_be_tried_again(
+    sceneprint: Run, dead: tuple[str, str], data_folder: Path
+) -> None:
+    with Engine(Settings(data_dir=data_folder)) as engine, engine.store.database.read() as base:
+        asked = (
+            "SELECT f.blob FROM frames f JOIN jobs j ON j.frame_number = f.number "
+            f"WHERE j.id = '{dead[0]}'"
+        )
+        engine.store.blobs.remove(base.exec_driver_sql(asked).scalar_one())
+    said = sceneprint("jobs", "--retry-dead", expect=2)
+    assert "is gone from the data folder" in said[1]
+    assert said[0] == "0 jobs are tried again, 1 cannot be\n"
+    assert "is gone from the data folder" in sceneprint("jobs", "--retry", dead[0], expect=2)[1]
+
+
+def test_one_job_is_cancelled_or_tried_again(sceneprint: Run, dead: tuple[str, str]) -> None:
+    said = sceneprint("jobs", "--cancel", dead[1], expect=2)
+    assert said[1].startswith(f"sceneprint jobs: Job {dead[1]} is succeeded: ")
+    (said_out, _) = sceneprint("jobs", "--retry", dead[0], "--json")
+    again = json.loads(said_out)
+    assert (again["state"], again["map"], again["priority"]) == ("queued", "jobs", -3)
+    assert "There is no job" in sceneprint("jobs", "--cancel", "nobody", expect=2)[1]
+    assert "--state is for listing" in sceneprint(
+        "jobs", "--state", "dead", "--retry", dead[0], expect=2
+    )[1]  # fmt: skip
+    assert sceneprint("jobs", "--state", "cancelled") == ("no such jobs\n", "")
+
+
+def test_a_priority_out_of_its_range_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    for wrong in ("11", "-11", "x", "--5", "1.0"):
+        with pytest.raises(SystemExit):
+            main(["upload", "m", "path", f"--priority={wrong}"])
+        assert "is not a whole number from -10 to 10" in capsys.readouterr().err

@@ -1,0 +1,275 @@
+"""Jobs that are cancelled, tried again, or taken from workers that died over them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from sqlalchemy import update
+
+from sceneprint.engine import Engine
+from sceneprint.engine import work as working
+from sceneprint.errors import CannotRetry, InvalidRequest, JobOver, UnknownJob
+from sceneprint.schemas import FrameState, JobState
+from sceneprint.store import queue
+from sceneprint.store.records import JobRow
+from sceneprint.store.tables import jobs
+
+DueNow = Callable[[Engine], None]
+Told = Callable[[Engine], list[str]]
+WorkOff = Callable[[Engine], list[JobState | None]]
+
+
+def row(engine: Engine, job_id: str) -> JobRow:
+    with engine.store.database.read() as connection:
+        return queue.find_job(connection, job_id)
+
+
+def claimed(engine: Engine) -> working.Work:
+    work = engine.claim("w")
+    assert work is not None
+    return work
+
+
+def die(engine: Engine, work: working.Work, *, counts: bool = True) -> JobState | None:
+    held = work.claim
+    return engine.worker_died(held.job.id, held.token, "signal 11", "Fatal", counts=counts)
+
+
+def test_a_cancelled_job_is_done_by_nobody_and_can_be_tried_again(
+    empty: Engine, uploads: Any, told: Told, work_off: WorkOff
+) -> None:
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta, 7)
+    cancelled = empty.cancel_job(added.job_id)
+    assert (cancelled.state, cancelled.priority) == (JobState.CANCELLED, 7)
+    assert cancelled.finished_at is not None
+    assert empty.cancel_job(added.job_id) == cancelled  # who asks twice is not refused
+    frame = empty.get_frame("hall", added.frame_id)
+    assert (frame.state, frame.reason) == (FrameState.FAILED, "its job was cancelled")
+    assert work_off(empty) == []
+    again, new = empty.retry_job(added.job_id)
+    assert (new, again.state, again.priority, again.attempts) == (True, JobState.QUEUED, 7, 0)
+    assert again.job_id != added.job_id
+    assert again.frame_id == added.frame_id
+    assert empty.retry_job(added.job_id) == (again, False)  # nor is it tried twice
+    frame = empty.get_frame("hall", added.frame_id)
+    assert (frame.state, frame.reason) == (FrameState.RECEIVED, None)
+    assert frame.job_id == again.job_id
+    with pytest.raises(CannotRetry, match="is queued and its frame received"):
+        empty.retry_job(again.job_id)
+    assert work_off(empty) == [JobState.SUCCEEDED]
+    assert told(empty)[1:] == ["frame.received", "frame.failed", "frame.received", "frame.indexed"]
+    with pytest.raises(JobOver, match=r"is succeeded: Done, .* Nothing is left to do\."):
+        empty.cancel_job(again.job_id)
+    with pytest.raises(CannotRetry, match="is succeeded and its frame indexed"):
+        empty.retry_job(again.job_id)
+    with pytest.raises(CannotRetry, match=f"was followed by {again.job_id}, which is succeeded"):
+        empty.retry_job(added.job_id)
+    for ask in (empty.cancel_job, empty.retry_job):
+        with pytest.raises(UnknownJob, match="nobody"):
+            ask("nobody")
+
+
+def test_what_is_cancelled_while_it_is_signed_is_not_stored(empty: Engine, uploads: Any) -> None:
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    work = claimed(empty)
+    assert empty.cancel_job(added.job_id).state == JobState.CANCELLED
+    assert empty.run(work) is None
+    assert empty.get_frame("hall", added.frame_id).state == FrameState.FAILED
+    assert empty.get_map("hall").revision == 0
+    assert len(list(empty.store.blobs.digests())) == 1  # the upload, and no artifact
+
+
+def test_what_cannot_be_signed_again_is_refused_with_the_reason(
+    empty: Engine, uploads: Any
+) -> None:
+    lost, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    gone, _ = empty.add_frame("hall", uploads[1].data, uploads[1].meta)
+    empty.cancel_job(lost.job_id)
+    empty.cancel_job(gone.job_id)
+    empty.store.blobs.remove(empty.store.blobs.put(uploads[0].data))
+    with pytest.raises(CannotRetry, match=f"The upload of frame {lost.frame_id} is gone"):
+        empty.retry_job(lost.job_id)
+    assert empty.get_frame("hall", lost.frame_id).state == FrameState.FAILED
+    empty.delete_frame("hall", gone.frame_id)
+    with pytest.raises(CannotRetry, match="is cancelled and its frame deleted"):
+        empty.retry_job(gone.job_id)
+
+
+def test_a_job_whose_worker_dies_is_tried_again_thrice(
+    empty: Engine, uploads: Any, due_now: DueNow, told: Told
+) -> None:
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    for failures, pause in ((1, 2.0), (2, 8.0)):
+        work = claimed(empty)
+        assert empty.get_frame("hall", added.frame_id).state == FrameState.SIGNING
+        before = time.time()
+        assert die(empty, work) == JobState.QUEUED
+        job = row(empty, added.job_id)
+        assert (job.failures, job.attempts, job.leased_until) == (failures, failures, None)
+        assert before + pause <= job.run_after <= time.time() + pause
+        assert (job.error, job.traceback) == ("signal 11", "Fatal")
+        assert empty.get_frame("hall", added.frame_id).state == FrameState.RECEIVED
+        assert die(empty, work) is None  # told of twice, it counts once
+        assert row(empty, added.job_id) == job
+        due_now(empty)
+    assert die(empty, claimed(empty)) == JobState.DEAD
+    job = row(empty, added.job_id)
+    assert (job.state, job.failures, job.traceback) == (JobState.DEAD, 3, "Fatal")
+    assert job.finished_at is not None
+    frame = empty.get_frame("hall", added.frame_id)
+    assert (frame.state, frame.reason) == (FrameState.FAILED, "signal 11")
+    assert told(empty)[-1] == "frame.failed"
+    due_now(empty)
+    assert empty.claim("w") is None
+
+
+def test_deaths_and_breakdowns_count_alike(
+    empty: Engine, uploads: Any, due_now: DueNow, work_off: WorkOff
+) -> None:
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    assert die(empty, claimed(empty)) == JobState.QUEUED
+    empty.store.blobs.remove(empty.store.blobs.put(uploads[0].data))
+    due_now(empty)
+    assert work_off(empty) == [JobState.QUEUED]
+    due_now(empty)
+    assert die(empty, claimed(empty)) == JobState.DEAD
+    assert row(empty, added.job_id).attempts == 3
+
+
+def test_to_be_killed_from_outside_is_no_fault_of_the_job(
+    empty: Engine, uploads: Any, due_now: DueNow
+) -> None:
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    for attempt in range(1, 10):
+        before = time.time()
+        assert die(empty, claimed(empty), counts=False) == JobState.QUEUED
+        job = row(empty, added.job_id)
+        assert (job.attempts, job.failures) == (attempt, 0)
+        assert before + 2.0 <= job.run_after <= time.time() + 2.0
+        due_now(empty)
+    assert die(empty, claimed(empty), counts=False) == JobState.DEAD
+    assert empty.get_frame("hall", added.frame_id).reason == "signal 11"
+
+
+def test_a_death_counts_where_another_has_the_job_by_now(
+    empty: Engine, uploads: Any, due_now: DueNow
+) -> None:
+    """A frame that hangs every worker longer than its lease is given up all the same."""
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    works = []
+    for _ in range(4):
+        works.append(claimed(empty))
+        due_now(empty)
+    assert die(empty, works[0], counts=False) is None
+    assert die(empty, works[0]) is None
+    job = row(empty, added.job_id)
+    assert (job.state, job.token, job.failures) == (JobState.RUNNING, 4, 1)
+    assert empty.get_frame("hall", added.frame_id).state == FrameState.SIGNING
+    assert die(empty, works[1]) is None
+    assert die(empty, works[2]) == JobState.DEAD  # though a fourth is at it still
+    assert die(empty, works[0]) is None  # it is over
+    assert row(empty, added.job_id).failures == 3
+    assert empty.run(works[3]) is None
+    assert empty.get_frame("hall", added.frame_id).state == FrameState.FAILED
+
+
+def test_a_breakdown_counts_the_deaths_since_it_was_claimed(
+    empty: Engine, uploads: Any, due_now: DueNow
+) -> None:
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    works = []
+    for _ in range(3):
+        works.append(claimed(empty))
+        due_now(empty)
+    assert [die(empty, work) for work in works[:2]] == [None, None]
+    empty.store.blobs.remove(empty.store.blobs.put(uploads[0].data))
+    assert empty.run(works[2]) == JobState.DEAD
+    assert empty.get_frame("hall", added.frame_id).state == FrameState.FAILED
+
+
+def test_a_death_over_what_is_gone_changes_nothing(empty: Engine, uploads: Any, told: Told) -> None:
+    cancelled, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    work = claimed(empty)
+    empty.cancel_job(cancelled.job_id)
+    assert die(empty, work) is None
+    assert empty.get_job(cancelled.job_id).state == JobState.CANCELLED
+    empty.add_frame("hall", uploads[1].data, uploads[1].meta)
+    work = claimed(empty)
+    empty.delete_map("hall")
+    assert die(empty, work) is None
+    assert told(empty)[-1] == "map.deleted"
+
+
+def test_only_what_nobody_raised_on_purpose_makes_a_process_unsound(
+    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unsound: list[str] = []
+    empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    empty.store.blobs.remove(empty.store.blobs.put(uploads[0].data))
+    assert empty.run(claimed(empty), lambda: unsound.append("damaged")) == JobState.QUEUED
+    empty.add_frame("hall", uploads[1].data, uploads[1].meta)
+    assert empty.run(claimed(empty), lambda: unsound.append("good")) == JobState.SUCCEEDED
+    monkeypatch.setattr(working, "prepare", lambda *_: {}[0])
+    added, _ = empty.add_frame("hall", uploads[2].data, uploads[2].meta)
+
+    def note() -> None:
+        unsound.append(str(row(empty, added.job_id).error))  # it is stored by then
+
+    assert empty.run(claimed(empty), note) == JobState.QUEUED
+    assert unsound == ["KeyError: 0"]
+
+
+def test_jobs_are_listed_newest_first(empty: Engine, uploads: Any, work_off: WorkOff) -> None:
+    added = [empty.add_frame("hall", one.data, one.meta)[0] for one in uploads[:5]]
+    empty.cancel_job(added[1].job_id)
+    ids = [one.job_id for one in reversed(added)]
+    page = empty.list_jobs()
+    assert ([job.job_id for job in page.items], page.next_cursor) == (ids, None)
+    assert page.items[0] == empty.get_job(ids[0])
+    assert [job.frame_id for job in page.items] == [one.frame_id for one in reversed(added)]
+    seen, cursor = [], None
+    for size in (2, 2, 1):
+        page = empty.list_jobs(cursor=cursor, limit=2)
+        assert len(page.items) == size
+        seen += [job.job_id for job in page.items]
+        cursor = page.next_cursor
+    assert (seen, cursor) == (ids, None)
+    found = empty.list_jobs(JobState.CANCELLED).items
+    assert [job.job_id for job in found] == [added[1].job_id]
+    assert empty.list_jobs(JobState.DEAD).items == []
+    with pytest.raises(InvalidRequest, match="was not given out"):
+        empty.list_jobs(cursor="x")
+
+
+def test_a_job_that_signs_again_leaves_the_frame_as_it_is(
+    empty: Engine, uploads: Any, work_off: WorkOff
+) -> None:
+    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
+    work_off(empty)
+    empty.reencode("hall", "paper")
+    (job,) = empty.list_jobs(JobState.QUEUED).items
+    assert (job.kind, job.frame_id) == ("reencode", added.frame_id)
+    empty.cancel_job(job.job_id)
+    assert empty.get_frame("hall", added.frame_id).state == FrameState.INDEXED
+    again, new = empty.retry_job(job.job_id)
+    assert (new, again.kind, again.state) == (True, "reencode", JobState.QUEUED)
+    assert row(empty, again.job_id).model_id == row(empty, job.job_id).model_id is not None
+    assert empty.get_frame("hall", added.frame_id).state == FrameState.INDEXED
+
+
+def test_when_there_is_something_to_do_next(empty: Engine, uploads: Any) -> None:
+    assert empty.next_due() is None
+    for one in uploads[:3]:
+        empty.add_frame("hall", one.data, one.meta)
+    running = claimed(empty).claim.job
+    with empty.store.database.write() as connection:
+        connection.execute(update(jobs).values(run_after=300.0))
+        connection.execute(update(jobs).where(jobs.c.number == 3).values(run_after=200.0))
+    assert empty.next_due() == 200.0
+    with empty.store.database.write() as connection:
+        changed = update(jobs).where(jobs.c.number == running.number)
+        connection.execute(changed.values(leased_until=100.0, run_after=1.0))
+    assert empty.next_due() == 100.0

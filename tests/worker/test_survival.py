@@ -1,0 +1,124 @@
+"""Workers survive their input: frames that crash, hang, eat memory or break down are given up."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.schemas import FrameMeta, NewMap
+
+#: The workers as they are, but for what they do with frames of some focal lengths. Nothing but
+#: the bell, and the time of the next try, wakes those that wait.
+SCRIPT = """
+import ctypes, sys
+import numpy as np
+import sceneprint.engine.work as work
+import sceneprint.store.queue as queue
+import worker.loop, worker.supervisor
+
+queue.BACKOFF_S = 0.05
+worker.loop.LONGEST_S = worker.loop.UPKEEP_S = 1e6
+worker.supervisor.GRACE_S = 1.0
+prepare = work.prepare
+
+def crashing(): ctypes.string_at(0)
+def hanging(): ctypes.PyDLL(None).sleep(600)  # never gives the interpreter back
+def hungry(): return np.ones(1 << 30, np.uint8)
+def broken(): raise ZeroDivisionError("a bug")
+
+def spoilt(frame, signer):
+    for what, fx in ((crashing, 101), (hanging, 102), (hungry, 103), (broken, 104)):
+        if frame.intrinsics.fx == fx:
+            what()
+    return prepare(frame, signer)
+
+work.prepare = spoilt
+if __name__ == "__main__":
+    from worker.__main__ import main
+    sys.exit(main())
+"""
+MARKS = {"crashing": 101, "hanging": 102, "hungry": 103, "broken": 104}
+
+
+@pytest.fixture(scope="module")
+def script(tmp_path_factory) -> list[str]:
+    path = tmp_path_factory.mktemp("script") / "spoilt.py"
+    path.write_text(SCRIPT)
+    return [sys.executable, str(path)]
+
+
+@pytest.fixture(scope="module")
+def crew(hire, script) -> Iterator[Any]:
+    with hire(script, job_s=6, worker_bytes=512 << 20) as crew:
+        crew.engine.create_map(NewMap(name="hall", model="compact"))
+        yield crew
+
+
+def add_marked(engine: Engine, frame: tuple[bytes, FrameMeta], what: str) -> str:
+    """Upload a frame whose focal length says what becomes of its worker; id of its job."""
+    data, meta = frame
+    lens = meta.intrinsics.model_copy(update={"fx": float(MARKS[what])})
+    given = meta.model_copy(update={"intrinsics": lens})
+    return engine.add_frame("hall", data, given)[0].job_id
+
+
+def test_a_frame_that_ends_its_worker_is_given_up_and_costs_no_other(crew, frames):
+    bad = {what: add_marked(crew.engine, frames[i], what) for i, what in enumerate(MARKS)}
+    good = [crew.engine.add_frame("hall", *one)[0].job_id for one in frames[8:20]]
+    ended = {"failed": 4, "indexed": 12}  # twelve workers later, on a machine that is busy
+    crew.until(lambda: crew.engine.get_map("hall").frames == ended, 300)
+    jobs: dict[str, Any] = {what: crew.engine.get_job(job) for what, job in bad.items()}
+    assert {(job.state, job.attempts) for job in jobs.values()} == {("dead", 3)}
+    for what, job in jobs.items():
+        assert f"in {what}" in job.traceback
+        assert "spoilt.py" in job.traceback
+        assert crew.engine.get_frame("hall", job.frame_id).reason == job.error
+    assert jobs["crashing"].error == "its worker was killed by signal 11 (Segmentation fault)"
+    assert jobs["hanging"].error == "its worker ran longer than 6 s, and was ended"
+    assert jobs["hungry"].error.startswith("MemoryError: Unable to allocate 1.00 GiB")
+    assert jobs["broken"].error == "ZeroDivisionError: a bug"
+    # the others did not notice: none was tried twice, and nobody died but of the frames at fault
+    assert {crew.job(job, "state, attempts, failures") for job in good} == {("succeeded", 1, 0)}
+    crew.until(lambda: len(crew.log("worker replaced")) == 6)
+    died = [line["job_id"] for line in crew.log("worker died")]
+    assert sorted(died) == sorted(3 * [bad["crashing"], bad["hanging"]])
+    assert crew.log("lease lost") == []
+    assert crew.rows("SELECT count(*) FROM events WHERE kind = 'frame.failed'") == [(4,)]
+
+
+def test_a_worker_that_does_not_stop_gives_its_job_back(crew, frames):
+    job = add_marked(crew.engine, frames[20], "hanging")
+    crew.until(lambda: crew.job(job, "state") == ("running",))
+    crew.process.terminate()
+    assert crew.process.wait(60) == 0
+    assert crew.pid(job) in [line["pid"] for line in crew.log("worker does not stop")]
+    assert crew.job(job, "state, attempts, failures, leased_until") == ("queued", 1, 0, None)
+    assert crew.engine.get_frame("hall", crew.engine.get_job(job).frame_id).state == "received"
+
+
+def test_waiting_workers_leave_with_the_one_who_started_them(hire, script, alive):
+    with hire(script) as crew:
+        pids = [int(line["worker"].rpartition(":")[2]) for line in crew.log("worker ready")]
+        assert [alive(pid) for pid in pids] == [True, True]
+        crew.process.send_signal(signal.SIGKILL)
+        crew.process.wait(60)
+        crew.until(lambda: not any(alive(pid) for pid in pids))
+
+
+@pytest.fixture(scope="session")
+def alive():
+    """Whether a process runs."""
+
+    def look(pid: int) -> bool:
+        try:
+            return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        except OSError:
+            return False
+
+    return look
