@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+import errno
+import re
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any, BinaryIO
@@ -17,11 +19,13 @@ from starlette.formparsers import MultiPartException
 from sceneprint.errors import (
     InvalidRequest,
     MalformedBody,
+    StoreFull,
     TooLarge,
     UnsupportedType,
     UnusableStore,
 )
 from sceneprint.schemas import FrameMeta
+from sceneprint.schemas.frames import MOST_PRIORITY
 from service.problems import invalid
 
 #: Most bytes of a form field that is no file, and of a JSON body.
@@ -59,7 +63,7 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
     UnsupportedType : no form.
     MalformedBody : a form that cannot be parsed.
     InvalidRequest : a part is missing or unknown, or `meta` is not as it should be.
-    UnusableStore : the machine has no room to keep it until it is read.
+    StoreFull, UnusableStore : the machine cannot keep it until it is read.
     """
     if media_type(request) != FORM:
         raise UnsupportedType(
@@ -74,7 +78,8 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
             "`frame` and a field `meta`, with a boundary as in RFC 7578."
         ) from error
     except OSError as error:  # what is too large for memory is spooled to a file meanwhile
-        raise UnusableStore(
+        kind = StoreFull if error.errno in (errno.ENOSPC, errno.EDQUOT) else UnusableStore
+        raise kind(
             f"An upload cannot be kept in the folder of temporary files ({error}). Make room "
             "there, or name another folder in TMPDIR."
         ) from error
@@ -98,6 +103,24 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
         yield Upload(frame.file, _meta(texts.pop("meta", None)), texts)
     finally:
         await form.close()
+
+
+def priority_of(fields: Mapping[str, str]) -> int:
+    """The field `priority` of an upload; 0 where there is none.
+
+    Raises
+    ------
+    InvalidRequest : no whole number within MOST_PRIORITY of 0.
+    """
+    text = fields.get("priority", "0")
+    number = int(text) if re.fullmatch(r"[+-]?[0-9]{1,3}", text.strip(), re.ASCII) else None
+    if number is None or abs(number) > MOST_PRIORITY:
+        raise InvalidRequest(
+            f"The priority is {text!r:.40}. Send a whole number from {-MOST_PRIORITY} to "
+            f"{MOST_PRIORITY}, or leave it out for 0.",
+            (("priority", "no whole number in its range"),),
+        )
+    return number
 
 
 async def read_json(request: Request) -> Any:

@@ -10,6 +10,10 @@ down_revision = "0001"
 branch_labels = None
 depends_on = None
 
+SEARCHED = [
+    "map_number", "state", "session", "robot", "captured_at", "pose_parent", "pose_x", "pose_y",
+    "pose_z",
+]  # fmt: skip
 #: Rows that are read and written at once.
 _BLOCK = 1000
 
@@ -20,8 +24,7 @@ def upgrade() -> None:
     op.add_column("jobs", sa.Column("model_id", sa.String(length=64), nullable=True))
     for name in ("pose_x", "pose_y", "pose_z", "novelty"):
         op.add_column("frames", sa.Column(name, sa.Float(), nullable=True))
-    for name in ("session", "captured_at"):
-        op.create_index(op.f(f"ix_frames_map_number_{name}"), "frames", ["map_number", name])
+    op.create_index("ix_frames_searched", "frames", SEARCHED)
     op.create_table(
         "frame_tags",
         sa.Column("frame_number", sa.Integer(), nullable=False),

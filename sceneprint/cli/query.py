@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.cli.connection import add_service_options, one_line, open_client
+from sceneprint.cli.filters import add_filter_options, filter_of
 from sceneprint.cli.numbers import positive, whole
 from sceneprint.datasets import FrameReference, find_sequences
 from sceneprint.errors import DatasetError, FrameError
@@ -45,6 +46,7 @@ def add_to(commands: Any) -> None:
         "--seed", type=whole, default=0, metavar="S", help="of the random choices (default: 0)"
     )
     command.add_argument("--json", action="store_true", help="print each answer as a line of JSON")
+    add_filter_options(command)
     add_service_options(command)
     command.set_defaults(run=run)
 
@@ -53,13 +55,14 @@ def run(options: argparse.Namespace) -> int:
     """Ask; returns 2 where a frame could not be looked up."""
     references = _chosen(options.path, options.frame)
     stages: Any = tuple(stage.strip() for stage in options.stages.split(","))
+    wanted = filter_of(options)
     failed = 0
     with open_client(options) as client:
         for reference in references:
             try:
                 answer = client.query(
                     options.map, reference, k=options.k, stages=stages, exact=options.exact,
-                    seed=options.seed,
+                    seed=options.seed, filter=wanted,
                 )  # fmt: skip
             except FrameError as error:  # says nothing of the next frame
                 failed += 1
@@ -109,9 +112,12 @@ def lines_of(name: str, answer: Answer) -> list[str]:
     """An answer for people: a line of what came out, a line each match, and the pose."""
     counts = answer.counts
     tried = f"{counts.accepted} of {counts.validated} validated, " if counts.validated else ""
+    of = f"{counts.map}"
+    if counts.passed != counts.map:
+        of = f"{counts.passed} that pass, of {counts.map}"
     lines = [
         f"{one_line(name)}: {answer.status.replace('_', ' ')} ({tried}{counts.ranked} ranked of "
-        f"{counts.map} frames, {answer.milliseconds.get('total', 0.0):.0f} ms)"
+        f"{of} frames, {answer.milliseconds.get('total', 0.0):.0f} ms)"
     ]
     if answer.matches:
         width = max(len(_label(match)) for match in answer.matches)

@@ -22,6 +22,7 @@ class Tally:
     indexed: int = 0
     rejected: int = 0
     failed: int = 0
+    redundant: int = 0  #: not kept, as the map had their places
     #: Names of the frames that are not signed yet, by their jobs; one content has one job.
     waiting: dict[str, list[str]] = field(default_factory=dict)
     errors: list[tuple[str, str]] = field(default_factory=list)  #: name of a frame, and why
@@ -36,6 +37,8 @@ class Tally:
             self.waiting.setdefault(added.job_id, []).append(name)
         elif added.state is FrameState.INDEXED:
             self.indexed += 1
+        elif added.state is FrameState.REDUNDANT:
+            self.redundant += 1
         else:
             self._lose(name, added.reason, rejected=added.state is FrameState.REJECTED)
 
@@ -44,12 +47,14 @@ class Tally:
         self.refused += 1
         self.errors.append((name, reason))
 
-    def end(self, job: Job) -> None:
-        """A job that is over."""
+    def end(self, job: Job, *, redundant: bool = False) -> None:
+        """A job that is over, and whether its frame was not kept."""
         from sceneprint.schemas import JobState
 
         for name in self.waiting.pop(job.job_id):
-            if job.state is JobState.SUCCEEDED:
+            if redundant:
+                self.redundant += 1
+            elif job.state is JobState.SUCCEEDED:
                 self.indexed += 1
             else:
                 reason = job.error or job.state.sentence
@@ -59,10 +64,11 @@ class Tally:
         """Print the sum, and a line for each frame that was not indexed."""
         refused = f", {self.refused} refused" if self.refused else ""
         waiting = f", {len(self.waiting)} waiting" if self.waiting else ""
+        redundant = f", {self.redundant} redundant" if self.redundant else ""
         print(
             f"{total} frames: {self.new} received, {self.there} already there{refused}; "
-            f"{self.indexed} indexed, {self.rejected} rejected, {self.failed} failed{waiting}; "
-            f"{(self.new + self.there) / max(seconds, 1e-9):.1f} frames/s"
+            f"{self.indexed} indexed, {self.rejected} rejected, {self.failed} failed"
+            f"{redundant}{waiting}; {(self.new + self.there) / max(seconds, 1e-9):.1f} frames/s"
         )
         for name, reason in sorted(self.errors):
             print(f"{one_line(name)}: {one_line(reason)}", file=sys.stderr)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from sceneprint.cli.awaiting import STALL_S, wait_for_all
 from sceneprint.cli.connection import add_service_options, open_client
 from sceneprint.cli.numbers import positive
 from sceneprint.cli.tally import Tally
@@ -25,13 +26,13 @@ from sceneprint.errors import (
     Refused,
     UnknownMap,
 )
+from sceneprint.schemas.frames import MOST_PRIORITY
+from sceneprint.schemas.novelty import NOVEL, novelty_of
 
 if TYPE_CHECKING:
     from sceneprint.client import Client
     from sceneprint.schemas import Added
 
-#: Seconds without a frame signed after which no worker is believed to be there.
-STALL_S = 120.0
 #: What is wrong with one frame, and says nothing of the next.
 _OF_FRAME = (FrameError, DatasetError, FrameConflict, InvalidRequest, Refused)
 
@@ -75,6 +76,22 @@ def add_to(commands: Any) -> None:
     command.add_argument(
         "--every", type=positive, default=1, metavar="N", help="take every Nth frame"
     )
+    command.add_argument(
+        "--priority",
+        type=_priority,
+        default=0,
+        metavar="N",
+        help="from -10 to 10: frames of a greater one are signed first (default: 0)",
+    )
+    command.add_argument(
+        "--if-novel",
+        nargs="?",
+        type=_novelty,
+        const=True,
+        metavar="D",
+        help="keep a frame only if the map lacks its place: if the nearest frame is farther than D "
+        f"of the distance of unrelated frames (without a number: {NOVEL:g})",
+    )
     command.add_argument("--no-wait", action="store_true", help="do not wait until all are signed")
     command.add_argument(
         "--parallel", type=positive, default=4, metavar="N", help="in flight at once (default: 4)"
@@ -92,7 +109,8 @@ def run(options: argparse.Namespace) -> int:
         try:
             _send_all(client, options, found, tally)
             if not options.no_wait:
-                stalled = not _wait_for_all(client, tally)
+                novel = options.if_novel is not None
+                stalled = not wait_for_all(client, options.map, tally, may_be_redundant=novel)
         finally:  # what was received stays, however the run ended
             tally.report(len(found), time.perf_counter() - start)
             if stalled:
@@ -132,6 +150,24 @@ def _found(
                 )
             for reference in sequence.frames[::every]:
                 yield sequence, reference
+
+
+def _priority(text: str) -> int:
+    """A whole number from -10 to 10."""
+    if text.removeprefix("-") not in {str(number) for number in range(MOST_PRIORITY + 1)}:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from -10 to 10")
+    return int(text)
+
+
+def _novelty(text: str) -> float:
+    """A share of the distance of unrelated frames."""
+    try:
+        share = novelty_of(text)
+    except InvalidRequest:
+        share = None
+    if share is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0, up to 1")
+    return share
 
 
 def _see_to_map(client: Client, options: argparse.Namespace) -> None:
@@ -187,7 +223,9 @@ def _send(
         with_pose=not options.no_pose,
         parent_frame=_parent_frame(options, sequence),
     )
-    return client.add(options.map, reference, meta)
+    return client.add(
+        options.map, reference, meta, priority=options.priority, if_novel=options.if_novel
+    )
 
 
 def _parent_frame(options: argparse.Namespace, sequence: Sequence) -> str:
@@ -203,25 +241,3 @@ def _session(sequence: Sequence) -> str:
     if sequence.parent_frame == sequence.name:
         return sequence.name
     return f"{sequence.parent_frame}/{sequence.folder.name}"
-
-
-def _wait_for_all(client: Client, tally: Tally) -> bool:
-    """Wait for the jobs as long as some end now and then; whether all did."""
-    total = len(tally.waiting)
-    with tqdm(total=total, desc="sign", unit="frame", disable=None) as bar:
-        while tally.waiting:
-            before = total - len(tally.waiting)
-
-            def progress(done: int, _: int, before: int = before) -> None:
-                bar.update(before + done - bar.n)
-
-            over = [
-                job
-                for job in client.wait(tally.waiting, timeout_s=STALL_S, progress=progress)
-                if job.state.over
-            ]
-            for job in over:
-                tally.end(job)
-            if not over:
-                return False
-    return True

@@ -4,6 +4,7 @@ Field names, units and words are those of the JSON; docs/api.md has examples.
 """
 
 from sceneprint.schemas.base import Page, Problem
+from sceneprint.schemas.filters import Filter, Region
 from sceneprint.schemas.frames import (
     Added,
     CameraIntrinsics,
@@ -12,7 +13,7 @@ from sceneprint.schemas.frames import (
     GivenPose,
     Job,
 )
-from sceneprint.schemas.maps import Map, NewMap
+from sceneprint.schemas.maps import Map, NewMap, Reencoding
 from sceneprint.schemas.queries import (
     Answer,
     AnswerStatus,
@@ -33,6 +34,7 @@ __all__ = [
     "AnswerStatus",
     "CameraIntrinsics",
     "Counts",
+    "Filter",
     "Frame",
     "FrameMeta",
     "FrameState",
@@ -47,6 +49,8 @@ __all__ = [
     "Problem",
     "Quaternion",
     "Query",
+    "Reencoding",
+    "Region",
     "Residual",
     "Stage",
     "Transform",

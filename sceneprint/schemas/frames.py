@@ -11,6 +11,9 @@ from sceneprint.schemas.base import Given, Label, Told
 from sceneprint.schemas.states import FrameState, JobState
 from sceneprint.schemas.transforms import Transform
 
+#: A frame's priority is a whole number from minus this to this.
+MOST_PRIORITY = 10
+
 Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
@@ -105,7 +108,9 @@ class Added(Told):
     frame_id: str
     job_id: str = Field(description="The job that signs it: GET /v1/jobs/{job_id}.")
     state: FrameState
-    reason: str | None = Field(default=None, description="Why it was rejected, or failed.")
+    reason: str | None = Field(
+        default=None, description="Why it was rejected, or failed, or was not kept."
+    )
 
 
 class Frame(Told):
@@ -114,7 +119,7 @@ class Frame(Told):
     frame_id: str
     map: str
     state: FrameState
-    reason: str | None = Field(description="Why it was rejected, or failed.")
+    reason: str | None = Field(description="Why it was rejected, or failed, or was not kept.")
     job_id: str
     content_id: str | None = Field(description="Hash of samples and camera; null when deleted.")
     kind: Literal["depth"] = "depth"
@@ -135,10 +140,14 @@ class Job(Told):
     """A piece of work in the queue."""
 
     job_id: str
-    kind: Literal["sign"]
+    kind: Literal["sign", "reencode"] = Field(
+        description="`reencode` signs an indexed frame once more, with the model to come or as "
+        "what was made of it is damaged."
+    )
     state: JobState
     map: str
     frame_id: str
+    priority: int = Field(description="Jobs of a greater one are done first.")
     attempts: int
     created_at: datetime
     started_at: datetime | None = Field(description="Of the latest try.")

@@ -24,7 +24,24 @@ class NewMap(Given):
     )
     title: str | None = Field(default=None, max_length=200, description="For people.")
     model: Preset = Field(
-        default="paper", description="The model that signs its frames; never changes."
+        default="paper",
+        description="The model that signs its frames, until `sceneprint reencode` changes it.",
+    )
+
+
+class Reencoding(Told):
+    """How far a map has come that is being signed with another model."""
+
+    model: str = Field(description="Name and first digits of the id of the model to come.")
+    model_id: str
+    done: int = Field(description="Frames that it has signed.")
+    left: int = Field(description="Frames that wait for it.")
+    failed: int = Field(
+        description="Frames in which it finds nothing to sign: rejected at the switch."
+    )
+    dead: int = Field(
+        description="Frames whose jobs broke down in every try: the switch waits until they are "
+        "tried again or deleted."
     )
 
 
@@ -35,6 +52,9 @@ class Map(Told):
     title: str | None
     model: str = Field(description="Name and first digits of the id of its model.")
     model_id: str
+    reencoding: Reencoding | None = Field(
+        default=None, description="Where the map is on its way to another model."
+    )
     created_at: datetime
     revision: int = Field(description="Grows with every frame that is indexed or deleted.")
     frames: dict[str, int] = Field(description="How many frames are in each state.")

@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field, field_validator
 
 from sceneprint.schemas.base import Given, Told
+from sceneprint.schemas.filters import Filter, parsed
 from sceneprint.schemas.transforms import Transform
 
 Stage = Literal["retrieve", "diversify", "validate"]
@@ -26,7 +27,13 @@ class Query(Given):
         default=STAGES,
         description="R, DR, VR or VDR of the paper: always from `retrieve`, in this order.",
     )
-    exact: bool = Field(default=False, description="Compare every frame of the map.")
+    exact: bool = Field(
+        default=False, description="Compare every frame of the map that passes the filter."
+    )
+    filter: Filter | None = Field(
+        default=None,
+        description="Only frames that pass it are searched, and as many are found as exist.",
+    )
     seed: int = Field(
         default=0, ge=0, lt=2**32, description="Of the random choices; the answer echoes it."
     )
@@ -41,6 +48,11 @@ class Query(Given):
             return stages
         # pydantic would speak of tuples, as Python does
         raise ValueError("give a list of stages, or a text with commas between them")
+
+    @field_validator("filter", mode="before", json_schema_input_type=str | Filter | None)
+    @classmethod
+    def _from_json(cls, given: object) -> object:
+        return parsed(given)
 
     @field_validator("stages")
     @classmethod
@@ -119,7 +131,8 @@ class Counts(Told):
     """How many frames each stage saw."""
 
     map: int = Field(description="Frames of the map that can be found.")
-    compared: int = Field(description="Of them compared by their whole signature.")
+    passed: int = Field(description="Of them those that pass the filter; all without one.")
+    compared: int = Field(description="Of these compared by their whole signature.")
     ranked: int
     selected: int
     validated: int
@@ -141,7 +154,7 @@ class Answer(Told):
     seed: int
     model: str
     index_generation: int = Field(description="0 where the map is scanned without an index.")
-    exact: bool = Field(description="Every frame of the map was compared.")
+    exact: bool = Field(description="Every frame that passes the filter was compared.")
     counts: Counts
     milliseconds: dict[str, float] = Field(
         description="`prepare` (signature and geometry of the query), `retrieve`, `diversify`, "

@@ -11,7 +11,9 @@ from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
 
 from sceneprint.schemas import Added, Frame, FrameState, Page
-from service.bodies import FORM, uploaded
+from sceneprint.schemas.frames import MOST_PRIORITY
+from sceneprint.schemas.novelty import NOVEL, novelty_of
+from service.bodies import FORM, priority_of, uploaded
 from service.context import Context, Here
 from service.problems import declared
 
@@ -45,15 +47,40 @@ BODY: dict[str, Any] = {
 }
 
 
+def _with_options() -> dict[str, Any]:
+    """What an upload may say beside what a query says."""
+    form = BODY["content"][FORM]
+    priority = {
+        "type": "integer",
+        "minimum": -MOST_PRIORITY,
+        "maximum": MOST_PRIORITY,
+        "default": 0,
+        "description": "Frames of a greater one are signed first.",
+    }
+    share = {"type": "number", "exclusiveMinimum": 0, "maximum": 1}
+    if_novel = {
+        "anyOf": [share, {"type": "boolean"}],
+        "default": False,
+        "description": "Keep it only if the map lacks the place: if its nearest frame is farther "
+        f"than this share of the distance of unrelated frames; true: {NOVEL:g}. Else it ends "
+        "`redundant`, and its upload is removed.",
+    }
+    properties = {**form["schema"]["properties"], "priority": priority, "if_novel": if_novel}
+    return {
+        **BODY,
+        "content": {FORM: {**form, "schema": {**form["schema"], "properties": properties}}},
+    }
+
+
 @router.post(
     "",
     status_code=202,
     responses={
         200: {"model": Added, "description": "The map has this frame already."},
-        201: {"model": Added, "description": "Waited for: indexed, rejected or failed."},
+        201: {"model": Added, "description": "Waited for: indexed, redundant, rejected or failed."},
         **declared(400, 404, 409, 413, 415, 422),
     },
-    openapi_extra={"requestBody": BODY},
+    openapi_extra={"requestBody": _with_options()},
 )
 async def add_frame(
     map_name: str,
@@ -65,9 +92,13 @@ async def add_frame(
     ] = None,
 ) -> Added:
     """Take a frame into a map. When this answers, the frame is safe; a worker signs it next."""
-    async with here.gate.place(), uploaded(request) as upload:
-        added, is_new = await here.gate.run(
-            lambda: here.engine.add_frame(map_name, upload.file.read(), upload.meta)
+    async with here.uploads.place(), uploaded(request, "priority", "if_novel") as upload:
+        priority = priority_of(upload.fields)
+        if_novel = novelty_of(upload.fields.get("if_novel"))
+        added, is_new = await here.uploads.run(
+            lambda: here.engine.add_frame(
+                map_name, upload.file.read(), upload.meta, priority, if_novel
+            )
         )
     response.headers["Location"] = f"/v1/jobs/{added.job_id}"
     wait_s = _wait(prefer)

@@ -23,10 +23,17 @@ _OPTIONS = tuple(Query.model_fields)
 def _body() -> dict[str, Any]:
     """The two ways to ask, for the OpenAPI document."""
     form = FRAME["content"][FORM]["schema"]
-    options = Query.model_json_schema()["properties"]
+    template = "#/components/schemas/{model}"
+    options = Query.model_json_schema(ref_template=template)["properties"]
     stages = {"type": "string", "default": "retrieve,diversify,validate"}
     of_form = {**options, "stages": options["stages"] | stages}
     of_form["stages"].pop("anyOf")  # text or a list; a form has only text
+    of_form["filter"] = {
+        "type": "string",
+        "contentMediaType": "application/json",
+        "contentSchema": {"$ref": "#/components/schemas/Filter"},
+        "description": options["filter"]["description"],
+    }
     by_id = {"frame_id": {"type": "string", "description": "A frame of the map."}, **options}
     return {
         "required": True,

@@ -1,0 +1,90 @@
+"""Filters and `--if-novel` as a user gives them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sceneprint.cli.filters import add_filter_options, filter_of
+from sceneprint.client import Client
+
+Run = Callable[..., Any]
+
+
+def test_a_query_names_what_it_looks_among(sceneprint: Run, service_url: str, rooms: Path) -> None:
+    for room, tags in (("room-0", ["--tag", "a"]), ("room-1", ["--tag", "a", "--tag", "b"])):
+        sceneprint("upload", "sorted", rooms / room, "--robot", room, *tags)
+    frame = rooms / "room-0" / "seq-01" / "frame-000000.depth.png"
+    ask = ("query", "sorted", frame, "--stages", "retrieve")
+    with Client(service_url) as client:
+        ids = {one.frame_id: one.robot for one in client.frames("sorted")}
+    box = "--region=-99,-99,-99,99,99,99"
+    for options, robots in (
+        (["--robot", "room-1"], {"room-1"}),
+        (["--robot", "room-1", "--robot", "room-0"], {"room-0", "room-1"}),
+        (["--session", "room-0/seq-01"], {"room-0"}),
+        (["--tag", "a", "--tag", "b"], {"room-1"}),
+        ([box, "--region-frame", "room-1/room-1"], {"room-1"}),
+        (["--exclude", *[i for i, robot in ids.items() if robot == "room-0"][:1]],
+         {"room-0", "room-1"}),
+        (["--after", "2020-01-01T00:00:00Z"], set()),
+    ):  # fmt: skip
+        told = json.loads(sceneprint(*ask, "--json", *options).stdout)
+        assert {ids[match["frame_id"]] for match in told["matches"]} == robots
+    line = sceneprint(*ask, "--robot", "room-1").stdout.splitlines()[0]
+    assert "3 ranked of 3 that pass, of 6 frames" in line
+    assert "6 ranked of 6 frames" in sceneprint(*ask).stdout
+    for options, text in (
+        (["--not-within", "5"], "no captured_at"),
+        (["--not-within", "-5"], "filter.not_within_s: Input should be greater than 0"),
+        (["--before", "yesterday"], "filter.captured_before"),
+        ([box], "Give --region and --region-frame together"),
+    ):
+        said = sceneprint(*ask, *options, expect=2)
+        assert text in said.stderr
+        assert said.stderr.count("\n") == 1
+
+
+def test_options_are_a_filter() -> None:
+    import argparse
+
+    parser = argparse.ArgumentParser()
+    add_filter_options(parser)
+    assert filter_of(parser.parse_args([])) is None
+    given = (
+        "--session s --after 2026-11-16T09:30:00Z --before 2026-11-16T10:30:00Z --not-within 4.5 "
+        "--region 0,1,2,3,4.5,5 --region-frame hall --exclude f --exclude g"
+    )
+    assert filter_of(parser.parse_args(given.split())) == {
+        "session": ["s"], "captured_after": "2026-11-16T09:30:00Z",
+        "captured_before": "2026-11-16T10:30:00Z", "not_within_s": 4.5,
+        "region": {"parent_frame": "hall", "min": {"x": 0, "y": 1, "z": 2},
+                   "max": {"x": 3, "y": 4.5, "z": 5}},
+        "exclude_frames": ["f", "g"],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("text", ["1,2,3", "a,b,c,d,e,f", ""])
+def test_a_box_has_six_numbers(sceneprint: Run, text: str) -> None:
+    with pytest.raises(SystemExit):
+        sceneprint("query", "m", "x.png", "--region", text)
+
+
+def test_an_upload_counts_what_was_not_kept(sceneprint: Run, rooms: Path) -> None:
+    done = sceneprint("upload", "novel", rooms / "room-0", "--if-novel=1")
+    assert done.stderr == ""  # nothing is wrong
+    first = "3 frames: 3 received, 0 already there; 1 indexed, 0 rejected, 0 failed, 2 redundant; "
+    assert done.stdout.splitlines()[-1].startswith(first)
+    done = sceneprint("upload", "novel", rooms / "room-0", "--if-novel", "0.001")
+    again = "3 frames: 2 received, 1 already there; 3 indexed, 0 rejected, 0 failed; "
+    assert done.stdout.splitlines()[-1].startswith(again)
+
+
+@pytest.mark.parametrize("text", ["0", "1.5", "much", "false"])
+def test_a_condition_is_a_share(sceneprint: Run, rooms: Path, text: str) -> None:
+    with pytest.raises(SystemExit):
+        sceneprint("upload", "novel", rooms, f"--if-novel={text}")

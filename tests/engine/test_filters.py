@@ -1,0 +1,311 @@
+"""Queries with a filter: the ranking that plain Python makes of the frames that pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta, timezone
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.engine.engine import stored_maps
+from sceneprint.errors import InvalidRequest
+from sceneprint.geometry.retrieval import ranking_size
+from sceneprint.schemas import Answer, Filter, NewMap, Query
+from sceneprint.store.frames import add_frame
+from sceneprint.store.signatures import StoredSignature, index_frame
+
+Make = Callable[..., Engine]
+Ids = Callable[[Engine], list[str]]
+START = datetime(2026, 11, 16, 9, 30, tzinfo=UTC)
+
+
+@dataclass(frozen=True)
+class Known:
+    """A frame as the oracle knows it."""
+
+    id: str
+    vector: np.ndarray
+    robot: str | None
+    session: str | None
+    at: datetime | None
+    tags: list[str]
+    parent: str | None
+    place: tuple[int, ...]
+
+
+def fill(engine: Engine, count: int, seed: int, name: str = "hall") -> list[Known]:
+    """Index frames of random metadata; places and times are round, so that bounds are met."""
+    rng = np.random.default_rng(seed)
+    made = []
+    with engine.store.database.write() as connection:
+        row = stored_maps.find_map(connection, name)
+        model = engine.signers(row.model_id).model
+        for i in range(count):
+            at = None if rng.random() < 0.1 else START + timedelta(seconds=int(rng.integers(60)))
+            place = tuple(rng.integers(-2, 3, 3).tolist())
+            pose = np.eye(4)
+            pose[:3, 3] = place
+            parent = rng.choice([None, "p1", "p2"], p=[0.1, 0.7, 0.2])
+            values = {
+                "content_id": f"{seed}-{i}", "blob": "00" * 32, "bytes": 3,
+                "intrinsics": {"width": 1, "height": 1, "fx": 1, "fy": 1, "cx": 0, "cy": 0},
+                "depth_scale": 1000.0, "depth_along_ray": False,
+                "robot": rng.choice([None, "r1", "r2", "r3"]),
+                "session": rng.choice([None, "s1", "s2"], p=[0.1, 0.6, 0.3]),
+                "captured_at": None if at is None else at.timestamp(),
+                "tags": [tag for tag in ("door", "é", "c") if rng.random() < 0.5],
+                "pose_parent": parent, "pose": None if parent is None else pose.tolist(),
+            }  # fmt: skip
+            frame = add_frame(connection, row.number, values)
+            vector = rng.integers(0, 3, model.signature_bytes, np.uint8)
+            signature = StoredSignature(model.id, vector.tobytes(), "11" * 32, [1], [1])
+            index_frame(connection, frame, signature)
+            made.append(
+                Known(
+                    frame.id,
+                    vector,
+                    values["robot"],
+                    values["session"],
+                    at,
+                    values["tags"],
+                    parent,
+                    place,
+                )
+            )
+    return made
+
+
+def passes(one: Known, wanted: Filter, own: Known) -> bool:
+    """By the sentences of `Filter`, condition by condition."""
+    if wanted.robot is not None and one.robot not in wanted.robot:
+        return False
+    if wanted.session is not None and one.session not in wanted.session:
+        return False
+    if wanted.captured_after and (one.at is None or one.at < wanted.captured_after):
+        return False
+    if wanted.captured_before and (one.at is None or one.at > wanted.captured_before):
+        return False
+    if not set(wanted.tags) <= set(one.tags):
+        return False
+    if wanted.not_within_s is not None and one.session == own.session:
+        other_robot = None not in (one.robot, own.robot) and one.robot != own.robot
+        near = one.at is None or abs((one.at - own.at).total_seconds()) <= wanted.not_within_s
+        if near and not other_robot:
+            return False
+    if wanted.region is not None:
+        low, high = wanted.region.min, wanted.region.max
+        inside = all(
+            getattr(low, axis) <= x <= getattr(high, axis)
+            for axis, x in zip("xyz", one.place, strict=True)
+        )
+        if one.parent != wanted.region.parent_frame or not inside:
+            return False
+    return one.id not in wanted.exclude_frames
+
+
+def ranked(frames: list[Known], own: Known, wanted: Filter) -> list[tuple[str, int]]:
+    """The oracle: all that pass, nearest first, ties as they came."""
+    found = [
+        (int(np.abs(one.vector.astype(int) - own.vector).sum()), i, one.id)
+        for i, one in enumerate(frames)
+        if one.id != own.id and passes(one, wanted, own)
+    ]
+    return [(frame_id, distance) for distance, _, frame_id in sorted(found)]
+
+
+def hold(answer: Answer, frames: list[Known], own: Known, wanted: Filter) -> int:
+    """Compare an answer with the oracle; returns how many frames passed."""
+    expected = ranked(frames, own, wanted)
+    counts = answer.counts
+    assert (counts.map, counts.passed) == (len(frames) - 1, len(expected))
+    assert (counts.compared, answer.exact) == (len(expected), True)
+    assert counts.ranked == ranking_size(len(expected))
+    assert [(m.frame_id, m.distance) for m in answer.matches] == expected[:50]
+    return len(expected)
+
+
+def draw(rng: np.random.Generator, frames: list[Known]) -> Filter:
+    """A filter of one to three conditions."""
+    seconds = [int(one) for one in sorted(rng.integers(0, 60, 2))]
+    corners = np.sort(rng.integers(-2, 3, (2, 3)), axis=0).tolist()
+    given: dict[str, Any] = {
+        "robot": "r1" if rng.random() < 0.5 else ["r2", "r3"],
+        "session": rng.choice(["s1", "s2"]),
+        "captured_after": START + timedelta(seconds=seconds[0]),
+        "captured_before": START + timedelta(seconds=seconds[1]),
+        "tags": rng.permutation(["door", "é", "c"])[: rng.integers(1, 4)].tolist(),
+        "not_within_s": float(rng.integers(1, 20)),
+        "region": {
+            "parent_frame": "p1",
+            **{k: dict(zip("xyz", c, strict=True)) for k, c in zip(("min", "max"), corners,
+                                                                  strict=True)},
+        },
+        "exclude_frames": [one.id for one in rng.choice(np.array(frames, object), 9)],
+    }  # fmt: skip
+    chosen = rng.permutation(list(given))[: rng.integers(1, 4)]
+    return Filter.model_validate({name: given[name] for name in chosen})
+
+
+def ask(engine: Engine, own: Known, wanted: Filter, *, exact: bool = False) -> Answer:
+    query = Query(stages=("retrieve",), k=50, filter=wanted, exact=exact)
+    return engine.query_frame("hall", own.id, query)
+
+
+@pytest.mark.parametrize("published", [False, True])
+def test_a_filter_leaves_what_plain_python_leaves(make_engine: Make, published: bool) -> None:
+    """With a tail alone and with a generation; frames come and go; another map is beside it."""
+    engine = make_engine(tail_frames=50)
+    for name in ("hall", "other"):
+        engine.create_map(NewMap(name=name, model="compact"))
+    frames = fill(engine, 120, 1)
+    fill(engine, 20, 4, "other")
+    if published:
+        assert engine.publish_due() == 1
+    frames += fill(engine, 40, 2)
+    for gone in frames[5:125:12]:
+        engine.delete_frame("hall", gone.id)
+        frames.remove(gone)
+    rng, sizes = np.random.default_rng(3), []
+    askers = [one for one in frames if one.session is not None and one.at is not None]
+    for i in range(60):
+        own = askers[int(rng.integers(len(askers)))]
+        wanted = draw(rng, frames)
+        answer = ask(engine, own, wanted, exact=i % 2 == 1)
+        assert answer.index_generation == int(published)
+        sizes.append(hold(answer, frames, own, wanted))
+    assert min(sizes) == 0
+    assert sum(size > 20 for size in sizes) > 10
+    everything = Filter()
+    assert hold(ask(engine, frames[0], everything), frames, frames[0], everything) > 100
+
+
+def test_each_condition_alone(make_engine: Make) -> None:
+    engine = make_engine()
+    engine.create_map(NewMap(name="hall", model="compact"))
+    frames = fill(engine, 100, 5)
+    times = [one.at for one in frames]
+    whole = [one for one in frames if None not in (one.session, one.robot, one.at)]
+    own = next(one for one in whole if times.count(one.at) > 1)
+    nameless = next(one for one in frames if one.session and one.at and one.robot is None)
+    later = own.at + timedelta(hours=2)
+    box = {"min": {"x": -1, "y": -1, "z": -1}, "max": {"x": 1, "y": 1, "z": 1}}
+    cases: list[tuple[dict[str, Any], Known]] = [
+        ({"robot": own.robot}, own),
+        ({"robot": ["r1", "r2", "r3"]}, own),
+        ({"session": "s2"}, own),
+        ({"captured_after": own.at}, own),
+        ({"captured_before": own.at}, own),
+        ({"captured_after": own.at, "captured_before": own.at}, own),
+        # another zone's clock, the same moment
+        ({"captured_before": own.at.astimezone(timezone(timedelta(hours=5)))}, own),
+        ({"tags": ["é"]}, own),
+        ({"tags": ["c", "door", "c"]}, own),
+        ({"not_within_s": 10}, own),
+        ({"not_within_s": 10}, nameless),
+        ({"not_within_s": 1e300}, own),
+        ({"region": {"parent_frame": "p1", **box}}, own),
+        ({"region": {"parent_frame": "p2", **box}}, own),
+        ({"exclude_frames": [one.id for one in frames[:90]] + ["nobody"]}, own),
+    ]
+    for given, asker in cases:
+        wanted = Filter.model_validate(given)
+        passed = hold(ask(engine, asker, wanted), frames, asker, wanted)
+        assert 0 < passed < 99, given
+    nothing: list[dict[str, Any]] = [
+        {"robot": "nobody"},
+        {"tags": ["door", "window"]},
+        {"captured_after": later},
+        {"region": {"parent_frame": "p3", **box}},
+        {"exclude_frames": [one.id for one in frames]},
+    ]
+    for given in nothing:
+        wanted = Filter.model_validate(given)
+        assert hold(ask(engine, own, wanted), frames, own, wanted) == 0
+
+
+def test_what_does_not_pass_is_neither_matched_nor_located_by(
+    full: Engine, uploads: Any, ids: Ids
+) -> None:
+    """All stages, of an uploaded frame: the other room's frames are as good as not there."""
+    asked, names = uploads[8], ids(full)
+    for wanted in (
+        Filter(exclude_frames=[names[8]]),
+        Filter(exclude_frames=names[:6]),
+        Filter.model_validate(
+            {"region": {"parent_frame": asked.room, "min": {"x": -99, "y": -99, "z": -99},
+                        "max": {"x": 99, "y": 99, "z": 99}}}
+        ),
+    ):  # fmt: skip
+        answer = full.query_upload("hall", asked.data, asked.meta, Query(k=50, filter=wanted))
+        told = {match.frame_id for match in answer.matches}
+        if wanted.region is not None:
+            assert told == set(names[6:])
+        else:
+            assert told == set(names) - set(wanted.exclude_frames)
+        assert answer.counts.passed == len(told)
+        assert answer.status == "found"
+    for stages in (("retrieve",), ("retrieve", "diversify", "validate")):
+        query = Query(stages=stages, filter=Filter(tags=["nowhere"]))
+        answer = full.query_upload("hall", asked.data, asked.meta, query)
+        assert answer.status == ("unvalidated" if len(stages) == 1 else "not_found")
+        assert (answer.matches, answer.location) == ([], None)
+        assert answer.counts.model_dump() == {
+            "map": 12, "passed": 0, "compared": 0, "ranked": 0, "selected": 0, "validated": 0,
+            "accepted": 0,
+        }  # fmt: skip
+
+
+def test_who_asks_to_keep_away_from_itself_says_where_it_is(
+    full: Engine, uploads: Any, ids: Ids, make_engine: Make
+) -> None:
+    query = Query(stages=("retrieve",), filter=Filter(not_within_s=5))
+    needed = "needed by filter.not_within_s"
+    with pytest.raises(InvalidRequest, match="no session and no captured_at") as caught:
+        full.query_upload("hall", uploads[0].data, uploads[0].meta, query)
+    assert caught.value.fields == (("session", needed), ("captured_at", needed))
+    with pytest.raises(InvalidRequest, match="has no session and no captured_at"):
+        full.query_frame("hall", ids(full)[0], query)
+    named = uploads[0].meta.model_copy(update={"session": "s1"})
+    with pytest.raises(InvalidRequest, match="has no captured_at") as caught:
+        full.query_upload("hall", uploads[0].data, named, query)
+    assert caught.value.fields == (("captured_at", needed),)
+    whole = named.model_copy(update={"captured_at": START})
+    assert full.query_upload("hall", uploads[0].data, whole, query).counts.passed == 12
+
+
+def test_frames_between_view_and_filter_do_no_harm(
+    make_engine: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One is deleted, and one indexed, after the view was made and before the filter is asked."""
+    from sceneprint.engine import answers
+
+    engine = make_engine()
+    engine.create_map(NewMap(name="hall", model="compact"))
+    frames = fill(engine, 20, 6)
+    passing, gone = answers.passing, frames[3]
+
+    def late(*given: Any) -> Any:
+        monkeypatch.setattr(answers, "passing", passing)
+        engine.delete_frame("hall", gone.id)
+        fill(engine, 5, 7)
+        return passing(*given)
+
+    monkeypatch.setattr(answers, "passing", late)
+    answer = ask(engine, frames[0], Filter())
+    left = [one for one in frames if one is not gone]
+    assert [m.frame_id for m in answer.matches] == [i for i, _ in ranked(left, frames[0], Filter())]
+    assert (answer.counts.map, answer.counts.passed) == (19, 18)
+
+    def early(*given: Any) -> Any:
+        numbers = passing(*given)
+        engine.delete_frame("hall", frames[4].id)
+        return numbers
+
+    monkeypatch.setattr(answers, "passing", early)
+    answer = ask(engine, frames[0], Filter())
+    assert frames[4].id not in {m.frame_id for m in answer.matches}  # though it was compared
+    assert len(answer.matches) == 22

@@ -1,0 +1,260 @@
+"""Frames that are kept only where their map lacks the place: `if_novel` of an upload."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import select
+
+from sceneprint.engine import Engine
+from sceneprint.engine import novelty as judging
+from sceneprint.engine import work as working
+from sceneprint.engine.engine import stored_maps
+from sceneprint.errors import InvalidRequest
+from sceneprint.pipeline import Signature, Signer
+from sceneprint.schemas import FrameState, JobState, NewMap, Query
+from sceneprint.schemas.novelty import NOVEL, novelty_of
+from sceneprint.store.signatures import StoredSignature
+from sceneprint.store.tables import events, signatures
+from sceneprint.types import Geometry
+
+Make = Callable[..., Engine]
+WorkOff = Callable[[Engine], list[JobState | None]]
+Told = Callable[[Engine], list[str]]
+Prepared = list[tuple[Signature, Geometry]]
+
+
+@pytest.fixture
+def share(prepared: Prepared, signer: Signer) -> Callable[[int, int], float]:
+    """How far two of the uploads are apart, as a share of unrelated frames."""
+
+    def of(i: int, j: int) -> float:
+        a, b = (prepared[k][0].vector.astype(np.int64) for k in (i, j))
+        return int(np.abs(a - b).sum()) / signer.model.unrelated_distance
+
+    return of
+
+
+@pytest.fixture
+def send(uploads: Any, work_off: WorkOff) -> Callable[..., Any]:
+    """Upload one of the uploads, sign it, and return the frame."""
+
+    def run(engine: Engine, which: int, if_novel: float | None = None, name: str = "hall") -> Any:
+        added, new = engine.add_frame(
+            name, uploads[which].data, uploads[which].meta, if_novel=if_novel
+        )
+        assert new
+        assert work_off(engine) == [JobState.SUCCEEDED]
+        return engine.get_frame(name, added.frame_id)
+
+    return run
+
+
+def found(engine: Engine, uploads: Any) -> set[str]:
+    query = Query(stages=("retrieve",), k=50)
+    answer = engine.query_upload("hall", uploads[0].data, uploads[0].meta, query)
+    return {match.frame_id for match in answer.matches}
+
+
+def rows(engine: Engine) -> int:
+    with engine.store.database.read() as connection:
+        return len(connection.execute(select(signatures.c.frame_number)).all())
+
+
+def test_a_frame_whose_place_the_map_has_is_not_kept(
+    empty: Engine, uploads: Any, send: Any, share: Any, told: Told
+) -> None:
+    near, far = share(0, 1), share(0, 7)
+    assert 0 < near < far
+    between = (near + far) / 2
+    first = send(empty, 0, 1.0)  # an empty map has no place
+    assert (first.state, first.reason) == (FrameState.INDEXED, None)
+    blobs = set(empty.store.blobs.digests())
+    second = send(empty, 1, between)
+    assert second.state == FrameState.REDUNDANT
+    assert second.reason == (
+        f"the map has this place: frame {first.frame_id} is at {near:.3f} of the distance of "
+        f"unrelated frames (asked: more than {between:g})"
+    )
+    job = empty.get_job(second.job_id)
+    assert (job.state, job.error) == (JobState.SUCCEEDED, None)
+    assert second.indexed_at is None
+    assert set(empty.store.blobs.digests()) == blobs  # neither its upload nor its artifact
+    assert rows(empty) == 1
+    assert found(empty, uploads) == {first.frame_id}
+    assert empty.get_map("hall").frames == {"indexed": 1, "redundant": 1}
+    third = send(empty, 7, between)
+    assert third.state == FrameState.INDEXED
+    assert found(empty, uploads) == {first.frame_id, third.frame_id}
+    assert told(empty)[1:] == ["frame.received", "frame.indexed", "frame.received",
+                               "frame.redundant", "frame.received", "frame.indexed"]  # fmt: skip
+    with empty.store.database.read() as connection:
+        last = select(events).where(events.c.kind == "frame.redundant")
+        event = connection.execute(last).mappings().one()
+    assert (event["frame_id"], event["job_id"]) == (second.frame_id, second.job_id)
+    page = empty.list_frames("hall", state=FrameState.REDUNDANT)
+    assert [one.frame_id for one in page.items] == [second.frame_id]
+    unconditional = send(empty, 2)
+    assert unconditional.state == FrameState.INDEXED
+
+
+def test_the_nearest_frame_decides_and_must_be_farther(
+    empty: Engine, uploads: Any, send: Any, share: Any
+) -> None:
+    for which in (6, 1, 7):
+        assert send(empty, which).state == FrameState.INDEXED
+    nearest = min(share(0, which) for which in (6, 1, 7))
+    assert nearest == share(0, 1)
+    not_kept = send(empty, 0, nearest)
+    assert not_kept.state == FrameState.REDUNDANT
+    again = send(empty, 0, float(np.nextafter(nearest, 0)))
+    assert (again.state, again.frame_id) == (FrameState.INDEXED, not_kept.frame_id)
+
+
+def test_what_is_gone_is_no_place_and_a_frame_may_come_again(
+    empty: Engine, uploads: Any, send: Any
+) -> None:
+    """The same frame with the same id and another job, once the map has lost what was near."""
+    first = send(empty, 0)
+    blob_count = len(list(empty.store.blobs.digests()))
+    redundant = send(empty, 1, 1.0)
+    assert redundant.state == FrameState.REDUNDANT
+    still = send(empty, 1, 1.0)
+    assert (still.state, still.frame_id) == (FrameState.REDUNDANT, redundant.frame_id)
+    empty.delete_frame("hall", first.frame_id)
+    kept = send(empty, 1, 1.0)
+    assert (kept.state, kept.reason) == (FrameState.INDEXED, None)
+    assert kept.frame_id == redundant.frame_id
+    assert len({redundant.job_id, still.job_id, kept.job_id}) == 3
+    assert found(empty, uploads) == {kept.frame_id}
+    assert len(list(empty.store.blobs.digests())) == blob_count
+    added, new = empty.add_frame("hall", uploads[1].data, uploads[1].meta, if_novel=1.0)
+    assert (added.frame_id, added.state, new) == (kept.frame_id, FrameState.INDEXED, False)
+
+
+def test_another_map_has_other_places(empty: Engine, uploads: Any, send: Any) -> None:
+    empty.create_map(NewMap(name="other", model="compact"))
+    send(empty, 0)
+    assert send(empty, 1, 1.0, "other").state == FrameState.INDEXED
+    not_kept = send(empty, 1, 1.0)
+    assert not_kept.state == FrameState.REDUNDANT
+    assert len(list(empty.store.blobs.digests())) == 4  # the other map's frame has the same two
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "kept"),
+    [(1.0, None, True), (1.0, 0.01, True), (0.01, 1.0, True), (None, 1.0, True), (1.0, 1.0, False)],
+)
+@pytest.mark.parametrize("claimed", [False, True])
+def test_who_sends_it_without_the_condition_is_not_let_down(
+    empty: Engine, uploads: Any, send: Any, work_off: WorkOff, first: float | None,
+    second: float | None, kept: bool, claimed: bool,
+) -> None:  # fmt: skip
+    """Told that it is there, waiting or being signed: then the weaker condition counts."""
+    send(empty, 0)
+    frame, _ = empty.add_frame("hall", uploads[1].data, uploads[1].meta, if_novel=first)
+    work = empty.claim("w") if claimed else None
+    again, new = empty.add_frame("hall", uploads[1].data, uploads[1].meta, if_novel=second)
+    assert (again.frame_id, again.job_id, new) == (frame.frame_id, frame.job_id, False)
+    states = [empty.run(work)] if work is not None else work_off(empty)
+    assert states == [JobState.SUCCEEDED]
+    state = FrameState.INDEXED if kept else FrameState.REDUNDANT
+    assert empty.get_frame("hall", frame.frame_id).state == state
+
+
+def test_of_two_that_are_signed_at_once_one_is_kept(
+    make_engine: Make, uploads: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two workers look at an empty map, and only then either stores what it made."""
+    engines = [make_engine(), make_engine()]
+    engines[0].create_map(NewMap(name="hall", model="compact"))
+    for which in (0, 1):
+        engines[0].add_frame("hall", uploads[which].data, uploads[which].meta, if_novel=1.0)
+    looked = threading.Barrier(2)
+
+    def together(*given: Any) -> Any:
+        seen = judging.look(*given)
+        assert seen is not None
+        assert seen.nearest is None
+        looked.wait(60)
+        return seen
+
+    monkeypatch.setattr(working, "look", together)
+    claims = [engine.claim(f"w{i}") for i, engine in enumerate(engines)]
+    states: list[JobState | None] = []
+    threads = [
+        threading.Thread(target=lambda e=engine, c=work: states.append(e.run(c)))
+        for engine, work in zip(engines, claims, strict=True)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert states == [JobState.SUCCEEDED] * 2
+    frames = {one.state: one for one in engines[0].list_frames("hall").items}
+    assert set(frames) == {FrameState.INDEXED, FrameState.REDUNDANT}
+    assert frames[FrameState.INDEXED].frame_id in str(frames[FrameState.REDUNDANT].reason)
+    assert rows(engines[0]) == 1
+
+
+@pytest.mark.parametrize("left", [1, 7])
+def test_a_nearest_frame_that_is_deleted_meanwhile_is_looked_for_again(
+    empty: Engine, uploads: Any, send: Any, share: Any, monkeypatch: pytest.MonkeyPatch, left: int
+) -> None:
+    nearest = send(empty, 2)
+    other = send(empty, left)
+    limit = (share(3, 1) + share(3, 7)) / 2
+    assert share(3, 2) < share(3, 1) < limit < share(3, 7)
+    looks = []
+
+    def interrupted(*given: Any) -> Any:
+        looks.append(judging.look(*given))
+        if len(looks) == 1:
+            empty.delete_frame("hall", nearest.frame_id)
+        return looks[-1]
+
+    monkeypatch.setattr(working, "look", interrupted)
+    frame = send(empty, 3, limit)
+    assert len(looks) == 2
+    if left == 1:
+        assert frame.state == FrameState.REDUNDANT
+        assert other.frame_id in frame.reason
+    else:
+        assert frame.state == FrameState.INDEXED
+
+
+def test_signatures_of_another_model_are_not_compared(
+    empty: Engine, uploads: Any, send: Any, prepared: Prepared
+) -> None:
+    send(empty, 0)
+    with empty.store.database.read() as connection:
+        row = stored_maps.find_map(connection, "hall")
+    vector = prepared[1][0].vector.tobytes()
+    made = StoredSignature(row.model_id, vector, "00" * 32, [1], [1])
+    database, readers = empty.store.database, empty._readers
+    seen = judging.look(database, readers, row, made)
+    assert seen is not None
+    assert seen.nearest is not None
+    assert judging.look(database, readers, row, replace(made, model_id="ab" * 32)) is None
+    assert judging.look(database, readers, replace(row, number=99), made) is None
+
+
+@pytest.mark.parametrize(
+    ("given", "share"),
+    [(None, None), (False, None), ("false", None), (True, NOVEL), ("true", NOVEL), (1, 1.0),
+     ("0.25", 0.25), (0.1, 0.1)],
+)  # fmt: skip
+def test_what_may_be_asked(given: Any, share: float | None) -> None:
+    assert novelty_of(given) == share
+
+
+@pytest.mark.parametrize("given", [0, 0.0, "0", -0.1, 1.1, "nan", float("inf"), "yes", "", "True"])
+def test_what_may_not_be_asked(given: Any) -> None:
+    with pytest.raises(InvalidRequest, match="above 0, up to 1") as caught:
+        novelty_of(given)
+    assert [place for place, _ in caught.value.fields] == ["if_novel"]
