@@ -15,22 +15,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import Connection
 
+from sceneprint.engine.growing import Growing
 from sceneprint.engine.signers import Signers
 from sceneprint.index import Generation, Tail, newest, newest_number
 from sceneprint.store.events import holds_anchor
 from sceneprint.store.records import MapRow
-from sceneprint.store.signatures import Change, changes_since
-from sceneprint.types import Bytes
+from sceneprint.store.signatures import Change, changes_since, count_indexed
 
 log = logging.getLogger(__name__)
 
 #: Memory of all tails above which maps that were not asked for long are forgotten.
 HELD_BYTES = 1 << 30
-#: Seconds between two looks for a newer generation while the tail is long.
+#: Seconds between two looks for a newer generation.
 _LOOK_S = 1.0
+#: Bytes of a generation's signatures up to which all are verified when it is opened: it takes a
+#: second a gigabyte. Larger ones are verified by workers, in the background.
+VERIFIED_BYTES = 256 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,18 +41,22 @@ class View:
 
     Parameters
     ----------
+    model_id : of the model that made all signatures
     revision : of the map
     generation : of its index, or None
     tail : frames newer than it
     dead : frames of both that are deleted
     size : frames that can be found
+    damaged : frames that were passed over, as their signature is damaged
     """
 
+    model_id: str
     revision: int
     generation: Generation | None
     tail: Tail
     dead: frozenset[int]
     size: int
+    damaged: frozenset[int] = frozenset()
 
 
 def index_folder(indexes: Path, row: MapRow) -> Path:
@@ -83,18 +89,16 @@ class Reader:
     row : of the map
     folder : of its index
     length : bytes of a signature
-    tail_frames : length of the tail from which on a newer generation is looked for
     """
 
-    def __init__(
-        self, connection: Connection, row: MapRow, folder: Path, length: int, tail_frames: int
-    ) -> None:
-        self._folder, self._length = folder, length
-        self._tail_frames, self._looked = tail_frames, 0.0
+    def __init__(self, connection: Connection, row: MapRow, folder: Path, length: int) -> None:
+        self._folder, self._length, self._model_id = folder, length, row.model_id
+        self._looked = time.monotonic()
         self._lock = threading.Lock()
-        self._tail = _Growing(length)
+        self._tail = Growing(length, folder)
         self._dead: dict[int, int] = {}  # what was deleted after the generation, and when
-        self._view = self._begin(trusted(connection, row, newest(folder, row.model_id, length)))
+        self._damaged: set[int] = set()
+        self._view = self._begin(self._newest(connection, row, None))
 
     @property
     def bytes_held(self) -> int:
@@ -103,56 +107,87 @@ class Reader:
 
     def view(self, connection: Connection, row: MapRow) -> View:
         """The map as of the row's revision, or later."""
-        if self._view.revision < row.revision:
-            with self._lock:
+        behind = self._view.revision < row.revision
+        # who only looks for a newer generation waits for nobody
+        if (behind or self._is_time()) and self._lock.acquire(blocking=behind):
+            try:
                 if self._view.revision < row.revision:
                     self._catch_up(connection, row)
+                if self._is_time():
+                    self._swap(connection, row)
+            finally:
+                self._lock.release()
         return self._view
+
+    def _is_time(self) -> bool:
+        return time.monotonic() - self._looked >= _LOOK_S
 
     def _begin(self, generation: Generation | None) -> View:
         revision = 0 if generation is None else generation.revision
-        return View(revision, generation, self._tail.tail(), frozenset(), len(generation or ()))
+        size = len(generation or ())
+        return View(self._model_id, revision, generation, self._tail.tail(), frozenset(), size)
 
     def _catch_up(self, connection: Connection, row: MapRow) -> None:
         view = self._view
+        self._tail.reserve(count_indexed(connection, row.number, view.revision))
         for block in changes_since(connection, row, view.revision):
             for change in block:
                 self._take(change)
         self._publish(view.generation, row.revision)
-        if len(self._tail) >= self._tail_frames:
-            self._swap(connection, row)
 
     def _take(self, change: Change) -> None:
+        self._damaged.discard(change.number)
         if change.deleted:
             self._dead[change.number] = change.revision  # a newer generation may hold it
         elif change.vector is None:
             # one frame must not cost the others; a worker's log says it too
             log.error("a damaged signature is passed over", extra={"frame_id": change.frame_id})
-        elif change.number not in self._tail:  # an error may have ended the last time half way
+            self._damaged.add(change.number)
+        elif self._tail.revision_of(change.number) < change.revision:
+            # else an error ended the last time half way
+            if change.number in self._tail:  # signed anew, as it had been damaged
+                self._tail = self._tail.without(change.number)
             self._tail.append(change, np.frombuffer(change.vector, np.uint8))
+            self._dead.pop(change.number, None)  # rejected by a model, and tried again by another
 
     def _swap(self, connection: Connection, row: MapRow) -> None:
-        """Take a newer generation, if a worker has published one, and keep the rest as tail."""
-        if time.monotonic() - self._looked < _LOOK_S:
-            return
+        """Take another generation, if a worker has published one, and keep the rest as tail."""
         self._looked = time.monotonic()
         view = self._view
-        own = None if view.generation is None else view.generation.number
-        if newest_number(self._folder) == own:
+        number, since = (0, 0) if view.generation is None else (
+            view.generation.number, view.generation.revision
+        )  # fmt: skip
+        if newest_number(self._folder) in (None, number):
             return
-        found = newest(self._folder, row.model_id, self._length, known=view.generation)
-        since = 0 if view.generation is None else view.generation.revision
-        found = trusted(connection, row, found)
-        if found is None or not since < found.revision <= view.revision:
+        found = self._newest(connection, row, view.generation)
+        # one of the same revision stands for one that was found damaged
+        if found is None or found.number == number or not since <= found.revision <= view.revision:
             return
         self._tail = self._tail.after(found.revision)
         self._dead = {n: deleted for n, deleted in self._dead.items() if deleted > found.revision}
         self._publish(found, view.revision)
 
+    def _newest(
+        self, connection: Connection, row: MapRow, known: Generation | None
+    ) -> Generation | None:
+        found = newest(self._folder, row.model_id, self._length, known=known)
+        if found is not None:
+            old = set() if known is None else set(map(id, known.segments))
+            new = [each for each in found.segments if id(each) not in old]
+            small = sum(each.size for each in new) <= VERIFIED_BYTES
+            if small and not all(each.is_sound() for each in new):
+                log.error("a damaged index is not used", extra={"map": row.name})
+                return None
+        return trusted(connection, row, found)
+
     def _publish(self, generation: Generation | None, revision: int) -> None:
         dead = frozenset(n for n in self._dead if n in self._tail or _holds(generation, n))
-        size = len(generation or ()) + len(self._tail) - len(dead)
-        self._view = View(revision, generation, self._tail.tail(), dead, size)
+        tail, both = self._tail.tail(), 0
+        if generation is not None:  # signed anew since
+            both = int((generation.places.of(tail.keys) >= 0).sum())
+        size = len(generation or ()) + len(tail) - both - len(dead)
+        damaged = frozenset(self._damaged)
+        self._view = View(self._model_id, revision, generation, tail, dead, size, damaged)
 
 
 class Readers:
@@ -162,23 +197,23 @@ class Readers:
     ----------
     signers : see Signers
     indexes : folder of all indexes
-    tail_frames : see Reader
     """
 
-    def __init__(self, signers: Signers, indexes: Path, tail_frames: int) -> None:
-        self._signers, self._indexes, self._tail_frames = signers, indexes, tail_frames
+    def __init__(self, signers: Signers, indexes: Path) -> None:
+        self._signers, self._indexes = signers, indexes
         self._lock = threading.Lock()
-        self._open: OrderedDict[str, tuple[int, Reader]] = OrderedDict()
+        self._open: OrderedDict[str, tuple[tuple[int, str], Reader]] = OrderedDict()
 
     def view(self, connection: Connection, row: MapRow) -> View:
         """A map as of the row's revision, or later."""
         with self._lock:
-            number, reader = self._open.get(row.name, (0, None))
-            if reader is None or number != row.number:  # a map of that name was made anew
+            held, reader = self._open.get(row.name, (None, None))
+            wanted = (row.number, row.model_id)
+            if reader is None or held != wanted:  # made anew, or signed with another model
                 length = self._signers(row.model_id).model.signature_bytes
                 folder = index_folder(self._indexes, row)
-                reader = Reader(connection, row, folder, length, self._tail_frames)
-                self._open[row.name] = (row.number, reader)
+                reader = Reader(connection, row, folder, length)
+                self._open[row.name] = (wanted, reader)
             self._open.move_to_end(row.name)
             # the one that was asked longest ago first, and never the one that is asked now
             while len(self._open) > 1 and self._bytes_held() > HELD_BYTES:
@@ -192,48 +227,6 @@ class Readers:
         """Give up what is held of a map that was deleted."""
         with self._lock:
             self._open.pop(name, None)
-
-
-class _Growing:
-    """A tail that is appended to behind what has been handed out of it."""
-
-    def __init__(self, length: int) -> None:
-        self._keys: NDArray[np.int64] = np.empty(64, np.int64)
-        self._revisions: NDArray[np.int64] = np.empty(64, np.int64)
-        self._rows: Bytes = np.empty((64, length), np.uint8)
-        self._places: dict[int, int] = {}
-
-    def __len__(self) -> int:
-        return len(self._places)
-
-    def __contains__(self, key: int) -> bool:
-        return key in self._places
-
-    @property
-    def bytes_held(self) -> int:
-        return self._rows.nbytes
-
-    def append(self, change: Change, row: Bytes) -> None:
-        n = len(self._places)
-        if n == len(self._keys):  # views keep the old arrays
-            self._keys = np.concatenate([self._keys, np.empty_like(self._keys)])
-            self._revisions = np.concatenate([self._revisions, np.empty_like(self._revisions)])
-            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
-        self._keys[n], self._revisions[n], self._rows[n] = change.number, change.revision, row
-        self._places[change.number] = n
-
-    def after(self, revision: int) -> _Growing:
-        """Those indexed after a revision, in arrays of their own."""
-        kept = _Growing(self._rows.shape[1])
-        for key, place in self._places.items():
-            if self._revisions[place] > revision:
-                change = Change(key, "", int(self._revisions[place]), None)
-                kept.append(change, self._rows[place])
-        return kept
-
-    def tail(self) -> Tail:
-        n = len(self._places)
-        return Tail(self._keys[:n], self._rows[:n])
 
 
 def _holds(generation: Generation | None, key: int) -> bool:

@@ -5,20 +5,24 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection
 
+from sceneprint.engine.healing import sign_again
 from sceneprint.engine.readers import index_folder, is_index_folder, trusted
+from sceneprint.engine.scrubbing import Scrubber
 from sceneprint.engine.signers import Signers
-from sceneprint.errors import SceneprintError, UnknownMap
-from sceneprint.index import newest, publish
+from sceneprint.errors import BusyIndex, InvalidRequest, SceneprintError, UnknownMap
+from sceneprint.index import Generation, newest, newest_number, publish
 from sceneprint.store import Store
 from sceneprint.store.events import anchor_of
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.records import MapRow
+from sceneprint.store.reencoding import is_complete
 from sceneprint.store.signatures import changes_since, count_indexed, deleted_since
 from sceneprint.types import Bytes
 
@@ -32,16 +36,21 @@ class Upkeep:
     ----------
     store, signers : see there
     indexes : folder of all indexes
-    tail_frames : frames that a generation may lack
+    tail_frames : frames that a generation may lack, and deleted ones that it may hold
+    scrub_s : seconds after which all files are read again, to see that they are sound
     """
 
-    def __init__(self, store: Store, signers: Signers, indexes: Path, tail_frames: int) -> None:
+    def __init__(
+        self, store: Store, signers: Signers, indexes: Path, tail_frames: int, scrub_s: float
+    ) -> None:
         self._store, self._signers = store, signers
         self._indexes, self._tail_frames = indexes, tail_frames
-        self._published: dict[int, int] = {}  # revision up to which each map is known to be
+        # map and model: number of their index, revision
+        self._published: dict[tuple[int, str], tuple[int, int]] = {}
+        self._scrubber = Scrubber(indexes, scrub_s)
 
     def run(self) -> int:
-        """Publish what is due; returns how many generations were.
+        """Publish what is due, and verify a little; returns how many generations were published.
 
         What goes wrong with one map's index is logged, and costs neither the others nor any
         frame: queries read from the database what no index holds.
@@ -49,70 +58,149 @@ class Upkeep:
         with self._store.database.read() as connection:
             rows = list_maps(connection)
             due = [row for row in rows if self._due(connection, row)]
-        published = 0
-        for row in due:
-            try:
-                published += self._publish(row)
-            except UnknownMap:
-                pass  # deleted in the meantime
-            except (OSError, SceneprintError, ValueError) as error:
-                log.error("no index published", extra={"map": row.name, "error": str(error)})
+        published = sum(self._tried(row) for row in due)
         self._clean(rows)
+        damaged = self._scrubber.step([index_folder(self._indexes, row) for row in rows])
+        for row in rows:
+            if index_folder(self._indexes, row) == damaged:
+                published += self._tried(row, anyway=True)
         return published
 
-    def _due(self, connection: Connection, row: MapRow) -> bool:
-        known = self._published.get(row.number, 0)
-        return count_indexed(connection, row.number, known) > self._tail_frames
+    def rebuild(self, row: MapRow) -> Generation | None:
+        """Publish the index of a map from nothing; None where another process is building it.
 
-    def _publish(self, row: MapRow) -> bool:
+        Raises
+        ------
+        UnknownMap : the map is gone.
+        InvalidRequest : there is no indexed frame in it.
+        OSError : it cannot be written; what was there stays.
+        """
+        return self._publish(row, anyway=True, anew=True)
+
+    def ahead(self, row: MapRow) -> Generation | None:
+        """Publish the index of the model that a map is about to switch to, where that is due.
+
+        Where it cannot be written, that is logged, and the map has to do without.
+
+        Returns
+        -------
+        the newest generation of that model, if there is any
+
+        Raises
+        ------
+        UnknownMap : the map is gone.
+        BusyIndex : another process is building it.
+        """
+        coming = _coming(row)
+        try:
+            if self._publish(coming) is None:
+                with self._store.database.read() as connection:
+                    if self._due(connection, coming):
+                        raise BusyIndex(
+                            f"Another process is building the index of map {row.name!r} for the "
+                            "model that it is about to switch to. Wait until it has."
+                        )
+            length = self._signers(coming.model_id).model.signature_bytes
+            return newest(index_folder(self._indexes, coming), coming.model_id, length)
+        except (OSError, ValueError) as error:
+            log.error("no index published", extra={"map": row.name, "error": str(error)})
+            return None
+
+    def _tried(self, row: MapRow, *, anyway: bool = False) -> bool:
+        try:
+            return self._publish(row, anyway=anyway) is not None
+        except UnknownMap:
+            return False  # deleted in the meantime
+        except (OSError, SceneprintError, ValueError) as error:
+            log.error("no index published", extra={"map": row.name, "error": str(error)})
+            return False
+
+    def _due(self, connection: Connection, row: MapRow) -> bool:
+        number, known = self._published.get((row.number, row.model_id), (None, 0))
+        if newest_number(index_folder(self._indexes, row)) != number:
+            known = 0  # published by another process, or removed: to be looked at
+        return self._is_long(connection, row, known)
+
+    def _is_long(self, connection: Connection, row: MapRow, since: int) -> bool:
+        if row.revision - since <= self._tail_frames:  # spares the counting
+            return False
+        return count_indexed(connection, row.number, since) > self._tail_frames or (
+            len(deleted_since(connection, row.number, since)) > self._tail_frames
+        )
+
+    def _publish(
+        self, row: MapRow, *, anyway: bool = False, anew: bool = False
+    ) -> Generation | None:
         signer = self._signers(row.model_id)  # before a connection is held: it takes one itself
+        damaged: list[int] = []
         with self._store.database.read() as connection:
             now = find_map(connection, row.name)
-            if now.number != row.number:
-                return False  # made anew in the meantime; next time
+            if row.model_id == now.next_model_id and is_complete(connection, now):
+                now = replace(now, model_id=row.model_id)  # about to be the map's own
+            if (now.number, now.model_id) != (row.number, row.model_id):
+                return None  # made anew, or signed anew, in the meantime; next time
             folder = index_folder(self._indexes, now)
             length = signer.model.signature_bytes
-            previous = trusted(connection, now, newest(folder, now.model_id, length))
+            previous = None
+            if not anew:
+                previous = trusted(connection, now, newest(folder, now.model_id, length))
             since = 0 if previous is None else previous.revision
-            self._published[now.number] = since
-            if count_indexed(connection, now.number, since) <= self._tail_frames:
-                return False  # another worker was first
+            if previous is not None:
+                self._published[now.number, now.model_id] = (previous.number, since)
+            if not anyway and not self._is_long(connection, now, since):
+                return None  # another worker was first
+            if previous is None and count_indexed(connection, now.number, 0) == 0:
+                if anew:
+                    raise InvalidRequest(
+                        f"Map {now.name!r} has no indexed frame: there is nothing to build of it."
+                    )
+                return None
             generation = publish(
                 folder,
                 model_id=now.model_id,
                 revision=now.revision,
-                blocks=_blocks(connection, now, since),
+                blocks=_blocks(connection, now, since, damaged),
                 previous=previous,
                 drop=deleted_since(connection, now.number, since),
                 anchor=anchor_of(connection, now.name),
             )
+        sign_again(self._store, now, damaged, now.model_id)
         if generation is None:
-            return False
-        self._published[now.number] = generation.revision
+            return None
+        self._published[now.number, now.model_id] = (generation.number, generation.revision)
         log.info(
             "index published",
             extra={"map": now.name, "generation": generation.number, "frames": len(generation)},
         )
-        return True
+        return generation
 
     def _clean(self, rows: Sequence[MapRow]) -> None:
-        """Remove the indexes of maps that are no more."""
-        kept = {index_folder(self._indexes, row).name for row in rows}
+        """Remove the indexes of maps that are no more, and of models that they had."""
         if not self._indexes.is_dir():
             return
         with self._store.database.read() as connection:  # a map may have been made since
-            kept |= {index_folder(self._indexes, row).name for row in list_maps(connection)}
+            known = [*rows, *list_maps(connection)]
+        known += [_coming(row) for row in known if row.next_model_id is not None]
+        kept = {index_folder(self._indexes, row).name for row in known}
         for folder in self._indexes.iterdir():
             if is_index_folder(folder.name) and folder.name not in kept:
                 shutil.rmtree(folder, ignore_errors=True)
                 log.info("index removed", extra={"folder": folder.name})
 
 
+def _coming(row: MapRow) -> MapRow:
+    """A map as it will be with the model that it is being signed with."""
+    if row.next_model_id is None:
+        raise ValueError(f"map {row.name} has no next model")
+    return replace(row, model_id=row.next_model_id)
+
+
 def _blocks(
-    connection: Connection, row: MapRow, since: int
+    connection: Connection, row: MapRow, since: int, damaged: list[int]
 ) -> Iterator[tuple[NDArray[np.int64], Bytes]]:
-    """Keys and signatures of what was indexed after a revision."""
+    """Keys and signatures of what was indexed after a revision; numbers of those left out."""
     for block in changes_since(connection, row, since):
+        damaged += [one.number for one in block if one.vector is None and not one.deleted]
         made = [(one.number, one.vector) for one in block if one.vector is not None]
         if made:
             rows = np.stack([np.frombuffer(vector, np.uint8) for _, vector in made])

@@ -118,7 +118,7 @@ def _open(folder: Path, manifest: Manifest, verify: bool, known: Generation | No
     segments = []
     for name, size in manifest.of_kind("segment"):
         segment = shared.get(name)
-        if segment is None or not (folder / name).is_file():
+        if segment is None or _inode(folder / name) != segment.inode:
             segment = open_segment(folder / name, verify=verify)
         if segment.size != size or segment.signatures.shape[1] != manifest.dimension:
             raise DamagedIndex(f"{folder / name}: not the segment that its manifest means.")
@@ -146,6 +146,13 @@ def _open(folder: Path, manifest: Manifest, verify: bool, known: Generation | No
         keys=keys_of(segments)[rows],
         coarse=read_coarse(index, len(code.matrix), len(rows)),
     )
+
+
+def _inode(path: Path) -> int | None:
+    try:
+        return path.stat().st_ino
+    except OSError:
+        return None
 
 
 def keys_of(segments: list[Segment]) -> Keys:

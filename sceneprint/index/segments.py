@@ -42,17 +42,25 @@ class Segment:
     ----------
     name : of the file, from its content
     size : of the file, bytes
+    inode : of the file that is mapped: one of the same name may have replaced it
+    digest : SHA-256 that the signatures had when they were written
     keys : (n,) int64, of the frames
     signatures : (n, D) uint8, read-only; keeps the mapping alive, also after the file is unlinked
     """
 
     name: str
     size: int
+    inode: int
+    digest: bytes
     keys: NDArray[np.int64]
     signatures: Bytes
 
     def __len__(self) -> int:
         return len(self.keys)
+
+    def is_sound(self) -> bool:
+        """Whether the signatures are those that were written: reads them all."""
+        return hashlib.sha256(self.signatures.data).digest() == self.digest
 
 
 def write_segment(folder: Path, blocks: Iterable[Block]) -> str:
@@ -132,7 +140,8 @@ def open_segment(path: Path, *, verify: bool) -> Segment:
     """
     try:
         with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
+            status = os.fstat(file.fileno())
+            size = status.st_size
             if size < _PAGE:
                 raise DamagedIndex(f"{path}: {size} bytes are no segment.")
             mapped = mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ)
@@ -153,10 +162,12 @@ def open_segment(path: Path, *, verify: bool) -> Segment:
         mapped.madvise(mmap.MADV_SEQUENTIAL)
     # plain arrays: a memmap pays for its class on every slice
     stored: Bytes = np.frombuffer(mapped, np.uint8, n * length, _PAGE)
-    if verify and hashlib.sha256(stored.data).digest() != rows_digest:
-        raise DamagedIndex(f"{path}: its signatures are not those that were written.")
     keys = np.frombuffer(rest, "<i8", offset=keys_at - end).astype(np.int64)
-    return Segment(path.name, size, keys, stored.reshape(n, length))
+    rows = stored.reshape(n, length)
+    segment = Segment(path.name, size, status.st_ino, rows_digest, keys, rows)
+    if verify and not segment.is_sound():
+        raise DamagedIndex(f"{path}: its signatures are not those that were written.")
+    return segment
 
 
 def gather(segments: Sequence[Segment], rows: NDArray[np.int64]) -> Bytes:

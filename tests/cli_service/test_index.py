@@ -1,0 +1,146 @@
+"""`sceneprint index` on a data folder of twelve frames."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import update
+
+from sceneprint.cli import main
+from sceneprint.engine import Engine
+from sceneprint.index import Generation, Tail, newest, search
+from sceneprint.index.codes import draw
+from sceneprint.maintenance import indexes
+from sceneprint.schemas import NewMap
+from sceneprint.settings import Settings
+from sceneprint.store.frames import add_frame, frame_of
+from sceneprint.store.maps import find_map
+from sceneprint.store.signatures import StoredSignature, index_frame
+from sceneprint.store.tables import signatures
+
+N, LENGTH = 60, 12_800
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A map of sixty frames like nothing else: their order by codes is not that by signatures."""
+    vectors = np.random.default_rng(5).integers(0, 256, (N, LENGTH), np.uint8)
+    with Engine(Settings(data_dir=tmp_path / "data")) as engine:
+        engine.create_map(NewMap(name="hall", model="compact"))
+        engine.create_map(NewMap(name="empty", model="compact"))
+        artifact = engine.store.blobs.put(b"artifact" * 10)
+        upload = engine.store.blobs.put(b"upload" * 50)
+        with engine.store.database.write() as connection:
+            row = find_map(connection, "hall")
+            for i in range(N):
+                values = {
+                    "content_id": f"{i:064x}", "blob": upload, "bytes": 300, "intrinsics": {},
+                    "depth_scale": 1000.0, "depth_along_ray": False, "robot": None,
+                    "session": None, "captured_at": None, "tags": [], "pose_parent": None,
+                    "pose": None,
+                }  # fmt: skip
+                frame = add_frame(connection, row.number, values)
+                vector = vectors[i].tobytes()
+                made = StoredSignature(row.model_id, vector, artifact, (1, 1), (1, 1))
+                index_frame(connection, frame, made)
+    return tmp_path / "data"
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str]:
+    code = main(["index", *map(str, arguments)])
+    return code, capsys.readouterr().out
+
+
+def generation_of(data: Path) -> Generation:
+    (folder,) = data.glob("index/hall-*")
+    with Engine(Settings(data_dir=data)) as engine:
+        found = newest(folder, engine.get_map("hall").model_id, LENGTH)
+    assert found is not None
+    return found
+
+
+def test_rebuild_stats_and_verify(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out = told(capsys, "stats", "hall", "--data", data, "--json")
+    before = json.loads(out)
+    assert (code, before["generation"], before["lag_frames"]) == (0, 0, N)
+    assert (before["index_bytes"], before["recall"]) == (0, None)
+    assert told(capsys, "rebuild", "hall", "--data", data) == (0, "map hall: generation 1\n")
+    code, out = told(capsys, "stats", "hall", "--data", data, "--json")
+    after = json.loads(out)
+    assert (code, after["generation"], after["lag_frames"], after["fitted_on"]) == (0, 1, 0, N)
+    assert (after["upload_bytes"], after["artifact_bytes"]) == (300, 80)
+    on_disk = sum(path.stat().st_size for path in data.glob("index/hall-*/*"))
+    assert after["index_bytes"] == round(on_disk / N)
+    assert after["bytes_beyond_upload"] == LENGTH + 80 + round(on_disk / N)
+    assert told(capsys, "verify", "hall", "--data", data) == (0, "map hall: sound\n")
+    code, out = told(capsys, "stats", "--data", data)  # for people, and of all maps
+    assert code == 0
+    assert out.startswith("map empty, compact")
+    assert "generation 1" in out
+
+
+def test_recall_is_of_the_shortlist_and_counts_what_it_misses(
+    data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told(capsys, "rebuild", "hall", "--data", data)
+
+    def shortened(*arguments: Any, **more: Any) -> Any:
+        return search(*arguments, **{"shortlist": 4, **more})
+
+    monkeypatch.setattr(indexes, "search", shortened)
+    monkeypatch.setattr(indexes, "NEAR", 4)
+    with Engine(Settings(data_dir=data)) as engine:
+        told_recall = indexes.describe_index(engine, "hall", 20, seed=3).recall
+    generation, none, hits = generation_of(data), Tail.empty(LENGTH), 0
+    for i in draw(N, 20, 3):  # four by the codes, against four by the signatures
+        row, own = generation.segments[0].signatures[i], frozenset([int(generation.keys[i])])
+        near = search(row, generation, none, 4, dead=own, shortlist=4)
+        exact = np.abs(generation.segments[0].signatures.astype(int) - row).sum(1)
+        limit = np.sort(np.delete(exact, i))[3]
+        hits += int((near.distances <= limit).sum())
+    assert told_recall == hits / 80
+    assert 0 < told_recall < 1  # it does miss some
+
+
+@pytest.mark.parametrize("what", ["signature", "database"])
+def test_verify_names_what_is_wrong_and_rebuild_mends_it(
+    data: Path, capsys: pytest.CaptureFixture[str], what: str
+) -> None:
+    told(capsys, "rebuild", "hall", "--data", data)
+    if what == "signature":
+        (path,) = data.glob("index/hall-*/*.segment")
+        content = bytearray(path.read_bytes())
+        content[4096 + 7 * LENGTH + 3] ^= 1
+        path.write_bytes(content)
+        expected = f"map hall: {path}: damaged or missing"
+    else:  # sound files, that are not those of this database
+        with Engine(Settings(data_dir=data)) as engine:
+            changed = bytes(LENGTH)
+            with engine.store.database.write() as connection:
+                frame = frame_of(connection, 8).id
+                connection.execute(
+                    update(signatures)
+                    .where(signatures.c.frame_number == 8)
+                    .values(vector=changed, checksum=zlib.crc32(changed))
+                )
+        expected = f"the signature of frame {frame} is not that of the database"
+    code, out = told(capsys, "verify", "hall", "--data", data)
+    assert code == 1
+    assert expected in out.splitlines()[0]
+    assert "sceneprint index rebuild hall" in out.splitlines()[-1]
+    assert told(capsys, "rebuild", "hall", "--data", data)[0] == 0
+    assert told(capsys, "verify", "hall", "--data", data) == (0, "map hall: sound\n")
+
+
+def test_what_cannot_be_done_is_said_in_one_line(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["index", "rebuild", "empty", "--data", str(data)]) == 2
+    assert "has no indexed frame" in capsys.readouterr().err
+    assert main(["index", "stats", "nowhere", "--data", str(data)]) == 2
+    assert "There is no map 'nowhere'" in capsys.readouterr().err

@@ -1,0 +1,140 @@
+"""The index of a map, from nothing to a damaged file and back: answers are right throughout."""
+
+from __future__ import annotations
+
+import random
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.engine import Engine, growing, readers
+from sceneprint.engine.growing import Growing
+from sceneprint.index import newest
+from sceneprint.schemas import Query
+from sceneprint.store.signatures import Change
+
+Make = Callable[..., Engine]
+ALL = Query(stages=("retrieve",), k=50)
+
+
+@pytest.fixture
+def data(signed_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(readers, "_LOOK_S", 0.0)
+    shutil.copytree(signed_folder, tmp_path / "data")
+    return tmp_path / "data"
+
+
+def ask(engine: Engine, uploads: Any) -> tuple[list[tuple[str, int]], int]:
+    answer = engine.query_upload("hall", uploads[2].data, uploads[2].meta, ALL)
+    return [(match.frame_id, match.distance) for match in answer.matches], answer.index_generation
+
+
+def until_healed(engine: Engine) -> int:
+    """Generations that upkeep publishes until a round of verifying is over."""
+    published = 0
+    for _ in range(20):
+        published += engine.publish_due()
+    return published
+
+
+def flip(path: Path, position: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[position] ^= 1 << position % 8
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("kind", ["segment", "faiss", "rows", "code", "json"])
+def test_a_flipped_byte_of_an_index_is_found_and_healed(
+    data: Path, make_engine: Make, uploads: Any, kind: str
+) -> None:
+    builder = make_engine(data, tail_frames=1, scrub_s=1)
+    served = make_engine(data)  # holds the index open all the time
+    wanted, _ = ask(make_engine(data), uploads)
+    assert builder.publish_due() == 1
+    assert ask(served, uploads) == (wanted, 1)
+    (path,) = data.glob(f"index/hall-*/*.{kind}")
+    flip(path, random.Random(kind).randrange(path.stat().st_size))
+    again = make_engine(data, tail_frames=1, scrub_s=1)
+    (data / "index" / ".scrubbed").unlink(missing_ok=True)  # it is time
+    assert until_healed(again) == 1
+    assert until_healed(again) == 0
+    folder = next(data.glob("index/hall-*"))
+    sound = newest(folder, served.get_map("hall").model_id, 12_800, verify=True)
+    assert sound is not None
+    assert (sound.number, len(sound)) == (2, 12)
+    for engine in (served, make_engine(data)):
+        assert ask(engine, uploads) == (wanted, 2)
+
+
+def test_a_small_index_is_verified_when_it_is_opened(
+    data: Path, make_engine: Make, uploads: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted, _ = ask(make_engine(data), uploads)
+    assert make_engine(data, tail_frames=1).publish_due() == 1
+    (path,) = data.glob("index/hall-*/*.segment")
+    flip(path, 4096 + 5 * 12_800)
+    assert ask(make_engine(data), uploads) == (wanted, 0)
+    monkeypatch.setattr(readers, "VERIFIED_BYTES", 0)  # a large one is left to the workers
+    assert ask(make_engine(data), uploads)[1] == 1
+
+
+def test_who_scrubs_leaves_a_mark_and_nobody_else_does_for_a_while(
+    data: Path, make_engine: Make
+) -> None:
+    assert make_engine(data, tail_frames=1, scrub_s=3600).publish_due() == 1
+    (path,) = data.glob("index/hall-*/*.segment")
+    flip(path, 4096 + 5 * 12_800)
+    assert until_healed(make_engine(data, tail_frames=1, scrub_s=3600)) == 0
+    (data / "index" / ".scrubbed").unlink()
+    assert until_healed(make_engine(data, tail_frames=1, scrub_s=3600)) == 1
+
+
+def test_rebuilding_makes_the_same_index_from_nothing(
+    data: Path, make_engine: Make, uploads: Any
+) -> None:
+    engine = make_engine(data, tail_frames=1)
+    wanted, _ = ask(engine, uploads)
+    assert engine.publish_due() == 1
+    names = {path.name for path in data.glob("index/hall-*/*.segment")}
+    generation = engine.rebuild_index("hall")
+    assert generation == 2
+    assert {path.name for path in data.glob("index/hall-*/*.segment")} == names
+    assert ask(engine, uploads) == (wanted, 2)
+
+
+def test_a_frame_signed_anew_is_found_once_with_its_new_signature() -> None:
+    tail = Growing(4, Path("unused"))
+    tail.append(Change(7, "", 1, None), np.full(4, 1, np.uint8))
+    tail.append(Change(8, "", 2, None), np.full(4, 2, np.uint8))
+    handed_out = tail.tail()
+    other = tail.without(7)
+    other.append(Change(7, "", 3, None), np.full(4, 3, np.uint8))
+    assert (tail.revision_of(7), other.revision_of(7), other.revision_of(9)) == (1, 3, 0)
+    np.testing.assert_array_equal(other.tail().keys, [8, 7])
+    np.testing.assert_array_equal(other.tail().signatures[:, 0], [2, 3])
+    np.testing.assert_array_equal(handed_out.signatures[:, 0], [1, 2])
+
+
+@pytest.mark.parametrize("in_memory", [10**9, 0])
+def test_a_tail_in_a_file_is_as_one_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_memory: int
+) -> None:
+    monkeypatch.setattr(growing, "IN_MEMORY", in_memory)
+    rows = np.random.default_rng(3).integers(0, 256, (300, 50), np.uint8)
+    tail, views = Growing(50, tmp_path / "index"), []
+    for i, row in enumerate(rows):
+        tail.append(Change(i, "", i + 1, None), row)
+        if i % 50 == 0:
+            views.append(tail.tail())
+    assert tail.bytes_held == (512 * 50 if in_memory else 0)
+    for n, view in zip(range(1, 300, 50), views, strict=True):
+        np.testing.assert_array_equal(view.signatures, rows[:n])
+        np.testing.assert_array_equal(view.keys, np.arange(n))
+    late = tail.after(200)
+    np.testing.assert_array_equal(late.tail().signatures, rows[200:])
+    np.testing.assert_array_equal(late.tail().keys, np.arange(200, 300))
+    assert list(tmp_path.glob("index/*")) == []  # nothing to be left behind
