@@ -5,17 +5,23 @@ bytes  --put-->  digest  --get-->  the same bytes, or an error
 
 from __future__ import annotations
 
-import errno
+import fcntl
 import hashlib
 import os
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 from sceneprint.errors import DamagedBlob, UnusableStore
-from sceneprint.writing import write_durable
+from sceneprint.store.faults import unusable
+from sceneprint.writing import make_folder, sync_folder, write_durable
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
+
+#: What a blob is found to be.
+Condition = Literal["sound", "missing", "damaged"]
 
 
 class Blobs:
@@ -24,21 +30,20 @@ class Blobs:
     Parameters
     ----------
     folder : made where missing
+    make : whether it is
 
     Raises
     ------
     UnusableStore : it cannot be made.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, make: bool = True) -> None:
         self._folder = folder
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            if make:
+                make_folder(folder)
         except OSError as error:
-            raise UnusableStore(
-                f"{folder}: the folder cannot be made ({error.strerror}). Name another with "
-                "--data, or check its permissions."
-            ) from error
+            raise unusable(f"{folder}: the folder cannot be made", error) from error
 
     def put(self, data: bytes) -> str:
         """Keep bytes; when this returns they survive the loss of power.
@@ -49,7 +54,8 @@ class Blobs:
 
         Raises
         ------
-        UnusableStore : the disk is full or may not be written; nothing is left behind.
+        StoreFull : the disk is full; nothing is left behind.
+        UnusableStore : it may not be written, or is not there.
         """
         digest = hashlib.sha256(data).hexdigest()
         path = self._path(digest)
@@ -57,11 +63,7 @@ class Blobs:
             path.parent.mkdir(exist_ok=True)
             write_durable(path, data)
         except OSError as error:
-            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-            advice = "Free some space." if full else "Check the folder and its permissions."
-            raise UnusableStore(
-                f"{self._folder}: a blob cannot be written ({error.strerror}). {advice}"
-            ) from error
+            raise unusable(f"{self._folder}: a blob cannot be written", error) from error
         return digest
 
     def get(self, digest: str) -> bytes:
@@ -89,9 +91,107 @@ class Blobs:
         """Whether there is a blob of that digest."""
         return self._path(digest).exists()
 
+    def size(self, digest: str) -> int | None:
+        """Bytes of a blob as it lies there, unchecked; None where it is missing."""
+        try:
+            return self._path(digest).stat().st_size
+        except OSError:
+            return None
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """See that no blob is removed meanwhile; waits for who is removing some.
+
+        The folder itself is the lock, so that there is none to make or to clear away; the kernel
+        releases that of a process that dies, however it dies.
+
+        Raises
+        ------
+        UnusableStore : the folder cannot be locked.
+        """
+        try:
+            descriptor = self._lock(fcntl.LOCK_SH)
+        except OSError as error:
+            raise UnusableStore(
+                f"{self._folder}: the folder cannot be locked ({error.strerror}). Stop the "
+                "service and copy the data folder as it is."
+            ) from error
+        try:
+            yield
+        finally:
+            os.close(descriptor)
+
+    @contextmanager
+    def removing(self) -> Iterator[bool]:
+        """Hold the right to remove blobs; False where somebody needs them kept, or removes some.
+
+        Ask for it within a writing transaction: removers then come one after the other, and leave
+        room between them for who waits in `kept`.
+        """
+        try:
+            descriptor = self._lock(fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:  # held by another, or there are no locks: what stays does no harm
+            yield False
+            return
+        try:
+            yield True
+        finally:
+            os.close(descriptor)
+
     def remove(self, digest: str) -> None:
-        """Forget a blob that nothing refers to."""
+        """Forget a blob that nothing refers to; only within `removing`."""
         self._path(digest).unlink(missing_ok=True)
+
+    def condition(self, digest: str, *, quick: bool = False) -> Condition:
+        """Whether a blob is as it was stored; read in parts, so that memory is bounded.
+
+        Parameters
+        ----------
+        digest : of the blob; what is no digest names none
+        quick : see only whether it is there
+
+        Raises
+        ------
+        UnusableStore : it may not be read by this user.
+        """
+        if not _DIGEST.fullmatch(digest):
+            return "missing"
+        try:
+            with self._path(digest).open("rb") as file:
+                if quick or hashlib.file_digest(file, "sha256").hexdigest() == digest:
+                    return "sound"
+        except FileNotFoundError:
+            return "missing"
+        except PermissionError as error:
+            raise UnusableStore(
+                f"{self._path(digest)}: may not be read. Run it as the user who owns the data "
+                "folder."
+            ) from error
+        except OSError:  # the disk cannot read it, or a folder has its name
+            pass
+        return "damaged"
+
+    def quarantine(self, digest: str, folder: Path) -> Path | None:
+        """Move what lies under a digest out of the way, durably; None where there is nothing.
+
+        Parameters
+        ----------
+        digest : of a blob that was found damaged; only within `removing`
+        folder : to move it to, of the same file system; made where missing
+        """
+        path, place = self._path(digest), folder / f"blob-{digest}"
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            os.replace(path, place)  # noqa: PTH105  (the one call that is atomic by contract)
+        except FileNotFoundError:
+            return None
+        for each in (folder, folder.parent, path.parent):
+            sync_folder(each)
+        return place
+
+    def path(self, digest: str) -> Path:
+        """Where a blob lies, for people to look at."""
+        return self._folder / digest[:2] / digest
 
     def digests(self) -> Iterator[str]:
         """All blobs, in no order."""
@@ -100,6 +200,16 @@ class Blobs:
                 for name in os.listdir(folder):  # noqa: PTH208  (a path for each would cost)
                     if _DIGEST.fullmatch(name):
                         yield name
+
+    def _lock(self, how: int) -> int:
+        # of this call alone: flock then keeps out other threads as well as other processes
+        descriptor = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(descriptor, how)
+        except BaseException:
+            os.close(descriptor)
+            raise
+        return descriptor
 
     def _path(self, digest: str) -> Path:
         if not _DIGEST.fullmatch(digest):

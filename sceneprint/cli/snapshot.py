@@ -1,0 +1,94 @@
+"""`sceneprint snapshot`: all that must not be lost, in one archive."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+from sceneprint.cli.connection import one_line
+from sceneprint.cli.serve import add_data_option, settings_of
+from sceneprint.cli.signals import ended_by_signals
+
+if TYPE_CHECKING:
+    from sceneprint.maintenance.snapshots import Snapshot
+
+#: Damaged blobs that are named one by one.
+_SHOWN = 10
+
+
+def add_to(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "snapshot",
+        help="write all that must not be lost into one archive, while the service runs",
+        description="Write one state of the data folder into an archive: database and blobs. "
+        "The service and its workers may go on. Search indexes are not in it, as they are made "
+        "anew. Exit code 1 where a blob was missing or damaged and could not be taken along. "
+        "The archive holds all frames and the hashes of keys: keep it as you keep the folder.",
+    )
+    add_data_option(command)
+    command.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="archive to write, or its folder (default: sceneprint-TIME.tar here)",
+    )
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Take a snapshot; returns 1 where something could not be taken along."""
+    from sceneprint.maintenance.snapshots import take_snapshot
+
+    name = f"sceneprint-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tar"
+    path = Path(name) if options.out is None else options.out
+    if path.is_dir():
+        path = path / name
+    start = time.perf_counter()
+    with ended_by_signals(), shown_progress("snapshot") as progress:
+        taken = take_snapshot(settings_of(options), path, progress)
+    print(f"{one_line(str(path))}: {contents(taken)} in {time.perf_counter() - start:.1f} s")
+    return 1 if name_damaged(taken, "Run `sceneprint fsck` to see what can be done.") else 0
+
+
+@contextmanager
+def shown_progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar of bytes on a terminal; yields what is to be told of bytes done and in all."""
+    with tqdm(desc=what, unit="B", unit_scale=True, disable=None) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield progress
+
+
+def contents(snapshot: Snapshot) -> str:
+    """What is in a snapshot, in a few words."""
+    held = snapshot.manifest
+    return (
+        f"{held.maps} maps, {held.n_frames} frames, {held.blobs.count} blobs, "
+        f"{held.bytes / 1e6:,.1f} MB"
+    )
+
+
+def name_damaged(snapshot: Snapshot, advice: str) -> bool:
+    """Name on standard error what is not in a snapshot; whether there is any."""
+    if not snapshot.damaged:
+        return False
+    for one in snapshot.damaged[:_SHOWN]:
+        of = ", ".join(f"{use.role} of {use.map}/{use.frame}" for use in one.of)
+        print(one_line(f"not in it: blob {one.digest[:12]}, {one.why}: {of}"), file=sys.stderr)
+    more = len(snapshot.damaged) - _SHOWN
+    if more > 0:
+        print(f"... and {more} more, in damaged.jsonl of the archive", file=sys.stderr)
+    print(f"All else is in it. {advice}", file=sys.stderr)
+    return True

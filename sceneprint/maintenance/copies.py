@@ -1,0 +1,170 @@
+"""The database in one file that nobody writes: made, checked, and asked what it refers to.
+
+database in use  --copy_database-->  file  --open_copy-->  Connection of sqlite3
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from alembic.config import Config
+from alembic.script import ScriptDirectory
+from sqlalchemy import URL, make_url
+from sqlalchemy.exc import ArgumentError
+
+from sceneprint.errors import NewerSchema, SnapshotError, UnusableStore
+from sceneprint.maintenance.manifests import Use
+from sceneprint.schemas import FrameState
+from sceneprint.store.sealed import Sealed, sealed_file
+
+#: Seconds to wait for whoever recovers the database.
+BUSY_S = 30.0
+#: What every blob that has to be there is for: (digest, number of the frame, upload | geometry).
+_USES = (
+    "SELECT blob AS digest, number, 'upload' AS role FROM frames WHERE state NOT IN"
+    f" ('{FrameState.DELETED}', '{FrameState.REDUNDANT}')"
+    " UNION ALL SELECT geometry, frame_number, 'geometry' FROM signatures"
+)
+
+
+def database_file(url: str) -> Path:
+    """The file of a database.
+
+    Raises
+    ------
+    SnapshotError : it is no SQLite database in a file.
+    """
+    try:
+        parsed = make_url(url)
+        kind, name = parsed.get_backend_name(), parsed.database or ""
+    except (ArgumentError, ValueError):  # the URL may hold a password: it is not shown
+        kind, name = "unknown", ""
+    if kind != "sqlite" or name in ("", ":memory:") or name.startswith("file:"):
+        raise SnapshotError(
+            f"Snapshots are taken of SQLite databases that are named by their path; those of kind "
+            f"{kind} come with a later version. Use that database's own tools, then copy the blobs."
+        )
+    return Path(name).absolute()
+
+
+def copy_database(source: Path, to: Path) -> None:
+    """Write one state of a database that is in use into a file of its own; nobody waits for it.
+
+    Parameters
+    ----------
+    source : of a service that may run
+    to : is made
+
+    Raises
+    ------
+    UnusableStore : it is missing, cannot be read, or is damaged; or there is no room for it.
+    """
+    if not source.is_file():
+        raise UnusableStore(f"{source}: there is no database. Name its folder with --data.")
+    alone = sealed_file(URL.create("sqlite", database=str(source)))
+    sealed = None if alone is None else Sealed(alone)  # SQLite could not write beside it
+    before = None if sealed is None else sealed.state()
+    try:
+        connection = _connect(source, "mode=ro") if sealed is None else sealed.connect()
+        connection.isolation_level = None
+        with closing(connection):
+            connection.execute("VACUUM INTO ?", (str(to),))
+    except sqlite3.Error as error:
+        raise UnusableStore(
+            f"{source}: the database cannot be copied ({error}). See that it can be read and the "
+            "disk has room; where it is damaged, restore an earlier snapshot."
+        ) from error
+    if sealed is not None:
+        sealed.check(before)
+
+
+@contextmanager
+def open_copy(path: Path) -> Iterator[sqlite3.Connection]:
+    """A database that nobody writes, to be read."""
+    with closing(_connect(path, "mode=ro&immutable=1")) as connection:
+        yield connection
+
+
+def check_copy(connection: sqlite3.Connection) -> str | None:
+    """What is wrong with a database, in a few words; None where it is sound."""
+    try:
+        said = str(connection.execute("PRAGMA integrity_check(1)").fetchone()[0])
+        if said != "ok":
+            return said.replace("\n", " ")
+        lost = connection.execute("PRAGMA foreign_key_check").fetchone()
+    except sqlite3.Error as error:
+        return str(error)
+    return f"a row of {lost[0]} refers to one of {lost[2]} that is missing" if lost else None
+
+
+def check_schema(connection: sqlite3.Connection, place: str) -> str:
+    """The schema's revision.
+
+    Parameters
+    ----------
+    connection : of `open_copy`
+    place : what it is a copy of, for messages
+
+    Raises
+    ------
+    NewerSchema : this version does not know it, nor what it refers to.
+    UnusableStore : there is none.
+    """
+    try:
+        ((revision,),) = connection.execute("SELECT version_num FROM alembic_version").fetchall()
+    except (sqlite3.Error, ValueError) as error:
+        raise UnusableStore(
+            f"{place}: no database of sceneprint. Name another folder with --data."
+        ) from error
+    if revision not in _known_revisions():
+        raise NewerSchema(
+            f"{place} has schema {revision!r:.40}, which this version of sceneprint does not "
+            "know: a later one wrote it. Use that version."
+        )
+    return str(revision)
+
+
+def counts(connection: sqlite3.Connection) -> dict[str, Any]:
+    """How many maps, signatures, and frames in each state there are."""
+    states = connection.execute("SELECT state, count(*) FROM frames GROUP BY state ORDER BY state")
+    return {
+        "maps": connection.execute("SELECT count(*) FROM maps").fetchone()[0],
+        "frames": dict(states.fetchall()),
+        "signatures": connection.execute("SELECT count(*) FROM signatures").fetchone()[0],
+    }
+
+
+def referred(connection: sqlite3.Connection) -> Iterator[str]:
+    """Digests of all blobs that have to be there, each once, in order."""
+    for (digest,) in connection.execute(f"SELECT DISTINCT digest FROM ({_USES}) ORDER BY digest"):
+        yield digest
+
+
+def uses(connection: sqlite3.Connection, digest: str) -> tuple[Use, ...]:
+    """Whose a blob is."""
+    rows = connection.execute(
+        "SELECT maps.name, frames.id, used.role FROM"
+        f" ({_USES}) AS used JOIN frames ON frames.number = used.number"
+        " JOIN maps ON maps.number = frames.map_number WHERE digest = ? ORDER BY frames.number",
+        (digest,),
+    )
+    return tuple(Use(map=name, frame=frame, role=role) for name, frame, role in rows)
+
+
+def _known_revisions() -> set[str]:
+    import migrations
+
+    config = Config()
+    config.set_main_option("script_location", str(Path(migrations.__file__).parent))
+    return {one.revision for one in ScriptDirectory.from_config(config).walk_revisions()}
+
+
+def _connect(path: Path, how: str) -> sqlite3.Connection:
+    return sqlite3.connect(
+        f"file:{quote(str(path.absolute()))}?{how}", uri=True, timeout=BUSY_S, isolation_level=None
+    )

@@ -1,0 +1,179 @@
+"""What the snapshot tests share: a data folder with something of every kind, and its snapshot."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from sceneprint.cli import main
+from sceneprint.datasets import write_depth_png
+from sceneprint.engine import Engine
+from sceneprint.maintenance.snapshots import take_snapshot
+from sceneprint.schemas import (
+    Answer,
+    CameraIntrinsics,
+    FrameMeta,
+    GivenPose,
+    JobState,
+    NewMap,
+    Query,
+)
+from sceneprint.settings import Settings
+from sceneprint.types import Frame
+
+SIGNED = 4
+
+
+def settings_of(folder: Path) -> Settings:
+    """Settings of a data folder, whatever the environment says."""
+    return Settings(data_dir=folder, database_url=None, index_dir=None)
+
+
+@pytest.fixture(scope="session")
+def settings() -> Callable[[Path], Settings]:
+    return settings_of
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A frame as a robot sends it."""
+
+    data: bytes
+    meta: FrameMeta
+
+
+@pytest.fixture(scope="session")
+def uploads(
+    room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory
+) -> list[Upload]:
+    """24 small frames with poses: every fourth sample from each of four corners of six views."""
+    path, found = tmp_path_factory.mktemp("png") / "frame.png", []
+    for frame in room_frames:
+        k = frame.intrinsics
+        assert frame.pose is not None
+        for place in range(4):
+            y, x = divmod(place, 2)
+            write_depth_png(path, np.ascontiguousarray(frame.depth[y::4, x::4]), 1000.0)
+            camera = CameraIntrinsics(
+                width=160, height=120, fx=k.fx / 4, fy=k.fy / 4,
+                cx=(k.cx - x) / 4, cy=(k.cy - y) / 4,
+            )  # fmt: skip
+            pose = GivenPose(parent_frame=frame.name[:-2], matrix=frame.pose.tolist())
+            found.append(Upload(path.read_bytes(), FrameMeta(intrinsics=camera, pose=pose)))
+    return found
+
+
+@pytest.fixture(scope="session")
+def master(uploads: list[Upload], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data folder with signed frames, one deleted, one that waits, a key, and an orphan.
+
+    Not to be changed.
+    """
+    folder = tmp_path_factory.mktemp("master") / "data"
+    with Engine(settings_of(folder)) as engine:
+        engine.create_map(NewMap(name="hall", model="compact"))
+        for each in uploads[: SIGNED + 1]:
+            engine.add_frame("hall", each.data, each.meta)
+        while (work := engine.claim("w")) is not None:
+            assert engine.run(work) == JobState.SUCCEEDED
+        engine.delete_frame("hall", engine.list_frames("hall").items[SIGNED].frame_id)
+        engine.add_frame("hall", uploads[SIGNED + 1].data, uploads[SIGNED + 1].meta)
+        engine.store.blobs.put(b"nothing refers to this")
+        engine.create_key("robot")
+    return folder
+
+
+@pytest.fixture
+def data(master: Path, tmp_path: Path) -> Path:
+    """A copy of `master` to be changed."""
+    return Path(shutil.copytree(master, tmp_path / "data"))
+
+
+@pytest.fixture(scope="session")
+def archive(master: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A snapshot of `master`; not to be changed."""
+    path = tmp_path_factory.mktemp("archive") / "snapshot.tar"
+    take_snapshot(settings_of(master), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def content() -> Callable[[Path], dict[str, str]]:
+    """What is in a data folder: SQL of its database, and the hash of every blob by its path."""
+
+    def of(folder: Path) -> dict[str, str]:
+        with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
+            sql = "\n".join(sorted(database.iterdump()))
+        blobs = [path for path in (folder / "blobs").rglob("*") if path.is_file()]
+        return {"": sql} | {
+            str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in blobs
+        }
+
+    return of
+
+
+@pytest.fixture(scope="session")
+def rows() -> Callable[..., list[tuple[Any, ...]]]:
+    """Ask a data folder's database."""
+
+    def ask(folder: Path, asked: str) -> list[tuple[Any, ...]]:
+        with closing(sqlite3.connect(folder / "sceneprint.db", timeout=30)) as database:
+            found = database.execute(asked).fetchall()
+            database.commit()
+            return found
+
+    return ask
+
+
+@pytest.fixture(scope="session")
+def answers() -> Callable[[Path, list[Upload]], list[Answer]]:
+    """What the map `hall` of a data folder answers, but for what no two answers share."""
+
+    def of(folder: Path, asked: list[Upload]) -> list[Answer]:
+        free = {"query_id": "", "milliseconds": {}}
+        with Engine(settings_of(folder)) as engine:
+            return [
+                engine.query_upload("hall", one.data, one.meta, Query(exact=True)).model_copy(
+                    update=free
+                )
+                for one in asked
+            ]
+
+    return of
+
+
+class Said(NamedTuple):
+    """What a command printed."""
+
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def sceneprint(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., Said]]:
+    """Runs a command in this process and checks its exit code."""
+    monkeypatch.delenv("SCENEPRINT_DATABASE_URL", raising=False)
+
+    def run(*arguments: object, expect: int = 0) -> Said:
+        capsys.readouterr()
+        code = main([str(one) for one in arguments])
+        said = Said(*capsys.readouterr())
+        assert code == expect, said
+        if expect == 2:
+            assert said.stdout == ""
+            assert said.stderr.count("\n") == 1
+        return said
+
+    return run

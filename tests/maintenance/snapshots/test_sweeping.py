@@ -1,0 +1,73 @@
+"""Deletions while a snapshot is being taken: it misses nothing, and what stays is found later."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+from sceneprint.engine import Engine
+from sceneprint.maintenance.restoring import verify_snapshot
+from sceneprint.maintenance.snapshots import take_snapshot
+
+
+def test_what_is_deleted_meanwhile_is_in_it(data, tmp_path, settings, rows):
+    """All frames go as soon as the database was copied, and no blob has been."""
+    with Engine(settings(data)) as engine:
+        before = set(engine.store.blobs.digests())
+        frames = [one.frame_id for one in engine.list_frames("hall").items]
+
+        def delete(_done: int, _total: int) -> None:
+            while frames:
+                engine.delete_frame("hall", frames.pop())
+
+        taken = take_snapshot(settings(data), tmp_path / "a.tar", delete)
+        assert frames == []
+        assert taken.damaged == []
+        assert taken.manifest.blobs.count == 9
+        assert set(engine.store.blobs.digests()) == before
+        assert verify_snapshot(tmp_path / "a.tar").damaged == []
+        assert rows(data, "SELECT DISTINCT state FROM frames") == [("deleted",)]
+
+
+def test_after_it_deletions_remove_blobs_again(data, tmp_path, settings):
+    with Engine(settings(data)) as engine:
+        blobs = engine.store.blobs
+        count = len(list(blobs.digests()))
+        first, second, *_ = [one.frame_id for one in engine.list_frames("hall").items]
+        with blobs.kept(), blobs.kept():  # two snapshots do not mind each other
+            engine.delete_frame("hall", first)
+        assert len(list(blobs.digests())) == count
+        engine.delete_frame("hall", second)
+        assert len(list(blobs.digests())) == count - 2  # those of the first are for fsck
+        take_snapshot(settings(data), tmp_path / "a.tar")
+        engine.delete_map("hall")
+        assert len(list(blobs.digests())) == 2  # the artifact of the first, and the orphan
+
+
+def test_a_sweep_under_way_is_waited_for(data, tmp_path, settings):
+    """Before the database is copied: the copy must not refer to what the sweep removes."""
+    taken = []
+    with Engine(settings(data)) as engine:
+        (frame, *_) = [one.frame_id for one in engine.list_frames("hall").items]
+
+        def take() -> None:
+            taken.append(take_snapshot(settings(data), tmp_path / "a.tar"))
+
+        thread = threading.Thread(target=take)
+        with engine.store.blobs.removing() as allowed:
+            assert allowed
+            with engine.store.blobs.removing() as second:
+                assert not second
+            thread.start()
+            workplaces = list(tmp_path.glob(".sceneprint-snapshot-*"))
+            while not workplaces:
+                time.sleep(0.01)
+                workplaces = list(tmp_path.glob(".sceneprint-snapshot-*"))
+            time.sleep(0.3)
+            assert list(workplaces[0].iterdir()) == []
+            assert thread.is_alive()
+            engine.delete_frame("hall", frame)
+        thread.join()
+    assert taken[0].damaged == []
+    assert taken[0].manifest.frames == {"deleted": 2, "indexed": 3, "received": 1}
+    assert taken[0].manifest.blobs.count == 7
