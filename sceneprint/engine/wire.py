@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
@@ -9,11 +10,11 @@ import numpy as np
 from sqlalchemy import Connection
 
 from sceneprint.engine.transforms import transform
-from sceneprint.schemas import CameraIntrinsics, Frame, Job, Map
-from sceneprint.store.frames import frame_of
+from sceneprint.schemas import CameraIntrinsics, Frame, Job, Map, Reencoding
 from sceneprint.store.maps import count_frames, model_names
 from sceneprint.store.queue import jobs_of
 from sceneprint.store.records import FrameRow, JobRow, MapRow
+from sceneprint.store.reencoding import REENCODE, standing
 
 
 def when(seconds: float | None) -> Any:
@@ -33,12 +34,17 @@ def camera_frame(frame_id: str) -> str:
 
 def tell_map(connection: Connection, row: MapRow) -> Map:
     """A map."""
-    name = model_names(connection)[row.model_id]
+    names, coming = model_names(connection), None
+    if row.next_model_id is not None:
+        label = model_label(names[row.next_model_id], row.next_model_id)
+        now = standing(connection, row)
+        coming = Reencoding(model=label, model_id=row.next_model_id, **asdict(now))
     return Map(
         name=row.name,
         title=row.title,
-        model=model_label(name, row.model_id),
+        model=model_label(names[row.model_id], row.model_id),
         model_id=row.model_id,
+        reencoding=coming,
         created_at=when(row.created_at),
         revision=row.revision,
         frames=count_frames(connection, row.number),
@@ -51,14 +57,15 @@ def tell_frames(connection: Connection, row: MapRow, found: list[FrameRow]) -> l
     return [_frame(row, frame, jobs[frame.number]) for frame in found]
 
 
-def tell_job(connection: Connection, job: JobRow, map_name: str) -> Job:
-    """A job."""
+def tell_job(job: JobRow, frame_id: str, map_name: str) -> Job:
+    """A job, and the names of what it is about."""
     return Job(
         job_id=job.id,
-        kind="sign",
+        kind="reencode" if job.kind == REENCODE else "sign",
         state=job.state,
         map=map_name,
-        frame_id=frame_of(connection, job.frame_number).id,
+        frame_id=frame_id,
+        priority=job.priority,
         attempts=job.attempts,
         created_at=when(job.created_at),
         started_at=when(job.started_at),

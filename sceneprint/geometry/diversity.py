@@ -11,6 +11,7 @@ and diversity part, and their logarithms neither overflow nor underflow.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,10 +117,42 @@ def _log_quality(to_query: Floats, omega: float) -> Floats:
 
 
 def _greedy(log_quality: Floats, among: Floats, sigma: float, k: int) -> Selection:
-    """Incremental Cholesky factor of exp(-among / sigma), one column for each one taken."""
+    similarity = similar(among, sigma)
+    taken, gains = greedy(log_quality, similarity.__getitem__, k)
+    order = np.argsort(taken)
+    return Selection(taken[order], gains[order])
+
+
+def similar(distances: Floats, sigma: float) -> Floats:
+    """The kernel of Eq. (3) without its quality: exp(-d / sigma).
+
+    Where half of all pairs are duplicates sigma is 0: what is not a duplicate is then unlike.
+    """
+    likeness: Floats = np.exp(-distances / sigma) if sigma > 0 else (distances <= 0).astype(float)
+    return likeness
+
+
+def greedy(
+    log_quality: Floats, similarity_of: Callable[[int], Floats], k: int
+) -> tuple[NDArray[np.intp], Floats]:
+    """Greedy maximisation of det L_C: Sec. III-D.
+
+    The Cholesky factor of the similarities grows by one row for each one taken, so that only
+    their similarities are ever asked for.
+
+    Parameters
+    ----------
+    log_quality : (n,) log rho^2, up to a constant
+    similarity_of : (n,) similarities of one to all, of its index
+    k : how many to take, at most n
+
+    Returns
+    -------
+    taken : (up to k,) indices in the order in which they were taken, ties by index; fewer where
+        the rest are duplicates
+    gains : see Selection; in the same order
+    """
     n = len(log_quality)
-    # where half of all pairs are duplicates sigma is 0: what is not a duplicate is then unlike
-    similarity = np.exp(-among / sigma) if sigma > 0 else (among <= 0).astype(float)
     factor = np.zeros((k, n))
     variance = np.ones(n)
     taken: list[int] = []
@@ -134,11 +167,11 @@ def _greedy(log_quality: Floats, among: Floats, sigma: float, k: int) -> Selecti
         best = int(np.argmax(value))
         if not np.isfinite(value[best]):
             break
-        row = (similarity[best] - factor[:, best] @ factor) / np.sqrt(variance[best])
+        known = factor[: len(taken)]
+        row = (similarity_of(best) - known[:, best] @ known) / np.sqrt(variance[best])
         gains.append(float(variance[best]))
         factor[len(taken)] = row
         variance = variance - row**2
         open_[best] = False
         taken.append(best)
-    order = np.argsort(taken)
-    return Selection(np.array(taken, np.intp)[order], np.array(gains)[order])
+    return np.array(taken, np.intp), np.array(gains)

@@ -44,6 +44,22 @@ def renew_frame(connection: Connection, frame_id: str, values: dict[str, Any]) -
     return _one(connection, frames.c.id == frame_id)
 
 
+def renew_upload(
+    connection: Connection, number: int, blob: str, size: int, reason: str | None
+) -> None:
+    """Let a frame refer to its content as it came once more; nothing else of it changes.
+
+    Parameters
+    ----------
+    number : of the frame
+    blob, size : of the upload
+    reason : that is left of the frame's
+    """
+    connection.execute(
+        update(frames).where(frames.c.number == number).values(blob=blob, bytes=size, reason=reason)
+    )
+
+
 def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
     """The frame of an id in a map, deleted ones too.
 

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, func, insert, select, update
 
+from sceneprint.errors import DamagedSignature
 from sceneprint.schemas import FrameState
 from sceneprint.store.maps import next_revision
 from sceneprint.store.records import FrameRow, MapRow
-from sceneprint.store.tables import frames, signatures
+from sceneprint.store.tables import frames, maps, signatures
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,10 @@ class StoredSignature:
 
 @dataclass(frozen=True)
 class Change:
-    """A frame that was indexed or deleted; `vector` is None where it was deleted, or is damaged."""
+    """A frame that was indexed, or is searched no more; `vector` is None then, or is damaged.
+
+    `deleted` says that it was deleted, or rejected by a model that its map came to have.
+    """
 
     number: int
     frame_id: str
@@ -61,6 +65,41 @@ def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) 
         .values(state=FrameState.INDEXED, reason=None, indexed_at=time.time(), revision=revision)
     )
     return revision
+
+
+def replace_signature(connection: Connection, frame: FrameRow, made: StoredSignature) -> bool:
+    """Store what was made of an indexed frame once more, in place of what is damaged or missing.
+
+    The frame stays found all the while. Where the bytes of the map's own signatures change, it
+    takes the map's next revision, so that readers and indexes learn of it.
+
+    Returns
+    -------
+    changed : whether the stored bytes were others
+    """
+    own = (signatures.c.frame_number == frame.number) & (signatures.c.model_id == made.model_id)
+    values = {
+        "vector": made.vector, "checksum": zlib.crc32(made.vector), "geometry": made.geometry,
+        "n_patches": list(made.n_patches), "n_pairs": list(made.n_pairs),
+    }  # fmt: skip
+    known = connection.execute(select(signatures.c.vector, signatures.c.checksum).where(own))
+    before = known.first()
+    if before is None:
+        connection.execute(
+            insert(signatures).values(frame_number=frame.number, model_id=made.model_id, **values)
+        )
+    else:
+        connection.execute(update(signatures).where(own).values(**values))
+    # a checksum that does not fit made readers pass the frame over, whatever its bytes
+    if before is not None and tuple(before) == (made.vector, values["checksum"]):
+        return False
+    searched = select(maps.c.model_id).where(maps.c.number == frame.map_number)
+    if connection.execute(searched).scalar_one() == made.model_id:
+        revision = next_revision(connection, frame.map_number)
+        connection.execute(
+            update(frames).where(frames.c.number == frame.number).values(revision=revision)
+        )
+    return True
 
 
 def changes_since(
@@ -90,7 +129,7 @@ def _change(
     number: int, frame_id: str, revision: int, state: str, vector: bytes | None,
     checksum: int | None,
 ) -> Change:  # fmt: skip
-    if state == FrameState.DELETED:
+    if state != FrameState.INDEXED:
         return Change(number, frame_id, revision, None, deleted=True)
     sound = vector is not None and zlib.crc32(vector) == checksum
     return Change(number, frame_id, revision, vector if sound else None)
@@ -109,12 +148,12 @@ def count_indexed(connection: Connection, map_number: int, revision: int) -> int
 
 
 def deleted_since(connection: Connection, map_number: int, revision: int) -> frozenset[int]:
-    """Numbers of the frames of a map that were deleted after a revision."""
+    """Numbers of the frames of a map that are searched no more since a revision."""
     found = connection.execute(
         select(frames.c.number).where(
             frames.c.map_number == map_number,
             frames.c.revision > revision,
-            frames.c.state == FrameState.DELETED,
+            frames.c.state != FrameState.INDEXED,
         )
     )
     return frozenset(found.scalars())
@@ -131,10 +170,34 @@ def geometry_blobs(connection: Connection, numbers: Iterable[int], model_id: str
 
 
 def stored_vector(connection: Connection, number: int, model_id: str) -> bytes | None:
-    """The signature of a frame, or None where it has none."""
+    """The signature of a frame, or None where it has none.
+
+    Raises
+    ------
+    DamagedSignature : its bytes are not those that were stored.
+    """
     found = connection.execute(
-        select(signatures.c.vector).where(
+        select(signatures.c.vector, signatures.c.checksum).where(
             signatures.c.frame_number == number, signatures.c.model_id == model_id
         )
-    ).scalar()
-    return None if found is None else bytes(found)
+    ).first()
+    if found is None:
+        return None
+    if zlib.crc32(found.vector) != found.checksum:
+        raise DamagedSignature(
+            "The signature of the frame is damaged: its checksum does not fit. It is made again "
+            "from its upload while a worker runs; `sceneprint fsck` says whether that can be done."
+        )
+    return bytes(found.vector)
+
+
+def stored_signatures(
+    connection: Connection, numbers: Iterable[int], model_id: str
+) -> dict[int, bytes]:
+    """Signatures of frames; those that have none, or a damaged one, are left out."""
+    found = connection.execute(
+        select(signatures.c.frame_number, signatures.c.vector, signatures.c.checksum).where(
+            signatures.c.frame_number.in_(list(numbers)), signatures.c.model_id == model_id
+        )
+    )
+    return {n: bytes(vector) for n, vector, checksum in found if zlib.crc32(vector) == checksum}

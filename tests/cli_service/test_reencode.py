@@ -1,0 +1,94 @@
+"""`sceneprint reencode`: begun, watched and given up beside a service, which then answers anew."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import update
+
+from sceneprint.cli import reencode as command
+from sceneprint.client import Client, meta_of
+from sceneprint.datasets import find_sequences
+from sceneprint.engine import Engine
+from sceneprint.schemas import JobState
+from sceneprint.settings import Settings
+from sceneprint.store.tables import jobs
+
+Run = Callable[..., Any]
+
+
+def test_a_map_is_signed_anew_while_its_service_runs(
+    sceneprint: Run, service_url: str, data_folder: Path, rooms: Path
+) -> None:
+    def reencode(*arguments: object, expect: int = 0) -> Any:
+        return sceneprint("reencode", "anew", *arguments, "--data", data_folder, expect=expect)
+
+    sceneprint("upload", "anew", rooms, "--model", "compact")
+    assert re.fullmatch(r"map anew, model compact-[0-9a-f]{12}\n", reencode("--status").stdout)
+    said = reencode("--model", "paper", "--wait").stdout
+    assert re.fullmatch(r"map anew, model paper-[0-9a-f]{12}\n", said)
+    assert reencode("--status").stdout == said
+    with Client(service_url) as client:
+        told = client.map("anew")
+        assert (f"map anew, model {told.model}\n", told.reencoding) == (said, None)
+        assert told.frames == {"indexed": 6}
+    frame = next(iter(sorted(rooms.rglob("*.depth.png"))))
+    answer = sceneprint("query", "anew", frame, "--json").stdout
+    assert f'"model":"{told.model}"' in answer.replace(": ", ":")
+    again = reencode("--model", "paper", expect=2).stderr
+    assert again.startswith("sceneprint reencode: Map 'anew' is signed with paper-")
+
+
+def test_what_is_given_up_and_what_breaks_down_is_said(sceneprint: Run, tmp_path: Path) -> None:
+    """In a folder on which no worker runs."""
+
+    def reencode(*arguments: object, expect: int = 0) -> Any:
+        return sceneprint("reencode", "hall", *arguments, "--data", tmp_path, expect=expect)
+
+    missing = reencode("--model", "paper", expect=2).stderr
+    assert missing.startswith("sceneprint reencode: There is no map 'hall'")
+    with Client.embedded(tmp_path) as client:
+        model = client.create_map("hall", model="compact").model
+    first = f"map hall, model {model}\n"
+    begun = reencode("--model", "paper").stdout
+    coming = r"to come: paper-[0-9a-f]{12}; 0 frames are signed with it, 0 wait\n"
+    assert re.fullmatch(first + coming, begun)
+    assert reencode("--status").stdout == begun
+    refused = reencode("--model", "compact", expect=2).stderr
+    assert re.search(r"Map 'hall' is being signed with paper-.* --cancel", refused)
+    assert reencode("--cancel").stdout == first
+    assert "not being signed with another model" in reencode("--cancel", expect=2).stderr
+    assert "no such file" in reencode("--model", tmp_path / "none", expect=2).stderr.lower()
+
+
+def test_waiting_ends_where_it_is_no_use(
+    sceneprint: Run, tmp_path: Path, rooms: Path, monkeypatch: Any
+) -> None:
+    """No worker runs, or a frame broke down in every try."""
+    monkeypatch.setattr(command, "STALL_S", 0.5)
+    with Client.embedded(tmp_path) as client:
+        client.create_map("hall", model="compact")
+        reference = find_sequences(rooms)[0].frames[0]
+        added, _ = client.add("hall", reference, meta_of(reference))
+        client.wait([added.job_id])
+        assert client.map("hall").frames == {"indexed": 1}
+
+    def wait() -> Any:
+        return sceneprint(
+            "reencode", "hall", "--model", "paper", "--wait", "--data", tmp_path, expect=2
+        )
+
+    said = wait()
+    assert "0 frames are signed with it, 1 wait\n" in said.stdout
+    assert "See that workers run: `sceneprint work` starts some." in said.stderr
+    broken = update(jobs).where(jobs.c.kind == "reencode").values(state=JobState.DEAD)
+    engine = Engine(Settings(data_dir=tmp_path, database_url=None))
+    with engine, engine.store.database.write() as connection:
+        connection.execute(broken)
+    said = sceneprint("reencode", "hall", "--status", "--wait", "--data", tmp_path, expect=2)
+    assert "1 frames broke down in every try, and the map does not switch before" in said.stdout
+    said = wait()  # tries it again
+    assert "0 frames are signed with it, 1 wait\n" in said.stdout
