@@ -143,7 +143,7 @@ def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
     makes = [line for line in commands if line.startswith("make")]
     assert makes == ["make demo"]
     serve, *rest = [line for line in commands if line not in makes]
-    assert len(rest) == 8
+    assert len(rest) == 15
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -171,6 +171,10 @@ def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
     assert "6 indexed" in printed["upload"]
     assert "found" in printed["query"]
     assert "building" in printed["maps"]
+    assert (tmp_path / "restored/sceneprint.db").stat().st_size > 6 * 125_000
+    assert printed["index"].startswith("map building, paper-")
+    assert "6" in printed["thin"]
+    assert "building" in printed["reencode"]
     index = json.loads((tmp_path / "signatures/signatures.json").read_text())
     assert [entry["signed"] for entry in index["frames"]] == [True] * 12
     assert (tmp_path / "frame.png").stat().st_size > 10_000
@@ -213,7 +217,7 @@ def test_every_room_of_the_staircase_is_on_its_page() -> None:
         one.strip().removeprefix("sceneprint.") for layer in layers for one in layer.split("|")
     }
     told = {"cli", "service", "worker", "client", "engine", "settings", "pipeline", "matches",
-            "store", "index", "schemas", "geometry", "errors"}  # fmt: skip
+            "store", "index", "schemas", "geometry", "errors", "maintenance"}  # fmt: skip
     assert told <= rooms
     assert all(re.search(rf"\b{name}\b", page) for name in told)
 
@@ -230,11 +234,8 @@ def test_readme_camera_is_valid_json() -> None:
 
 def test_make_has_the_verbs_the_docs_name() -> None:
     targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    named = set(
-        re.findall(
-            r"(?:`|\n)make (\w+)", README + MODEL + (ROOT / "docs/performance.md").read_text()
-        )
-    )
-    assert {"demo", "test", "bench", "models"} <= named
+    pages = README + "".join(page.read_text() for page in (ROOT / "docs").glob("*.md"))
+    named = set(re.findall(r"(?:`|\n)make (\w+)", pages))
+    assert {"demo", "test", "bench", "soak", "models"} <= named
     assert named <= targets
     assert "make test" in (ROOT / ".ci/run").read_text()

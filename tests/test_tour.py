@@ -72,6 +72,8 @@ def test_the_tour_runs_and_says_what_the_page_promises(outputs: list[str]) -> No
         asked,
         of_map,
         listed,
+        filtered,
+        newest,
         removed,
         refused,
         operations,
@@ -92,6 +94,10 @@ def test_the_tour_runs_and_says_what_the_page_promises(outputs: list[str]) -> No
     assert (again["status"], again["seed"]) == ("found", 7)
     unvalidated = documents(listed)[0]
     assert (unvalidated["status"], unvalidated["counts"]["selected"]) == ("unvalidated", 5)
+    assert [answer["counts"]["passed"] for answer in documents(filtered)] == [8, 13]
+    jobs = documents(newest)[0]
+    assert [job["state"] for job in jobs["items"]] == ["succeeded"] * 3
+    assert jobs["next_cursor"] is not None
     assert removed.strip() == ""
     assert documents(refused)[0]["type"] == "/problems/unknown-map"
     assert documents(operations.splitlines()[0])[0]["status"] == "ready"

@@ -86,9 +86,10 @@ def run(options: argparse.Namespace) -> int:
     supervisor, stop = Supervisor(settings), threading.Event()
     watching = threading.Thread(target=supervisor.watch, args=(stop,), name="supervisor")
 
-    def ready(url: str) -> None:
-        supervisor.start()  # after the service has brought the database to its schema
-        watching.start()
+    def ready(url: str, read_only: bool) -> None:
+        if not read_only:  # there would be nothing for workers to do
+            supervisor.start()  # after the service has brought the database to its schema
+            watching.start()
         print(f"sceneprint: serving {url}", flush=True)
 
     # uvicorn handles both signals while it runs; before and after, leave by the same way out

@@ -28,7 +28,8 @@ def run(options: argparse.Namespace) -> int:
     from worker.supervisor import run as work
 
     settings = settings_of(options)
-    Engine(settings).close()  # what cannot be opened is said once, and not by every worker
+    with Engine(settings) as engine:  # what is wrong is said once, and not by every worker
+        engine.store.database.require_writable()
     prepare_presets(settings)
     log_as_json()
     work(settings)

@@ -13,6 +13,7 @@ from sceneprint.schemas import (
     FrameMeta,
     FrameState,
     Job,
+    JobState,
     Map,
     NewMap,
     Page,
@@ -49,8 +50,9 @@ class Backend(Protocol):
         """Remove a map with all that is in it."""
 
     def add_frame(
-        self, map_name: str, data: bytes, meta: FrameMeta, wait_s: float
-    ) -> tuple[Added, bool]:
+        self, map_name: str, data: bytes, meta: FrameMeta, wait_s: float, priority: int,
+        if_novel: float | None,
+    ) -> tuple[Added, bool]:  # fmt: skip
         """Take a frame into a map, waiting for its job at most so long; whether it is new."""
 
     def list_frames(
@@ -66,6 +68,15 @@ class Backend(Protocol):
 
     def get_job(self, job_id: str) -> Job:
         """A job."""
+
+    def list_jobs(self, cursor: str | None, state: JobState | None) -> Page[Job]:
+        """A page of all jobs, the newest first."""
+
+    def cancel_job(self, job_id: str) -> Job:
+        """Give up a job that is not over."""
+
+    def retry_job(self, job_id: str) -> Job:
+        """Try again what was given up."""
 
     def query_upload(self, map_name: str, data: bytes, meta: FrameMeta, query: Query) -> Answer:
         """Look a frame up that is not kept."""

@@ -3,33 +3,38 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from sceneprint.client.backend import Backend, Status
 from sceneprint.client.frames import checked, sendable
-from sceneprint.client.waiting import settle, wait_for
+from sceneprint.client.jobs import Jobs
+from sceneprint.client.waiting import settle
 from sceneprint.datasets import FrameReference
+from sceneprint.errors import InvalidRequest
 from sceneprint.schemas import (
     Added,
     Answer,
+    Filter,
     Frame,
     FrameMeta,
     FrameState,
-    Job,
     Map,
     NewMap,
     Page,
     Query,
     Stage,
 )
+from sceneprint.schemas.frames import MOST_PRIORITY
+from sceneprint.schemas.novelty import novelty_of
 from sceneprint.schemas.queries import STAGES
 
 DEFAULT_URL = "http://127.0.0.1:8008"
 
 
-class Client:
+class Client(Jobs):
     """Maps, frames and queries of a service; safe to share between threads.
 
     Brief faults of the network and of a busy service are waited out; uploading twice is safe,
@@ -119,7 +124,8 @@ class Client:
 
     def upload(
         self, map_name: str, frame: bytes | Path | FrameReference, meta: FrameMeta | None = None,
-        *, wait_s: float | None = None,
+        *, wait_s: float | None = None, priority: int = 0,
+        if_novel: float | bool | None = None,
     ) -> Added:  # fmt: skip
         """Take a frame into a map; it is safe when this returns, and signed soon after.
 
@@ -129,6 +135,10 @@ class Client:
         frame : content of a PNG or NPY file, the file, or a frame of `find_sequences`
         meta : what is known of it; default: what `meta_of` finds
         wait_s : seconds to wait until it is signed; default: none
+        priority : from -10 to 10; frames of a greater one are signed first
+        if_novel : keep it only if the map lacks the place: if its nearest frame is farther than
+            this share of the distance of unrelated frames, or than 0.3 of it where just True;
+            else the frame ends `redundant`, and `reason` says which frame is near
 
         Returns
         -------
@@ -139,21 +149,31 @@ class Client:
         UnknownMap : no such map.
         FrameError, DatasetError : the frame cannot be read, or its camera or pose is none.
         FrameConflict : the map has the same content with other metadata.
+        InvalidRequest : a priority or `if_novel` out of its range.
         """
         until = time.monotonic() + (wait_s or 0.0)
-        added, _ = self.add(map_name, frame, meta, wait_s=wait_s)
+        added, _ = self.add(
+            map_name, frame, meta, wait_s=wait_s, priority=priority, if_novel=if_novel
+        )
         return settle(self._backend, map_name, added, until)
 
     def add(
         self, map_name: str, frame: bytes | Path | FrameReference, meta: FrameMeta | None = None,
-        *, wait_s: float | None = None,
+        *, wait_s: float | None = None, priority: int = 0,
+        if_novel: float | bool | None = None,
     ) -> tuple[Added, bool]:  # fmt: skip
         """As `upload`, with a flag: False where the map had the frame already.
 
         The wait may end early; `upload` goes on to the end of it.
         """
+        if abs(priority) > MOST_PRIORITY:
+            raise InvalidRequest(
+                f"The priority is {priority}. Give one from {-MOST_PRIORITY} to {MOST_PRIORITY}.",
+                (("priority", "out of its range"),),
+            )
+        novelty = novelty_of(if_novel)
         data, known = sendable(frame, meta, with_pose=True)
-        return self._backend.add_frame(map_name, data, known, wait_s or 0.0)
+        return self._backend.add_frame(map_name, data, known, wait_s or 0.0, priority, novelty)
 
     def frames(self, map_name: str, state: FrameState | None = None) -> Iterator[Frame]:
         """Frames of a map in the order they came; deleted ones only where asked for.
@@ -172,40 +192,13 @@ class Client:
         """Take a frame out of its map; UnknownMap or UnknownFrame where there is none."""
         self._backend.delete_frame(map_name, frame_id)
 
-    # jobs
-
-    def job(self, job_id: str) -> Job:
-        """A job; UnknownJob where there is none."""
-        return self._backend.get_job(job_id)
-
-    def wait(
-        self, job_ids: Iterable[str], *, timeout_s: float = 600.0,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> list[Job]:  # fmt: skip
-        """Wait until jobs are over.
-
-        Parameters
-        ----------
-        job_ids : of uploads
-        timeout_s : after which they are returned as they are
-        progress : called with the number of jobs that are over, and of all
-
-        Returns
-        -------
-        jobs : in the order given; `job.state.over` is False where the time ran out
-
-        Raises
-        ------
-        UnknownJob : there is no job of one of the ids.
-        """
-        return wait_for(self._backend, list(job_ids), timeout_s, progress)
-
     # queries
 
     def query(
         self, map_name: str, frame: bytes | Path | FrameReference | None = None,
         meta: FrameMeta | None = None, *, frame_id: str | None = None, k: int = 5,
         stages: Iterable[Stage] = STAGES, exact: bool = False, seed: int = 0,
+        filter: Filter | dict[str, Any] | None = None,  # noqa: A002  (as in JSON)
     ) -> Answer:  # fmt: skip
         """Where was this frame taken? The frame is not kept.
 
@@ -215,6 +208,7 @@ class Client:
         frame, meta : as for `upload`
         frame_id : of a frame of the map, in place of `frame`; it does not find itself
         k, stages, exact, seed : see Query
+        filter : see Filter, or its fields as a dictionary; only frames that pass it are searched
 
         Raises
         ------
@@ -224,8 +218,8 @@ class Client:
         TypeError : not one of `frame` and `frame_id`.
         """
         query = checked(
-            Query, "The query", k=k, stages=tuple(stages), exact=exact, seed=seed
-        )  # fmt: skip
+            Query, "The query", k=k, stages=tuple(stages), exact=exact, seed=seed, filter=filter
+        )
         if frame_id is not None and frame is None:
             return self._backend.query_frame(map_name, frame_id, query)
         if frame is None or frame_id is not None:

@@ -18,6 +18,7 @@ from sceneprint.schemas import (
     FrameMeta,
     FrameState,
     Job,
+    JobState,
     Map,
     NewMap,
     Page,
@@ -65,11 +66,12 @@ class Embedded:
         self._engine.delete_map(name)
 
     def add_frame(
-        self, map_name: str, data: bytes, meta: FrameMeta, wait_s: float
-    ) -> tuple[Added, bool]:
+        self, map_name: str, data: bytes, meta: FrameMeta, wait_s: float, priority: int,
+        if_novel: float | None,
+    ) -> tuple[Added, bool]:  # fmt: skip
         """Take a frame into a map; nobody but who waits would sign it."""
         del wait_s
-        return self._engine.add_frame(map_name, data, meta)
+        return self._engine.add_frame(map_name, data, meta, priority, if_novel)
 
     def list_frames(
         self, map_name: str, cursor: str | None, state: FrameState | None
@@ -88,6 +90,18 @@ class Embedded:
     def get_job(self, job_id: str) -> Job:
         """A job."""
         return self._engine.get_job(job_id)
+
+    def list_jobs(self, cursor: str | None, state: JobState | None) -> Page[Job]:
+        """A page of all jobs, the newest first."""
+        return self._engine.list_jobs(state, cursor)
+
+    def cancel_job(self, job_id: str) -> Job:
+        """Give up a job that is not over."""
+        return self._engine.cancel_job(job_id)
+
+    def retry_job(self, job_id: str) -> Job:
+        """Try again what was given up."""
+        return self._engine.retry_job(job_id)[0]
 
     def query_upload(self, map_name: str, data: bytes, meta: FrameMeta, query: Query) -> Answer:
         """Look a frame up that is not kept."""

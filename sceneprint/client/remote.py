@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import logging
-import re
 import time
-from typing import Any, TypeVar
+from typing import Any
 
 import httpx
-from pydantic import BaseModel, ValidationError
 
 from sceneprint import __version__
 from sceneprint.client.backend import Status
-from sceneprint.client.problems import not_ours, refusal
+from sceneprint.client.messages import Quiet, Record, form, frame_path, job_path, map_path, read
+from sceneprint.client.problems import refusal
 from sceneprint.client.retrying import persist
-from sceneprint.errors import SceneprintError, UnknownFrame, UnknownJob, UnknownMap, Unreachable
+from sceneprint.errors import Unreachable
 from sceneprint.schemas import (
     Added,
     Answer,
@@ -22,14 +21,13 @@ from sceneprint.schemas import (
     FrameMeta,
     FrameState,
     Job,
+    JobState,
     Map,
     NewMap,
     Page,
     Query,
 )
 from sceneprint.settings import is_loopback
-
-Record = TypeVar("Record", bound=BaseModel)
 
 #: Longest time the service is asked to wait for a worker, seconds.
 _LONGEST_WAIT_S = 60
@@ -75,7 +73,7 @@ class Remote:
                 f"{url!r:.200} is not the address of a service, or the key is not one ({error}). "
                 "Write it like http://127.0.0.1:8008."
             ) from error
-        self._quiet = _Quiet(self._url)
+        self._quiet = Quiet(self._url)
         logging.getLogger("httpx").addFilter(self._quiet)
 
     def close(self) -> None:
@@ -95,27 +93,33 @@ class Remote:
 
     def get_map(self, name: str) -> Map:
         """A map."""
-        return self._ask(Map, "GET", _map(name))
+        return self._ask(Map, "GET", map_path(name))
 
     def delete_map(self, name: str) -> None:
         """Remove a map with all that is in it."""
-        self._delete(_map(name))
+        self._delete(map_path(name))
 
     # frames
 
     def add_frame(
-        self, map_name: str, data: bytes, meta: FrameMeta, wait_s: float
-    ) -> tuple[Added, bool]:
+        self, map_name: str, data: bytes, meta: FrameMeta, wait_s: float, priority: int,
+        if_novel: float | None,
+    ) -> tuple[Added, bool]:  # fmt: skip
         """Take a frame into a map; the service does not wait for one it had already."""
         wait = min(int(wait_s), _LONGEST_WAIT_S)
+        sent = form(data, meta)
+        if priority:  # a service of before knows of none
+            sent["data"]["priority"] = str(priority)
+        if if_novel is not None:
+            sent["data"]["if_novel"] = repr(if_novel)
         response = self._send(
             "POST",
-            f"{_map(map_name)}/frames",
+            f"{map_path(map_name)}/frames",
             headers={"Prefer": f"wait={wait}"} if wait else {},
             timeout=self._timeout_s + wait,
-            **_form(data, meta),
+            **sent,
         )
-        return _read(Added, response), response.status_code != 200
+        return read(Added, response), response.status_code != 200
 
     def list_frames(
         self, map_name: str, cursor: str | None, state: FrameState | None
@@ -123,37 +127,53 @@ class Remote:
         """A page of the frames of a map."""
         given = {"cursor": cursor, "state": state, "limit": str(_PAGE)}
         parameters = {name: value for name, value in given.items() if value is not None}
-        return self._ask(Page[Frame], "GET", f"{_map(map_name)}/frames", params=parameters)
+        return self._ask(Page[Frame], "GET", f"{map_path(map_name)}/frames", params=parameters)
 
     def get_frame(self, map_name: str, frame_id: str) -> Frame:
         """A frame."""
-        return self._ask(Frame, "GET", _frame(map_name, frame_id))
+        return self._ask(Frame, "GET", frame_path(map_name, frame_id))
 
     def delete_frame(self, map_name: str, frame_id: str) -> None:
         """Take a frame out of its map."""
-        self._delete(_frame(map_name, frame_id))
+        self._delete(frame_path(map_name, frame_id))
 
     def get_job(self, job_id: str) -> Job:
         """A job."""
-        return self._ask(Job, "GET", f"/v1/jobs/{_part(job_id, 'job', UnknownJob)}")
+        return self._ask(Job, "GET", job_path(job_id))
+
+    def list_jobs(self, cursor: str | None, state: JobState | None) -> Page[Job]:
+        """A page of all jobs, the newest first."""
+        given = {"cursor": cursor, "state": state, "limit": str(_PAGE)}
+        parameters = {name: value for name, value in given.items() if value is not None}
+        return self._ask(Page[Job], "GET", "/v1/jobs", params=parameters)
+
+    def cancel_job(self, job_id: str) -> Job:
+        """Give up a job that is not over."""
+        return self._ask(Job, "POST", f"{job_path(job_id)}/cancel")
+
+    def retry_job(self, job_id: str) -> Job:
+        """Try again what was given up; asked twice, the service tells of the same new job."""
+        return self._ask(Job, "POST", f"{job_path(job_id)}/retry")
 
     # queries
 
     def query_upload(self, map_name: str, data: bytes, meta: FrameMeta, query: Query) -> Answer:
         """Look a frame up that is not kept."""
-        form = _form(data, meta)
-        form["data"] |= {
+        sent = form(data, meta)
+        sent["data"] |= {
             "k": str(query.k),
             "stages": ",".join(query.stages),
             "exact": str(query.exact).lower(),
             "seed": str(query.seed),
         }
-        return self._ask(Answer, "POST", f"{_map(map_name)}/queries", **form)
+        if query.filter is not None:
+            sent["data"]["filter"] = query.filter.model_dump_json(exclude_none=True)
+        return self._ask(Answer, "POST", f"{map_path(map_name)}/queries", **sent)
 
     def query_frame(self, map_name: str, frame_id: str, query: Query) -> Answer:
         """Look a frame of the map up among the others."""
-        body = {"frame_id": frame_id, **query.model_dump(mode="json")}
-        return self._ask(Answer, "POST", f"{_map(map_name)}/queries", json=body)
+        body = {"frame_id": frame_id, **query.model_dump(mode="json", exclude_none=True)}
+        return self._ask(Answer, "POST", f"{map_path(map_name)}/queries", json=body)
 
     # the service
 
@@ -175,7 +195,7 @@ class Remote:
             return False
 
     def _ask(self, kind: type[Record], method: str, path: str, **request: Any) -> Record:
-        return _read(kind, self._send(method, path, **request))
+        return read(kind, self._send(method, path, **request))
 
     def _delete(self, path: str) -> None:
         self._send("DELETE", path)
@@ -190,45 +210,3 @@ class Remote:
         if response.is_success or deleted_before:
             return response
         raise refusal(response)
-
-
-class _Quiet(logging.Filter):
-    """Keeps a line a request of one service out of the log of whoever uses the client."""
-
-    def __init__(self, url: str) -> None:
-        super().__init__()
-        self._url = url
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """False for what httpx tells of requests to the service."""
-        about = record.args if isinstance(record.args, tuple) else ()
-        return not any(str(one).startswith(self._url) for one in about)
-
-
-def _read(kind: type[Record], response: httpx.Response) -> Record:
-    try:
-        return kind.model_validate_json(response.content)
-    except ValidationError as error:
-        raise not_ours(response) from error
-
-
-def _form(data: bytes, meta: FrameMeta) -> dict[str, Any]:
-    return {
-        "files": {"frame": ("frame", data, "application/octet-stream")},
-        "data": {"meta": meta.model_dump_json(exclude_none=True)},
-    }
-
-
-def _map(name: str) -> str:
-    return f"/v1/maps/{_part(name, 'map', UnknownMap)}"
-
-
-def _frame(map_name: str, frame_id: str) -> str:
-    return f"{_map(map_name)}/frames/{_part(frame_id, 'frame', UnknownFrame)}"
-
-
-def _part(name: str, what: str, error: type[SceneprintError]) -> str:
-    """A name that stays one part of a path: `..` would lead to another resource."""
-    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
-        raise error(f"There is no {what} {name!r:.80}. Check the name.")
-    return name

@@ -14,16 +14,19 @@ import numpy as np
 
 from sceneprint.artifacts import read_geometry
 from sceneprint.engine.asking import Asked
+from sceneprint.engine.healing import sign_again
 from sceneprint.engine.readers import View
 from sceneprint.engine.telling import Found, tell_location, tell_matches
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
 from sceneprint.geometry.diversity import Selection, diversify
 from sceneprint.geometry.retrieval import Ranking, pairwise_distances, ranking_size, similarity
 from sceneprint.index import search, signatures_of
+from sceneprint.index.keys import Keys
 from sceneprint.matches import Match, associate
 from sceneprint.models import Model
-from sceneprint.schemas import Answer, AnswerStatus, Counts, Query
+from sceneprint.schemas import Answer, AnswerStatus, Counts, Filter, Query
 from sceneprint.store import Store
+from sceneprint.store.filters import passing
 from sceneprint.store.frames import frames_of
 from sceneprint.store.records import MapRow
 from sceneprint.store.signatures import geometry_blobs
@@ -60,12 +63,15 @@ def answer(
     view : of the map
     asked, query : what is sought, and how
     """
+    sign_again(store, row, sorted(view.damaged), row.model_id)
     clock = _Clock({"prepare": round(asked.prepare_ms, 2)})
     dead = view.dead if asked.frame is None else view.dead | {asked.frame[0]}
     size = max(view.size - (asked.frame is not None), 0)  # it may just have been deleted
+    among = None if query.filter is None else _among(store, row, view, dead, asked, query.filter)
+    passed = size if among is None else len(among)
     hits = search(
-        asked.vector, view.generation, view.tail, ranking_size(size), dead=dead,
-        exact=query.exact or size <= WHOLE,
+        asked.vector, view.generation, view.tail, ranking_size(passed), dead=dead, among=among,
+        exact=query.exact or passed <= WHOLE,
     )  # fmt: skip
     shares = similarity(hits.distances, model.unrelated_distance)
     ranking = Ranking(hits.keys.astype(np.intp), hits.distances, shares)
@@ -93,6 +99,7 @@ def answer(
         exact=hits.exact,
         counts=Counts(
             map=size,
+            passed=passed,
             compared=hits.compared,
             ranked=len(ranking),
             selected=0 if selection is None else len(selection.indices),
@@ -101,6 +108,18 @@ def answer(
         ),
         milliseconds=clock.spent,
     )
+
+
+def _among(
+    store: Store, row: MapRow, view: View, dead: frozenset[int], asked: Asked, wanted: Filter
+) -> Keys:
+    """Frames of a view that pass a filter; the database may be newer or older than the view."""
+    with store.database.read() as connection:
+        numbers = passing(connection, row.number, wanted, asked.taken)
+    known = view.tail.places.of(numbers) >= 0
+    if view.generation is not None:
+        known |= view.generation.places.of(numbers) >= 0
+    return numbers[known & ~np.isin(numbers, list(dead))]
 
 
 def _selection(view: View, ranking: Ranking, wanted: int) -> Selection:
@@ -126,6 +145,7 @@ def _validated(
             opened[number] = read_geometry(store.blobs.get(blob))
         except (DamagedBlob, UnreadableGeometry) as error:  # one frame must not cost the answer
             unreadable[number] = str(error)
+    sign_again(store, row, sorted(unreadable), row.model_id)
     among = [i for i in chosen if int(ranking.indices[i]) in opened]
     matches = associate(query_geometry, ranking, among, opened.__getitem__, query.k, query.seed)
     return matches, unreadable

@@ -12,10 +12,18 @@ import numpy as np
 
 from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.engine.frames import read_upload
-from sceneprint.errors import DamagedBlob, InvalidRequest, UnknownFrame
+from sceneprint.engine.healing import sign_again
+from sceneprint.errors import (
+    DamagedBlob,
+    DamagedSignature,
+    InvalidRequest,
+    UnknownFrame,
+    UnreadableGeometry,
+)
 from sceneprint.pipeline import Signer, prepare, sign
 from sceneprint.schemas import FrameMeta, Query
 from sceneprint.store import Store
+from sceneprint.store.filters import Taken
 from sceneprint.store.frames import find_frame, refers_to
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import geometry_blobs, stored_vector
@@ -28,14 +36,18 @@ class Asked:
 
     Parameters
     ----------
+    model_id : of the model that signed it
     vector : (D,) its signature
     geometry : its artifact; None where validation was not asked for
+    taken : by whom, in which run and when
     frame : its number and id, if it is one of the map: it does not find itself
     prepare_ms : what making it ready took
     """
 
+    model_id: str
     vector: Bytes
     geometry: Geometry | None
+    taken: Taken
     frame: tuple[int, str] | None
     prepare_ms: float
 
@@ -46,15 +58,19 @@ def ask_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -> As
     Raises
     ------
     FrameError : see `read_upload`; UselessFrame where nothing in it can be signed.
+    InvalidRequest : the filter asks for distance from its session, and `meta` lacks it or a time.
     """
     start = time.perf_counter()
+    at = None if meta.captured_at is None else meta.captured_at.timestamp()
+    taken = _checked(Taken(meta.robot, meta.session, at), query)
     frame = read_upload(data, meta)
     if "validate" not in query.stages:
-        return Asked(sign(frame, signer).vector, None, None, _since(start))
+        vector = sign(frame, signer).vector
+        return Asked(signer.model.id, vector, None, taken, None, _since(start))
     signature, seen = prepare(frame, signer)
     # as it would be read back: the same answer as when the frame is in the map
     geometry = read_geometry(write_geometry(seen))
-    return Asked(signature.vector, geometry, None, _since(start))
+    return Asked(signature.model_id, signature.vector, geometry, taken, None, _since(start))
 
 
 def ask_stored(store: Store, map_name: str, frame_id: str, query: Query) -> Asked:
@@ -63,34 +79,57 @@ def ask_stored(store: Store, map_name: str, frame_id: str, query: Query) -> Aske
     Raises
     ------
     UnknownMap, UnknownFrame : there is none.
-    InvalidRequest : the frame has no signature, or not yet.
-    DamagedBlob, UnreadableGeometry : its artifact was damaged.
+    InvalidRequest : the frame has no signature, or not yet; or the filter asks for distance from
+        its session, and it has none, or no time.
+    DamagedSignature, DamagedBlob, UnreadableGeometry : what was made of it is damaged; it is made
+        again.
     """
     start = time.perf_counter()
-    with store.database.read() as connection:
-        row = find_map(connection, map_name)
-        frame = find_frame(connection, row, frame_id)
-        vector = stored_vector(connection, frame.number, row.model_id)
-        blobs = geometry_blobs(connection, [frame.number], row.model_id)
+    try:
+        with store.database.read() as connection:
+            row = find_map(connection, map_name)
+            frame = find_frame(connection, row, frame_id)
+            vector = stored_vector(connection, frame.number, row.model_id)
+            blobs = geometry_blobs(connection, [frame.number], row.model_id)
+    except DamagedSignature:
+        sign_again(store, row, [frame.number], row.model_id)
+        raise
     if vector is None:
         raise InvalidRequest(
             f"Frame {frame_id} is {frame.state}: {frame.state.sentence} It can be asked for "
             "while it is indexed.",
             (("frame_id", f"is {frame.state}"),),
         )
+    taken = _checked(Taken(frame.robot, frame.session, frame.captured_at), query)
     geometry = None
     if "validate" in query.stages:
         try:
             geometry = read_geometry(store.blobs.get(blobs[frame.number]))
-        except DamagedBlob:
+        except (DamagedBlob, UnreadableGeometry):
             with store.database.read() as connection:
                 if not refers_to(connection, blobs[frame.number]):
                     raise UnknownFrame(
                         f"Frame {frame_id} of map {map_name!r} was deleted while it was asked for."
                     ) from None
+            sign_again(store, row, [frame.number], row.model_id)
             raise
     own = (frame.number, frame.id)
-    return Asked(np.frombuffer(vector, np.uint8), geometry, own, _since(start))
+    asked = np.frombuffer(vector, np.uint8)
+    return Asked(row.model_id, asked, geometry, taken, own, _since(start))
+
+
+def _checked(taken: Taken, query: Query) -> Taken:
+    """What is known of a query, if it is enough for the filter."""
+    if query.filter is not None and query.filter.not_within_s is not None:
+        missing = [name for name in ("session", "captured_at") if getattr(taken, name) is None]
+        if missing:
+            raise InvalidRequest(
+                f"The filter has `not_within_s`, and the query frame has no "
+                f"{' and no '.join(missing)}: there is nothing to keep away from. Send the frame "
+                "with both in its meta, or leave `not_within_s` out.",
+                tuple((name, "needed by filter.not_within_s") for name in missing),
+            )
+    return taken
 
 
 def _since(start: float) -> float:

@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from sqlalchemy import Connection
 
 from sceneprint.engine.frames import columns, content_id, read_upload
-from sceneprint.errors import FrameConflict
+from sceneprint.engine.healing import take_upload, without_loss
+from sceneprint.errors import FrameConflict, UnusableStore
 from sceneprint.schemas import Added, FrameMeta, FrameState
 from sceneprint.store import Store
 from sceneprint.store.events import tell
 from sceneprint.store.frames import add_frame, find_content, refers_to, renew_frame
 from sceneprint.store.maps import find_map
+from sceneprint.store.novelty import loosen
 from sceneprint.store.queue import enqueue, jobs_of
 from sceneprint.store.records import MapRow
 
+log = logging.getLogger(__name__)
+
 #: What to call a column when it differs.
 _FIELDS = {"pose_parent": "pose.parent_frame"}
+_BEING_SIGNED = (FrameState.RECEIVED, FrameState.SIGNING)
+#: It broke down every time, or was near to a frame that may be gone since.
+_TRIED_AGAIN = (FrameState.FAILED, FrameState.REDUNDANT)
 
 
-def upload(store: Store, map_name: str, data: bytes, meta: FrameMeta) -> tuple[Added, bool]:
+def upload(
+    store: Store, map_name: str, data: bytes, meta: FrameMeta, priority: int = 0,
+    if_novel: float | None = None,
+) -> tuple[Added, bool]:  # fmt: skip
     """Take a frame into a map; it is safe when this returns, and signed soon after.
 
-    The same content with the same metadata is the frame that is there; one that failed is tried
-    again.
+    The same content with the same metadata is the frame that is there; one that failed, or that
+    was not kept as the map had its place, is tried again, and one whose upload was lost or damaged
+    on disk has it again.
 
     Parameters
     ----------
@@ -32,6 +46,10 @@ def upload(store: Store, map_name: str, data: bytes, meta: FrameMeta) -> tuple[A
     map_name : of the map
     data : a PNG or NPY file
     meta : what is known of it
+    priority : frames of a greater one are signed first; of one that is there it changes nothing
+    if_novel : keep it only if the nearest frame of the map is farther, as a share of the distance
+        of unrelated frames; None to keep it anyway. Of one that is not signed yet, the weaker
+        condition counts
 
     Returns
     -------
@@ -51,28 +69,54 @@ def upload(store: Store, map_name: str, data: bytes, meta: FrameMeta) -> tuple[A
     content, known = content_id(frame), columns(meta, frame)
     with store.database.read() as connection:
         there = _there(connection, find_map(connection, map_name), content, known)
-    if there is not None and there.state != FrameState.FAILED:
-        return there, False
+    if there is not None and there.state in _BEING_SIGNED:
+        with store.database.write() as connection:
+            there = _there(connection, find_map(connection, map_name), content, known)
+            if there is not None:
+                loosen(connection, there.frame_id, if_novel)
+    if there is not None and there.state not in _TRIED_AGAIN:
+        return _healed(store, map_name, there, data), False
+    store.database.require_writable()  # before a blob to which nothing could refer
     while True:
         blob = store.blobs.put(data)
-        with store.database.write() as connection:
+        with _unless_refused(store, blob), store.database.write() as connection:
             row = find_map(connection, map_name)
             there = _there(connection, row, content, known)  # another upload may have been first
-            if there is not None and there.state != FrameState.FAILED:
+            if there is not None and there.state not in _TRIED_AGAIN:
+                loosen(connection, there.frame_id, if_novel)
                 break
             if store.blobs.holds(blob):  # a deletion may have removed it
-                of_blob = {"blob": blob, "bytes": len(data)}
+                of_blob = {"blob": blob, "bytes": len(data), "novelty": if_novel}
                 if there is None:
                     values = {"content_id": content, **of_blob, **known}
                     frame_row = add_frame(connection, row.number, values)
-                else:  # it broke down every time, and somebody asks for another
+                else:  # it was given up, and somebody asks for another try
                     frame_row = renew_frame(connection, there.frame_id, of_blob)
-                job = enqueue(connection, "sign", frame_row.number)
+                job = enqueue(connection, "sign", frame_row.number, priority)
                 tell(connection, "frame.received", row.name, frame_row.id, job.id)
                 state = frame_row.state
                 return Added(frame_id=frame_row.id, job_id=job.id, state=state, reason=None), True
     sweep(store, [blob])
     return there, False
+
+
+def _healed(store: Store, map_name: str, there: Added, data: bytes) -> Added:
+    """The frame that is there; what came now takes the place of an upload that was lost."""
+    left = take_upload(store, map_name, there.frame_id, data)
+    if left:
+        sweep(store, left)
+    return there.model_copy(update={"reason": without_loss(there.reason)})
+
+
+@contextmanager
+def _unless_refused(store: Store, blob: str) -> Iterator[None]:
+    """Leave no blob on a full disk that nothing refers to."""
+    try:
+        yield
+    except UnusableStore:
+        with suppress(UnusableStore):
+            sweep(store, [blob])
+        raise
 
 
 def _there(
@@ -97,9 +141,13 @@ def _there(
 def sweep(store: Store, blobs: list[str]) -> None:
     """Remove blobs that nothing refers to any more.
 
-    In a writing transaction, so that no upload comes to refer to one in between.
+    In a writing transaction, so that no upload comes to refer to one in between. While a snapshot
+    is being taken they stay, as it may refer to them: `sceneprint fsck` removes them later.
     """
-    with store.database.write() as connection:
+    with store.database.write() as connection, store.blobs.removing() as allowed:
+        if not allowed:
+            log.info("blobs left for fsck", extra={"blobs": len(blobs)})
+            return
         for blob in blobs:
             if not refers_to(connection, blob):
                 store.blobs.remove(blob)

@@ -3,46 +3,43 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
-import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import suppress
 
 from sceneprint.artifacts import write_geometry
+from sceneprint.engine.endings import (
+    Outdated,
+    Work,
+    about,
+    begin_anew,
+    break_down,
+    leave,
+    reject,
+    tell_of,
+)
 from sceneprint.engine.frames import read_stored
+from sceneprint.engine.leases import renewed
+from sceneprint.engine.novelty import Stale, judge, look
+from sceneprint.engine.readers import Readers
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.uploads import sweep
-from sceneprint.errors import DamagedBlob, FrameError, LostLease, SceneprintError
+from sceneprint.errors import DamagedBlob, FrameError, LostLease, SceneprintError, UnusableStore
 from sceneprint.pipeline import prepare
 from sceneprint.schemas import FrameState, JobState
 from sceneprint.store import Store, queue
 from sceneprint.store.events import tell
 from sceneprint.store.frames import frame_of, set_state
 from sceneprint.store.maps import map_of
-from sceneprint.store.records import FrameRow, MapRow
-from sceneprint.store.signatures import StoredSignature, index_frame
+from sceneprint.store.reencoding import REENCODE, enqueue_all, models_of
+from sceneprint.store.signatures import (
+    StoredSignature,
+    geometry_blobs,
+    index_frame,
+    replace_signature,
+)
 
 log = logging.getLogger(__name__)
-
-#: Seconds after which a lease is renewed no more: nothing that ends takes so long.
-LONGEST_S = 600.0
-
-
-@dataclass(frozen=True, eq=False)
-class Work:
-    """A job in hand.
-
-    Parameters
-    ----------
-    claim : on the job
-    frame, map : that it is about
-    """
-
-    claim: queue.Claim
-    frame: FrameRow
-    map: MapRow
 
 
 def claim(store: Store, worker: str, lease_s: float) -> Work | None:
@@ -59,6 +56,8 @@ def claim(store: Store, worker: str, lease_s: float) -> Work | None:
             return None
     with store.database.write() as connection:
         for job in queue.bury(connection):
+            if job.kind == REENCODE:
+                continue
             frame = frame_of(connection, job.frame_number)
             set_state(connection, frame.number, FrameState.FAILED, job.error)
             name = map_of(connection, frame.map_number).name
@@ -67,58 +66,70 @@ def claim(store: Store, worker: str, lease_s: float) -> Work | None:
         if held is None:
             return None
         frame = frame_of(connection, held.job.frame_number)
-        set_state(connection, frame.number, FrameState.SIGNING)
+        if held.job.kind != REENCODE:
+            set_state(connection, frame.number, FrameState.SIGNING)
         return Work(held, frame, map_of(connection, frame.map_number))
 
 
-def run(store: Store, signers: Signers, work: Work, lease_s: float) -> JobState | None:
+def run(
+    store: Store, signers: Signers, readers: Readers, work: Work, lease_s: float, longest_s: float,
+    broke: Callable[[], None] | None = None,
+) -> JobState | None:  # fmt: skip
     """Sign a claimed frame.
 
     Parameters
     ----------
-    store, signers : see there
+    store, signers, readers : see there
     work : of `claim`
     lease_s : seconds for which each renewal holds
+    longest_s : seconds after which it is renewed no more: what takes so long does not end
+    broke : told of an error that nobody raised on purpose, when what came of it is stored:
+        whatever this process holds may be unsound from now on
 
     Returns
     -------
-    state : of the job; queued where it broke down and will be tried again; None where the lease
-        was lost, and with it the work
+    state : of the job; queued where it broke down, or the map's model changed, and it will be
+        tried again; None where the lease was lost, and with it the work
     """
     start = time.perf_counter()
     state: JobState | None
     made: StoredSignature | None = None
+    gone: list[str] = []
     try:
-        with _renewed(store, work.claim, lease_s):
+        with renewed(store, work.claim, lease_s, longest_s):
             made = _sign(store, signers, work)
-        _store(store, work, made)
+            gone = _store(store, signers, readers, work, made)
         state = JobState.SUCCEEDED
     except LostLease as error:
-        log.warning("lease lost", extra=_about(work, error=str(error)))
+        log.warning("lease lost", extra=about(work, error=str(error)))
         state = None
+    except Outdated:
+        state = begin_anew(store, work)
     except FrameError as error:
-        state = _reject(store, work, error)
+        state = reject(store, work, error)
+    except UnusableStore:  # a full disk is no fault of the frame's, and costs it no try
+        leave(store, work, made)
+        raise
     except Exception as error:
-        state = _break(store, work, error)
+        state = break_down(store, work, error)
+        if broke is not None and not isinstance(error, SceneprintError):
+            broke()
     if made is not None and state != JobState.SUCCEEDED:
-        sweep(store, [made.geometry])  # nothing came to refer to it
+        gone = [made.geometry]  # nothing came to refer to it
+    if gone:
+        sweep(store, gone)
     if state is None:
         return None
     milliseconds = round(1e3 * (time.perf_counter() - start), 1)
-    log.info("job %s", state, extra=_about(work, state=state, milliseconds=milliseconds))
+    log.info("job %s", state, extra=about(work, state=state, milliseconds=milliseconds))
     return state
 
 
-def put_back(store: Store, work: Work) -> None:
-    """Queue again what was claimed and not begun, as when a worker is told to stop."""
-    with suppress(LostLease), store.database.write() as connection:
-        queue.give_back(connection, work.claim)
-        set_state(connection, work.frame.number, FrameState.RECEIVED)
-
-
 def _sign(store: Store, signers: Signers, work: Work) -> StoredSignature:
+    if work.model_id not in models_of(work.map):
+        raise Outdated
     frame = read_stored(store.blobs.get(work.frame.blob), work.frame)
-    signature, geometry = prepare(frame, signers(work.map.model_id))
+    signature, geometry = prepare(frame, signers(work.model_id))
     return StoredSignature(
         model_id=signature.model_id,
         vector=signature.vector.tobytes(),
@@ -128,78 +139,60 @@ def _sign(store: Store, signers: Signers, work: Work) -> StoredSignature:
     )
 
 
-def _store(store: Store, work: Work, made: StoredSignature) -> None:
-    """Signature, artifact, state and end of the job in one commit."""
+def _store(
+    store: Store, signers: Signers, readers: Readers, work: Work, made: StoredSignature
+) -> list[str]:
+    """Signature, artifact, state and end of the job in one commit.
+
+    Returns
+    -------
+    blobs : that a frame refers to no more which was not to be kept: its map has the place
+    """
+    if work.again:
+        return _store_again(store, work, made)
+    while True:
+        seen = None
+        if work.frame.novelty is not None:
+            seen = look(store.database, readers, work.map, made)
+        with suppress(Stale), store.database.write() as connection:
+            queue.finish(connection, work.claim, JobState.SUCCEEDED)
+            row = map_of(connection, work.frame.map_number)
+            if row.model_id != made.model_id:
+                raise Outdated
+            reason = None
+            if seen is not None:
+                reason = judge(connection, work.frame, made, seen, signers(made.model_id).model)
+            if reason is not None:
+                set_state(connection, work.frame.number, FrameState.REDUNDANT, reason)
+                tell_of(connection, "frame.redundant", work)
+                return [work.frame.blob, made.geometry]
+            if not store.blobs.holds(made.geometry):  # nothing referred to it until now
+                raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
+            index_frame(connection, work.frame, made)
+            if row.next_model_id is not None:
+                enqueue_all(connection, row, [work.frame.number])
+            tell_of(connection, "frame.indexed", work)
+            return []
+
+
+def _store_again(store: Store, work: Work, made: StoredSignature) -> list[str]:
+    """Signature and artifact of an indexed frame, beside those of another model or in the place
+    of damaged ones, and the end of the job in one commit.
+
+    Returns
+    -------
+    blobs : that the frame refers to no more
+    """
+    number = work.frame.number
     with store.database.write() as connection:
         queue.finish(connection, work.claim, JobState.SUCCEEDED)
-        if not store.blobs.holds(made.geometry):  # nothing referred to it until now
+        row = map_of(connection, work.frame.map_number)
+        indexed = frame_of(connection, number).state == FrameState.INDEXED
+        if not indexed or made.model_id not in models_of(row):
+            raise Outdated
+        if not store.blobs.holds(made.geometry):
             raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
-        index_frame(connection, work.frame, made)
-        tell(connection, "frame.indexed", work.map.name, work.frame.id, work.claim.job.id)
-
-
-def _reject(store: Store, work: Work, error: FrameError) -> JobState | None:
-    """A frame that holds nothing to sign: it would hold nothing the next time either."""
-    reason = str(error).removeprefix(f"{work.frame.id}: ")
-    try:
-        with store.database.write() as connection:
-            queue.finish(connection, work.claim, JobState.FAILED, reason)
-            set_state(connection, work.frame.number, FrameState.REJECTED, reason)
-            tell(connection, "frame.rejected", work.map.name, work.frame.id, work.claim.job.id)
-    except LostLease:
-        return None
-    return JobState.FAILED
-
-
-def _break(store: Store, work: Work, error: Exception) -> JobState | None:
-    reason = (
-        str(error) if isinstance(error, SceneprintError) else f"{type(error).__name__}: {error}"
-    )
-    trace = "".join(traceback.format_exception(error))
-    log.error("job broke down", extra=_about(work, error=reason, traceback=trace))
-    try:
-        with store.database.write() as connection:
-            state = queue.fail(connection, work.claim, reason, trace)
-            dead = state == JobState.DEAD
-            after = FrameState.FAILED if dead else FrameState.RECEIVED
-            set_state(connection, work.frame.number, after, reason if dead else None)
-            if dead:
-                tell(connection, "frame.failed", work.map.name, work.frame.id, work.claim.job.id)
-    except LostLease:
-        return None
-    return state
-
-
-@contextmanager
-def _renewed(store: Store, claim: queue.Claim, lease_s: float) -> Iterator[None]:
-    """Renew a lease from a thread of its own while the work goes on."""
-    done = threading.Event()
-
-    def renew() -> None:
-        until = time.monotonic() + LONGEST_S
-        while not done.wait(lease_s / 3) and time.monotonic() < until:
-            try:
-                with store.database.write() as connection:
-                    queue.renew(connection, claim, lease_s)
-            except LostLease:
-                return  # the end of the work will learn of it
-            except SceneprintError as error:  # the database may be back before the lease is over
-                log.warning("lease not renewed", extra={"error": str(error)})
-
-    thread = threading.Thread(target=renew, name="lease", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
-
-
-def _about(work: Work, **more: object) -> dict[str, object]:
-    return {
-        "job_id": work.claim.job.id,
-        "frame_id": work.frame.id,
-        "map": work.map.name,
-        "attempt": work.claim.job.attempts,
-        **more,
-    }
+        before = geometry_blobs(connection, [number], made.model_id).values()
+        replace_signature(connection, work.frame, made)
+        tell_of(connection, "frame.reencoded", work)
+        return [blob for blob in before if blob != made.geometry]

@@ -12,9 +12,11 @@ import pytest
 from sceneprint.client import Client, meta_of
 from sceneprint.datasets import FrameReference
 from sceneprint.errors import (
+    CannotRetry,
     FrameConflict,
     InvalidIntrinsics,
     InvalidRequest,
+    JobOver,
     MapExists,
     UnknownFrame,
     UnknownJob,
@@ -91,6 +93,63 @@ def test_jobs_are_waited_for(
     assert [one.frame_id for one in client.frames(map_name)] == [one.frame_id for one in added]
     rejected = client.frames(map_name, FrameState.REJECTED)
     assert [one.frame_id for one in rejected] == [added[2].frame_id]
+
+
+def test_jobs_that_are_over(
+    client: Client, map_name: str, references: tuple[FrameReference, ...], bare_wall: Path
+) -> None:
+    client.create_map(map_name, model="compact")
+    good = client.upload(map_name, references[0], wait_s=30, priority=-10)
+    wall = client.upload(map_name, bare_wall, wait_s=30)
+    assert [client.job(one.job_id).priority for one in (good, wall)] == [-10, 0]
+    with pytest.raises(JobOver, match="is succeeded"):
+        client.cancel_job(good.job_id)
+    with pytest.raises(CannotRetry, match="nothing was given up"):
+        client.retry_job(good.job_id)
+    again = client.retry_job(wall.job_id)
+    assert (again.frame_id, again.job_id != wall.job_id) == (wall.frame_id, True)
+    (done,) = client.wait([again.job_id], timeout_s=60)
+    assert done.state is JobState.FAILED
+    assert client.frame(map_name, wall.frame_id).state is FrameState.REJECTED
+    with pytest.raises(CannotRetry, match=f"was followed by {again.job_id}"):
+        client.retry_job(wall.job_id)
+    own = [job.job_id for job in client.jobs() if job.map == map_name]
+    assert own == [again.job_id, wall.job_id, good.job_id]
+    assert [j.job_id for j in client.jobs(JobState.SUCCEEDED) if j.map == map_name] == own[2:]
+    for ask in (client.cancel_job, client.retry_job):
+        for name in ("nobody", "..", ""):
+            with pytest.raises(UnknownJob, match="There is no job"):
+                ask(name)
+    for priority in (-11, 11):
+        with pytest.raises(InvalidRequest, match=f"is {priority}") as told:
+            client.upload(map_name, references[1], priority=priority)
+        assert told.value.fields == (("priority", "out of its range"),)
+
+
+def test_a_job_is_cancelled_before_anybody_waits_for_it(
+    embedded: Client, references: tuple[FrameReference, ...]
+) -> None:
+    embedded.create_map("m", model="compact")
+    first = embedded.upload("m", references[0])
+    assert embedded.cancel_job(first.job_id).state is JobState.CANCELLED
+    late = embedded.upload("m", references[1], priority=5)
+    again = embedded.retry_job(first.job_id)
+    assert embedded.retry_job(first.job_id) == again
+    jobs = embedded.wait([again.job_id, late.job_id], timeout_s=60)
+    assert [job.state for job in jobs] == ["succeeded", "succeeded"]
+    assert jobs[0].started_at is not None
+    assert jobs[1].started_at is not None
+    assert jobs[1].started_at < jobs[0].started_at  # of a greater priority
+
+
+def test_many_jobs_come_in_pages(embedded: Client, references: tuple[FrameReference, ...]) -> None:
+    embedded.create_map("m", model="compact")
+    added = [embedded.upload("m", references[0]).job_id]
+    while len(added) < 103:
+        embedded.cancel_job(added[-1])
+        added.append(embedded.retry_job(added[-1]).job_id)
+    assert [job.job_id for job in embedded.jobs()] == added[::-1]
+    assert [job.job_id for job in embedded.jobs(JobState.CANCELLED)] == added[-2::-1]
 
 
 def test_a_wait_ends_when_its_time_is_over(

@@ -44,7 +44,7 @@ def test_the_document_is_whole(document):
             place = place[step]
         assert isinstance(place, dict)
     names = [operation["operationId"] for operation in operations(document).values()]
-    assert len(names) == len(set(names)) == 13
+    assert len(names) == len(set(names)) == 16
     used = {reference.rpartition("/")[2] for reference in found}
     assert set(document["components"]["schemas"]) == used  # nothing that nothing refers to
 
@@ -70,14 +70,17 @@ def test_every_refusal_is_a_problem(document):
         ("post", "/v1/maps/{map_name}/frames", {200, 201, 202, 400, 404, 409, 413, 415, 422}),
         ("get", "/v1/maps/{map_name}/frames", {200, 404, 422}),
         ("post", "/v1/maps/{map_name}/queries", {200, 400, 404, 413, 415, 422}),
+        ("get", "/v1/jobs", {200, 422}),
         ("get", "/v1/jobs/{job_id}", {200, 404}),
+        ("post", "/v1/jobs/{job_id}/cancel", {200, 404, 409}),
+        ("post", "/v1/jobs/{job_id}/retry", {200, 202, 404, 409}),
         ("get", "/healthz", {200}),
         ("get", "/metrics", {200}),
     ],
 )  # fmt: skip
 def test_an_operation_declares_what_it_answers(document, method, path, statuses):
     declared = operations(document)[method, path]["responses"]
-    assert {int(status) for status in declared} == statuses | {401, 403, 421, 500, 503}
+    assert {int(status) for status in declared} == statuses | {401, 403, 421, 500, 503, 507}
 
 
 def test_bodies_that_are_read_by_hand_are_described(document):
@@ -87,9 +90,10 @@ def test_bodies_that_are_read_by_hand_are_described(document):
     upload = operations(document)["post", "/v1/maps/{map_name}/frames"]["requestBody"]
     assert list(upload["content"]) == ["multipart/form-data"]
     form = upload["content"]["multipart/form-data"]["schema"]
-    assert (form["required"], sorted(form["properties"])) == (["frame", "meta"], ["frame", "meta"])
+    assert form["required"] == ["frame", "meta"]
+    assert sorted(form["properties"]) == ["frame", "if_novel", "meta", "priority"]
     query = operations(document)["post", "/v1/maps/{map_name}/queries"]["requestBody"]
-    options = {"k", "stages", "exact", "seed"}
+    options = {"k", "stages", "exact", "filter", "seed"}
     assert sorted(query["content"]) == ["application/json", "multipart/form-data"]
     by_form = query["content"]["multipart/form-data"]["schema"]["properties"]
     by_id = query["content"]["application/json"]["schema"]["properties"]
@@ -99,6 +103,10 @@ def test_bodies_that_are_read_by_hand_are_described(document):
     assert by_form["stages"]["type"] == "string"
     assert {"items", "anyOf"} & set(by_form["stages"]) == set()
     assert [one["type"] for one in by_id["stages"]["anyOf"]] == ["string", "array"]
+    reference = {"$ref": "#/components/schemas/Filter"}
+    assert reference in by_id["filter"]["anyOf"]
+    assert (by_form["filter"]["type"], by_form["filter"]["contentSchema"]) == ("string", reference)
+    assert schemas["Filter"]["additionalProperties"] is False
     made = operations(document)["post", "/v1/maps"]["requestBody"]
     assert (made["required"], list(made["content"])) == (True, ["application/json"])
     schema = made["content"]["application/json"]["schema"]

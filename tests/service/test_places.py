@@ -139,9 +139,10 @@ def test_at_most_twenty_fields_are_listed(inside):
     inside(test)
 
 
-def test_uploads_that_are_still_read_take_places(inside):
+@pytest.mark.parametrize(("kind", "other"), [("frames", "queries"), ("queries", "frames")])
+def test_bodies_that_are_still_read_take_places_among_their_like(inside, kind, other):
     async def test(app: FastAPI) -> None:
-        path = "/v1/maps/a/frames"
+        path = f"/v1/maps/a/{kind}"
         slow = [Asked(app, path, FORM, [HEAD, END]) for _ in range(3)]
         for one in slow:
             one.more.clear()
@@ -150,12 +151,15 @@ def test_uploads_that_are_still_read_take_places(inside):
                 break
             await asyncio.sleep(0.01)
         assert [(one.read, one.status, one.body) for one in slow] == [(2, 0, b"")] * 3
-        for kind in ("frames", "queries"):
-            late = Asked(app, f"/v1/maps/a/{kind}", FORM, [HEAD, END])
-            assert (await late.problem())["type"] == "/problems/busy"
-            assert late.read == 0  # and so nothing is spooled
+        late = Asked(app, path, FORM, [HEAD, END])
+        assert (await late.problem())["type"] == "/problems/busy"
+        assert late.read == 0  # and so nothing is spooled
+        welcome = Asked(app, f"/v1/maps/a/{other}", FORM, [HEAD, END])  # uploads stop no query
+        assert (await welcome.problem())["type"] == "/problems/invalid-request"
         by_id = Asked(app, "/v1/maps/a/queries", JSON, [b'{"frame_id": "a"}'])
-        assert ((await by_id.problem())["status"], by_id.read) == (503, 0)
+        told = await by_id.problem()
+        busy = kind == "queries"
+        assert (told["status"], by_id.read > 0) == (503 if busy else 404, not busy)
         for one in slow:
             one.more.set()
             assert (await one.problem())["detail"].startswith("The form has no field `meta`.")
@@ -166,8 +170,17 @@ def test_uploads_that_are_still_read_take_places(inside):
     inside(test, concurrency=1, waiting=2)
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.ENOENT])
-def test_where_there_is_no_room_to_read_nothing_is_taken(inside, monkeypatch, caplog, number):
+@pytest.mark.parametrize(
+    ("number", "status", "kind"),
+    [
+        (errno.ENOSPC, 507, "store-full"),
+        (errno.EDQUOT, 507, "store-full"),
+        (errno.ENOENT, 503, "unusable-store"),
+    ],
+)
+def test_where_there_is_no_room_to_read_nothing_is_taken(
+    inside, monkeypatch, caplog, number, status, kind
+):
     class Full(SpooledTemporaryFile[bytes]):
         def write(self, data: Any) -> int:
             raise OSError(number, "no room in /the/folder")
@@ -178,7 +191,7 @@ def test_where_there_is_no_room_to_read_nothing_is_taken(inside, monkeypatch, ca
         for _ in range(3):  # each gives its place back
             asked = Asked(app, "/v1/maps/a/frames", FORM, [HEAD, END])
             problem = await asked.problem()
-            assert (problem["status"], problem["type"]) == (503, "/problems/unusable-store")
+            assert (problem["status"], problem["type"]) == (status, f"/problems/{kind}")
             assert "folder" not in problem["detail"]
 
     inside(test, concurrency=1, waiting=0)

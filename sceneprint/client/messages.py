@@ -1,0 +1,67 @@
+"""Requests and answers of the service, as the client writes and reads them."""
+
+from __future__ import annotations
+
+import logging
+import re
+from typing import Any, TypeVar
+
+import httpx
+from pydantic import BaseModel, ValidationError
+
+from sceneprint.client.problems import not_ours
+from sceneprint.errors import SceneprintError, UnknownFrame, UnknownJob, UnknownMap
+from sceneprint.schemas import FrameMeta
+
+Record = TypeVar("Record", bound=BaseModel)
+
+
+class Quiet(logging.Filter):
+    """Keeps a line a request of one service out of the log of whoever uses the client."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__()
+        self._url = url
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """False for what httpx tells of requests to the service."""
+        about = record.args if isinstance(record.args, tuple) else ()
+        return not any(str(one).startswith(self._url) for one in about)
+
+
+def read(kind: type[Record], response: httpx.Response) -> Record:
+    """The record in an answer; Refused where the answer is none of ours."""
+    try:
+        return kind.model_validate_json(response.content)
+    except ValidationError as error:
+        raise not_ours(response) from error
+
+
+def form(data: bytes, meta: FrameMeta) -> dict[str, Any]:
+    """Arguments of a request that sends a frame."""
+    return {
+        "files": {"frame": ("frame", data, "application/octet-stream")},
+        "data": {"meta": meta.model_dump_json(exclude_none=True)},
+    }
+
+
+def map_path(name: str) -> str:
+    """Path of a map; UnknownMap for a name that none can have."""
+    return f"/v1/maps/{_part(name, 'map', UnknownMap)}"
+
+
+def frame_path(map_name: str, frame_id: str) -> str:
+    """Path of a frame; UnknownMap or UnknownFrame as `map_path`."""
+    return f"{map_path(map_name)}/frames/{_part(frame_id, 'frame', UnknownFrame)}"
+
+
+def job_path(job_id: str) -> str:
+    """Path of a job; UnknownJob as `map_path`."""
+    return f"/v1/jobs/{_part(job_id, 'job', UnknownJob)}"
+
+
+def _part(name: str, what: str, error: type[SceneprintError]) -> str:
+    """A name that stays one part of a path: `..` would lead to another resource."""
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+        raise error(f"There is no {what} {name!r:.80}. Check the name.")
+    return name
