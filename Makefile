@@ -8,13 +8,14 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint format bench models lock clean
+.PHONY: help demo test lint format bench soak models lock clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
 	@echo "make test    lint, types, import contracts and all tests"
 	@echo "make lint    lint, types and import contracts only"
 	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
+	@echo "make soak    200 kills, and a crowd of writers and readers; rewrites its part of docs/reliability.md"
 	@echo "make models  train the presets that ship with the package (minutes)"
 	@echo "make lock    resolve the dependencies anew into requirements.txt"
 
@@ -45,6 +46,9 @@ format: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks --page docs/performance.md
+
+soak: $(STAMP)
+	$(BIN)/python -m benchmarks.soak --page docs/reliability.md
 
 models: $(STAMP)
 	$(BIN)/sceneprint train --preset paper --out sceneprint/presets/paper.safetensors

@@ -13,8 +13,10 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks import dpp, registration, scan, search, service
+from benchmarks import dpp, growth, registration, scan, search, service
 from benchmarks.encode import EncodeFigures, measure
+from benchmarks.growth_page import GrowthFigures
+from benchmarks.growth_page import table as growth_table
 from benchmarks.machine import (
     Machine,
     describe_machine,
@@ -31,7 +33,7 @@ from sceneprint.types import Frame
 
 ROOT = Path(__file__).resolve().parent.parent
 #: Frames and bytes of the maps that are searched.
-SEARCHED = ((1_000, 12_800), (10_000, 12_800), (4_000, 125_000))
+SEARCHED = ((1_000, 12_800), (10_000, 12_800), (100_000, 12_800), (10_000, 125_000))
 BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
 
 
@@ -99,11 +101,12 @@ class Rows:
     """All that one run measured; `encode`: figures and peak memory (MB) of each preset."""
 
     encode: dict[str, tuple[EncodeFigures, float]]
-    scan: scan.ScanFigures
+    scan: list[scan.ScanFigures]
     dpp: dpp.DppFigures
     registration: registration.RegistrationFigures
     search: list[search.SearchFigures]
     service: service.ServiceFigures
+    growth: GrowthFigures | None = None
 
 
 def page(machine: Machine, rows: Rows, start: float) -> str:
@@ -118,8 +121,10 @@ def page(machine: Machine, rows: Rows, start: float) -> str:
     ]
     for preset, (figures, peak) in rows.encode.items():
         lines += table(preset, figures, peak)
-    lines += service.table(rows.service) + scan.table(rows.scan) + search.table(rows.search)
+    lines += service.table(rows.service)
+    lines += [line for one in rows.scan for line in scan.table(one)] + search.table(rows.search)
     lines += dpp.table(rows.dpp) + registration.table(rows.registration)
+    lines += growth_table(rows.growth) if rows.growth is not None else []
     return "\n".join([*lines, f"`import sceneprint`: {start:.2f} s.", END])
 
 
@@ -134,11 +139,12 @@ def measure_all(n_frames: int, n_pairs: int) -> Rows:
     signers = {preset: open_signer(preset) for preset in PRESETS}
     return Rows(
         encode={p: (measure(frames, s), peak_memory(frames, p)) for p, s in signers.items()},
-        scan=scan.measure(),
+        scan=[scan.measure(*size) for size in scan.SCANNED],
         dpp=dpp.measure(),
         registration=registration.measure(pairs, signers["paper"].model),
         search=[search.measure(*size) for size in SEARCHED],
         service=served,
+        growth=growth.measure_small(),
     )
 
 
@@ -160,11 +166,12 @@ def main() -> int:
         "machine": asdict(machine),
         "import_seconds": start,
         "encode": {p: asdict(f) | {"peak_megabytes": m} for p, (f, m) in rows.encode.items()},
-        "scan": asdict(rows.scan),
+        "scan": [asdict(one) for one in rows.scan],
         "dpp": asdict(rows.dpp),
         "registration": asdict(rows.registration),
         "search": [asdict(one) for one in rows.search],
         "service": asdict(rows.service),
+        "growth": None if rows.growth is None else asdict(rows.growth),
     }
     options.json.write_text(json.dumps(result, indent=1) + "\n")
     if options.page is not None:

@@ -1,21 +1,19 @@
 """Signatures as robots would send them: real recordings, and laps through synthetic rooms.
 
-`python -m benchmarks.trajectories FOLDER` signs them into a folder (resumable); nothing of it
-belongs into the repository.
-
 A lap is a robot's round of one room: the path of `sceneprint.synth.trajectory`, of which every
 STEP-th pose is taken (18 to 48 cm or 6 to 18 degrees a frame, a robot of half a metre a second
 that uploads one or two frames a second). Each lap of a room begins at another phase, drifts
 smoothly about the path, and has sensor noise of its own. Laps 0 to 3 are the map; of a fifth lap,
 which is in no map, every fifth frame is a query. No model was trained on these rooms.
+
+Of a real recording, at 30 frames a second, stretches are held out whole and their middles asked:
+else the nearest frames of each would be those just before it and just after.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 
@@ -25,27 +23,44 @@ from tqdm import tqdm
 
 from sceneprint.datasets import find_sequences
 from sceneprint.errors import UselessFrame
+from sceneprint.models import PRESETS
 from sceneprint.pipeline import Signer, open_signer, sign
-from sceneprint.synth import KINECT, take, trajectory
+from sceneprint.synth import KINECT_V1, Room, take, trajectory
 from sceneprint.synth.synthesis import room_and_rng
-from sceneprint.types import Bytes, Floats, Frame
+from sceneprint.types import Bytes, Floats, Frame, Intrinsics
 from sceneprint.writing import write_whole
 
 #: Collection of the rooms; models are trained on collection 0.
 SEED = 7000
 #: Rooms; laps of each that are its map; frames of a lap; poses of a path from one to the next.
-ROOMS, LAPS, FRAMES, STEP = 45, 4, 50, 6
-#: One in so many frames of the lap that is asked, and of a real recording, is a query.
+ROOMS, LAPS, FRAMES, STEP = 46, 4, 50, 6
+#: One in so many frames of the lap that is asked is a query.
 ASKED = 5
+#: Of so many frames of a recording, those before the second number are the map's, and those from
+#: the third to the fourth are asked.
+STRETCH = (150, 90, 105, 135)
 #: Frames of a room that are taken a second time, from the same pose, to measure sensor noise.
 TWINS = 4
 #: Standard deviation of a lap's drift about the path, and poses over which it is smooth.
 DRIFT_M, DRIFT_RAD, DRIFT_POSES = 0.08, 0.06, 40
-#: Rooms that the large preset signs too.
-PAPER_ROOMS = 15
-
-#: What a frame is for.
-MAP, QUERY, TWIN = 0, 1, 2
+#: The camera of 7-Scenes at half its pixels each way, and its sensor in these pixels: signing
+#: works on a quarter, so that a frame costs half the time, and two takes of a pose by one and by
+#: the other differ no more than two by one.
+CAMERA = Intrinsics(320, 240, 292.5, 292.5, 159.75, 119.75)
+SENSOR = replace(
+    KINECT_V1,
+    disparity_sigma=KINECT_V1.disparity_sigma / 2,
+    correlation=KINECT_V1.correlation / 2,
+    warp=KINECT_V1.warp / 2,
+    disparity_step=KINECT_V1.disparity_step / 2,
+    edge_jitter=KINECT_V1.edge_jitter / 2,
+    edge_block=2,
+    shadow_margin=KINECT_V1.shadow_margin / 2,
+    shadow_growth=2,
+    patch=KINECT_V1.patch / 2,
+)
+#: What a frame is for; ASIDE is near a query in time, and in no map.
+MAP, QUERY, TWIN, ASIDE = 0, 1, 2, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +70,7 @@ class Signed:
     Parameters
     ----------
     signatures : (n, D) uint8
-    roles : (n,) MAP, QUERY or TWIN
+    roles : (n,) MAP, QUERY, TWIN or ASIDE
     runs : (n,) lap or recording; neighbours of one run are neighbours in time
     origins : (n,) of a twin the row that it was taken again of, else -1
     """
@@ -67,7 +82,8 @@ class Signed:
 
     def of(self, role: int) -> Bytes:
         """(k, D) the signatures of one role."""
-        return self.signatures[self.roles == role]
+        chosen: Bytes = self.signatures[self.roles == role]
+        return chosen
 
 
 def laps(index: int, count: int, frames: int) -> Iterator[tuple[int, int, int, Frame]]:
@@ -98,11 +114,8 @@ def laps(index: int, count: int, frames: int) -> Iterator[tuple[int, int, int, F
         yield TWIN, count + 1, row, _taken(room, poses[row], rng)
 
 
-def _taken(room: object, pose: Floats, rng: np.random.Generator) -> Frame:
-    from sceneprint.synth import Room
-
-    assert isinstance(room, Room)
-    return Frame(take(room, pose, KINECT, rng), KINECT, pose=pose)
+def _taken(room: Room, pose: Floats, rng: np.random.Generator) -> Frame:
+    return Frame(take(room, pose, CAMERA, rng, SENSOR), CAMERA, pose=pose)
 
 
 def _drifted(path: Floats, rng: np.random.Generator) -> Floats:
@@ -127,13 +140,22 @@ def _small(move: Floats) -> Floats:
 
 
 def recorded(root: Path) -> Iterator[tuple[int, int, int, Frame]]:
-    """Frames of the real recordings, as of `laps`; every fifth is a query."""
-    number = 0
-    for run, place in enumerate(("7scenes/redkitchen", "tum/fr1_rpy", "sun3d/studyroom2")):
+    """Frames of the real recordings, as of `laps`."""
+    run = 0
+    for place in ("7scenes/redkitchen", "tum/fr1_rpy", "sun3d/studyroom2"):
         for sequence in find_sequences(root / place):
-            for reference in sequence.frames:
-                yield (QUERY if number % ASKED == 0 else MAP), run, -1, reference.read()
-                number += 1
+            for number, reference in enumerate(sequence.frames):
+                yield role_in_recording(number), run, -1, reference.read()
+            run += 1
+
+
+def role_in_recording(number: int) -> int:
+    """What frame `number` of a recording is for."""
+    length, known, start, end = STRETCH
+    at = number % length
+    if at < known:
+        return MAP
+    return QUERY if start <= at < end else ASIDE
 
 
 def signed(frames: Iterator[tuple[int, int, int, Frame]], signers: list[Signer]) -> list[Signed]:
@@ -182,33 +204,17 @@ def read_signed(path: Path) -> Signed:
 
 
 def make(
-    folder: Path, recordings: Path | None, rooms: int = ROOMS, paper_rooms: int = PAPER_ROOMS
+    folder: Path, recordings: Path, presets: Sequence[str] = tuple(PRESETS), rooms: int = ROOMS
 ) -> None:
-    """Sign all that is not in the folder yet: real recordings, then room after room."""
-    signers = {name: open_signer(name) for name in ("compact", "paper")}
-    places: list[tuple[str, Iterator[tuple[int, int, int, Frame]], list[Signer]]] = []
-    if recordings is not None and recordings.is_dir():
-        places.append(("real", recorded(recordings), list(signers.values())))
-    for index in range(rooms):
-        own = list(signers.values()) if index < paper_rooms else [signers["compact"]]
-        places.append((f"room-{index:03d}", laps(index, LAPS, FRAMES), own))
-    for place, frames, wanted in tqdm(places, unit="place", disable=None):
-        paths = [file_of(folder, signer.model.id, place) for signer in wanted]
-        if not all(path.is_file() for path in paths):
-            for path, made in zip(paths, signed(frames, wanted), strict=True):
-                write_signed(path, made)
-
-
-def main() -> int:
-    """Sign into a folder."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--data", type=Path, help="folder of real recordings")
-    parser.add_argument("--rooms", type=int, default=ROOMS)
-    options = parser.parse_args()
-    make(options.folder, options.data, options.rooms)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    """Sign what is not in the folder yet: the recordings, then room by room."""
+    signers = [open_signer(name) for name in presets]
+    places = {f"room-{i:03d}": laps(i, LAPS, FRAMES) for i in range(rooms)}
+    if recordings.is_dir():
+        places = {"real": recorded(recordings)} | places
+    for place, frames in tqdm(places.items(), unit="place", disable=None):
+        paths = {file_of(folder, signer.model.id, place): signer for signer in signers}
+        missing = {path: signer for path, signer in paths.items() if not path.is_file()}
+        if missing:
+            made = signed(frames, list(missing.values()))
+            for path, one in zip(missing, made, strict=True):
+                write_signed(path, one)

@@ -1,0 +1,109 @@
+"""`make soak` at reduced size, with real processes; and that it would see what is lost or wrong."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.soak import kills
+from benchmarks.soak.__main__ import BEGIN, END, table, write_page
+from benchmarks.soak.answers import State
+from benchmarks.soak.crowd import STABLE, CrowdFigures, K, crowd, faults
+from benchmarks.soak.kills import KillFigures, figures, kill
+from benchmarks.soak.load import shots
+from benchmarks.soak.writers import Plan
+
+
+def test_kills_lose_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kills, "PAUSE_S", (0.2, 1.2))
+    found = kill(tmp_path, shots(60), n_kills=14, seed=2)
+    assert sum(found.kills.values()) == 14
+    assert (found.acknowledged, found.deleted) == (60, 6)
+    assert (found.lost, found.doubled, found.half_written) == (0, 0, 0)
+    assert found.queries == 54 + 9  # one in one for its ranking, one in six validated
+    assert (found.differing, found.wrong) == (0, 0)
+
+
+def test_a_crowd_sees_nothing_wrong(tmp_path: Path) -> None:
+    found = crowd(tmp_path, shots(STABLE + 40), 3, 3, seconds=6, seed=1)
+    assert (found.errors, found.locked, found.wrong) == ([], 0, [])
+    assert min(found.uploads, found.answers) >= 6
+
+
+def state(**changed: Any) -> State:
+    same: dict[str, Any] = {
+        "contents": {"f0": "c0", "f1": "c1"}, "signatures": {"c0": b"0", "c1": b"1"},
+        "doubled": 0, "tries": 1, "answers": {"c0 ranked": [1]},
+    }  # fmt: skip
+    return State(**same | changed)
+
+
+@pytest.mark.parametrize(
+    ("changed", "counted"),
+    [
+        ({}, {}),
+        ({"contents": {"f0": "c0"}}, {"lost": 1}),
+        ({"contents": {"f0": "c0", "f1": "c1", "f2": "c2"}}, {"lost": 1}),  # it was deleted
+        ({"contents": {"f0": "c0", "f1": "c1", "f9": "c9"}}, {"doubled": 1}),  # nobody's
+        ({"doubled": 2}, {"doubled": 2}),
+        ({"signatures": {"c0": b"0", "c1": b"other"}}, {"differing": 1}),
+        ({"signatures": {"c0": b"0"}}, {"differing": 1}),
+        ({"answers": {"c0 ranked": [2]}}, {"wrong": 1}),
+        ({"answers": {}}, {"wrong": 1}),
+    ],
+)
+def test_what_is_lost_is_counted(changed: dict[str, Any], counted: dict[str, int]) -> None:
+    plan = Plan(range(3))
+    plan.acknowledged, plan.deleted = {0: "f0", 1: "f1", 2: "f2"}, {"f2"}
+    found = figures(Counter(service=1), plan, 0, 0, state(**changed), state(), 1.0)
+    names = ("lost", "doubled", "half_written", "differing", "wrong")
+    told = {name: getattr(found, name) for name in names}
+    assert told == dict.fromkeys(names, 0) | counted
+
+
+def note(*matches: tuple[str, int], begun: float = 5.0) -> dict[str, Any]:
+    return {"asked": "s0", "found": [list(one) for one in matches], "begun": begun}
+
+
+@pytest.mark.parametrize(
+    ("answer", "wrong"),
+    [
+        (note(("s1", 4), ("w", 8)), []),
+        (note(("s1", 4), ("stranger", 6), ("w", 8)), []),  # not acknowledged before the end
+        (note(("s1", 4), ("w", 9)), ["w at 9, which is not its distance"]),
+        (note(("w", 8), ("s1", 4)), ["the matches are not in their order, or one is there twice"]),
+        (note(("s1", 4), ("s1", 4)), ["the matches are not in their order, or one is there twice"]),
+        (note(("w", 8)), ["s1 at 4 is missing"]),
+        (note(("s1", 4), ("w", 8), begun=8.0), ["w is found, and was deleted before"]),
+        (note(("s1", 4), ("w", 8), begun=6.5), []),  # it was being deleted
+    ],
+)
+def test_a_wrong_answer_is_seen(answer: dict[str, Any], wrong: list[str]) -> None:
+    vectors = np.array([[0, 0], [4, 0], [4, 4]], np.uint8)
+    numbers, stable = {"s0": 0, "s1": 1, "w": 2}, {"s0": 0, "s1": 1}
+    assert faults(answer, numbers, {"w": (6.0, 7.0)}, stable, vectors) == wrong
+
+
+def test_a_frame_beyond_the_last_match_is_not_missed() -> None:
+    vectors = np.array([0, 40, *range(1, K + 1)], np.uint8)[:, None]
+    numbers = {f"w{i}": i + 1 for i in range(1, K + 1)}
+    answer = note(*[(f"w{i}", i) for i in range(1, K + 1)])
+    assert faults(answer, numbers, {}, {"s0": 0, "s1": 1}, vectors) == []
+
+
+def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    of_kills = KillFigures({"service": 3, "a writer": 1}, 9, 1, 0, 0, 0, 2, 0, 40, 0, 5, 3, 60.0)
+    lines = table(of_kills, CrowdFigures(8, 8, 120, 5, 6, 7))
+    write_page(page, lines)
+    text = page.read_text()
+    assert text.startswith(f"before\n{BEGIN}\n### 4 kills within 60 s\n")
+    assert text.endswith(f"{END}\nafter\n")
+    assert "SIGKILL of 1 of a writer, 3 of service, under load." in text
+    assert "| uploads acknowledged, of them deleted again | 9, 1 |" in text
+    assert "old" not in text
