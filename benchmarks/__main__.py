@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks import dpp, growth, registration, scan, search, service
+from benchmarks import dpp, growth, readiness, registration, scan, search, service
 from benchmarks.encode import EncodeFigures, measure
 from benchmarks.growth_page import GrowthFigures
 from benchmarks.growth_page import table as growth_table
@@ -106,6 +106,7 @@ class Rows:
     registration: registration.RegistrationFigures
     search: list[search.SearchFigures]
     service: service.ServiceFigures
+    readiness: readiness.ReadinessFigures | None = None
     growth: GrowthFigures | None = None
 
 
@@ -122,6 +123,7 @@ def page(machine: Machine, rows: Rows, start: float) -> str:
     for preset, (figures, peak) in rows.encode.items():
         lines += table(preset, figures, peak)
     lines += service.table(rows.service)
+    lines += readiness.table(rows.readiness) if rows.readiness is not None else []
     lines += [line for one in rows.scan for line in scan.table(one)] + search.table(rows.search)
     lines += dpp.table(rows.dpp) + registration.table(rows.registration)
     lines += growth_table(rows.growth) if rows.growth is not None else []
@@ -135,6 +137,7 @@ def measure_all(n_frames: int, n_pairs: int) -> Rows:
     recording = recordings() / "7scenes" / "redkitchen"
     with service.frames_of(recording if recording.is_dir() else None) as served_frames:
         served = service.measure(served_frames)
+        started = readiness.measure(served_frames[0], list(served_frames[1:201]))
     pin_to_one_processor()  # the service above has all processors, as it would
     signers = {preset: open_signer(preset) for preset in PRESETS}
     return Rows(
@@ -144,6 +147,7 @@ def measure_all(n_frames: int, n_pairs: int) -> Rows:
         registration=registration.measure(pairs, signers["paper"].model),
         search=[search.measure(*size) for size in SEARCHED],
         service=served,
+        readiness=started,
         growth=growth.measure_small(),
     )
 
@@ -171,6 +175,7 @@ def main() -> int:
         "registration": asdict(rows.registration),
         "search": [asdict(one) for one in rows.search],
         "service": asdict(rows.service),
+        "readiness": None if rows.readiness is None else asdict(rows.readiness),
         "growth": None if rows.growth is None else asdict(rows.growth),
     }
     options.json.write_text(json.dumps(result, indent=1) + "\n")

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import dpp, registration, scan, search, service
+from benchmarks import dpp, readiness, registration, scan, search, service
 from benchmarks.__main__ import BEGIN, END, Rows, page
 from benchmarks.encode import Clock, EncodeFigures, open3d, points_of
 from benchmarks.machine import Machine
@@ -259,3 +259,14 @@ def test_a_search_from_a_shortlist_is_compared_with_the_scan_of_all() -> None:
     assert (found.frames, found.signature_bytes, found.shortlist) == (300, 512, 50)
     assert min(found.publish, found.exact, found.search, found.code, found.nearest) > 0
     assert 0 < found.spread[0] <= found.ratio <= found.spread[1]
+
+
+def test_a_start_is_measured_with_and_without_the_index(tmp_path: Path) -> None:
+    with service.frames_of(tmp_path / "building", 40) as frames:
+        found = readiness.measure(frames[0], list(frames[1:40]), 60, "compact")
+    assert (found.frames, found.signature_bytes, found.bare_exact) == (60, 12_800, True)
+    assert 0 < found.ready < found.first
+    assert found.bare > 0
+    assert set(found.signed) == {1, 2}
+    assert min(found.signed.values()) > 0
+    assert f"**{found.signed[2] / found.signed[1]:.2f}** times" in readiness.table(found)[-2]

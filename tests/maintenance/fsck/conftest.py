@@ -1,0 +1,166 @@
+"""What the tests of fsck share: a data folder with something of every kind, and damage to it."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import zlib
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.datasets import write_depth_png
+from sceneprint.engine import Engine
+from sceneprint.maintenance.fsck import Outcome, fsck
+from sceneprint.models import Model, open_table, write_model
+from sceneprint.schemas import CameraIntrinsics, FrameMeta, GivenPose, JobState, Query
+from sceneprint.settings import Settings
+from sceneprint.store.maps import add_map, keep_model
+from sceneprint.types import Frame
+
+#: Frames of `hall`, all signed; the first index holds half of them, the second all.
+HALL = 12
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A frame as a robot sends it."""
+
+    data: bytes
+    meta: FrameMeta
+
+
+class House:
+    """A data folder and a cache folder in one place, and what happens to them."""
+
+    def __init__(self, place: Path) -> None:
+        self.place, self.data = place, place / "data"
+        self.settings = Settings(
+            data_dir=self.data, cache_dir=place / "cache", database_url=None, index_dir=None,
+            tail_frames=HALL // 2 - 1,
+        )  # fmt: skip
+
+    def look(self, **how: Any) -> list[Outcome]:
+        return list(fsck(self.settings, **how))
+
+    def files(self) -> dict[str, int | None]:
+        """Checksum of every file, and every folder."""
+        return {
+            str(path.relative_to(self.place)): (
+                zlib.crc32(path.read_bytes()) if path.is_file() else None
+            )
+            for path in self.place.rglob("*")
+        }
+
+    def sql(self, asked: str, *values: object) -> list[tuple[Any, ...]]:
+        """Ask or change the database, and leave no log behind."""
+        with closing(sqlite3.connect(self.data / "sceneprint.db")) as database:
+            found = database.execute(asked, values).fetchall()
+            database.commit()
+        return found
+
+    def blob(self, digest: str) -> Path:
+        return self.data / "blobs" / digest[:2] / digest
+
+    def work(self) -> list[JobState | None]:
+        """Do all jobs, and publish what is due."""
+        with Engine(self.settings) as engine:
+            states = []
+            while (claimed := engine.claim("w")) is not None:
+                states.append(engine.run(claimed))
+            engine.publish_due()
+        return states
+
+    def answers(self, uploads: list[Upload], without: str = "") -> list[Any]:
+        """What `hall` answers, without what no two answers share, and without a frame."""
+        found = []
+        with Engine(self.settings) as engine:
+            for each in uploads:
+                query = Query(exact=True, k=50, stages=("retrieve",))
+                answer = engine.query_upload("hall", each.data, each.meta, query)
+                found.append(
+                    [(m.frame_id, m.distance) for m in answer.matches if m.frame_id != without]
+                )
+        return found
+
+
+@pytest.fixture(scope="session")
+def uploads(
+    room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory
+) -> list[Upload]:
+    """24 small frames with poses: every fourth sample from each of four corners of six views."""
+    path, found = tmp_path_factory.mktemp("png") / "frame.png", []
+    for number, frame in enumerate(room_frames):
+        k = frame.intrinsics
+        assert frame.pose is not None
+        for place in range(4):
+            y, x = divmod(place, 2)
+            write_depth_png(path, np.ascontiguousarray(frame.depth[y::4, x::4]), 1000.0)
+            camera = CameraIntrinsics(
+                width=160, height=120, fx=k.fx / 4, fy=k.fy / 4,
+                cx=(k.cx - x) / 4, cy=(k.cy - y) / 4,
+            )  # fmt: skip
+            pose = GivenPose(parent_frame=frame.name[:-2], matrix=frame.pose.tolist())
+            tags = ["all", f"view-{number}"]
+            meta = FrameMeta(intrinsics=camera, pose=pose, tags=tags)
+            found.append(Upload(path.read_bytes(), meta))
+    return found
+
+
+@pytest.fixture(scope="session")
+def master(
+    uploads: list[Upload], small_model: Model, tmp_path_factory: pytest.TempPathFactory
+) -> House:
+    """`hall` with two generations of its index; `attic` with a signed frame, a deleted, one that
+    waits. Not to be changed.
+    """
+    house = House(tmp_path_factory.mktemp("master"))
+    open_table(small_model, house.settings.cache_dir)
+    with Engine(house.settings) as engine:
+        with engine.store.database.write() as connection:
+            keep_model(connection, small_model.id, "small", write_model(small_model))
+            for name in ("hall", "attic"):
+                add_map(connection, name, None, small_model.id)
+
+        def add(name: str, some: list[Upload]) -> None:
+            for each in some:
+                engine.add_frame(name, each.data, each.meta)
+
+        for start in (0, HALL // 2):
+            add("hall", uploads[start : start + HALL // 2])
+            while (work := engine.claim("w")) is not None:
+                assert engine.run(work) == JobState.SUCCEEDED
+            assert engine.publish_due() == 1
+        add("attic", uploads[HALL : HALL + 2])
+        while (work := engine.claim("w")) is not None:
+            assert engine.run(work) == JobState.SUCCEEDED
+        engine.delete_frame("attic", engine.list_frames("attic").items[0].frame_id)
+        add("attic", [uploads[HALL + 2]])
+    return house
+
+
+@pytest.fixture(scope="session")
+def copied(master: House) -> Callable[[Path], House]:
+    """A copy of `master` in another place, to be changed."""
+
+    def copy(place: Path) -> House:
+        shutil.copytree(master.place, place)
+        return House(place)
+
+    return copy
+
+
+@pytest.fixture
+def house(copied: Callable[[Path], House], tmp_path: Path) -> House:
+    return copied(tmp_path / "house")
+
+
+@pytest.fixture(scope="session")
+def truth(master: House, copied: Any, uploads: Any, tmp_path_factory: Any) -> list[Any]:
+    """What `hall` answers where nothing is wrong."""
+    return copied(tmp_path_factory.mktemp("truth") / "house").answers(uploads[:HALL])

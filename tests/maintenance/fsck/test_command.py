@@ -1,0 +1,134 @@
+"""`sceneprint fsck` as people use it: what it says, its exit codes, and beside a service."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sceneprint.cli import main
+from sceneprint.cli.served import serving
+from sceneprint.client import Client
+
+
+@pytest.fixture
+def fsck(
+    house: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., str]:
+    """Runs the command in this process and checks its exit code."""
+    monkeypatch.setenv("SCENEPRINT_CACHE_DIR", str(house.settings.cache_dir))
+
+    def run(*options: object, expect: int) -> str:
+        capsys.readouterr()
+        code = main(["fsck", "--data", str(house.data), *map(str, options)])
+        said = capsys.readouterr()
+        assert code == expect, said
+        return said.err if expect == 2 else said.out
+
+    return run
+
+
+def test_it_says_what_it_would_do_and_what_it_did(
+    house: Any, fsck: Callable[..., str], tmp_path: Any
+) -> None:
+    assert fsck(expect=0).splitlines() == [
+        "checked 1 models, 15 frames, 13 signatures, 27 blobs, 27 files, 2 generations, 1 tables",
+        "all is well",
+    ]
+    house.sql("INSERT INTO frame_tags VALUES (1, 'other')")
+    (house.data / "blobs" / "notes.txt").write_text("mine")
+    ((frame,),) = house.sql("SELECT id FROM frames WHERE number = 1")
+    record = tmp_path / "found.json"
+    before = house.files()
+    lines = fsck("--json", record, expect=1).splitlines()
+    assert house.files() == before
+    assert lines[0] == (
+        f"damage    other-tags  frame {frame} of map hall: the tags that are searched are not "
+        "those of the frame; would: write them anew from the frame"
+    )
+    assert lines[1].startswith("note      foreign-file  ")
+    assert lines[-1] == (
+        "1 damaged, 0 left over; nothing was changed: `sceneprint fsck --repair` can mend 1"
+    )
+    told = json.loads(record.read_text())
+    assert told["checked"]["frames"] == 15
+    assert [(one["kind"], one["frame_id"], one["done"]) for one in told["findings"]] == [
+        ("other-tags", frame, None),
+        ("foreign-file", None, None),
+    ]
+    lines = fsck("--repair", expect=0).splitlines()
+    assert lines[0].endswith("; done: 2 written")
+    assert lines[-1].startswith("1 damaged, 0 left over: 1 repaired, 0 not. Look again")
+    assert fsck("--map", "hall", expect=0).splitlines()[-1] == "all is well"
+
+
+def test_what_cannot_be_checked_or_repaired_has_its_own_code(
+    house: Any, fsck: Callable[..., str]
+) -> None:
+    assert fsck("--map", "cellar", expect=2).startswith("sceneprint fsck: There is no map 'cellar'")
+    house.sql("UPDATE frames SET tags = '[' WHERE number = 3")
+    assert "would: restore a snapshot" in fsck("--repair", expect=1)
+    with pytest.raises(SystemExit):
+        fsck("--repair", "--quick", expect=2)
+    (house.data / "blobs").rename(house.data / "away")
+    said = fsck("--repair", expect=2)
+    assert "there is no such folder" in said
+    assert said.count("\n") == 1
+
+
+def variant(upload: Any, n: int) -> bytes:
+    """The upload, n millimetres farther away: another content, and another blob."""
+    out, samples = io.BytesIO(), np.array(Image.open(io.BytesIO(upload.data)))
+    Image.fromarray(np.where(samples > 0, samples + n, 0).astype(np.uint16)).save(out, "PNG")
+    return out.getvalue()
+
+
+def test_beside_a_service_nothing_is_lost(house: Any, uploads: Any) -> None:
+    """Robots upload and delete while fsck repairs without grace: worse than an operator does."""
+    record = house.place / "found.json"
+    command = [
+        sys.executable, "-m", "sceneprint", "fsck", "--repair", "--grace", "0",
+        "--data", str(house.data), "--json", str(record),
+    ]  # fmt: skip
+    ended, found = [], []
+
+    def check() -> None:
+        while len(ended) < 2:
+            done = subprocess.run(command, capture_output=True, text=True)
+            ended.append((done.returncode, done.stderr))
+            found.extend(json.loads(record.read_text())["findings"])
+
+    kept, deleted = {}, 0
+    with serving(house.data, 1) as url, Client(url) as client:
+        client.create_map("busy", model="compact")
+        thread = threading.Thread(target=check)
+        thread.start()
+        n = 0
+        while thread.is_alive():
+            n += 1
+            for i, each in enumerate(uploads):
+                data = variant(each, n)
+                added, _ = client.add("busy", data, each.meta)
+                kept[added.frame_id] = (added.job_id, data)
+                if n > 1 or i % 3 == 2:  # enough to sign, and still enough to do
+                    client.delete_frame("busy", added.frame_id)
+                    del kept[added.frame_id]
+                    deleted += 1
+        thread.join()
+        assert ended == [(0, "")] * 2
+        # what may be found is a blob before its commit, or after its frame was deleted
+        assert {one["kind"] for one in found} <= {"unreferenced-blob"}
+        client.wait([job for job, _ in kept.values()], timeout_s=300)
+        assert client.map("busy").frames == {"deleted": deleted, "indexed": len(kept)}
+    for frame, (_, data) in kept.items():
+        ((blob,),) = house.sql("SELECT blob FROM frames WHERE id = ?", frame)
+        assert house.blob(blob).read_bytes() == data
+    assert house.look() == []

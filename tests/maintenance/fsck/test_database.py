@@ -1,0 +1,178 @@
+"""The database itself: a flipped byte of it, and folders that are not there."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.errors import NewerSchema, UnknownMap, UnusableStore
+from sceneprint.maintenance.fsck import FATAL
+from sceneprint.schemas import NewMap
+
+FLIPS = 30
+#: Rows of which every byte that matters is checked.
+CHECKED = ('INSERT INTO "signatures"', 'INSERT INTO "frame_tags"')
+
+
+def dump(path: Path) -> set[str]:
+    """What is in a database."""
+    with closing(sqlite3.connect(path)) as database:
+        return set(database.iterdump())
+
+
+def test_a_flipped_byte_anywhere_in_it_breaks_no_check(house: Any) -> None:
+    """It is found, or harmless; and where it is found, a repair leaves every blob where it is."""
+    path = house.data / "sceneprint.db"
+    sound, rng = path.read_bytes(), np.random.default_rng(11)
+    content = dump(path)
+    blobs = {name for name in house.files() if name.startswith("data/blobs")}
+    found = dict.fromkeys(("refused", "fatal", "rows", "nothing"), 0)
+    messages: list[str] = []
+    used = np.flatnonzero(np.frombuffer(sound, np.uint8))
+    for _ in range(FLIPS):
+        data = bytearray(sound)
+        data[rng.choice(used)] ^= 1 << int(rng.integers(8))
+        path.write_bytes(data)
+        try:
+            outcomes = house.look()
+            if any(one.finding.kind in FATAL for one in outcomes):
+                repaired = house.look(repair=True)
+                assert all(one.done is None for one in repaired)
+                found["fatal"] += 1
+            elif outcomes:
+                found["rows"] += 1
+            else:  # nothing that has a checksum, and one word of one row at the most
+                found["nothing"] += 1
+                changed = dump(path) ^ content
+                assert len(changed) in (0, 2)
+                assert not any(line.startswith(CHECKED) for line in changed)
+        except (UnusableStore, NewerSchema) as error:
+            found["refused"] += 1
+            messages.append(str(error))
+        assert {name for name in house.files() if name.startswith("data/blobs")} == blobs
+        for left in house.data.glob("sceneprint.db-*"):
+            left.unlink()
+    assert sum(found.values()) == FLIPS > found["nothing"]  # which bytes they hit is by chance
+    assert [message for message in messages if "\n" in message] == []
+    path.write_bytes(sound)
+    assert house.look() == []
+
+
+def test_an_index_that_contradicts_its_table_keeps_all_hands_off(house: Any) -> None:
+    """Else a frame whose row names another blob would seem to have lost its upload."""
+    ((blob,),) = house.sql("SELECT blob FROM frames WHERE number = 1")
+    path = house.data / "sceneprint.db"
+    data = bytearray(path.read_bytes())
+    places, at = [], data.find(blob.encode())
+    while at >= 0:
+        places.append(at)
+        at = data.find(blob.encode(), at + 1)
+    assert len(places) >= 2  # the table, and the index over its blobs
+    for place in places:
+        changed = bytearray(data)
+        changed[place] = ord("0") if data[place] != ord("0") else ord("1")
+        path.write_bytes(changed)
+        before = house.files()
+        found = house.look(repair=True)
+        assert found[0].finding.kind == "damaged-database"
+        assert all(one.done is None for one in found)
+        now = house.files()
+        assert {k: v for k, v in now.items() if "sceneprint.db" not in k} == {
+            k: v for k, v in before.items() if "sceneprint.db" not in k
+        }
+
+
+def test_a_row_that_refers_to_none_keeps_all_hands_off(house: Any) -> None:
+    house.sql("UPDATE maps SET model_id = 'ff' || SUBSTR(model_id, 3) WHERE name = 'hall'")
+    found = house.look(repair=True)
+    assert found[0].finding.kind == "dangling-row"
+    assert found[0].finding.what == "row 1 of table maps"
+    assert all(one.done is None for one in found)
+    assert house.sql("SELECT COUNT(*) FROM signatures") == [(13,)]
+
+
+def test_a_damaged_model_that_ships_is_put_back(house: Any) -> None:
+    with Engine(house.settings) as engine:
+        engine.create_map(NewMap(name="other", model="compact"))
+    ((sound,),) = house.sql("SELECT content FROM models WHERE name = 'compact'")
+    damaged = bytearray(sound)
+    damaged[-3] ^= 4
+    house.sql("UPDATE models SET content = ? WHERE name = 'compact'", bytes(damaged))
+    (found,) = house.look()
+    assert (found.finding.kind, found.left) == ("damaged-model", True)
+    assert [one.left for one in house.look(repair=True)] == [False]
+    assert house.sql("SELECT content FROM models WHERE name = 'compact'") == [(sound,)]
+    assert house.look() == []
+
+
+def test_a_folder_that_is_not_there_is_not_taken_for_one_that_has_lost_all(house: Any) -> None:
+    """As of a disk that is not mounted."""
+    for name in ("blobs", "sceneprint.db"):
+        away = house.place / "away"
+        (house.data / name).rename(away)
+        before = house.files()
+        for repair in (False, True)[: 2 if name == "blobs" else 1]:
+            with pytest.raises(UnusableStore, match=f"{name}: there is no"):
+                house.look(repair=repair)
+        assert house.files() == before
+        away.rename(house.data / name)
+    assert house.look() == []
+
+
+def test_an_older_and_a_newer_schema_are_told_apart(house: Any) -> None:
+    house.sql("UPDATE alembic_version SET version_num = '9999'")
+    with pytest.raises(NewerSchema, match="has schema 9999"):
+        house.look()
+    house.sql("UPDATE alembic_version SET version_num = '0001'")
+    before = house.files()
+    with pytest.raises(UnusableStore, match="has schema 0001, and this version works with"):
+        house.look()
+    assert house.files() == before
+
+
+def test_a_map_that_is_not_there_and_a_quick_repair_are_refused(house: Any) -> None:
+    with pytest.raises(UnknownMap):
+        house.look(map_name="cellar")
+    with pytest.raises(ValueError, match="quick"):
+        house.look(quick=True, repair=True)
+
+
+def test_a_quick_look_sees_what_is_missing(house: Any) -> None:
+    ((blob, other),) = house.sql(
+        "SELECT a.blob, b.blob FROM frames a, frames b WHERE a.number = 1 AND b.number = 2"
+    )
+    house.blob(blob).unlink()
+    house.blob(other).write_bytes(b"other bytes")
+    next((house.data / "index").glob("hall*/*.segment")).unlink()
+    found = [one.finding.kind for one in house.look(quick=True)]
+    assert found == ["missing-upload", "damaged-index"]
+
+
+def test_a_log_that_was_not_emptied_is_read_and_left(house: Any, tmp_path: Any) -> None:
+    """Of a service that was killed: the last commits are in it."""
+    with Engine(house.settings) as engine:
+        engine.get_map("hall")
+        with engine.store.database.write() as connection:
+            connection.exec_driver_sql("DELETE FROM frame_tags WHERE tag = 'all'")
+        killed = tmp_path / "killed"
+        shutil.copytree(house.place, killed)
+    assert {path.name for path in (killed / "data").glob("sceneprint.db-*")} == {
+        "sceneprint.db-shm",
+        "sceneprint.db-wal",
+    }
+    other = type(house)(killed)
+    before = other.files()
+    assert {one.finding.kind for one in other.look()} == {"other-tags"}
+    assert other.files() == before
+    (killed / "data" / "sceneprint.db-shm").unlink()  # as in a copy
+    assert {one.finding.kind for one in other.look()} == {"other-tags"}
+    now = other.files()
+    assert now.pop("data/sceneprint.db-shm", None)
+    assert now == {k: v for k, v in before.items() if not k.endswith("-shm")}
