@@ -66,7 +66,8 @@ def test_what_is_lost_is_counted(changed: dict[str, Any], counted: dict[str, int
 
 
 def note(*matches: tuple[str, int], begun: float = 5.0) -> dict[str, Any]:
-    return {"asked": "s0", "found": [list(one) for one in matches], "begun": begun}
+    found = [list(one) for one in matches]
+    return {"asked": "s0", "found": found, "begun": begun, "done": begun + 0.5}
 
 
 @pytest.mark.parametrize(
@@ -78,6 +79,8 @@ def note(*matches: tuple[str, int], begun: float = 5.0) -> dict[str, Any]:
         (note(("w", 8), ("s1", 4)), ["the matches are not in their order, or one is there twice"]),
         (note(("s1", 4), ("s1", 4)), ["the matches are not in their order, or one is there twice"]),
         (note(("w", 8)), ["s1 at 4 is missing"]),
+        (note(), ["0 matches, where 0 can have been deleted meanwhile"]),
+        (note(begun=6.8), []),  # one was being deleted
         (note(("s1", 4), ("w", 8), begun=8.0), ["w is found, and was deleted before"]),
         (note(("s1", 4), ("w", 8), begun=6.5), []),  # it was being deleted
     ],

@@ -252,7 +252,13 @@ def faults(
     distances = [distance for _, distance in found]
     if distances != sorted(distances) or len({name for name, _ in found}) != len(found):
         wrong.append("the matches are not in their order, or one is there twice")
-    farthest = distances[-1] if len(found) == K else np.inf
+    # what is deleted while it is asked for is left out, and nothing takes its place
+    meanwhile = sum(
+        begun <= note["done"] and done >= note["begun"] for begun, done in deleted.values()
+    )
+    if len(found) + meanwhile < min(K, len(stable) - 1):
+        wrong.append(f"{len(found)} matches, where {meanwhile} can have been deleted meanwhile")
+    farthest = distances[-1] if distances else -1
     names = {name for name, _ in found}
     for frame_id, number in stable.items():
         near = int(np.abs(query - vectors[number]).sum())

@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine, answers, readers
-from sceneprint.engine import engine as engines
+from sceneprint.engine import Engine, administration, answers, readers
 from sceneprint.errors import UnreadableModel
 from sceneprint.index import search
 from sceneprint.schemas import JobState, NewMap, Query
@@ -128,7 +127,7 @@ def test_a_model_that_cannot_be_read_costs_its_maps_alone(
     fresh = make_engine()
     fresh.warm()
     (error,) = [r for r in caplog.records if r.levelname == "ERROR"]
-    assert (error.name, error.__dict__["model"]) == (engines.__name__, old)
+    assert (error.name, error.__dict__["model"]) == (administration.__name__, old)
     fill(fresh, uploads, work_off, range(1))
     assert fresh.query_upload("hall", uploads[0].data, uploads[0].meta, ALL).counts.map == 1
     with pytest.raises(UnreadableModel):
