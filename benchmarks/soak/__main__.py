@@ -12,7 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from benchmarks.machine import describe_machine
-from benchmarks.soak.crowd import STABLE, CrowdFigures, crowd
+from benchmarks.soak.checking import CrowdFigures
+from benchmarks.soak.crowd import STABLE, crowd
 from benchmarks.soak.kills import KillFigures, kill
 from benchmarks.soak.load import shots
 

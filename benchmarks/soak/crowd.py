@@ -11,52 +11,20 @@ import random
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from benchmarks.soak.checking import CrowdFigures, K, check
 from benchmarks.soak.load import MAP, MODEL, Shot, free_port, service, workers
 from benchmarks.soak.writers import read_shots, write_shots
 from sceneprint.client import Client
 from sceneprint.errors import SceneprintError, UnknownFrame
-from sceneprint.pipeline import open_signer, sign
-from sceneprint.types import Bytes
 
 #: Frames that are there from the beginning to the end: these are asked for.
 STABLE = 40
-#: Matches that are asked for.
-K = 20
 #: Share of a writer's steps in which it deletes a frame of its own.
 DELETING = 0.3
-
-
-@dataclass
-class CrowdFigures:
-    """What came of it.
-
-    Parameters
-    ----------
-    writers, readers : how many
-    seconds : for how long
-    uploads, deletions, answers : acknowledged
-    errors : of any process, none of which should be: with their texts
-    locked : lines of any log with "database is locked"
-    wrong : answers with a distance that is not that of the signatures, in a wrong order, without
-        a frame that had to be in it, or with one that was deleted before; with what is wrong
-    """
-
-    writers: int
-    readers: int
-    seconds: float
-    uploads: int = 0
-    deletions: int = 0
-    answers: int = 0
-    errors: list[str] = field(default_factory=list)
-    locked: int = 0
-    wrong: list[str] = field(default_factory=list)
 
 
 def crowd(
@@ -114,7 +82,7 @@ def crowd(
         if (folder / f"{kind}{i}").exists()
     ]
     logs = [path.read_text() for path in folder.glob("*.log")]
-    _check(figures, shots, stable, [one for own in told for one in own], logs)
+    check(figures, shots, stable, [one for own in told for one in own], logs)
     return figures
 
 
@@ -190,78 +158,3 @@ def _read(place: str, stable: list[str], seconds: float, seed: int, told: str) -
 
 def _note(notes: Any, note: dict[str, Any]) -> None:
     notes.write(json.dumps(note) + "\n")
-
-
-def _check(
-    figures: CrowdFigures, shots: list[Shot], stable: dict[str, int],
-    notes: list[dict[str, Any]], logs: list[str],
-) -> None:  # fmt: skip
-    """Hold every answer against the signatures, and against what was acknowledged when."""
-    figures.errors += [one["error"] for one in notes if "error" in one]
-    figures.errors += [
-        line for log in logs for line in log.splitlines()
-        if '"level": "ERROR"' in line or "Traceback" in line
-    ]  # fmt: skip
-    figures.locked = sum("database is locked" in text for text in (*figures.errors, *logs))
-    numbers, deleted = dict(stable), dict[str, tuple[float, float]]()
-    for one in notes:
-        if one.get("what") == "upload":
-            numbers[one["frame_id"]] = one["number"]
-            figures.uploads += 1
-        elif one.get("what") == "delete":
-            deleted[one["frame_id"]] = (one["begun"], one["done"])
-            figures.deletions += 1
-    vectors = _signed(shots)
-    for one in notes:
-        if one.get("what") == "answer":
-            figures.answers += 1
-            figures.wrong += faults(one, numbers, deleted, stable, vectors)
-
-
-def _signed(shots: list[Shot]) -> Bytes:
-    """Signatures of all shots, by the library alone."""
-    from sceneprint.engine.frames import read_upload
-
-    signer = open_signer(MODEL)
-    return np.stack([sign(read_upload(one.png, one.meta), signer).vector for one in shots])
-
-
-def faults(
-    note: dict[str, Any], numbers: dict[str, int], deleted: dict[str, tuple[float, float]],
-    stable: dict[str, int], vectors: Bytes,
-) -> list[str]:  # fmt: skip
-    """What is wrong with an answer.
-
-    Parameters
-    ----------
-    note : of a reader: the frame that was asked for, (id, distance) of the matches, the time
-    numbers : of the shots, by the ids of their frames
-    deleted : when the deletion of a frame was begun and done
-    stable : numbers of the frames that are there all the time
-    vectors : (n, D) signatures of the shots
-    """
-    query, found = vectors[stable[note["asked"]]].astype(np.int64), note["found"]
-    wrong = []
-    for frame_id, distance in found:
-        if frame_id not in numbers:
-            continue  # its upload was not acknowledged before the end
-        if distance != int(np.abs(query - vectors[numbers[frame_id]]).sum()):
-            wrong.append(f"{frame_id} at {distance}, which is not its distance")
-        if frame_id in deleted and deleted[frame_id][1] < note["begun"]:
-            wrong.append(f"{frame_id} is found, and was deleted before")
-    distances = [distance for _, distance in found]
-    if distances != sorted(distances) or len({name for name, _ in found}) != len(found):
-        wrong.append("the matches are not in their order, or one is there twice")
-    # what is deleted while it is asked for is left out, and nothing takes its place
-    meanwhile = sum(
-        begun <= note["done"] and done >= note["begun"] for begun, done in deleted.values()
-    )
-    if len(found) + meanwhile < min(K, len(stable) - 1):
-        wrong.append(f"{len(found)} matches, where {meanwhile} can have been deleted meanwhile")
-    farthest = distances[-1] if distances else -1
-    names = {name for name, _ in found}
-    for frame_id, number in stable.items():
-        near = int(np.abs(query - vectors[number]).sum())
-        if frame_id != note["asked"] and near < farthest and frame_id not in names:
-            wrong.append(f"{frame_id} at {near} is missing")
-    return wrong

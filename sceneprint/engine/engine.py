@@ -14,7 +14,7 @@ from sceneprint.engine.asking import Asked, ask_stored, ask_upload
 from sceneprint.engine.cursors import row_of
 from sceneprint.engine.endings import Work, put_back
 from sceneprint.engine.readers import View
-from sceneprint.engine.reencoding import check_model, steadily
+from sceneprint.engine.switches import check_model, steadily
 from sceneprint.engine.uploads import sweep, upload
 from sceneprint.engine.wire import tell_frames
 from sceneprint.errors import BusyIndex, UnknownMap
@@ -30,8 +30,8 @@ from sceneprint.schemas import (
     Query,
 )
 from sceneprint.store import frames as stored_frames
+from sceneprint.store import listing, queue
 from sceneprint.store import maps as stored_maps
-from sceneprint.store import queue
 from sceneprint.store.records import MapRow
 
 log = logging.getLogger(__name__)
@@ -188,7 +188,7 @@ class Engine(Administration):
     def counts(self) -> tuple[dict[str, int], dict[str, int]]:
         """How many frames and how many jobs are in each state."""
         with self.store.database.read() as connection:
-            return stored_frames.count_states(connection), queue.count_jobs(connection)
+            return stored_frames.count_states(connection), listing.count_jobs(connection)
 
     def publish_due(self) -> int:
         """Bring maps on to their next models, publish the indexes that have fallen behind, and

@@ -17,8 +17,9 @@ from sceneprint.schemas import FrameState
 from sceneprint.store import Store
 from sceneprint.store.blobs import Condition
 from sceneprint.store.frames import find_frame, frames_of, renew_upload
+from sceneprint.store.listing import last_of
 from sceneprint.store.maps import find_map
-from sceneprint.store.queue import enqueue, last_of
+from sceneprint.store.queue import enqueue
 from sceneprint.store.records import MapRow
 from sceneprint.store.reencoding import REENCODE
 from sceneprint.store.signatures import geometry_blobs

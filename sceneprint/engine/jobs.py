@@ -10,7 +10,7 @@ from sceneprint.engine.cursors import row_of
 from sceneprint.engine.wire import tell_job
 from sceneprint.errors import CannotRetry
 from sceneprint.schemas import FrameState, Job, JobState, Page
-from sceneprint.store import Store, queue
+from sceneprint.store import Store, listing, queue
 from sceneprint.store.deaths import fail_of_dead
 from sceneprint.store.events import tell
 from sceneprint.store.frames import frame_of, set_state
@@ -44,7 +44,7 @@ def list_jobs(store: Store, state: JobState | None, cursor: str | None, limit: i
 def get_job(store: Store, job_id: str) -> Job:
     """A job; UnknownJob where there is none."""
     with store.database.read() as connection:
-        return _told(connection, queue.find_job(connection, job_id))
+        return _told(connection, listing.find_job(connection, job_id))
 
 
 def cancel(store: Store, job_id: str) -> Job:
@@ -58,11 +58,11 @@ def cancel(store: Store, job_id: str) -> Job:
     JobOver : there is nothing left to give up.
     """
     with store.database.write() as connection:
-        job = queue.find_job(connection, job_id)
+        job = listing.find_job(connection, job_id)
         if job.state != JobState.CANCELLED:
             queue.cancel(connection, job)
             _fail_frame(connection, job, CANCELLED)
-        return _told(connection, queue.find_job(connection, job_id))
+        return _told(connection, listing.find_job(connection, job_id))
 
 
 def retry(store: Store, job_id: str) -> tuple[Job, bool]:
@@ -80,10 +80,10 @@ def retry(store: Store, job_id: str) -> tuple[Job, bool]:
         gone.
     """
     with store.database.write() as connection:
-        job = queue.find_job(connection, job_id)
+        job = listing.find_job(connection, job_id)
         frame = frame_of(connection, job.frame_number)
         row = map_of(connection, frame.map_number)
-        latest = queue.last_of(connection, job.kind, frame.number, job.model_id) or job
+        latest = listing.last_of(connection, job.kind, frame.number, job.model_id) or job
         if latest.number != job.number and not latest.state.over:
             return _told(connection, latest), False
         if latest.number != job.number:

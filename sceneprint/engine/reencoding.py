@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,25 +20,21 @@ from sceneprint.engine.upkeep import Upkeep
 from sceneprint.engine.uploads import sweep
 from sceneprint.engine.wire import model_label, tell_map
 from sceneprint.errors import (
-    Busy,
     BusyIndex,
     Conflict,
-    ModelMismatch,
     SceneprintError,
     UnknownMap,
 )
 from sceneprint.index import Generation
 from sceneprint.models import read_model, write_model
-from sceneprint.schemas import Answer, Map
-from sceneprint.store import Store
+from sceneprint.schemas import Map
+from sceneprint.store import Store, stale
 from sceneprint.store import reencoding as stored
 from sceneprint.store.maps import find_map, keep_model, list_maps, model_names
 from sceneprint.store.records import MapRow
 
 log = logging.getLogger(__name__)
 
-#: Times that a query is asked while its map switches from model to model.
-TRIES = 5
 #: Seconds that a worker removes former signatures before it looks for frames to sign again.
 TIDY_S = 2.0
 
@@ -100,61 +95,6 @@ def cancel(store: Store, map_name: str) -> Map:
     _tidy(store, row)
     with store.database.read() as connection:
         return tell_map(connection, find_map(connection, map_name))
-
-
-def steadily(store: Store, map_name: str, ask: Callable[[MapRow], Answer]) -> Answer:
-    """Ask a map, and once more where it switched to another model meanwhile.
-
-    Parameters
-    ----------
-    store : see Store
-    map_name : of the map
-    ask : signs the query with the model of the row, and answers it from a map of that model
-
-    Raises
-    ------
-    UnknownMap : no such map.
-    Busy : the map switched again and again.
-    """
-    with store.database.read() as connection:
-        row = find_map(connection, map_name)
-    for _ in range(TRIES):
-        try:
-            found = ask(row)
-        except SceneprintError:
-            now = _other_model(store, row)
-            if now is None:
-                raise
-        else:
-            # also where all went well: artifacts of the former model may have been missed
-            now = _other_model(store, row)
-            if now is None:
-                return found
-        row = now
-    raise Busy(f"Map {map_name!r} changed its model again and again while it was asked. Ask again.")
-
-
-def check_model(one: str, other: str) -> None:
-    """See that signatures are of one model before they are compared.
-
-    Raises
-    ------
-    ModelMismatch : they are not.
-    """
-    if one != other:
-        raise ModelMismatch(
-            f"Signatures of two models cannot be compared: {one[:12]} and {other[:12]}. Ask again."
-        )
-
-
-def _other_model(store: Store, row: MapRow) -> MapRow | None:
-    """The map where it has another model by now, or None."""
-    try:
-        with store.database.read() as connection:
-            now = find_map(connection, row.name)
-    except UnknownMap:
-        return None
-    return now if now.number == row.number and now.model_id != row.model_id else None
 
 
 class Reencoding:
@@ -242,23 +182,23 @@ def _tidy(store: Store, row: MapRow, at_most_s: float = math.inf) -> bool:
     start = time.monotonic()
     while True:
         with store.database.read() as connection:
-            if not stored.stale_jobs(connection, find_map(connection, row.name)):
+            if not stale.stale_jobs(connection, find_map(connection, row.name)):
                 break
         with store.database.write() as connection:
             now = find_map(connection, row.name)
-            stored.cancel_jobs(connection, stored.stale_jobs(connection, now))
+            stale.cancel_jobs(connection, stale.stale_jobs(connection, now))
     after = 0
     while True:
         with store.database.read() as connection:
-            if not stored.stale_signatures(connection, find_map(connection, row.name), after):
+            if not stale.stale_signatures(connection, find_map(connection, row.name), after):
                 return True
         if time.monotonic() - start > at_most_s:
             return False
         blobs: list[str] = []
         with store.database.write() as connection:
             now = find_map(connection, row.name)
-            for number, model_id in stored.stale_signatures(connection, now, after):
-                blobs += stored.remove_signature(connection, number, model_id)
+            for number, model_id in stale.stale_signatures(connection, now, after):
+                blobs += stale.remove_signature(connection, number, model_id)
                 after = number - 1  # a frame may have several
         sweep(store, blobs)
 

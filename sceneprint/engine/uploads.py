@@ -16,9 +16,10 @@ from sceneprint.schemas import Added, FrameMeta, FrameState
 from sceneprint.store import Store
 from sceneprint.store.events import tell
 from sceneprint.store.frames import add_frame, find_content, refers_to, renew_frame
+from sceneprint.store.listing import jobs_of
 from sceneprint.store.maps import find_map
 from sceneprint.store.novelty import loosen
-from sceneprint.store.queue import enqueue, jobs_of
+from sceneprint.store.queue import enqueue
 from sceneprint.store.records import MapRow
 
 log = logging.getLogger(__name__)

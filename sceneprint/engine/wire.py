@@ -11,8 +11,8 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.transforms import transform
 from sceneprint.schemas import CameraIntrinsics, Frame, Job, Map, Reencoding
+from sceneprint.store.listing import jobs_of
 from sceneprint.store.maps import count_frames, model_names
-from sceneprint.store.queue import jobs_of
 from sceneprint.store.records import FrameRow, JobRow, MapRow
 from sceneprint.store.reencoding import REENCODE, standing
 

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, Connection, and_, func, insert, or_, select, update
 
-from sceneprint.errors import JobOver, LostLease, UnknownJob
+from sceneprint.errors import JobOver, LostLease
 from sceneprint.schemas import JobState
+from sceneprint.store.listing import find_job
 from sceneprint.store.records import JobRow, job_row
 from sceneprint.store.tables import jobs
 
@@ -56,48 +57,6 @@ def enqueue(
         )
     )  # fmt: skip
     return find_job(connection, job_id)
-
-
-def find_job(connection: Connection, job_id: str) -> JobRow:
-    """The job of an id.
-
-    Raises
-    ------
-    UnknownJob : there is none.
-    """
-    row = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().first()
-    if row is None:
-        raise UnknownJob(
-            f"There is no job {job_id!r:.80}. An upload answers with the id of its job, and "
-            "deleting a map deletes its jobs."
-        )
-    return job_row(row)
-
-
-def last_of(
-    connection: Connection, kind: str, frame_number: int, model_id: str | None = None
-) -> JobRow | None:
-    """The latest job of a kind, and for a model, of a frame."""
-    row = connection.execute(
-        select(jobs)
-        .where(
-            jobs.c.frame_number == frame_number, jobs.c.kind == kind,
-            jobs.c.model_id.is_(None) if model_id is None else jobs.c.model_id == model_id,
-        )
-        .order_by(jobs.c.number.desc())
-        .limit(1)
-    ).mappings().first()  # fmt: skip
-    return None if row is None else job_row(row)
-
-
-def jobs_of(connection: Connection, frame_numbers: list[int]) -> dict[int, JobRow]:
-    """The latest job of each frame that is to have it indexed, not those that sign it again."""
-    rows = connection.execute(
-        select(jobs)
-        .where(jobs.c.frame_number.in_(frame_numbers), jobs.c.kind == "sign")
-        .order_by(jobs.c.number)
-    ).mappings()
-    return {row["frame_number"]: job_row(row) for row in rows}
 
 
 def next_due(connection: Connection) -> float | None:
@@ -258,12 +217,6 @@ def cancel_of(connection: Connection, frame_number: int) -> None:
         )
         .values(state=JobState.CANCELLED, finished_at=time.time(), leased_until=None)
     )
-
-
-def count_jobs(connection: Connection) -> dict[str, int]:
-    """How many jobs are in each state that has any."""
-    rows = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state))
-    return {row[0]: row[1] for row in rows}
 
 
 def _due(now: float) -> ColumnElement[bool]:

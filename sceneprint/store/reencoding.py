@@ -10,7 +10,7 @@ import time
 import uuid
 from dataclasses import dataclass
 
-from sqlalchemy import ColumnElement, Connection, and_, delete, exists, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, and_, exists, func, insert, select, update
 
 from sceneprint.schemas import FrameState, JobState
 from sceneprint.store.events import tell
@@ -27,7 +27,8 @@ PRIORITY = -10
 #: Rows that one transaction handles, so that writers wait for tenths of a second at most.
 QUEUED_AT_ONCE, REMOVED_AT_ONCE = 2000, 50
 
-_PENDING = (JobState.QUEUED, JobState.RUNNING)
+#: States of jobs that something may still come of.
+PENDING = (JobState.QUEUED, JobState.RUNNING)
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def standing(connection: Connection, row: MapRow) -> Standing:
 
     every, lacking = count(_indexed(row)), count(lacks)
     failed = over(JobState.FAILED)
-    dead = over(JobState.DEAD, ~_has_job(row, (*_PENDING, JobState.FAILED)))
+    dead = over(JobState.DEAD, ~_has_job(row, (*PENDING, JobState.FAILED)))
     return Standing(every - lacking, lacking - failed - dead, failed, dead)
 
 
@@ -86,7 +87,7 @@ def is_pending(connection: Connection, row: MapRow) -> bool:
     found = connection.execute(
         select(jobs.c.number)
         .join(frames, frames.c.number == jobs.c.frame_number)
-        .where(_for_next(row), jobs.c.state.in_(_PENDING), frames.c.map_number == row.number)
+        .where(_for_next(row), jobs.c.state.in_(PENDING), frames.c.map_number == row.number)
         .limit(1)
     )
     return found.first() is not None
@@ -102,7 +103,7 @@ def unqueued(connection: Connection, row: MapRow, after: int, *, again: bool = F
     after : number of a frame
     again : also those whose jobs broke down in every try
     """
-    had = (*_PENDING, JobState.FAILED, *(() if again else (JobState.DEAD,)))
+    had = (*PENDING, JobState.FAILED, *(() if again else (JobState.DEAD,)))
     found = connection.execute(
         select(frames.c.number)
         .where(_indexed(row), frames.c.number > after, ~_signed(row.next_model_id),
@@ -200,59 +201,6 @@ def switch(connection: Connection, row: MapRow) -> list[str]:
     )
     tell(connection, "map.reencoded", row.name, model=row.next_model_id, before=row.model_id)
     return [one.id for one in rejected.values()]
-
-
-def stale_signatures(connection: Connection, row: MapRow, after: int) -> list[tuple[int, str]]:
-    """The next signatures of a map that are of neither of its models: frame, model.
-
-    Parameters
-    ----------
-    connection : of a transaction
-    row : of the map
-    after : number of a frame
-    """
-    found = connection.execute(
-        select(signatures.c.frame_number, signatures.c.model_id)
-        .join(frames, frames.c.number == signatures.c.frame_number)
-        .where(
-            frames.c.map_number == row.number, frames.c.number > after,
-            signatures.c.model_id.not_in(models_of(row)),
-        )
-        .order_by(frames.c.number)
-        .limit(REMOVED_AT_ONCE)
-    )  # fmt: skip
-    return [(number, model_id) for number, model_id in found]
-
-
-def remove_signature(connection: Connection, number: int, model_id: str) -> list[str]:
-    """Forget what a model made of a frame; returns the blobs that it referred to."""
-    own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
-    blobs = list(connection.execute(select(signatures.c.geometry).where(own)).scalars())
-    connection.execute(delete(signatures).where(own))
-    return blobs
-
-
-def stale_jobs(connection: Connection, row: MapRow) -> list[int]:
-    """Some jobs that wait or run for a model that is neither of a map's."""
-    found = connection.execute(
-        select(jobs.c.number)
-        .join(frames, frames.c.number == jobs.c.frame_number)
-        .where(
-            jobs.c.state.in_(_PENDING), jobs.c.kind == REENCODE,
-            jobs.c.model_id.not_in(models_of(row)), frames.c.map_number == row.number,
-        )
-        .limit(QUEUED_AT_ONCE)
-    )  # fmt: skip
-    return list(found.scalars())
-
-
-def cancel_jobs(connection: Connection, numbers: list[int]) -> None:
-    """Cancel jobs that wait or run."""
-    connection.execute(
-        update(jobs)
-        .where(jobs.c.number.in_(numbers), jobs.c.state.in_(_PENDING))
-        .values(state=JobState.CANCELLED, finished_at=time.time(), leased_until=None)
-    )
 
 
 def models_of(row: MapRow) -> tuple[str, ...]:

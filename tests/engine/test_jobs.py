@@ -13,7 +13,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine import work as working
 from sceneprint.errors import CannotRetry, InvalidRequest, JobOver, UnknownJob
 from sceneprint.schemas import FrameState, JobState
-from sceneprint.store import queue
+from sceneprint.store import listing
 from sceneprint.store.records import JobRow
 from sceneprint.store.tables import jobs
 
@@ -24,7 +24,7 @@ WorkOff = Callable[[Engine], list[JobState | None]]
 
 def row(engine: Engine, job_id: str) -> JobRow:
     with engine.store.database.read() as connection:
-        return queue.find_job(connection, job_id)
+        return listing.find_job(connection, job_id)
 
 
 def claimed(engine: Engine) -> working.Work:

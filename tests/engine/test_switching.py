@@ -354,7 +354,7 @@ while True:
         ("sceneprint.engine.work", "replace_signature", 5, "after", False),
         ("sceneprint.engine.upkeep", "publish", 1, "after", False),
         ("sceneprint.store.reencoding", "switch", 1, "after", False),  # and not committed
-        ("sceneprint.store.reencoding", "remove_signature", 4, "after", True),
+        ("sceneprint.store.stale", "remove_signature", 4, "after", True),
     ],
 )
 def test_whoever_is_killed_on_the_way_leaves_what_another_ends(

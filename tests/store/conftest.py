@@ -13,7 +13,7 @@ import pytest
 from sqlalchemy import update
 
 from sceneprint.schemas import JobState
-from sceneprint.store import Store, open_store, queue
+from sceneprint.store import Store, listing, open_store, queue
 from sceneprint.store.frames import add_frame
 from sceneprint.store.maps import add_map, keep_model
 from sceneprint.store.records import FrameRow, JobRow, MapRow
@@ -141,7 +141,7 @@ class Hand:
 
     def row(self, job: JobRow) -> JobRow:
         with self.database.read() as connection:
-            return queue.find_job(connection, job.id)
+            return listing.find_job(connection, job.id)
 
     def fail(self, held: queue.Claim, error: str = "broke", trace: str = "Trace") -> JobState:
         with self.database.write() as connection:

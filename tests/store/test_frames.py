@@ -11,7 +11,7 @@ from sqlalchemy.exc import IntegrityError
 
 from sceneprint.errors import Conflict, UnknownFrame, UnknownKey, UnknownMap
 from sceneprint.schemas import FrameState
-from sceneprint.store import Store, queue
+from sceneprint.store import Store, listing, queue
 from sceneprint.store import frames as stored
 from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
@@ -189,7 +189,7 @@ def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(
     with store.database.read() as connection:
         assert [row.name for row in stored_maps.list_maps(connection)] == ["other"]
         assert stored.frames_of(connection, [mine.number, theirs.number]).keys() == {theirs.number}
-        assert queue.jobs_of(connection, [mine.number, theirs.number]) == {theirs.number: kept}
+        assert listing.jobs_of(connection, [mine.number, theirs.number]) == {theirs.number: kept}
         assert job.number != kept.number
         assert stored.refers_to(connection, "11" * 32)
         assert signed.stored_vector(connection, mine.number, hall.model_id) is None

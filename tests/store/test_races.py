@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from sceneprint.schemas import JobState
-from sceneprint.store import Store, queue
+from sceneprint.store import Store, listing, queue
 from sceneprint.store.maps import find_map, next_revision
 from sceneprint.store.records import JobRow, MapRow
 
@@ -59,7 +59,7 @@ def test_threads_at_one_queue_get_each_job_once(store: Store, hall: MapRow, queu
     assert raised == []
     assert sorted(done) == wanted
     with store.database.read() as connection:
-        assert queue.count_jobs(connection) == {"succeeded": 60}
+        assert listing.count_jobs(connection) == {"succeeded": 60}
         assert find_map(connection, "hall").revision == 60
 
 
@@ -71,7 +71,7 @@ def test_processes_at_one_queue_get_each_job_once(
     assert all(isinstance(each, list) for each in found), found  # else what was raised
     assert sorted(number for each in found for number in each) == wanted
     with store.database.read() as connection:
-        assert queue.count_jobs(connection) == {"succeeded": 60}
+        assert listing.count_jobs(connection) == {"succeeded": 60}
         assert find_map(connection, "hall").revision == 60
 
 
