@@ -12,7 +12,8 @@ import pytest
 from benchmarks.soak import kills
 from benchmarks.soak.__main__ import BEGIN, END, table, write_page
 from benchmarks.soak.answers import State
-from benchmarks.soak.crowd import STABLE, CrowdFigures, K, crowd, faults
+from benchmarks.soak.checking import CrowdFigures, K, check, faults
+from benchmarks.soak.crowd import STABLE, crowd
 from benchmarks.soak.kills import KillFigures, figures, kill
 from benchmarks.soak.load import shots
 from benchmarks.soak.writers import Plan
@@ -110,3 +111,21 @@ def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
     assert "SIGKILL of 1 of a writer, 3 of service, under load." in text
     assert "| uploads acknowledged, of them deleted again | 9, 1 |" in text
     assert "old" not in text
+
+
+def test_errors_of_any_log_are_seen(tmp_path: Path) -> None:
+    import logging
+
+    from sceneprint.logs import JsonFormatter
+
+    def line(level: int, message: str) -> str:
+        return JsonFormatter().format(logging.LogRecord("x", level, "", 0, message, None, None))
+
+    logs = [
+        "\n".join([line(logging.INFO, "fine"), line(logging.ERROR, "request failed")]),
+        line(logging.WARNING, "other writers of this process have waited for long"),
+    ]
+    found = CrowdFigures(1, 1, 1)
+    check(found, [], {}, [{"error": "the service says no"}], logs)
+    assert [one for one in found.errors if "request failed" in one]
+    assert (len(found.errors), found.locked) == (2, 1)

@@ -95,7 +95,8 @@ def main() -> int:
         write_page(options.page, lines)
     lost = of_kills.lost + of_kills.doubled + of_kills.half_written
     wrong = of_kills.differing + of_kills.wrong + len(of_crowd.wrong) + len(of_crowd.errors)
-    return int(bool(lost + wrong + of_crowd.locked))
+    idle = 0 in (of_crowd.uploads, of_crowd.deletions, of_crowd.answers)  # nothing was tried
+    return int(bool(lost + wrong + of_crowd.locked) or idle)
 
 
 if __name__ == "__main__":

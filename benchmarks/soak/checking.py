@@ -13,6 +13,8 @@ from sceneprint.types import Bytes
 
 #: Matches that are asked for.
 K = 20
+#: How SQLite says that a writer gave up waiting, and how we do.
+LOCKED = ("database is locked", "have waited for long", "has been writing for long")
 
 
 @dataclass
@@ -49,9 +51,9 @@ def check(
     figures.errors += [one["error"] for one in notes if "error" in one]
     figures.errors += [
         line for log in logs for line in log.splitlines()
-        if '"level": "ERROR"' in line or "Traceback" in line
+        if '"level": "error"' in line or '"level": "critical"' in line or "Traceback" in line
     ]  # fmt: skip
-    figures.locked = sum("database is locked" in text for text in (*figures.errors, *logs))
+    figures.locked = sum(text.count(sign) for text in (*figures.errors, *logs) for sign in LOCKED)
     numbers, deleted = dict(stable), dict[str, tuple[float, float]]()
     for one in notes:
         if one.get("what") == "upload":
@@ -60,11 +62,11 @@ def check(
         elif one.get("what") == "delete":
             deleted[one["frame_id"]] = (one["begun"], one["done"])
             figures.deletions += 1
-    vectors = _signed(shots)
-    for one in notes:
-        if one.get("what") == "answer":
-            figures.answers += 1
-            figures.wrong += faults(one, numbers, deleted, stable, vectors)
+    answers = [one for one in notes if one.get("what") == "answer"]
+    figures.answers = len(answers)
+    vectors = _signed(shots) if answers else np.empty((0, 0), np.uint8)
+    for one in answers:
+        figures.wrong += faults(one, numbers, deleted, stable, vectors)
 
 
 def _signed(shots: list[Shot]) -> Bytes:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import sqlalchemy as sa
 from alembic import op
 
@@ -25,6 +27,8 @@ def upgrade() -> None:
     for name in ("pose_x", "pose_y", "pose_z", "novelty"):
         op.add_column("frames", sa.Column(name, sa.Float(), nullable=True))
     op.create_index("ix_frames_searched", "frames", SEARCHED)
+    order: list[Any] = ["state", sa.text("priority DESC"), "attempts", "number"]
+    op.create_index("ix_jobs_claimed", "jobs", order)
     op.create_table(
         "frame_tags",
         sa.Column("frame_number", sa.Integer(), nullable=False),

@@ -84,6 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return int(options.run(options))
     except SceneprintError as error:
         return _refuse(command, str(error))
+    except UnicodeEncodeError as error:  # of an argument: what we print ourselves is escaped
+        return _refuse(command, f"{error.object!a:.80} is not text in UTF-8. Use another name.")
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

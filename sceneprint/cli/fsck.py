@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
         for outcome in fsck(
             settings_of(options), map_name=options.map, repair=options.repair,
             quick=options.quick, progress=progress, counts=counts,
-            grace_s=GRACE_S if options.grace is None else options.grace,
+            grace_s=GRACE_S if options.grace is None else min(options.grace, 10**10),
         ):  # fmt: skip
             outcomes.append(outcome)
             tqdm.write(_line(outcome))

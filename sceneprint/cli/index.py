@@ -8,6 +8,7 @@ import sys
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from sceneprint.cli.existing import require_database
 from sceneprint.cli.numbers import whole
 from sceneprint.cli.serve import add_data_option, settings_of
 
@@ -47,7 +48,9 @@ def run(options: argparse.Namespace) -> int:
     from sceneprint.engine import Engine
 
     do = {"stats": _stats, "verify": _verify, "rebuild": _rebuild}[options.what]
-    with Engine(settings_of(options)) as engine:
+    settings = settings_of(options)
+    require_database(settings)
+    with Engine(settings) as engine:
         for name in options.map:  # all of them are there, before anything is done with one
             engine.get_map(name)
         names = options.map or [one.name for one in engine.list_maps().items]

@@ -67,7 +67,7 @@ def _retry_dead(client: Client, *, as_json: bool) -> int:
     """
     again, refused = 0, 0
     for job in list(client.jobs(JobState.DEAD)):  # all before the first: pages would shift
-        if client.frame(job.map, job.frame_id).job_id != job.job_id:
+        if job.kind == "sign" and client.frame(job.map, job.frame_id).job_id != job.job_id:
             continue
         try:
             retried = client.retry_job(job.job_id)

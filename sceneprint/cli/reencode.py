@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from sceneprint.cli.existing import require_database
 from sceneprint.cli.serve import add_data_option, settings_of
 
 if TYPE_CHECKING:
@@ -47,7 +48,9 @@ def run(options: argparse.Namespace) -> int:
     """Begin, watch or give up; returns 2 where waiting was no use."""
     from sceneprint.engine import Engine
 
-    with Engine(settings_of(options)) as engine:
+    settings = settings_of(options)
+    require_database(settings)
+    with Engine(settings) as engine:
         if options.model is not None:
             told = engine.reencode(options.map, options.model)
         elif options.cancel:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from sceneprint.cli.connection import one_line
+from sceneprint.cli.existing import require_database
 from sceneprint.cli.numbers import positive, whole
 from sceneprint.cli.serve import add_data_option, settings_of
 from sceneprint.writing import check_writable, write_whole
@@ -66,7 +67,9 @@ def run(options: argparse.Namespace) -> int:
 
     if options.json is not None:
         check_writable(options.json)
-    with Engine(settings_of(options)) as engine:
+    settings = settings_of(options)
+    require_database(settings)
+    with Engine(settings) as engine:
         with _Bar("compare") as bar:
             proposal = propose(
                 engine, options.map, keep=options.keep, novelty=options.novelty,
@@ -81,8 +84,9 @@ def run(options: argparse.Namespace) -> int:
             return 0
         with _Bar("delete") as bar:
             deleted = carry_out(engine, proposal, bar.tell)
-    gone = len(proposal.losses) - deleted
-    print(f"{deleted} frames are deleted" + (f", {gone} were gone already" if gone else ""))
+    left = len(proposal.losses) - deleted
+    why = f", {left} not: they are gone already, or what stood for them is" if left else ""
+    print(f"{deleted} frames are deleted{why}")
     return 0
 
 

@@ -10,7 +10,7 @@ from sceneprint.engine.readers import Readers
 from sceneprint.engine.reencoding import Reencoding
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep import Upkeep
-from sceneprint.engine.uploads import sweep
+from sceneprint.engine.uploads import sweep_deleted
 from sceneprint.engine.warming import warm
 from sceneprint.engine.wire import tell_map
 from sceneprint.errors import ModelError
@@ -92,7 +92,7 @@ class Administration:
         with self.store.database.write() as connection:
             blobs = stored_maps.remove_map(connection, stored_maps.find_map(connection, name))
         self._readers.forget(name)
-        sweep(self.store, blobs)
+        sweep_deleted(self.store, blobs)
 
     def reencode(self, name: str, model: str | Path) -> Map:
         """Have a map signed with another model, to which it then switches; see `begin`."""

@@ -22,6 +22,9 @@ from sceneprint.store.signatures import StoredSignature
 
 log = logging.getLogger(__name__)
 
+#: Seconds until a job is tried again whose result could not be stored.
+LEFT_S = 5.0
+
 
 @dataclass(frozen=True, eq=False)
 class Work:
@@ -52,18 +55,21 @@ class Outdated(Exception):
     """The map has come to have another model since the job was claimed."""
 
 
-def put_back(store: Store, work: Work) -> None:
+def put_back(store: Store, work: Work, after_s: float = 0.0) -> None:
     """Queue again what was claimed and not begun, as when a worker is told to stop."""
     with suppress(LostLease), store.database.write() as connection:
-        queue.give_back(connection, work.claim)
+        queue.give_back(connection, work.claim, after_s)
         if not work.again:
             set_state(connection, work.frame.number, FrameState.RECEIVED)
 
 
 def leave(store: Store, work: Work, made: StoredSignature | None) -> None:
-    """Give a job back, as far as the store lets us; else its lease runs out."""
+    """Give a job back, as far as the store lets us; else its lease runs out.
+
+    Others go before it: it may be its own folder of blobs alone that cannot be written.
+    """
     with suppress(UnusableStore):
-        put_back(store, work)
+        put_back(store, work, LEFT_S)
         if made is not None:
             sweep(store, [made.geometry])
 

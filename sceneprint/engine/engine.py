@@ -15,7 +15,7 @@ from sceneprint.engine.cursors import row_of
 from sceneprint.engine.endings import Work, put_back
 from sceneprint.engine.readers import View
 from sceneprint.engine.switches import check_model, steadily
-from sceneprint.engine.uploads import sweep, upload
+from sceneprint.engine.uploads import sweep_deleted, upload
 from sceneprint.engine.wire import tell_frames
 from sceneprint.errors import BusyIndex, UnknownMap
 from sceneprint.models import Model
@@ -108,7 +108,7 @@ class Engine(Administration):
             frame = stored_frames.find_frame(connection, row, frame_id)
             queue.cancel_of(connection, frame.number)
             blobs = stored_frames.delete_frame(connection, row, frame)
-        sweep(self.store, blobs)
+        sweep_deleted(self.store, blobs)
 
     # queries
 

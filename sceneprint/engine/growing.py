@@ -36,7 +36,7 @@ class Growing:
         self._folder, self._capacity = folder, max(capacity, 64)
         self._keys: NDArray[np.int64] = np.empty(self._capacity, np.int64)
         self._revisions: NDArray[np.int64] = np.empty(self._capacity, np.int64)
-        self._rows = self._room(length)
+        self._rows = self._room(self._capacity, length)
         self._places: dict[int, int] = {}
 
     def __len__(self) -> int:
@@ -59,13 +59,16 @@ class Growing:
         """
         n = len(self)
         if n + more > self._capacity:
-            self._capacity = max(n + more, 2 * self._capacity)
-            rows = self._room(self._rows.shape[1])
+            length = self._rows.shape[1]
+            # twice as many, but no more than memory would be used for at once
+            step = min(self._capacity, max(IN_MEMORY // length, 64))
+            capacity = max(n + more, self._capacity + step)
+            rows = self._room(capacity, length)  # where this fails, all is as it was
             rows[:n] = self._rows[:n]  # views keep the old arrays
-            keys, revisions = self._keys[:n], self._revisions[:n]
-            self._keys = np.concatenate([keys, np.empty(self._capacity - n, np.int64)])
-            self._revisions = np.concatenate([revisions, np.empty(self._capacity - n, np.int64)])
-            self._rows = rows
+            new = np.empty(capacity - n, np.int64)
+            self._keys = np.concatenate([self._keys[:n], new])
+            self._revisions = np.concatenate([self._revisions[:n], new])
+            self._capacity, self._rows = capacity, rows
 
     def append(self, change: Change, row: Bytes) -> None:
         """Take the signature of a frame that is not there yet."""
@@ -102,12 +105,12 @@ class Growing:
         n = len(self)
         return Tail(self._keys[:n], self._rows[:n])
 
-    def _room(self, length: int) -> Bytes:
-        size = self._capacity * length
+    def _room(self, capacity: int, length: int) -> Bytes:
+        size = capacity * length
         if size <= IN_MEMORY:
-            return np.empty((self._capacity, length), np.uint8)
+            return np.empty((capacity, length), np.uint8)
         mapped = _nameless(self._folder, size)
-        return np.frombuffer(mapped, np.uint8).reshape(self._capacity, length)
+        return np.frombuffer(mapped, np.uint8).reshape(capacity, length)
 
 
 def _nameless(folder: Path, size: int) -> mmap.mmap:

@@ -5,6 +5,7 @@ is taken when the same content comes again.
 from __future__ import annotations
 
 import logging
+import random
 import re
 import time
 from collections.abc import Sequence
@@ -81,7 +82,9 @@ def sign_again(store: Store, row: MapRow, numbers: Sequence[int], model_id: str)
         return 0
     try:
         with store.database.read() as connection:  # most often all is done already: no lock
-            due = _due(connection, numbers[:MOST], model_id)
+            # at random: some may never be healed, and must not keep others from it
+            some = random.sample(list(numbers), min(MOST, len(numbers)))
+            due = _due(connection, some, model_id)
         if not due:
             return 0
         with store.database.write() as connection:
@@ -101,7 +104,9 @@ def _due(connection: Connection, numbers: Sequence[int], model_id: str) -> list[
     for number in dict.fromkeys(numbers):
         job = last_of(connection, REENCODE, number, model_id)
         busy = job is not None and (not job.state.over or now - job.created_at < PAUSE_S)
-        if number in found and found[number].state == FrameState.INDEXED and not busy:
+        if number not in found or busy or is_known_loss(found[number].reason):
+            continue  # or nothing is left to sign it from
+        if found[number].state == FrameState.INDEXED:
             due.append(number)
     return due
 

@@ -98,6 +98,7 @@ class Reader:
         self._tail = Growing(length, folder)
         self._dead: dict[int, int] = {}  # what was deleted after the generation, and when
         self._damaged: set[int] = set()
+        self._unsound: int | None = None  # number of a generation that was found damaged
         self._view = self._begin(self._newest(connection, row, None))
 
     @property
@@ -157,7 +158,7 @@ class Reader:
         number, since = (0, 0) if view.generation is None else (
             view.generation.number, view.generation.revision
         )  # fmt: skip
-        if newest_number(self._folder) in (None, number):
+        if newest_number(self._folder) in (None, number, self._unsound):
             return
         found = self._newest(connection, row, view.generation)
         # one of the same revision stands for one that was found damaged
@@ -177,11 +178,16 @@ class Reader:
             small = sum(each.size for each in new) <= VERIFIED_BYTES
             if small and not all(each.is_sound() for each in new):
                 log.error("a damaged index is not used", extra={"map": row.name})
+                self._unsound = found.number
                 return None
         return trusted(connection, row, found)
 
     def _publish(self, generation: Generation | None, revision: int) -> None:
-        dead = frozenset(n for n in self._dead if n in self._tail or _holds(generation, n))
+        deleted = np.fromiter(self._dead, np.int64, len(self._dead))
+        held = np.isin(deleted, self._tail.tail().keys)
+        if generation is not None:
+            held |= generation.places.of(deleted) >= 0
+        dead = frozenset(deleted[held].tolist())
         tail, both = self._tail.tail(), 0
         if generation is not None:  # signed anew since
             both = int((generation.places.of(tail.keys) >= 0).sum())
@@ -227,7 +233,3 @@ class Readers:
         """Give up what is held of a map that was deleted."""
         with self._lock:
             self._open.pop(name, None)
-
-
-def _holds(generation: Generation | None, key: int) -> bool:
-    return generation is not None and bool(generation.places.of(np.array([key]))[0] >= 0)

@@ -23,7 +23,7 @@ from sceneprint.store.events import anchor_of
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.records import MapRow
 from sceneprint.store.reencoding import is_complete
-from sceneprint.store.signatures import changes_since, count_indexed, deleted_since
+from sceneprint.store.signatures import changes_since, count_gone, count_indexed, deleted_since
 from sceneprint.types import Bytes
 
 log = logging.getLogger(__name__)
@@ -125,7 +125,7 @@ class Upkeep:
         if row.revision - since <= self._tail_frames:  # spares the counting
             return False
         return count_indexed(connection, row.number, since) > self._tail_frames or (
-            len(deleted_since(connection, row.number, since)) > self._tail_frames
+            count_gone(connection, row.number, since) > self._tail_frames
         )
 
     def _publish(

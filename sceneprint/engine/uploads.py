@@ -15,7 +15,7 @@ from sceneprint.errors import FrameConflict, UnusableStore
 from sceneprint.schemas import Added, FrameMeta, FrameState
 from sceneprint.store import Store
 from sceneprint.store.events import tell
-from sceneprint.store.frames import add_frame, find_content, refers_to, renew_frame
+from sceneprint.store.frames import add_frame, find_content, find_frame, refers_to, renew_frame
 from sceneprint.store.listing import jobs_of
 from sceneprint.store.maps import find_map
 from sceneprint.store.novelty import loosen
@@ -24,6 +24,8 @@ from sceneprint.store.records import MapRow
 
 log = logging.getLogger(__name__)
 
+#: Blobs that are removed in one transaction: writers wait meanwhile.
+SWEPT_AT_ONCE = 200
 #: What to call a column when it differs.
 _FIELDS = {"pose_parent": "pose.parent_frame"}
 _BEING_SIGNED = (FrameState.RECEIVED, FrameState.SIGNING)
@@ -78,6 +80,7 @@ def upload(
     if there is not None and there.state not in _TRIED_AGAIN:
         return _healed(store, map_name, there, data), False
     store.database.require_writable()  # before a blob to which nothing could refer
+    former, added = list[str](), None
     while True:
         blob = store.blobs.put(data)
         with _unless_refused(store, blob), store.database.write() as connection:
@@ -92,11 +95,17 @@ def upload(
                     values = {"content_id": content, **of_blob, **known}
                     frame_row = add_frame(connection, row.number, values)
                 else:  # it was given up, and somebody asks for another try
+                    former = [find_frame(connection, row, there.frame_id).blob]
                     frame_row = renew_frame(connection, there.frame_id, of_blob)
                 job = enqueue(connection, "sign", frame_row.number, priority)
                 tell(connection, "frame.received", row.name, frame_row.id, job.id)
                 state = frame_row.state
-                return Added(frame_id=frame_row.id, job_id=job.id, state=state, reason=None), True
+                added = Added(frame_id=frame_row.id, job_id=job.id, state=state, reason=None)
+                break
+    if added is not None:
+        sweep_deleted(store, [one for one in former if one != blob])  # it was packed otherwise
+        return added, True
+    assert there is not None
     sweep(store, [blob])
     return there, False
 
@@ -142,13 +151,23 @@ def _there(
 def sweep(store: Store, blobs: list[str]) -> None:
     """Remove blobs that nothing refers to any more.
 
-    In a writing transaction, so that no upload comes to refer to one in between. While a snapshot
-    is being taken they stay, as it may refer to them: `sceneprint fsck` removes them later.
+    In writing transactions, so that no upload comes to refer to one in between, and short ones.
+    While a snapshot is being taken they stay, as it may refer to them: `sceneprint fsck` removes
+    them later.
     """
-    with store.database.write() as connection, store.blobs.removing() as allowed:
-        if not allowed:
-            log.info("blobs left for fsck", extra={"blobs": len(blobs)})
-            return
-        for blob in blobs:
-            if not refers_to(connection, blob):
-                store.blobs.remove(blob)
+    for start in range(0, len(blobs), SWEPT_AT_ONCE):
+        with store.database.write() as connection, store.blobs.removing() as allowed:
+            if not allowed:
+                log.info("blobs left for fsck", extra={"blobs": len(blobs) - start})
+                return
+            for blob in blobs[start : start + SWEPT_AT_ONCE]:
+                if not refers_to(connection, blob):
+                    store.blobs.remove(blob)
+
+
+def sweep_deleted(store: Store, blobs: list[str]) -> None:
+    """As `sweep`, after a deletion that took effect already and is not to be refused any more."""
+    try:
+        sweep(store, blobs)
+    except UnusableStore as error:
+        log.warning("blobs left for fsck", extra={"blobs": len(blobs), "error": str(error)})

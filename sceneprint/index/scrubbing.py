@@ -6,6 +6,7 @@ This reads those too, a block at a time, for whoever has a moment.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,8 +28,8 @@ def scrub(folder: Path) -> Iterator[Path | None]:
     for _, path in manifests(folder):
         try:
             manifest = read_manifest(path)
-        except DamagedIndex:  # an older one is used in its place, as if this were not there
-            yield None
+        except DamagedIndex as error:  # an older one is used in its place meanwhile
+            yield path if _is_lasting(error) and path.exists() else None
             continue
         for name, size in manifest.files:
             try:
@@ -36,7 +37,9 @@ def scrub(folder: Path) -> Iterator[Path | None]:
                     yield from _scrub_segment(folder / name)
                 else:
                     get(folder, name, size)
-            except DamagedIndex:
+            except DamagedIndex as error:
+                if not _is_lasting(error):
+                    return
                 if manifests(folder)[:1] == [] or not path.exists():
                     return  # a builder has replaced the generation meanwhile
                 yield folder / name
@@ -52,6 +55,12 @@ def _scrub_segment(path: Path) -> Iterator[None]:
         yield None
     if digest.digest() != segment.digest:
         raise DamagedIndex(f"{path}: its signatures are not those that were written.")
+
+
+def _is_lasting(error: DamagedIndex) -> bool:
+    """Whether a file is damaged or missing, and not merely out of reach for the moment."""
+    cause = error.__cause__
+    return not isinstance(cause, OSError) or cause.errno in (errno.ENOENT, errno.EIO)
 
 
 def discard(path: Path) -> None:

@@ -10,12 +10,15 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from sqlalchemy import select
+
 from sceneprint.engine.uploads import sweep
 from sceneprint.errors import StoreError
 from sceneprint.maintenance.findings import Finding, Folder
 from sceneprint.maintenance.repairs import GONE
 from sceneprint.store import Blobs
 from sceneprint.store.frames import refers_to
+from sceneprint.store.tables import frames
 
 #: Seconds that a file which is being written is left alone at least, whatever the grace.
 WRITING_S = 60.0
@@ -98,7 +101,15 @@ def check_files(folder: Folder) -> Iterator[Finding]:
 def _unreferenced(folder: Folder, entries: list[_Entry]) -> Iterator[Finding]:
     with folder.store.database.read() as connection:
         stray = [each for each in entries if not refers_to(connection, str(each.digest))]
+        known = connection.execute(select(frames.c.number).limit(1)).first() is not None
     for entry in stray:
+        if not known:  # more likely another database's than nobody's
+            yield Finding(
+                "unreferenced-blob", str(entry.path), "note",
+                "the database has never held a frame: is it the one of these blobs?",
+                path=entry.path,
+            )  # fmt: skip
+            continue
         yield Finding(
             "unreferenced-blob", str(entry.path), "leftover",
             "no frame refers to it: its upload was killed half way, or its frame was deleted",

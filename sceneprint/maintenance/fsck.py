@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from sqlalchemy import select
+
 from sceneprint.errors import SceneprintError, UnusableStore
 from sceneprint.maintenance.blobs import check_artifacts, check_uploads
 from sceneprint.maintenance.files import check_files
@@ -22,11 +24,13 @@ from sceneprint.maintenance.rows import check_rows
 from sceneprint.maintenance.signatures import check_signatures
 from sceneprint.maintenance.tables import check_tables
 from sceneprint.maintenance.truth import FATAL, check_database, check_models, damaged_database
+from sceneprint.schemas import FrameState
 from sceneprint.settings import Settings
-from sceneprint.store import Store, open_store
+from sceneprint.store import Database, Store, open_store
 from sceneprint.store.blobs import Blobs
 from sceneprint.store.looking import look_at
 from sceneprint.store.maps import find_map
+from sceneprint.store.tables import frames
 
 #: Seconds in which a file that nothing refers to may be part of an upload that goes on.
 GRACE_S = 3600.0
@@ -135,6 +139,8 @@ def _opened(settings: Settings, *, repair: bool) -> Iterator[Store]:
             "that its disk is mounted, or restore a snapshot."
         )
     if repair:
+        with look_at(settings.database) as database:  # a repair makes no database
+            _check_blobs(database, settings)
         store = open_store(settings.database, settings.blob_dir)
         try:
             yield store
@@ -143,3 +149,22 @@ def _opened(settings: Settings, *, repair: bool) -> Iterator[Store]:
         return
     with look_at(settings.database) as database:
         yield Store(database, Blobs(settings.blob_dir, make=False))
+
+
+def _check_blobs(database: Database, settings: Settings) -> None:
+    """See that a folder without a single blob is not taken for the loss of all.
+
+    Raises
+    ------
+    UnusableStore : frames refer to blobs, and there is none.
+    """
+    with database.read() as connection:
+        kept = FrameState.DELETED, FrameState.REDUNDANT
+        refers = select(frames.c.number).where(frames.c.state.not_in(kept)).limit(1)
+        if connection.execute(refers).first() is None:
+            return
+    if next(Blobs(settings.blob_dir, make=False).digests(), None) is None:
+        raise UnusableStore(
+            f"{settings.blob_dir}: not one upload is there, and nothing was changed. See that its "
+            "disk is mounted, or restore a snapshot."
+        )

@@ -33,9 +33,21 @@ def sign_from_upload(folder: Folder, connection: Connection, number: int) -> str
     found = connection.execute(
         update(frames)
         .where(frames.c.number == number)
-        .values(state=FrameState.RECEIVED, reason=None, revision=None, indexed_at=None)
+        # it was kept once, and what still holds its old signature would call it redundant
+        .values(
+            state=FrameState.RECEIVED,
+            reason=None,
+            indexed_at=None,
+            novelty=None,
+        )
         .returning(frames.c.id, frames.c.map_number, frames.c.blob)
     ).one()
+    # readers and indexes that hold it learn that it is found no more, until it is signed
+    connection.execute(
+        update(frames)
+        .where(frames.c.number == number)
+        .values(revision=next_revision(connection, found.map_number))
+    )
     name = map_of(connection, found.map_number).name
     condition = folder.store.blobs.condition(found.blob)
     if condition == "sound":
@@ -46,10 +58,8 @@ def sign_from_upload(folder: Folder, connection: Connection, number: int) -> str
     connection.execute(
         update(frames)
         .where(frames.c.number == number)
-        # readers and indexes that hold it learn that it is found no more
-        .values(state=FrameState.FAILED, reason=reason,
-                revision=next_revision(connection, found.map_number))
-    )  # fmt: skip
+        .values(state=FrameState.FAILED, reason=reason)
+    )
     tell(connection, "frame.failed", name, found.id)
     return f"it is failed: {reason}"
 

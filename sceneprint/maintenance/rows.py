@@ -19,6 +19,8 @@ from sceneprint.store.records import FrameRow, MapRow, frame_row
 from sceneprint.store.tables import frame_tags, frames, jobs, maps, signatures
 
 _BEING_SIGNED = (FrameState.RECEIVED, FrameState.SIGNING)
+#: More changes than any map has had.
+_MOST_REVISIONS = 1 << 48
 _GONE = (FrameState.DELETED, FrameState.REDUNDANT, FrameState.REJECTED)
 
 
@@ -142,14 +144,17 @@ def _faults(folder: Folder, one: _Known) -> Iterator[_Fault]:
             "write it anew from the pose", _write_place,
         )  # fmt: skip
     if frame.revision is not None and frame.revision > row.revision:
+        far = frame.revision > _MOST_REVISIONS  # no map has changed so often
         yield _Fault(
             "revision-ahead", f"its revision {frame.revision} is beyond its map's {row.revision}",
-            "count the map's revisions from there", _count_on,
+            "sign it again" if far else "count the map's revisions from there",
+            _sign_anew if far else _count_on,
         )  # fmt: skip
     if is_known_loss(frame.reason) and folder.store.blobs.condition(frame.blob) == "sound":
         yield _Fault(
             "found-upload", "its reason says that its upload is lost, and it is there",
-            "clear the reason", _clear_reason, leftover=True,
+            "clear the reason, and sign it where it had failed for that",
+            _clear_reason, leftover=True,
         )  # fmt: skip
 
 
@@ -178,6 +183,16 @@ def _queue(_: Folder, connection: Connection, one: _Known) -> tuple[str, list[st
 
 def _sign(folder: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
     return sign_from_upload(folder, connection, one.frame.number), []
+
+
+def _sign_anew(folder: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
+    removed = connection.execute(
+        delete(signatures)
+        .where(signatures.c.frame_number == one.frame.number)
+        .returning(signatures.c.geometry)
+    )
+    blobs = list(removed.scalars())
+    return sign_from_upload(folder, connection, one.frame.number), blobs
 
 
 def _remove_stray(_: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
@@ -219,7 +234,9 @@ def _count_on(_: Folder, connection: Connection, one: _Known) -> tuple[str, list
     return f"the map is at revision {one.frame.revision}", []
 
 
-def _clear_reason(_: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
+def _clear_reason(folder: Folder, connection: Connection, one: _Known) -> tuple[str, list[str]]:
+    if one.frame.state == FrameState.FAILED:  # for want of its upload alone
+        return _queue(folder, connection, one)
     connection.execute(
         update(frames)
         .where(frames.c.number == one.frame.number)

@@ -82,7 +82,13 @@ def take_snapshot(settings: Settings, path: Path, progress: Progress | None = No
         raise _taken(path)
     if not source.is_file():
         raise UnusableStore(f"{source}: there is no database. Name its folder with --data.")
-    blobs, folder = BlobFolder(settings.blob_dir), path.absolute().parent
+    if not settings.blob_dir.is_dir():  # a disk that is not mounted is not made up for
+        raise UnusableStore(
+            f"{settings.blob_dir}: there is no such folder. See that its disk is mounted, or run "
+            "`sceneprint fsck`."
+        )
+    blobs = BlobFolder(settings.blob_dir, make=False)
+    folder = path.absolute().parent
     with (
         full_disk_explained(path),
         staging(folder, _PREFIX, 0o700) as workplace,

@@ -20,6 +20,7 @@ from sceneprint.geometry.retrieval import cross_distances, pairwise_distances
 from sceneprint.geometry.summary import novel, summarise
 from sceneprint.index import search, signatures_of
 from sceneprint.index.keys import Keys
+from sceneprint.schemas import FrameState
 from sceneprint.store.thinning import Weight, weights_of
 from sceneprint.types import Bytes
 
@@ -131,13 +132,14 @@ def carry_out(engine: Engine, proposal: Proposal, progress: Progress | None = No
 
     Returns
     -------
-    deleted : how many; the others were gone already
+    deleted : how many; the others were gone already, or what stood for them is
     """
     deleted = 0
     for done, one in enumerate(proposal.losses, 1):
         try:
-            engine.delete_frame(proposal.map, one.frame_id)
-            deleted += 1
+            if engine.get_frame(proposal.map, one.like).state == FrameState.INDEXED:
+                engine.delete_frame(proposal.map, one.frame_id)
+                deleted += 1
         except NotFound:
             pass  # somebody was first
         if progress is not None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sceneprint.store.blobs import Blobs
-from sceneprint.store.database import Database, open_database
+from sceneprint.store.database import Database, is_there, open_database
 from sceneprint.store.sealed import is_sealed
 
 __all__ = ["Blobs", "Database", "Store", "open_database", "open_store"]
@@ -25,7 +25,10 @@ class Store:
 
 
 def open_store(url: str, blobs: Path) -> Store:
-    """Open both, made where missing; beside a database that may be read alone nothing is made.
+    """Open both, made where both are missing.
+
+    The folder of a database that is there is never made: its disk is not mounted, and what was
+    written in its place would be gone when it is.
 
     Parameters
     ----------
@@ -36,5 +39,6 @@ def open_store(url: str, blobs: Path) -> Store:
     ------
     UnusableStore, NewerSchema : see `open_database`.
     """
-    kept = Blobs(blobs, make=not is_sealed(url))  # the data folder is made with it
+    new = not is_sealed(url) and not is_there(url)
+    kept = Blobs(blobs, make=new)  # the data folder is made with it
     return Store(open_database(url), kept)

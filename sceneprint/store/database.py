@@ -112,6 +112,16 @@ class Database:
         self._engine.dispose()
 
 
+def is_there(url: str) -> bool:
+    """Whether the database of a URL is a file that is there."""
+    try:
+        parsed = make_url(url)
+    except (ArgumentError, ValueError):
+        return False  # opening it says why
+    place = parsed.database if parsed.get_backend_name() == "sqlite" else None
+    return place is not None and Path(place).is_file()
+
+
 def open_database(url: str) -> Database:
     """Open a database and bring it to the schema of this version.
 
@@ -155,7 +165,7 @@ def _opened(url: URL) -> tuple[Database, Engine]:
         engine = create_engine(url, creator=sealed.connect, poolclass=NullPool)
     else:
         # SQLite waits for a writer itself, fairly enough; readers never wait in WAL
-        engine = create_engine(url, connect_args={"timeout": BUSY_S}, pool_size=16)
+        engine = create_engine(url, connect_args={"timeout": BUSY_S}, pool_size=16, max_overflow=-1)
     event.listen(engine, "connect", _configure_sqlite if sealed is None else _configure_sealed)
     event.listen(engine, "begin", _begin_sqlite)
     return Database(engine, sealed), engine

@@ -85,17 +85,15 @@ def claim(connection: Connection, worker: str, lease_s: float) -> Claim | None:
     lease_s : seconds until it must be renewed
     """
     now = time.time()
-    number = connection.execute(
-        select(jobs.c.number)
-        .where(_due(now), jobs.c.attempts < MAXIMUM_ATTEMPTS)
-        # what was tried before goes behind what was not: a frame that kills its worker, or a
-        # machine that dies again and again, must not hold up or use up the same job
-        .order_by(jobs.c.priority.desc(), jobs.c.attempts, jobs.c.number)
-        .limit(1)
-        .with_for_update(skip_locked=True)
-    ).scalar()
-    if number is None:
+    firsts = [
+        # "+ 0.0" keeps SQLite to the index that has the order: it would sort all that is due
+        _first(connection, jobs.c.state == JobState.QUEUED, jobs.c.run_after + 0.0 <= now),
+        _first(connection, jobs.c.state == JobState.RUNNING, jobs.c.leased_until < now),
+    ]
+    found = [one for one in firsts if one is not None]
+    if not found:
         return None
+    *_, number = min(found)
     row = connection.execute(
         update(jobs)
         .where(jobs.c.number == number)
@@ -106,6 +104,22 @@ def claim(connection: Connection, worker: str, lease_s: float) -> Claim | None:
         .returning(jobs)
     ).mappings().one()  # fmt: skip
     return Claim(job_row(row))
+
+
+def _first(connection: Connection, *due: ColumnElement[bool]) -> tuple[int, int, int] | None:
+    """The first to be claimed of some jobs that are due: its place in the order, and its number.
+
+    What was tried before goes behind what was not: a frame that kills its worker, or a machine
+    that dies again and again, must not hold up or use up the same job.
+    """
+    found = connection.execute(
+        select(jobs.c.priority, jobs.c.attempts, jobs.c.number)
+        .where(*due, jobs.c.attempts < MAXIMUM_ATTEMPTS)
+        .order_by(jobs.c.priority.desc(), jobs.c.attempts, jobs.c.number)
+        .limit(1)
+        .with_for_update(skip_locked=True)
+    ).first()
+    return None if found is None else (-found.priority, found.attempts, found.number)
 
 
 def bury(connection: Connection) -> list[JobRow]:
@@ -178,8 +192,14 @@ def pause_s(failures: int) -> float:
     return BACKOFF_S * 4.0 ** (failures - 1)
 
 
-def give_back(connection: Connection, held: Claim) -> None:
+def give_back(connection: Connection, held: Claim, after_s: float = 0.0) -> None:
     """Queue a job again that was not begun, as if it had not been claimed.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    held : the job
+    after_s : seconds in which others go before it
 
     Raises
     ------
@@ -187,7 +207,7 @@ def give_back(connection: Connection, held: Claim) -> None:
     """
     _hold(
         connection, held, state=JobState.QUEUED, attempts=held.job.attempts - 1,
-        leased_until=None, worker=None,
+        leased_until=None, worker=None, run_after=time.time() + after_s,
     )  # fmt: skip
 
 

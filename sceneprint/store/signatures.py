@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import Connection, func, insert, select, update
+from sqlalchemy import Connection, delete, func, insert, select, update
 
 from sceneprint.errors import DamagedSignature
 from sceneprint.schemas import FrameState
@@ -51,6 +51,12 @@ class Change:
 
 def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) -> int:
     """Store a signature and let queries find the frame; returns the map's revision."""
+    # a map that goes back to a model may still have what that model once made of the frame
+    connection.execute(
+        delete(signatures).where(
+            signatures.c.frame_number == frame.number, signatures.c.model_id == made.model_id
+        )
+    )
     connection.execute(
         insert(signatures).values(
             frame_number=frame.number, model_id=made.model_id, vector=made.vector,
@@ -157,6 +163,18 @@ def deleted_since(connection: Connection, map_number: int, revision: int) -> fro
         )
     )
     return frozenset(found.scalars())
+
+
+def count_gone(connection: Connection, map_number: int, revision: int) -> int:
+    """How many frames of a map are searched no more since a revision."""
+    counted = connection.execute(
+        select(func.count()).where(
+            frames.c.map_number == map_number,
+            frames.c.revision > revision,
+            frames.c.state != FrameState.INDEXED,
+        )
+    )
+    return int(counted.scalar_one())
 
 
 def geometry_blobs(connection: Connection, numbers: Iterable[int], model_id: str) -> dict[int, str]:

@@ -148,6 +148,8 @@ jobs = Table(
     Index(None, "frame_number"),
     sqlite_autoincrement=True,
 )
+#: The order in which jobs are claimed.
+Index("ix_jobs_claimed", jobs.c.state, jobs.c.priority.desc(), jobs.c.attempts, jobs.c.number)
 
 keys = Table(
     "keys",

@@ -48,6 +48,7 @@ def test_what_is_given_up_and_what_breaks_down_is_said(sceneprint: Run, tmp_path
     def reencode(*arguments: object, expect: int = 0) -> Any:
         return sceneprint("reencode", "hall", *arguments, "--data", tmp_path, expect=expect)
 
+    Client.embedded(tmp_path).close()
     missing = reencode("--model", "paper", expect=2).stderr
     assert missing.startswith("sceneprint reencode: There is no map 'hall'")
     with Client.embedded(tmp_path) as client:

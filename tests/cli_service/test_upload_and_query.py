@@ -134,11 +134,13 @@ def test_upload_refuses_what_would_mix(
 def test_ctrl_c_keeps_what_was_received(service_url: str, rooms: Path) -> None:
     with Client(service_url) as client:
         client.create_map("stopped")
+        before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background ignores it
         process = subprocess.Popen(
             [sys.executable, "-m", "sceneprint", "upload", "stopped", rooms, "--parallel", "1"],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             env={**os.environ, "SCENEPRINT_URL": service_url},
         )  # fmt: skip
+        signal.signal(signal.SIGINT, before)
         until = time.monotonic() + 30
         while not sum(client.map("stopped").frames.values()) and time.monotonic() < until:
             pass  # the first frame arrives

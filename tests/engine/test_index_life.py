@@ -13,7 +13,8 @@ import pytest
 
 from sceneprint.engine import Engine, growing, readers
 from sceneprint.engine.growing import Growing
-from sceneprint.index import newest
+from sceneprint.errors import UnusableStore
+from sceneprint.index import newest, scrub
 from sceneprint.schemas import Query
 from sceneprint.store.signatures import Change
 
@@ -138,3 +139,68 @@ def test_a_tail_in_a_file_is_as_one_in_memory(
     np.testing.assert_array_equal(late.tail().signatures, rows[200:])
     np.testing.assert_array_equal(late.tail().keys, np.arange(200, 300))
     assert list(tmp_path.glob("index/*")) == []  # nothing to be left behind
+
+
+def test_who_published_it_finds_a_damaged_manifest(
+    data: Path, make_engine: Make, uploads: Any
+) -> None:
+    builder = make_engine(data, tail_frames=1, scrub_s=1)
+    wanted, _ = ask(builder, uploads)
+    assert builder.publish_due() == 1
+    (path,) = data.glob("index/hall-*/*.json")
+    flip(path, 40)
+    (data / "index" / ".scrubbed").unlink(missing_ok=True)
+    builder._upkeep._scrubber._looked = -1e9
+    assert until_healed(builder) == 1
+    assert ask(make_engine(data), uploads)[0] == wanted
+    assert newest(path.parent, builder.get_map("hall").model_id, 12_800) is not None
+
+
+def test_a_damaged_index_is_read_once_and_not_with_every_query(
+    data: Path, make_engine: Make, uploads: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert make_engine(data, tail_frames=1).publish_due() == 1
+    (path,) = data.glob("index/hall-*/*.segment")
+    flip(path, 4096 + 5 * 12_800)
+    engine = make_engine(data)
+    for _ in range(5):
+        assert ask(engine, uploads)[1] == 0
+    said = [r for r in caplog.records if r.message == "a damaged index is not used"]
+    assert len(said) == 1
+
+
+def test_what_is_out_of_reach_for_a_moment_is_not_removed(
+    data: Path, make_engine: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert make_engine(data, tail_frames=1).publish_due() == 1
+    (folder,) = data.glob("index/hall-*")
+    before = sorted(path.name for path in folder.iterdir())
+    real = Path.open
+
+    def no_descriptor(path: Path, *given: Any, **more: Any) -> Any:
+        if path.suffix == ".segment":
+            raise OSError(24, "Too many open files")
+        return real(path, *given, **more)
+
+    monkeypatch.setattr(Path, "open", no_descriptor)
+    assert [one for one in scrub(folder) if one is not None] == []
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def test_a_tail_that_finds_no_room_is_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tail, row = Growing(50, tmp_path), np.ones(50, np.uint8)
+    for i in range(64):
+        tail.append(Change(i, "", i + 1, None), row)
+
+    def full(*_: object) -> None:
+        raise UnusableStore("no room")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Growing, "_room", full)
+        with pytest.raises(UnusableStore):
+            tail.append(Change(64, "", 65, None), row)
+    assert len(tail.tail()) == 64
+    tail.append(Change(64, "", 65, None), row)  # there is room again
+    np.testing.assert_array_equal(tail.tail().keys, np.arange(65))

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from sceneprint.engine import Engine, readers
+from sceneprint.engine import Engine, readers, reencoding
 from sceneprint.engine import engine as engines
 from sceneprint.engine import work as working
 from sceneprint.engine.readers import index_folder
@@ -397,3 +397,25 @@ def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
     digests = set(other.store.blobs.digests())
     assert {hashlib.sha256(each.data).hexdigest() for each in uploads} <= digests
     assert len(digests) >= 24  # an artifact may be left that nothing refers to
+
+
+def test_a_frame_is_signed_again_by_a_model_that_the_map_goes_back_to(
+    full: Engine, ids: Any, work_off: WorkOff, small_file: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the first model made of it is there still, as removing it takes a while."""
+    name = ids(full)[3]
+    with monkeypatch.context() as patch:
+        patch.setattr(reencoding, "_tidy", lambda *_, **__: False)
+        original, first = working.prepare, full.get_map("hall").model
+
+        def refuse(frame: Any, signer: Any) -> Any:
+            if frame.name == name and signer.model.label != first:
+                raise UselessFrame("nothing")
+            return original(frame, signer)
+
+        patch.setattr(working, "prepare", refuse)
+        switch(full, small_file, work_off)
+        assert full.get_frame("hall", name).state == "rejected"
+        switch(full, COMPACT, work_off)
+        work_off(full)
+    assert full.get_frame("hall", name).state == "indexed"

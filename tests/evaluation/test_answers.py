@@ -36,7 +36,8 @@ def match(frame_id: str, rank: int, status: str, T: np.ndarray | None) -> dict[s
 
 
 def answer(matches: list[dict[str, Any]], pose: Transform | None = None) -> Answer:
-    counts = dict.fromkeys(("map", "compared", "ranked", "selected", "validated", "accepted"), 0)
+    names = ("map", "passed", "compared", "ranked", "selected", "validated", "accepted")
+    counts = dict.fromkeys(names, 0)
     location = pose and {"pose": pose, "support": 1, "votes": 1, "spread_m": 0, "spread_deg": 0}
     return Answer.model_validate(
         {"query_id": "q", "status": "found", "matches": matches, "location": location, "seed": 0,

@@ -224,3 +224,14 @@ def test_what_cannot_be_asked_for(
     with pytest.raises(InvalidRequest, match=r"Choosing 7 of 60 frames would take .* --novelty"):
         propose(engine, "hall", keep=7)
     assert propose(engine, "hall", novelty=0.1).n_frames == N
+
+
+def test_a_frame_stays_whose_like_is_gone(make: Callable[..., Engine]) -> None:
+    engine = make()
+    proposal = propose(engine, "hall", novelty=0.2)
+    gone = proposal.losses[0].like
+    spared = {one.frame_id for one in proposal.losses if one.like == gone}
+    engine.delete_frame("hall", gone)
+    assert carry_out(engine, proposal) == len(proposal.losses) - len(spared)
+    left = {frame.frame_id for frame in engine.list_frames("hall", limit=1000).items}
+    assert spared <= left

@@ -160,4 +160,4 @@ def test_what_is_given_back_was_never_tried(store: Store, hand: Any, queued: Que
         assert (now.state, now.attempts, now.worker, now.leased_until) == (
             JobState.QUEUED, 0, None, None,
         )  # fmt: skip
-        assert now.run_after == job.run_after
+        assert now.run_after <= time.time()

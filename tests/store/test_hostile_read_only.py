@@ -197,4 +197,4 @@ def test_a_folder_that_may_be_written_is_opened_for_writing(folder: Path) -> Non
     store.database.require_writable()
     assert not store.database.read_only
     store.database.close()
-    assert (folder / "blobs").is_dir()
+    assert not (folder / "blobs").exists()  # not beside a database that was there

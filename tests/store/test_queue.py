@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from sqlalchemy import select
+from sqlalchemy import event, select
 
 from sceneprint.errors import LostLease, UnknownJob
 from sceneprint.schemas import JobState
@@ -136,3 +136,20 @@ def test_renewing_extends_the_lease_and_nothing_else(
     assert before + 30.0 <= now.leased_until <= time.time() + 30.0
     assert (now.token, now.attempts, now.state) == (1, 1, JobState.RUNNING)
     assert hand.take() is None
+
+
+def test_a_claim_is_looked_up_and_not_sorted(store: Store) -> None:
+    """100,000 jobs wait while a map is signed again, and a claim holds all writers up."""
+    with store.database.write() as connection:
+        said: list[str] = []
+
+        def listen(_: Any, _cursor: Any, statement: str, parameters: Any, *_more: Any) -> None:
+            if statement.startswith("SELECT jobs.priority"):
+                plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", parameters)
+                said.extend(row[3] for row in plan)
+
+        event.listen(connection, "before_cursor_execute", listen)
+        assert queue.claim(connection, "w", 60) is None
+    assert len(said) == 2
+    assert all("USING INDEX ix_jobs_claimed" in one for one in said)
+    assert not any("TEMP B-TREE" in one for one in said)

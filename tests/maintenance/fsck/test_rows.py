@@ -33,8 +33,10 @@ FAULTS = {
     "no signature": (
         f"DELETE FROM signatures WHERE frame_number = {FIRST}",
         "frame-without-signature",
-        "SELECT state, revision FROM frames WHERE number = 1",
-        [("received", None)],
+        # found no more until it is signed, and readers learn of it
+        "SELECT state, frames.revision = maps.revision FROM frames "
+        "JOIN maps ON map_number = maps.number WHERE frames.number = 1",
+        [("received", 1)],
     ),
     "a signature of a frame that waits": (
         f"INSERT INTO signatures SELECT {WAITING}, model_id, vector, checksum, geometry,"
