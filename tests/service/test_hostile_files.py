@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from sceneprint.client import Client
-from sceneprint.engine import Engine
+from sceneprint.engine import Engine, endings
 from sceneprint.errors import NewerSchema, UnusableStore
 from sceneprint.schemas import FrameMeta, FrameState, JobState, NewMap, Query
 from sceneprint.settings import Settings
@@ -164,7 +164,16 @@ def test_an_upload_that_is_missing_fails_after_its_tries(folder, small_shots):
         assert engine.run(work) == JobState.SUCCEEDED
 
 
-def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(stored, folder, tmp_path, small_shots):
+def due(folder):
+    """Let the time come at which what waits may be claimed."""
+    with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
+        database.execute("UPDATE jobs SET run_after = 0")
+        database.commit()
+
+
+def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
+    stored, folder, tmp_path, small_shots, monkeypatch
+):
     """The blob cannot be written, and the database can: no fault of the frame's."""
     shot = small_shots[30]
     artifact, asked = "", "SELECT geometry FROM signatures ORDER BY frame_number DESC LIMIT 1"
@@ -181,6 +190,18 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(stored, folder, tmp
         if place.exists():
             place.rename(folder / "away")
         place.write_bytes(b"a file where the folder should be")
+        with monkeypatch.context() as patch:
+            patch.setattr(endings, "LEFT_S", 600.0)
+            with pytest.raises(UnusableStore):
+                engine.run(engine.claim("w"))
+            assert engine.claim("w") is None  # it lets others go first
+            other, _ = engine.add_frame("hall", small_shots[31].png, meta_of(small_shots[31]))
+            work = engine.claim("w")
+            assert work is not None
+            assert work.frame.id == other.frame_id
+            assert engine.run(work) == JobState.SUCCEEDED
+        due(folder)
+        monkeypatch.setattr(endings, "LEFT_S", 0.0)
         for _ in range(4):  # more often than a frame may break down
             work = engine.claim("w")
             assert work is not None
