@@ -100,16 +100,11 @@ def _path_of(url: URL) -> Path | None:
 
 def _schema(engine: Engine) -> Finding:
     """Compare the schema with the one of this version; the database is not touched."""
-    from alembic.config import Config
     from alembic.migration import MigrationContext
-    from alembic.script import ScriptDirectory
 
-    import migrations
+    from sceneprint.store.revisions import known_revisions
 
-    config = Config()
-    config.set_main_option("script_location", str(Path(migrations.__file__).parent))
-    scripts = ScriptDirectory.from_config(config)
-    head, known = scripts.get_current_head(), {one.revision for one in scripts.walk_revisions()}
+    head, known = known_revisions()
     try:
         with engine.connect() as connection:
             found = MigrationContext.configure(connection).get_current_revision()

@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from alembic.config import Config
-from alembic.script import ScriptDirectory
 from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
 
 from sceneprint.errors import NewerSchema, SnapshotError, UnusableStore
 from sceneprint.maintenance.manifests import Use
 from sceneprint.schemas import FrameState
+from sceneprint.store.revisions import known_revisions
 from sceneprint.store.sealed import Sealed, sealed_file
 
 #: Seconds to wait for whoever recovers the database.
@@ -121,7 +120,7 @@ def check_schema(connection: sqlite3.Connection, place: str) -> str:
         raise UnusableStore(
             f"{place}: no database of sceneprint. Name another folder with --data."
         ) from error
-    if revision not in _known_revisions():
+    if revision not in known_revisions()[1]:
         raise NewerSchema(
             f"{place} has schema {revision!r:.40}, which this version of sceneprint does not "
             "know: a later one wrote it. Use that version."
@@ -154,14 +153,6 @@ def uses(connection: sqlite3.Connection, digest: str) -> tuple[Use, ...]:
         (digest,),
     )
     return tuple(Use(map=name, frame=frame, role=role) for name, frame, role in rows)
-
-
-def _known_revisions() -> set[str]:
-    import migrations
-
-    config = Config()
-    config.set_main_option("script_location", str(Path(migrations.__file__).parent))
-    return {one.revision for one in ScriptDirectory.from_config(config).walk_revisions()}
 
 
 def _connect(path: Path, how: str) -> sqlite3.Connection:

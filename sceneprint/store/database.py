@@ -11,14 +11,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from alembic.config import Config
 from alembic.migration import MigrationContext
-from alembic.script import ScriptDirectory
 from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, event, make_url
 from sqlalchemy.exc import ArgumentError
 
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
 from sceneprint.store.faults import explained
+from sceneprint.store.revisions import known_revisions, migration_config
 from sceneprint.store.sealed import Sealed, sealed_file
 
 #: Seconds a writer waits for another, and waits after somebody has waited so long in vain.
@@ -209,12 +208,7 @@ def _milliseconds(seconds: float) -> int:
 
 def _migrate(database: Database, engine: Engine) -> None:
     """Run what is missing of `migrations/`, in one transaction."""
-    import migrations
-
-    config = Config()
-    config.set_main_option("script_location", str(Path(migrations.__file__).parent))
-    scripts = ScriptDirectory.from_config(config)
-    head, known = scripts.get_current_head(), {s.revision for s in scripts.walk_revisions()}
+    head, known = known_revisions()
     with database.read() as connection:
         current = _current(connection, known, engine)
     if current == head:
@@ -228,12 +222,13 @@ def _migrate(database: Database, engine: Engine) -> None:
         if _current(connection, known, engine) != head:
             from alembic import command
 
+            config = migration_config()
             config.attributes["connection"] = connection
             with _migrating:
                 command.upgrade(config, "head")
 
 
-def _current(connection: Connection, known: set[str], engine: Engine) -> str | None:
+def _current(connection: Connection, known: frozenset[str], engine: Engine) -> str | None:
     current = MigrationContext.configure(connection).get_current_revision()
     if current is not None and current not in known:
         raise NewerSchema(

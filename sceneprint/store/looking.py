@@ -88,16 +88,11 @@ def _begin(connection: Any) -> None:
 
 
 def _check_schema(database: Database, engine: Engine) -> None:
-    from alembic.config import Config
     from alembic.migration import MigrationContext
-    from alembic.script import ScriptDirectory
 
-    import migrations
+    from sceneprint.store.revisions import known_revisions
 
-    config = Config()
-    config.set_main_option("script_location", str(Path(migrations.__file__).parent))
-    scripts = ScriptDirectory.from_config(config)
-    head, known = scripts.get_current_head(), {one.revision for one in scripts.walk_revisions()}
+    head, known = known_revisions()
     with database.read() as connection:
         found = MigrationContext.configure(connection).get_current_revision()
     if found is not None and found not in known:
