@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from sceneprint.index import discard, scrub
+from sceneprint.index import scrub
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ class Scrubber:
                 return None
             if damaged is not None:
                 log.error("a damaged file of an index is removed", extra={"path": str(damaged)})
-                discard(damaged)
+                damaged.unlink(missing_ok=True)  # what names it is passed over from now on
                 return damaged.parent
         return None
 

@@ -12,7 +12,7 @@ it again.
 from sceneprint.index.codes import Code, fit_code
 from sceneprint.index.generations import Generation, newest, newest_number
 from sceneprint.index.publishing import publish
-from sceneprint.index.scrubbing import discard, scrub
+from sceneprint.index.scrubbing import scrub
 from sceneprint.index.search import SHORTLIST, Hits, search
 from sceneprint.index.segments import Segment, open_segment, write_segment
 from sceneprint.index.tails import Tail, signatures_of
@@ -24,7 +24,6 @@ __all__ = [
     "Hits",
     "Segment",
     "Tail",
-    "discard",
     "fit_code",
     "newest",
     "newest_number",

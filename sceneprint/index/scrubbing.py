@@ -61,8 +61,3 @@ def _is_lasting(error: DamagedIndex) -> bool:
     """Whether a file is damaged or missing, and not merely out of reach for the moment."""
     cause = error.__cause__
     return not isinstance(cause, OSError) or cause.errno in (errno.ENOENT, errno.EIO)
-
-
-def discard(path: Path) -> None:
-    """Remove a damaged file: what names it is passed over from now on, and made anew."""
-    path.unlink(missing_ok=True)
