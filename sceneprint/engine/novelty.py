@@ -47,16 +47,13 @@ class Stale(Exception):
     """The nearest frame was deleted since the look, and nobody knows the next one."""
 
 
-def look(
-    database: Database, readers: Readers, row: MapRow, frame: FrameRow, made: StoredSignature
-) -> Look | None:
+def look(database: Database, readers: Readers, row: MapRow, made: StoredSignature) -> Look | None:
     """Search a map for the nearest frame.
 
     Parameters
     ----------
     database, readers : see there
     row : of the map, as it was
-    frame : that is to be kept or not; it is not near itself
     made : of the frame
 
     Returns
@@ -75,8 +72,9 @@ def look(
         if now.number != row.number or now.model_id != made.model_id:
             return None
         view = readers.view(connection, now)
-    dead = view.dead | {frame.number}
-    hits = search(_vector(made), view.generation, view.tail, 1, dead=dead, exact=view.size <= WHOLE)
+    hits = search(
+        _vector(made), view.generation, view.tail, 1, dead=view.dead, exact=view.size <= WHOLE
+    )
     if len(hits) == 0:
         return Look(view.revision, None)
     return Look(view.revision, Near(int(hits.keys[0]), int(hits.distances[0])))

@@ -153,7 +153,7 @@ def _store(
     while True:
         seen = None
         if work.frame.novelty is not None:
-            seen = look(store.database, readers, work.map, work.frame, made)
+            seen = look(store.database, readers, work.map, made)
         with suppress(Stale), store.database.write() as connection:
             queue.finish(connection, work.claim, JobState.SUCCEEDED)
             row = map_of(connection, work.frame.map_number)

@@ -33,7 +33,7 @@ def sign_from_upload(folder: Folder, connection: Connection, number: int) -> str
     found = connection.execute(
         update(frames)
         .where(frames.c.number == number)
-        # it was kept once, and what still holds its old signature would call it redundant
+        # it was kept once, whatever has come since that is like it
         .values(
             state=FrameState.RECEIVED,
             reason=None,

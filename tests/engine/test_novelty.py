@@ -19,7 +19,6 @@ from sceneprint.errors import InvalidRequest
 from sceneprint.pipeline import Signature, Signer
 from sceneprint.schemas import FrameState, JobState, NewMap, Query
 from sceneprint.schemas.novelty import NOVEL, novelty_of
-from sceneprint.store.frames import frame_of
 from sceneprint.store.signatures import StoredSignature
 from sceneprint.store.tables import events, signatures
 from sceneprint.types import Geometry
@@ -235,15 +234,14 @@ def test_signatures_of_another_model_are_not_compared(
     send(empty, 0)
     with empty.store.database.read() as connection:
         row = stored_maps.find_map(connection, "hall")
-        frame = replace(frame_of(connection, 1), number=2)  # another, that is to be kept or not
     vector = prepared[1][0].vector.tobytes()
     made = StoredSignature(row.model_id, vector, "00" * 32, [1], [1])
     database, readers = empty.store.database, empty._readers
-    seen = judging.look(database, readers, row, frame, made)
+    seen = judging.look(database, readers, row, made)
     assert seen is not None
     assert seen.nearest is not None
-    assert judging.look(database, readers, row, frame, replace(made, model_id="ab" * 32)) is None
-    assert judging.look(database, readers, replace(row, number=99), frame, made) is None
+    assert judging.look(database, readers, row, replace(made, model_id="ab" * 32)) is None
+    assert judging.look(database, readers, replace(row, number=99), made) is None
 
 
 @pytest.mark.parametrize(

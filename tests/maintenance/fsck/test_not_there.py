@@ -108,12 +108,12 @@ def test_a_frame_that_is_to_be_signed_again_is_not_found_meanwhile(
     assert any(name == frame_id for name, _ in house.answers(uploads[:1])[0])
 
 
-def test_a_repaired_frame_is_not_near_itself(house: Any) -> None:
-    """Its old signature is in the index still, and it had been sent with a condition."""
+def test_a_frame_that_was_kept_once_is_kept_when_it_is_repaired(house: Any) -> None:
+    """It had been sent with a condition, and others like it have come since."""
     ((number,),) = house.sql(
         "SELECT number FROM frames WHERE state = 'indexed' ORDER BY number LIMIT 1"
     )
-    house.sql("UPDATE frames SET novelty = 0.05 WHERE number = ?", number)
+    house.sql("UPDATE frames SET novelty = 1.0 WHERE number = ?", number)
     house.sql("UPDATE signatures SET checksum = checksum + 1 WHERE frame_number = ?", number)
     house.look(repair=True)
     house.work()
