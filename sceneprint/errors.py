@@ -6,6 +6,7 @@
         - InvalidIntrinsics     its camera is not a camera
         - InvalidPose           its pose is not a rigid transform
         - UselessFrame          it decodes, but there is nothing in it to sign
+        - UnreadableArchive     a file of many frames that is none, or is not safe to read
       x DatasetError            a folder or file that is no sequence of frames
       x ModelError
         - UnreadableModel       a model file that is none, or of another schema
@@ -14,18 +15,24 @@
       x DamagedIndex            a cache file of the index that is missing or damaged
       x BusyIndex               another process is building this index
       x NotFound                there is no such map, frame or job
-        - UnknownMap, UnknownFrame, UnknownJob
-      x UnknownKey              there is no key of that name
+        - UnknownMap, UnknownFrame, UnknownJob, UnknownQuery, UnknownSnapshot
+        - UnknownKey            there is no key of that name
       x Conflict                the request contradicts what is there
         - MapExists             a map of that name, made otherwise
         - FrameConflict         the same content with other metadata
         - JobOver               a job that is over cannot be cancelled
         - CannotRetry           a job that cannot be tried again
+        - NotIndexed            a frame or job that has not made yet what is asked of it
       x InvalidRequest          a field of a request is missing, unknown or out of its range
         - MalformedBody         its body cannot be parsed at all
         - UnsupportedType       its body is of a type that is not read
         - TooLarge              its body is larger than the service takes
+        - SlowBody              its body came too slowly
+        - IdempotencyConflict   its Idempotency-Key was used for something else
+      x PreconditionFailed      what is to be edited has been edited meanwhile
       x KeyRequired             the service asks for a key, and none or an unknown one was given
+      x Forbidden               the key that was shown may not do this
+      x RateLimited             this caller asks too often; come back
       x Misdirected             the request is meant for another host than this machine
       x ForeignOrigin           a page of another host sent the request
       x Busy                    as many requests wait as may; come back
@@ -83,6 +90,10 @@ class UselessFrame(FrameError):
     """The frame decodes, but holds nothing that can be signed."""
 
 
+class UnreadableArchive(FrameError):
+    """The bytes are no archive of frames, or none that is safe to read."""
+
+
 class DatasetError(SceneprintError):
     """The folder or file is no sequence of frames."""
 
@@ -127,8 +138,16 @@ class UnknownJob(NotFound):
     """There is no job of that id."""
 
 
-class UnknownKey(SceneprintError):
+class UnknownKey(NotFound):
     """There is no key of that name."""
+
+
+class UnknownQuery(NotFound):
+    """There is no answer of that id, or no longer."""
+
+
+class UnknownSnapshot(NotFound):
+    """There is no snapshot of that id."""
 
 
 class Conflict(SceneprintError):
@@ -149,6 +168,14 @@ class JobOver(Conflict):
 
 class CannotRetry(Conflict):
     """The job is not over, its frame has a later one, or there is nothing to try again."""
+
+
+class NotIndexed(Conflict):
+    """What is asked for is made when the frame is indexed, or the job done, and it is not."""
+
+
+class PreconditionFailed(SceneprintError):
+    """What is to be edited is not as it was when it was read."""
 
 
 class InvalidRequest(SceneprintError):
@@ -177,8 +204,24 @@ class TooLarge(InvalidRequest):
     """The body of a request is larger than the service takes."""
 
 
+class SlowBody(InvalidRequest):
+    """The body of a request came too slowly."""
+
+
+class IdempotencyConflict(InvalidRequest):
+    """The request's Idempotency-Key was used for another one."""
+
+
 class KeyRequired(SceneprintError):
     """The service asks for a key, and none or an unknown one was given."""
+
+
+class Forbidden(SceneprintError):
+    """The key that was shown may see this, but not do that."""
+
+
+class RateLimited(SceneprintError):
+    """The caller asks more often than it may."""
 
 
 class Misdirected(SceneprintError):

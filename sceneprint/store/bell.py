@@ -45,6 +45,15 @@ class Bell:
         for name in names:
             self._ring(self._folder / name)
 
+    def listeners(self) -> list[str]:
+        """Host and process id, as `host:pid`, of every process of this machine that listens."""
+        try:
+            names = sorted(os.listdir(self._folder))  # noqa: PTH208
+        except OSError:
+            return []
+        read = [name for name in names if self._is_read(self._folder / name)]
+        return [":".join(name.rsplit("-", 2)[:2]) for name in read]
+
     @contextmanager
     def listen(self) -> Iterator[Listener]:
         """Be woken from now on; what is rung before the wait begins ends it at once."""
@@ -53,6 +62,17 @@ class Bell:
             yield listener
         finally:
             listener.close()
+
+    def _is_read(self, path: Path) -> bool:
+        """Whether somebody has a FIFO open: one that was left behind cannot be written to."""
+        try:
+            opened = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+        except OSError:
+            return False
+        try:
+            return stat.S_ISFIFO(os.fstat(opened).st_mode)
+        finally:
+            os.close(opened)
 
     def _ring(self, path: Path) -> None:
         try:

@@ -9,10 +9,12 @@ import fcntl
 import hashlib
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from io import FileIO
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 
 from sceneprint.errors import DamagedBlob, UnusableStore
 from sceneprint.store.faults import unusable
@@ -22,6 +24,44 @@ _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 #: What a blob is found to be.
 Condition = Literal["sound", "missing", "damaged"]
+
+
+class IncomingBlob:
+    """A blob that comes in parts; see `Blobs.incoming`.
+
+    Parameters
+    ----------
+    file : that it is written to
+    what : to say where that fails
+    keep : gives the file its name
+    """
+
+    def __init__(self, file: BinaryIO | FileIO, what: str, keep: Callable[[str], None]) -> None:
+        self._file, self._what, self._keep = file, what, keep
+        self._hashed = hashlib.sha256()
+        #: Bytes so far.
+        self.size = 0
+
+    def write(self, data: bytes) -> None:
+        """Add to it."""
+        try:
+            left = memoryview(data)
+            while left:  # a file without a buffer may take a part alone
+                left = left[self._file.write(left) or 0 :]
+        except OSError as error:
+            raise unusable(self._what, error) from error
+        self._hashed.update(data)
+        self.size += len(data)
+
+    def keep(self) -> str:
+        """End it; when this returns it survives the loss of power. Returns its digest."""
+        digest = self._hashed.hexdigest()
+        try:
+            os.fsync(self._file.fileno())
+            self._keep(digest)
+        except OSError as error:
+            raise unusable(self._what, error) from error
+        return digest
 
 
 class Blobs:
@@ -39,6 +79,7 @@ class Blobs:
 
     def __init__(self, folder: Path, *, make: bool = True) -> None:
         self._folder = folder
+        self._durable: set[str] = set()  # folders in it that this process has synced it for
         try:
             if make:
                 make_folder(folder)
@@ -60,11 +101,51 @@ class Blobs:
         digest = hashlib.sha256(data).hexdigest()
         path = self._path(digest)
         try:  # also where it is there: that one may be damaged, not yet durable, or being removed
-            path.parent.mkdir(exist_ok=True)
-            write_durable(path, data)
+            new = self._made(path.parent)
+            write_durable(path, data, folder_is_new=new)
         except OSError as error:
             raise unusable(f"{self._folder}: a blob cannot be written", error) from error
+        self._durable.add(path.parent.name)
         return digest
+
+    @contextmanager
+    def incoming(self) -> Iterator[IncomingBlob]:
+        """Take a blob in parts, such as one that does not fit into memory.
+
+        What is not kept by the end of it is removed.
+
+        Raises
+        ------
+        StoreFull, UnusableStore : as `put`, also from `write` and `keep`.
+        """
+        part = self._folder / f".{secrets.token_hex(6)}.part"
+        what = f"{self._folder}: a blob cannot be written"
+        try:
+            file = part.open("xb", buffering=0)
+        except OSError as error:
+            raise unusable(what, error) from error
+        try:
+            with file:
+                yield IncomingBlob(file, what, lambda digest: self._keep(part, digest))
+        finally:
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+
+    def _keep(self, part: Path, digest: str) -> None:
+        """Give a file that is written and synced the name of its content."""
+        path = self._path(digest)
+        self._made(path.parent)
+        os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
+        sync_folder(path.parent)
+        sync_folder(self._folder)
+
+    def _made(self, folder: Path) -> bool:
+        """See that a folder is there; whether it may not be durable yet."""
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            return folder.name not in self._durable
+        return True
 
     def get(self, digest: str) -> bytes:
         """The bytes of a digest, checked against it.

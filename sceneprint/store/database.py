@@ -72,8 +72,13 @@ class Database:
                 self._sealed.check(before)
 
     @contextmanager
-    def write(self) -> Iterator[Connection]:
+    def write(self, *, unchecked: bool = False) -> Iterator[Connection]:
         """A transaction that is committed at the end, or leaves no trace where it raises.
+
+        Parameters
+        ----------
+        unchecked : let SQLite not look whether rows that others refer to are there: tables can be
+            made anew then
 
         Raises
         ------
@@ -96,6 +101,9 @@ class Database:
         try:
             with explained(self._engine), self._engine.connect() as connection:
                 options: dict[str, Any] = {"sceneprint_write": HELD_S if self._held else BUSY_S}
+                if unchecked:
+                    options["sceneprint_unchecked"] = True
+                    connection.detach()  # nobody else gets a connection that does not look
                 writing = connection.execution_options(**options)
                 with writing.begin():
                     self._held = False
@@ -191,6 +199,8 @@ def _begin_sqlite(connection: Connection) -> None:
     if wait_s is None:
         connection.exec_driver_sql("BEGIN")
         return
+    if connection.get_execution_options().get("sceneprint_unchecked"):
+        connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # within a transaction it is late
     # a reader that turns writer half way would fail where another wrote in between
     if wait_s == BUSY_S:
         connection.exec_driver_sql("BEGIN IMMEDIATE")
@@ -218,7 +228,7 @@ def _migrate(database: Database, engine: Engine) -> None:
             f"{engine.url!r} has schema {current}, this version needs {head}, and the file is "
             "read-only. Open it once where it may be written, or use the version that wrote it."
         )
-    with database.write() as connection:  # another process may have been first
+    with database.write(unchecked=True) as connection:  # another process may have been first
         if _current(connection, known, engine) != head:
             from alembic import command
 
@@ -226,6 +236,18 @@ def _migrate(database: Database, engine: Engine) -> None:
             config.attributes["connection"] = connection
             with _migrating:
                 command.upgrade(config, "head")
+            if database.is_sqlite:
+                _require_whole(connection, engine)
+
+
+def _require_whole(connection: Connection, engine: Engine) -> None:
+    """What `unchecked` did not look at, looked at in the end."""
+    if connection.exec_driver_sql("PRAGMA foreign_key_check").first() is not None:
+        raise UnusableStore(
+            f"{engine.url!r}: rows refer to others that are not there, so it is not brought to "
+            "the schema of this version, and nothing was changed. Run `sceneprint fsck` of the "
+            "version that wrote it."
+        )
 
 
 def _current(connection: Connection, known: frozenset[str], engine: Engine) -> str | None:

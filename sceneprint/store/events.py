@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, delete, func, insert, or_, select
 
-from sceneprint.store.tables import events
+from sceneprint.store.tables import events, maps
 
 
 def tell(
@@ -18,7 +20,7 @@ def tell(
     job_id: str | None = None,
     **data: Any,
 ) -> None:
-    """Note an event; `kind` is such as frame.indexed."""
+    """Note an event; `kind` is one of schemas.events.KINDS."""
     connection.execute(
         insert(events).values(
             at=time.time(), kind=kind, map=map_name, frame_id=frame_id, job_id=job_id, data=data
@@ -43,16 +45,127 @@ def holds_anchor(connection: Connection, anchor: str) -> bool:
     A database that was put back to an earlier state gives the same numbers out again, but not at
     the same time to the same frames.
     """
-    number = anchor.partition(" ")[0]
-    if not (number.isascii() and number.isdigit() and len(number) < 19):
+    number = anchor_number(anchor)
+    if number is None:
         return False
     found = connection.execute(
-        select(events.c.number, events.c.at, events.c.frame_id).where(
-            events.c.number == int(number)
-        )
+        select(events.c.number, events.c.at, events.c.frame_id).where(events.c.number == number)
     ).first()
     return found is not None and _mark(*found) == anchor
 
 
 def _mark(number: int, at: float, frame_id: str | None) -> str:
     return f"{number} {at!r} {frame_id}"
+
+
+@dataclass(frozen=True)
+class EventRow:
+    """An event; fields as in the table."""
+
+    number: int
+    at: float
+    kind: str
+    map: str | None
+    frame_id: str | None
+    job_id: str | None
+    data: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which events somebody asks for, and may see.
+
+    Parameters
+    ----------
+    maps : only of these; None: of all, and those of no map
+    kinds : beginnings of kinds, one of which must fit; none: all
+    of_maps : whether those of no map are left out
+    """
+
+    maps: frozenset[str] | None = None
+    kinds: tuple[str, ...] = ()
+    of_maps: bool = False
+
+    def __call__(self, event: EventRow) -> bool:
+        """Whether an event is one of them."""
+        if self.maps is None:
+            seen = event.map is not None or not self.of_maps
+        else:
+            seen = event.map in self.maps
+        return seen and (not self.kinds or event.kind.startswith(self.kinds))
+
+
+def newest_number(connection: Connection) -> int:
+    """Number of the newest event, 0 where there is none."""
+    return int(connection.execute(select(func.max(events.c.number))).scalar() or 0)
+
+
+def list_events(
+    connection: Connection, wanted: Wanted, *, after: int = 0, before: int | None = None,
+    limit: int = 1000, newest_first: bool = False,
+) -> list[EventRow]:  # fmt: skip
+    """Events between two numbers, neither of them included.
+
+    SQLite gives the numbers in the order of the commits: writers are one at a time, and a number
+    is given within the writer's turn. So who has read up to one number never misses a smaller one.
+    On another database two writers may commit in another order than they took their numbers.
+    """
+    order = events.c.number.desc() if newest_first else events.c.number
+    asked = select(events).where(events.c.number > after).order_by(order).limit(limit)
+    if before is not None:
+        asked = asked.where(events.c.number < before)
+    if wanted.maps is not None:
+        asked = asked.where(events.c.map.in_(sorted(wanted.maps)))
+    elif wanted.of_maps:
+        asked = asked.where(events.c.map.is_not(None))
+    if wanted.kinds:
+        fits = [events.c.kind.startswith(one, autoescape=True) for one in wanted.kinds]
+        asked = asked.where(or_(*fits))
+    return [EventRow(**row) for row in connection.execute(asked).mappings()]
+
+
+def spent_numbers(
+    connection: Connection, kept: int, anchors: Collection[int], limit: int
+) -> list[int]:
+    """Numbers of events that may be removed, the oldest first.
+
+    An index is believed while the event is there that was the last of its map when it was made:
+    its anchor. So of each map the last one stays of those that are old enough to go: an index
+    that is being published has no other. And so do the anchors of indexes that are there.
+
+    Parameters
+    ----------
+    connection : of the database
+    kept : newest events that stay
+    anchors : numbers that stay too
+    limit : at most so many
+    """
+    floor = newest_number(connection) - kept
+    oldest = connection.execute(select(func.min(events.c.number))).scalar()
+    if oldest is None or oldest > floor:
+        return []
+    last = [
+        connection.execute(
+            select(func.max(events.c.number)).where(events.c.map == name, events.c.number <= floor)
+        ).scalar()
+        for name in connection.execute(select(maps.c.name)).scalars()
+    ]
+    stay = {number for number in (*last, *anchors) if number is not None and number <= floor}
+    found = connection.execute(
+        select(events.c.number)
+        .where(events.c.number <= floor)
+        .order_by(events.c.number)
+        .limit(limit + len(stay))
+    ).scalars()
+    return [number for number in found if number not in stay][:limit]
+
+
+def remove_events(connection: Connection, numbers: Sequence[int]) -> None:
+    """Remove events; see `spent_numbers`."""
+    connection.execute(delete(events).where(events.c.number.in_(numbers)))
+
+
+def anchor_number(anchor: str) -> int | None:
+    """Number of the event that an anchor marks; None where it is none."""
+    number = anchor.partition(" ")[0]
+    return int(number) if number.isascii() and number.isdigit() and len(number) < 19 else None

@@ -41,13 +41,13 @@ def passing(
         select(listed).where(
             frames.c.map_number == map_number,
             frames.c.state == FrameState.INDEXED,
-            *_conditions(wanted, taken),
+            *_conditions(map_number, wanted, taken),
         )
     ).scalar()
     return np.sort(np.fromstring(found, np.int64, sep=",")) if found else _NONE
 
 
-def _conditions(wanted: Filter, taken: Taken) -> list[ColumnElement[bool]]:
+def _conditions(map_number: int, wanted: Filter, taken: Taken) -> list[ColumnElement[bool]]:
     """What must hold; of a column that is null, no comparison does."""
     found: list[ColumnElement[bool]] = []
     if wanted.robot is not None:
@@ -66,7 +66,9 @@ def _conditions(wanted: Filter, taken: Taken) -> list[ColumnElement[bool]]:
     if wanted.region is not None:
         found += _inside(wanted.region)
     if wanted.exclude_frames:
-        barred = select(frames.c.number).where(frames.c.id.in_(wanted.exclude_frames))
+        barred = select(frames.c.number).where(
+            frames.c.map_number == map_number, frames.c.id.in_(wanted.exclude_frames)
+        )
         found.append(frames.c.number.not_in(barred.correlate(None)))
     return found
 

@@ -14,12 +14,29 @@ from sceneprint.schemas import FrameState
 from sceneprint.store.events import tell
 from sceneprint.store.maps import next_revision
 from sceneprint.store.records import FrameRow, MapRow, frame_row
-from sceneprint.store.tables import frame_tags, frames, signatures
+from sceneprint.store.tables import frame_tags, frames, job_files, signatures
+
+#: Frames of one content that are looked at: nobody needs more.
+_MOST_ALIKE = 100
 
 
-def add_frame(connection: Connection, map_number: int, values: dict[str, Any]) -> FrameRow:
-    """Insert a frame as received; `values` are its columns but number, id, state and times."""
-    frame_id, pose = uuid.uuid4().hex, values["pose"]
+def add_frame(
+    connection: Connection, map_number: int, values: dict[str, Any], frame_id: str | None = None
+) -> FrameRow:
+    """Insert a frame as received.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    map_number : of its map
+    values : its columns but number, id, state and times
+    frame_id : its id, which no frame of the map has that is not deleted; default: a new one
+    """
+    if frame_id is None:
+        frame_id = uuid.uuid4().hex
+    else:
+        _free(connection, map_number, frame_id)
+    pose = values["pose"]
     place = {} if pose is None else {f"pose_{axis}": pose[i][3] for i, axis in enumerate("xyz")}
     connection.execute(
         insert(frames).values(
@@ -27,21 +44,21 @@ def add_frame(connection: Connection, map_number: int, values: dict[str, Any]) -
             **values, **place,
         )
     )  # fmt: skip
-    row = _one(connection, frames.c.id == frame_id)
+    row = _one(connection, (frames.c.map_number == map_number) & (frames.c.id == frame_id))
     named = [{"frame_number": row.number, "tag": tag} for tag in sorted(set(row.tags))]
     if named:
         connection.execute(insert(frame_tags), named)
     return row
 
 
-def renew_frame(connection: Connection, frame_id: str, values: dict[str, Any]) -> FrameRow:
+def renew_frame(connection: Connection, number: int, values: dict[str, Any]) -> FrameRow:
     """Take a frame that failed as received once more, with its upload as it came now."""
     connection.execute(
         update(frames)
-        .where(frames.c.id == frame_id)
+        .where(frames.c.number == number)
         .values(state=FrameState.RECEIVED, reason=None, **values)
     )
-    return _one(connection, frames.c.id == frame_id)
+    return frame_of(connection, number)
 
 
 def renew_upload(
@@ -83,16 +100,40 @@ def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
 
 
 def find_content(connection: Connection, map_number: int, content_id: str) -> FrameRow | None:
-    """The frame of a map with that content, or None."""
+    """The frame of a map with that content, the first that came if there are more; or None."""
     found = (
         connection.execute(
-            select(frames).where(
-                frames.c.map_number == map_number, frames.c.content_id == content_id
-            )
+            select(frames)
+            .where(frames.c.map_number == map_number, frames.c.content_id == content_id)
+            .order_by(frames.c.number)
+            .limit(1)
         )
         .mappings()
         .first()
     )
+    return None if found is None else frame_row(found)
+
+
+def frames_of_content(connection: Connection, map_number: int, content_id: str) -> list[FrameRow]:
+    """Frames of a map with that content, as they came; more than one where they were PUT."""
+    found = connection.execute(
+        select(frames)
+        .where(frames.c.map_number == map_number, frames.c.content_id == content_id)
+        .order_by(frames.c.number)
+        .limit(_MOST_ALIKE)
+    ).mappings()
+    return [frame_row(row) for row in found]
+
+
+def living_frame(connection: Connection, map_number: int, frame_id: str) -> FrameRow | None:
+    """The frame of an id in a map, or None where there is none that is not deleted."""
+    found = connection.execute(
+        select(frames).where(
+            frames.c.map_number == map_number,
+            frames.c.id == frame_id,
+            frames.c.state != FrameState.DELETED,
+        )
+    ).mappings().first()  # fmt: skip
     return None if found is None else frame_row(found)
 
 
@@ -109,20 +150,6 @@ def frames_of(connection: Connection, numbers: Iterable[int]) -> dict[int, Frame
         )
     ).mappings()
     return {row["number"]: frame_row(row) for row in found}
-
-
-def list_frames(
-    connection: Connection, map_number: int, after: int, limit: int, state: FrameState | None
-) -> list[FrameRow]:
-    """Frames of a map in the order they came, from number `after` on; deleted ones on request."""
-    wanted = frames.c.state != FrameState.DELETED if state is None else frames.c.state == state
-    found = connection.execute(
-        select(frames)
-        .where(frames.c.map_number == map_number, frames.c.number > after, wanted)
-        .order_by(frames.c.number)
-        .limit(limit)
-    )
-    return [frame_row(row) for row in found.mappings()]
 
 
 def set_state(
@@ -167,19 +194,33 @@ def delete_frame(connection: Connection, row: MapRow, frame: FrameRow) -> list[s
 
 
 def refers_to(connection: Connection, blob: str) -> bool:
-    """Whether a frame that is kept, or a signature, refers to a blob."""
+    """Whether a frame that is kept, a signature or a job refers to a blob."""
     of_frame = select(frames.c.number).where(
         frames.c.blob == blob,
         frames.c.state.not_in((FrameState.DELETED, FrameState.REDUNDANT)),
     )
     of_artifact = select(signatures.c.frame_number).where(signatures.c.geometry == blob)
-    return any(connection.execute(one.limit(1)).first() for one in (of_frame, of_artifact))
+    of_job = select(job_files.c.job_number).where(job_files.c.blob == blob)
+    return any(connection.execute(one.limit(1)).first() for one in (of_frame, of_artifact, of_job))
 
 
 def count_states(connection: Connection) -> dict[str, int]:
     """How many frames of all maps are in each state."""
     rows = connection.execute(select(frames.c.state, func.count()).group_by(frames.c.state))
     return {row[0]: row[1] for row in rows}
+
+
+def _free(connection: Connection, map_number: int, frame_id: str) -> None:
+    """Let a deleted frame give its id up: its row stays, as readers learn of it by its number."""
+    connection.execute(
+        update(frames)
+        .where(
+            frames.c.map_number == map_number,
+            frames.c.id == frame_id,
+            frames.c.state == FrameState.DELETED,
+        )
+        .values(id=uuid.uuid4().hex)
+    )
 
 
 def _one(connection: Connection, condition: ColumnElement[bool]) -> FrameRow:

@@ -6,11 +6,14 @@ import hashlib
 import secrets
 import time
 import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass
 
-from sqlalchemy import Connection, delete, insert, select
+from sqlalchemy import Connection, Select, delete, insert, select
 from sqlalchemy.exc import IntegrityError
 
 from sceneprint.errors import Conflict, UnknownKey
+from sceneprint.schemas.keys import Scope
 from sceneprint.store.events import tell
 from sceneprint.store.tables import keys
 
@@ -18,8 +21,28 @@ from sceneprint.store.tables import keys
 PREFIX = "sp_"
 
 
-def create_key(connection: Connection, name: str) -> str:
-    """Make a key and return its secret, which is stored nowhere.
+@dataclass(frozen=True)
+class KeyRow:
+    """A key; times are seconds since 1970.
+
+    Parameters
+    ----------
+    name : unique
+    grants : scope by name of a map, `*` for all
+    created_at, expires_at : None: it does not expire
+    """
+
+    name: str
+    grants: dict[str, Scope]
+    created_at: float
+    expires_at: float | None
+
+
+def create_key(
+    connection: Connection, name: str, grants: Mapping[str, Scope],
+    expires_at: float | None = None,
+) -> str:  # fmt: skip
+    """Make a key and return its secret, which is stored nowhere; for the rest see KeyRow.
 
     Raises
     ------
@@ -29,8 +52,8 @@ def create_key(connection: Connection, name: str) -> str:
     try:
         connection.execute(
             insert(keys).values(
-                id=uuid.uuid4().hex, name=name, digest=_digest(secret), scopes=["admin"],
-                created_at=time.time(),
+                id=uuid.uuid4().hex, name=name, digest=_digest(secret), grants=dict(grants),
+                created_at=time.time(), expires_at=expires_at,
             )
         )  # fmt: skip
     except IntegrityError as error:
@@ -39,18 +62,21 @@ def create_key(connection: Connection, name: str) -> str:
     return secret
 
 
-def key_name(connection: Connection, secret: str) -> str | None:
-    """Name of the key with that secret, or None."""
-    found: str | None = connection.execute(
-        select(keys.c.name).where(keys.c.digest == _digest(secret))
-    ).scalar()
-    return found
+def find_key(connection: Connection, secret: str) -> KeyRow | None:
+    """The key with that secret, or None; also one that has expired."""
+    own = keys.c.digest == _digest(secret)
+    found = connection.execute(_asked().where(own)).mappings().first()
+    return None if found is None else KeyRow(**found)
 
 
-def list_keys(connection: Connection) -> list[tuple[str, float]]:
-    """Name of every key and when it was made, by name."""
-    rows = connection.execute(select(keys.c.name, keys.c.created_at).order_by(keys.c.name))
-    return [(row.name, row.created_at) for row in rows]
+def list_keys(
+    connection: Connection, after: str | None = None, limit: int | None = None
+) -> list[KeyRow]:
+    """Keys by name, from behind `after` on; default: all."""
+    asked = _asked().order_by(keys.c.name).limit(limit)
+    if after is not None:
+        asked = asked.where(keys.c.name > after)
+    return [KeyRow(**row) for row in connection.execute(asked).mappings()]
 
 
 def revoke_key(connection: Connection, name: str) -> None:
@@ -65,6 +91,10 @@ def revoke_key(connection: Connection, name: str) -> None:
             f"There is no key named {name!r:.80}. List them with `sceneprint keys --list`."
         )
     tell(connection, "key.revoked", name=name)
+
+
+def _asked() -> Select[tuple[str, dict[str, Scope], float, float | None]]:
+    return select(keys.c.name, keys.c.grants, keys.c.created_at, keys.c.expires_at)
 
 
 def _digest(secret: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, func, select
@@ -17,21 +18,34 @@ class Listed:
     """A job with the names of what it is about."""
 
     job: JobRow
-    frame_id: str
-    map_name: str
+    frame_id: str | None
+    map_name: str | None
 
 
 def list_jobs(
-    connection: Connection, before: int | None, limit: int, state: JobState | None
-) -> list[Listed]:
-    """Jobs, the newest first, from below number `before` on."""
+    connection: Connection, before: int | None, limit: int, state: JobState | None,
+    kind: str | None = None, map_names: Collection[str] | None = None,
+) -> list[Listed]:  # fmt: skip
+    """Jobs, the newest first, from below number `before` on.
+
+    Parameters
+    ----------
+    connection : of the database
+    before, limit : see above
+    state, kind : of those that are wanted
+    map_names : of those that are wanted; jobs of no map are not among them
+    """
     asked = (
         select(jobs, frames.c.id.label("frame_id"), maps.c.name.label("map_name"))
-        .join(frames, frames.c.number == jobs.c.frame_number)
-        .join(maps, maps.c.number == frames.c.map_number)
+        .join(frames, frames.c.number == jobs.c.frame_number, isouter=True)
+        .join(maps, maps.c.number == jobs.c.map_number, isouter=True)
         .order_by(jobs.c.number.desc())
         .limit(limit)
     )
+    if kind is not None:
+        asked = asked.where(jobs.c.kind == kind)
+    if map_names is not None:
+        asked = asked.where(maps.c.name.in_(list(map_names)))
     if before is not None:
         asked = asked.where(jobs.c.number < before)
     if state is not None:
@@ -53,11 +67,16 @@ def find_job(connection: Connection, job_id: str) -> JobRow:
     """
     row = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().first()
     if row is None:
-        raise UnknownJob(
-            f"There is no job {job_id!r:.80}. An upload answers with the id of its job, and "
-            "deleting a map deletes its jobs."
-        )
+        raise unknown_job(job_id)
     return job_row(row)
+
+
+def unknown_job(job_id: str) -> UnknownJob:
+    """What is said of a job that is not there, or not for whoever asks: the same words."""
+    return UnknownJob(
+        f"There is no job {job_id!r:.80}. An upload answers with the id of its job, and "
+        "deleting a map deletes its jobs."
+    )
 
 
 def last_of(

@@ -9,7 +9,16 @@ from sqlalchemy import Connection, delete, func, insert, select, update
 from sceneprint.errors import UnknownMap
 from sceneprint.store.events import tell
 from sceneprint.store.records import MapRow, map_row
-from sceneprint.store.tables import frame_tags, frames, jobs, maps, models, signatures
+from sceneprint.store.tables import (
+    frame_tags,
+    frames,
+    job_files,
+    job_items,
+    jobs,
+    maps,
+    models,
+    signatures,
+)
 
 
 def find_map(connection: Connection, name: str) -> MapRow:
@@ -21,11 +30,16 @@ def find_map(connection: Connection, name: str) -> MapRow:
     """
     row = connection.execute(select(maps).where(maps.c.name == name)).mappings().first()
     if row is None:
-        raise UnknownMap(
-            f"There is no map {name!r:.80}. List the maps with `sceneprint maps` or GET /v1/maps, "
-            "or make it."
-        )
+        raise unknown_map(name)
     return map_row(row)
+
+
+def unknown_map(name: str) -> UnknownMap:
+    """What is said of a map that is not there, or not for whoever asks: the same words."""
+    return UnknownMap(
+        f"There is no map {name!r:.80}. List the maps with `sceneprint maps` or GET /v1/maps, "
+        "or make it."
+    )
 
 
 def map_of(connection: Connection, number: int) -> MapRow:
@@ -80,14 +94,17 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     blobs : that it referred to
     """
     own = select(frames.c.number).where(frames.c.map_number == row.number)
-    blobs = connection.execute(
-        select(frames.c.blob)
-        .where(frames.c.map_number == row.number)
-        .union(select(signatures.c.geometry).where(signatures.c.frame_number.in_(own)))
-    ).scalars()
-    referred = list(blobs)
+    of_map = select(jobs.c.number).where(jobs.c.map_number == row.number)
+    asked = (
+        select(frames.c.blob).where(frames.c.map_number == row.number),
+        select(signatures.c.geometry).where(signatures.c.frame_number.in_(own)),
+        select(job_files.c.blob).where(job_files.c.job_number.in_(of_map)),
+    )
+    referred = sorted({blob for one in asked for blob in connection.execute(one).scalars()})
     connection.execute(delete(signatures).where(signatures.c.frame_number.in_(own)))
-    connection.execute(delete(jobs).where(jobs.c.frame_number.in_(own)))
+    for made in (job_items, job_files):
+        connection.execute(delete(made).where(made.c.job_number.in_(of_map)))
+    connection.execute(delete(jobs).where(jobs.c.map_number == row.number))
     connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(own)))
     connection.execute(delete(frames).where(frames.c.map_number == row.number))
     connection.execute(delete(maps).where(maps.c.number == row.number))

@@ -8,7 +8,7 @@ from sceneprint.schemas import FrameState
 from sceneprint.store.tables import frames
 
 
-def loosen(connection: Connection, frame_id: str, novelty: float | None) -> None:
+def loosen(connection: Connection, number: int, novelty: float | None) -> None:
     """Keep a frame that is not signed yet on the weaker of two conditions.
 
     Who sends it with a weaker one, or with none, is told that it is there.
@@ -19,7 +19,7 @@ def loosen(connection: Connection, frame_id: str, novelty: float | None) -> None
     connection.execute(
         update(frames)
         .where(
-            frames.c.id == frame_id,
+            frames.c.number == number,
             frames.c.state.in_((FrameState.RECEIVED, FrameState.SIGNING)),
             weaker,
         )

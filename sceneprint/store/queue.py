@@ -12,14 +12,16 @@ from __future__ import annotations
 import time
 import uuid
 from dataclasses import dataclass
+from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, and_, func, insert, or_, select, update
 
 from sceneprint.errors import JobOver, LostLease
+from sceneprint.logs import request_id
 from sceneprint.schemas import JobState
 from sceneprint.store.listing import find_job
 from sceneprint.store.records import JobRow, job_row
-from sceneprint.store.tables import jobs
+from sceneprint.store.tables import frames, jobs
 
 #: Tries that broke down before a job is dead.
 MAXIMUM_FAILURES = 3
@@ -43,16 +45,31 @@ class Claim:
 
 
 def enqueue(
-    connection: Connection, kind: str, frame_number: int, priority: int = 0,
-    model_id: str | None = None,
+    connection: Connection, kind: str, frame_number: int | None, priority: int = 0,
+    model_id: str | None = None, *, map_number: int | None = None,
+    data: dict[str, Any] | None = None,
 ) -> JobRow:  # fmt: skip
-    """Queue a job, in the transaction that stores what it is about; `model_id`: see the table."""
+    """Queue a job, in the transaction that stores what it is about.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    kind, frame_number, priority, model_id, data : see the table
+    map_number : where it is of no single frame; else the frame's map is taken
+    """
     job_id = uuid.uuid4().hex
     now = time.time()
+    if data is None and request_id() is not None:
+        data = {"request_id": request_id()}  # whose log its worker's lines belong to
+    of_map: Any = map_number
+    if frame_number is not None:
+        of_map = (
+            select(frames.c.map_number).where(frames.c.number == frame_number).scalar_subquery()
+        )
     connection.execute(
         insert(jobs).values(
-            id=job_id, kind=kind, frame_number=frame_number, model_id=model_id,
-            state=JobState.QUEUED,
+            id=job_id, kind=kind, map_number=of_map, frame_number=frame_number,
+            model_id=model_id, data=data, state=JobState.QUEUED,
             priority=priority, attempts=0, failures=0, token=0, run_after=now, created_at=now,
         )
     )  # fmt: skip
@@ -153,9 +170,9 @@ def renew(connection: Connection, held: Claim, lease_s: float) -> None:
 
 def finish(
     connection: Connection, held: Claim, state: JobState, error: str | None = None,
-    traceback: str | None = None,
+    traceback: str | None = None, **values: object,
 ) -> None:  # fmt: skip
-    """End a job, in the transaction that stores what it made.
+    """End a job, in the transaction that stores what it made; `values`: of its other columns.
 
     Raises
     ------
@@ -163,7 +180,20 @@ def finish(
     """
     _hold(
         connection, held, state=state, error=error, traceback=traceback, leased_until=None,
-        finished_at=time.time(),
+        finished_at=time.time(), **values,
+    )  # fmt: skip
+
+
+def go_on(connection: Connection, held: Claim, progress: dict[str, Any]) -> None:
+    """Queue a long job again after a part of it, behind those that wait: no try is used up.
+
+    Raises
+    ------
+    LostLease : as `renew`.
+    """
+    _hold(
+        connection, held, state=JobState.QUEUED, attempts=held.job.attempts - 1, failures=0,
+        leased_until=None, worker=None, run_after=time.time(), progress=progress,
     )  # fmt: skip
 
 
@@ -225,6 +255,18 @@ def cancel(connection: Connection, job: JobRow) -> None:
         .where(jobs.c.number == job.number)
         .values(state=JobState.CANCELLED, finished_at=time.time(), leased_until=None)
     )
+
+
+def revive(connection: Connection, job: JobRow) -> None:
+    """Queue a job again that is over, with all its tries before it."""
+    connection.execute(
+        update(jobs)
+        .where(jobs.c.number == job.number)
+        .values(
+            state=JobState.QUEUED, attempts=0, failures=0, error=None, traceback=None,
+            finished_at=None, leased_until=None, worker=None, run_after=time.time(),
+        )
+    )  # fmt: skip
 
 
 def cancel_of(connection: Connection, frame_number: int) -> None:

@@ -47,6 +47,8 @@ class FrameRow:
     pose_x: float | None
     pose_y: float | None
     pose_z: float | None
+    base_frame: str | None
+    base: list[list[float]] | None
     novelty: float | None
     received_at: float
     indexed_at: float | None
@@ -60,8 +62,12 @@ class JobRow:
     number: int
     id: str
     kind: str
-    frame_number: int
+    frame_number: int | None
+    map_number: int | None
     model_id: str | None
+    data: dict[str, Any] | None
+    progress: dict[str, Any] | None
+    result: dict[str, Any] | None
     state: JobState
     priority: int
     attempts: int
@@ -75,6 +81,13 @@ class JobRow:
     created_at: float
     started_at: float | None
     finished_at: float | None
+
+    @property
+    def frame(self) -> int:
+        """Number of the frame that a job of a single frame is about."""
+        if self.frame_number is None:
+            raise ValueError(f"job {self.id} of kind {self.kind} is of no single frame")
+        return self.frame_number
 
 
 def map_row(row: RowMapping) -> MapRow:

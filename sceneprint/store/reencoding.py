@@ -120,6 +120,7 @@ def enqueue_all(connection: Connection, row: MapRow, numbers: list[int]) -> None
     values = [
         {
             "id": uuid.uuid4().hex, "kind": REENCODE, "frame_number": number,
+            "map_number": row.number,
             "model_id": row.next_model_id, "state": JobState.QUEUED, "priority": PRIORITY,
             "attempts": 0, "failures": 0, "token": 0, "run_after": now, "created_at": now,
         }

@@ -36,6 +36,14 @@ class StoredSignature:
 
 
 @dataclass(frozen=True)
+class Sizes:
+    """Patches and ordered pairs of each level of a frame, the finest first."""
+
+    n_patches: tuple[int, ...]
+    n_pairs: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class Change:
     """A frame that was indexed, or is searched no more; `vector` is None then, or is damaged.
 
@@ -207,6 +215,16 @@ def stored_vector(connection: Connection, number: int, model_id: str) -> bytes |
             "from its upload while a worker runs; `sceneprint fsck` says whether that can be done."
         )
     return bytes(found.vector)
+
+
+def signature_sizes(connection: Connection, number: int, model_id: str) -> Sizes | None:
+    """How much of a frame went into its signature, or None where it has none."""
+    found = connection.execute(
+        select(signatures.c.n_patches, signatures.c.n_pairs).where(
+            signatures.c.frame_number == number, signatures.c.model_id == model_id
+        )
+    ).first()
+    return None if found is None else Sizes(tuple(found.n_patches), tuple(found.n_pairs))
 
 
 def stored_signatures(

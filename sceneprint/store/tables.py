@@ -59,7 +59,7 @@ frames = Table(
     "frames",
     metadata,
     Column("number", Integer, primary_key=True),
-    Column("id", String(32), nullable=False, unique=True),
+    Column("id", String(64), nullable=False),  # one that is deleted may give it up to another
     Column("map_number", Integer, ForeignKey("maps.number"), nullable=False),
     Column("state", String(16), nullable=False),
     Column("reason", Text),
@@ -78,13 +78,17 @@ frames = Table(
     Column("pose_x", Float),  # its translation, metres, to be searched for
     Column("pose_y", Float),
     Column("pose_z", Float),
+    Column("base_frame", String(128)),
+    Column("base", JSON(none_as_null=True)),  # T_base_sensor, 4 rows of 4
     Column("novelty", Float),  # kept only if the nearest frame is farther, as a share of d0
     Column("received_at", Float, nullable=False),
     Column("indexed_at", Float),
     Column("revision", Integer),
-    UniqueConstraint("map_number", "content_id"),
+    UniqueConstraint("map_number", "id"),
+    Index(None, "map_number", "content_id"),
     Index(None, "map_number", "revision"),
     Index(None, "map_number", "number"),
+    Index(None, "map_number", "indexed_at"),
     Index(  # all that a filter asks about: rows need not be read for it
         "ix_frames_searched",
         "map_number",
@@ -129,8 +133,12 @@ jobs = Table(
     Column("number", Integer, primary_key=True),
     Column("id", String(32), nullable=False, unique=True),
     Column("kind", String(16), nullable=False),
-    Column("frame_number", Integer, ForeignKey("frames.number"), nullable=False),
+    Column("frame_number", Integer, ForeignKey("frames.number")),  # null: of no single frame
+    Column("map_number", Integer, ForeignKey("maps.number")),  # null: of no map
     Column("model_id", String(64)),  # to sign with; null: the map's own
+    Column("data", JSON(none_as_null=True)),  # what was asked for, by the kind
+    Column("progress", JSON(none_as_null=True)),  # done, total, and how the next slice goes on
+    Column("result", JSON(none_as_null=True)),  # what came of it, in short
     Column("state", String(16), nullable=False),
     Column("priority", Integer, nullable=False),
     Column("attempts", Integer, nullable=False),
@@ -146,10 +154,32 @@ jobs = Table(
     Column("finished_at", Float),
     Index(None, "state", "run_after"),
     Index(None, "frame_number"),
+    Index(None, "map_number", "number"),
     sqlite_autoincrement=True,
 )
 #: The order in which jobs are claimed.
 Index("ix_jobs_claimed", jobs.c.state, jobs.c.priority.desc(), jobs.c.attempts, jobs.c.number)
+
+#: What a long job found, appended slice by slice.
+job_items = Table(
+    "job_items",
+    metadata,
+    Column("job_number", Integer, ForeignKey("jobs.number"), primary_key=True),
+    Column("number", Integer, primary_key=True),
+    Column("data", JSON, nullable=False),
+)
+
+#: What a job works on, or made.
+job_files = Table(
+    "job_files",
+    metadata,
+    Column("job_number", Integer, ForeignKey("jobs.number"), primary_key=True),
+    Column("name", String(64), primary_key=True),
+    Column("blob", String(64), nullable=False),
+    Column("bytes", BigInteger, nullable=False),
+    Column("media_type", String(64), nullable=False),
+    Index(None, "blob"),
+)
 
 keys = Table(
     "keys",
@@ -157,8 +187,9 @@ keys = Table(
     Column("id", String(32), primary_key=True),
     Column("name", String(128), nullable=False, unique=True),
     Column("digest", String(64), nullable=False, unique=True),  # SHA-256 of the secret
-    Column("scopes", JSON, nullable=False),
+    Column("grants", JSON, nullable=False),  # scope by name of a map, "*" for all
     Column("created_at", Float, nullable=False),
+    Column("expires_at", Float),
 )
 
 events = Table(
@@ -168,8 +199,50 @@ events = Table(
     Column("at", Float, nullable=False),
     Column("kind", String(32), nullable=False),
     Column("map", String(63)),
-    Column("frame_id", String(32)),
+    Column("frame_id", String(64)),
     Column("job_id", String(32)),
     Column("data", JSON, nullable=False),
+    Index(None, "map", "number"),
+    sqlite_autoincrement=True,
+)
+
+#: What was done under an `Idempotency-Key`, for a day.
+idempotency = Table(
+    "idempotency",
+    metadata,
+    Column("actor", String(128), primary_key=True),  # name of the caller's key, or ""
+    Column("key", String(255), primary_key=True),
+    Column("fingerprint", String(64), nullable=False),  # of route and payload
+    Column("data", JSON, nullable=False),  # ids of what was made
+    Column("created_at", Float, nullable=False),
+    Index(None, "created_at"),
+)
+
+#: Who changed what.
+audit = Table(
+    "audit",
+    metadata,
+    Column("number", Integer, primary_key=True),
+    Column("at", Float, nullable=False),
+    Column("actor", String(128), nullable=False),
+    Column("address", String(64)),
+    Column("action", String(64), nullable=False),
+    Column("map", String(63)),
+    Column("target", String(128)),
+    Column("request_id", String(64)),
+    Column("data", JSON, nullable=False),
+    sqlite_autoincrement=True,
+)
+
+#: Figures of processes, a few times a minute, for an hour or two.
+samples = Table(
+    "samples",
+    metadata,
+    Column("number", Integer, primary_key=True),
+    Column("at", Float, nullable=False),
+    Column("process", String(128), nullable=False),
+    Column("kind", String(16), nullable=False),
+    Column("data", JSON, nullable=False),
+    Index(None, "kind", "at"),
     sqlite_autoincrement=True,
 )

@@ -89,14 +89,16 @@ def hall(store: Store) -> MapRow:
 def received(store: Store, hall: MapRow) -> Callable[..., FrameRow]:
     """Insert a frame; what is not given is like that of any other."""
 
-    def add(content: str, row: MapRow = hall, **given: object) -> FrameRow:
+    def add(
+        content: str, row: MapRow = hall, frame_id: str | None = None, **given: object
+    ) -> FrameRow:
         values: dict[str, Any] = {
             "content_id": content, "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1},
             "depth_scale": 1000.0, "depth_along_ray": False, "robot": None, "session": None,
             "captured_at": None, "tags": [], "pose_parent": None, "pose": None,
         }  # fmt: skip
         with store.database.write() as connection:
-            return add_frame(connection, row.number, values | given)
+            return add_frame(connection, row.number, values | given, frame_id)
 
     return add
 

@@ -24,7 +24,10 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.records import MapRow
 from sceneprint.store.tables import metadata
 
-TABLES = ["events", "frame_tags", "frames", "jobs", "keys", "maps", "models", "signatures"]
+TABLES = [
+    "audit", "events", "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs",
+    "keys", "maps", "models", "samples", "signatures",
+]  # fmt: skip
 
 OPENS = """
 from sceneprint.store import open_database
@@ -63,7 +66,7 @@ def described(path: Path) -> set[tuple[str, ...]]:
             "SELECT type, name, tbl_name, sql FROM sqlite_master WHERE tbl_name NOT LIKE 'alembic%'"
         ).fetchall()
     return {
-        (kind, name, table, *sorted((sql or "").replace(",", " ").split()))
+        (kind, name, table, *sorted((sql or "").replace(",", " ").replace('"', "").split()))
         for kind, name, table, sql in rows
     }
 
@@ -90,11 +93,13 @@ def test_opening_again_changes_nothing(url: str, store: Store, hall: MapRow) -> 
 def test_four_processes_may_migrate_one_empty_database_at_once(
     url: str, tmp_path: Path, race: Callable[..., list[Any]]
 ) -> None:
-    assert race(OPENS, 4, url) == [["0002"]] * 4
+    assert race(OPENS, 4, url) == [["0003"]] * 4
     with closing(sqlite3.connect(tmp_path / "truth.db")) as connection:
         assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
         names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
-    assert sorted(name for (name,) in names) == ["alembic_version", *TABLES, "sqlite_sequence"]
+    assert sorted(name for (name,) in names) == sorted(
+        ["alembic_version", *TABLES, "sqlite_sequence"]
+    )
 
 
 def test_threads_may_migrate_databases_of_their_own_at_once(tmp_path: Path) -> None:

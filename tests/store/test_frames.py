@@ -11,7 +11,8 @@ from sqlalchemy.exc import IntegrityError
 
 from sceneprint.errors import Conflict, UnknownFrame, UnknownKey, UnknownMap
 from sceneprint.schemas import FrameState
-from sceneprint.store import Store, listing, queue
+from sceneprint.schemas.browsing import FrameListing
+from sceneprint.store import Store, browsing, listing, queue
 from sceneprint.store import frames as stored
 from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
@@ -69,13 +70,26 @@ def test_a_row_comes_back_as_it_was_given(store: Store, hall: MapRow, received: 
     assert (frame.captured_at, frame.session) == (1763731200.123456, "s\u00e9ance")
 
 
-def test_a_map_has_a_content_once(store: Store, hall: MapRow, received: Received) -> None:
-    received("a")
+def test_an_id_is_in_a_map_once_and_given_up_by_what_is_deleted(
+    store: Store, hall: MapRow, received: Received
+) -> None:
+    first = received("a", frame_id="gate.1")
     with pytest.raises(IntegrityError):
-        received("a")
+        received("b", frame_id="gate.1")
     with store.database.write() as connection:
         other = stored_maps.add_map(connection, "other", None, hall.model_id)
-    assert received("a", other).map_number == other.number
+    assert received("a", other, frame_id="gate.1").map_number == other.number
+    second = received("a")  # the same content under an id of its own
+    with store.database.read() as connection:
+        assert stored.find_content(connection, hall.number, "a") == first
+    delete(store, hall, first)
+    again = received("b", frame_id="gate.1")
+    with store.database.read() as connection:
+        assert stored.find_content(connection, hall.number, "a") == second
+        assert stored.find_frame(connection, hall, "gate.1") == again
+        gone = stored.frame_of(connection, first.number)
+    assert (gone.state, gone.id != "gate.1") == (FrameState.DELETED, True)
+    assert again.number > second.number > first.number
 
 
 def test_changes_come_in_order_whatever_the_block(
@@ -138,11 +152,14 @@ def test_a_deleted_frame_leaves_a_row_and_nothing_else(
     artifact = f"{frame.number:064d}"
     assert delete(store, hall, frame) == ["11" * 32, artifact]
     with store.database.read() as connection:
-        now = stored.find_frame(connection, hall, frame.id)
+        now, gone = (
+            stored.find_frame(connection, hall, frame.id),
+            FrameListing(state=FrameState.DELETED),
+        )
         assert (now.state, now.content_id, now.revision) == (FrameState.DELETED, None, 2)
         assert stored.find_content(connection, hall.number, "a") is None
-        assert stored.list_frames(connection, hall.number, 0, 9, None) == [other]
-        assert stored.list_frames(connection, hall.number, 0, 9, FrameState.DELETED) == [now]
+        assert browsing.list_frames(connection, hall.number, None, 9, FrameListing()) == [other]
+        assert browsing.list_frames(connection, hall.number, None, 9, gone) == [now]
         assert stored.frames_of(connection, [frame.number, other.number]) == {other.number: other}
         assert signed.stored_vector(connection, frame.number, hall.model_id) is None
         assert signed.geometry_blobs(connection, [frame.number], hall.model_id) == {}
@@ -163,10 +180,11 @@ def test_pages_follow_the_order_of_arrival(
 ) -> None:
     frames = [received(str(i)) for i in range(5)]
     indexed(frames[3])
+    done = FrameListing(state=FrameState.INDEXED)
     with store.database.read() as connection:
-        first = stored.list_frames(connection, hall.number, 0, 2, None)
-        rest = stored.list_frames(connection, hall.number, first[-1].number, 9, None)
-        found = stored.list_frames(connection, hall.number, 0, 9, FrameState.INDEXED)
+        first = browsing.list_frames(connection, hall.number, None, 2, FrameListing())
+        rest = browsing.list_frames(connection, hall.number, first[-1].number, 9, FrameListing())
+        found = browsing.list_frames(connection, hall.number, None, 9, done)
         assert stored_maps.count_frames(connection, hall.number) == {"indexed": 1, "received": 4}
         assert stored.count_states(connection) == {"indexed": 1, "received": 4}
     assert [frame.number for frame in first + rest] == [frame.number for frame in frames]
@@ -207,16 +225,18 @@ def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(
 def test_a_key_is_shown_once_and_kept_as_a_hash(store: Store) -> None:
     with store.database.write() as connection:
         assert stored_keys.list_keys(connection) == []
-        secret = stored_keys.create_key(connection, "fleet")
-        other = stored_keys.create_key(connection, "dashboard")
+        secret = stored_keys.create_key(connection, "fleet", {"*": "admin"})
+        other = stored_keys.create_key(connection, "dashboard", {"hall": "read"}, 5.0)
     assert secret.startswith("sp_")
     assert len(secret) == 46
     with pytest.raises(Conflict, match="a key named 'fleet'"), store.database.write() as connection:
-        stored_keys.create_key(connection, "fleet")
+        stored_keys.create_key(connection, "fleet", {"*": "admin"})
     with store.database.read() as connection:
-        assert [name for name, _ in stored_keys.list_keys(connection)] == ["dashboard", "fleet"]
-        names = [stored_keys.key_name(connection, s) for s in (secret, other, secret[:-1], "")]
-        assert names == ["fleet", "dashboard", None, None]
+        assert [key.name for key in stored_keys.list_keys(connection)] == ["dashboard", "fleet"]
+        found = [stored_keys.find_key(connection, s) for s in (secret, other, secret[:-1], "")]
+        assert [one and (one.name, one.grants, one.expires_at) for one in found] == [
+            ("fleet", {"*": "admin"}, None), ("dashboard", {"hall": "read"}, 5.0), None, None,
+        ]  # fmt: skip
         rows = connection.execute(select(keys).order_by(keys.c.name.desc())).all()
         assert [row.digest for row in rows] == [
             hashlib.sha256(s.encode()).hexdigest() for s in (secret, other)
@@ -228,7 +248,7 @@ def test_a_key_is_shown_once_and_kept_as_a_hash(store: Store) -> None:
     assert secret not in repr(rows) + repr(told)
     with store.database.write() as connection:
         stored_keys.revoke_key(connection, "fleet")
-        assert stored_keys.key_name(connection, secret) is None
-        assert stored_keys.key_name(connection, other) == "dashboard"
+        assert stored_keys.find_key(connection, secret) is None
+        assert stored_keys.find_key(connection, other) is not None
     with pytest.raises(UnknownKey, match="no key named 'fleet'"), store.database.write() as c:
         stored_keys.revoke_key(c, "fleet")

@@ -7,9 +7,14 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+from sqlalchemy import text
+
 from sceneprint.schemas import FrameState
 from sceneprint.store import open_database
-from sceneprint.store.frames import frame_of
+from sceneprint.store.frames import add_frame, frame_of
+from sceneprint.store.keys import list_keys
+from sceneprint.store.listing import find_job
+from sceneprint.store.queue import enqueue
 from sceneprint.store.tables import frame_tags
 
 #: What version 0001 stored of three frames: with tags and pose, with neither, with a tag twice.
@@ -45,6 +50,16 @@ def an_old_database(path: Path) -> None:
                 "VALUES (?, ?, 1, 'received', 'b', 1, '{}', 1000, 0, ?, ?, 1.0)",
                 (number, f"f{number}", json.dumps(tags), pose and json.dumps(pose)),
             )
+            connection.execute(
+                "INSERT INTO jobs (number, id, kind, frame_number, state, priority, attempts, "
+                "failures, token, run_after, created_at) "
+                "VALUES (?, ?, 'sign', ?, 'queued', 0, 0, 0, 0, 1.0, 1.0)",
+                (10 + number, f"j{number}", number),
+            )
+        connection.execute("INSERT INTO keys VALUES ('k', 'fleet', 'd', '[\"admin\"]', 1.0)")
+        # numbers that were given out to what has been removed since
+        connection.execute("UPDATE sqlite_sequence SET seq = 70 WHERE name = 'frames'")
+        connection.execute("UPDATE sqlite_sequence SET seq = 80 WHERE name = 'jobs'")
 
 
 def test_what_is_searched_for_is_filled_in_from_what_was_stored(tmp_path: Path) -> None:
@@ -60,3 +75,24 @@ def test_what_is_searched_for_is_filled_in_from_what_was_stored(tmp_path: Path) 
     assert rows[0].pose == POSE
     assert {row.state for row in rows} == {FrameState.RECEIVED}
     assert {row.novelty for row in rows} == {None}
+
+
+def test_jobs_keys_and_numbers_go_on_where_they_were(tmp_path: Path) -> None:
+    an_old_database(tmp_path / "truth.db")
+    database = open_database(f"sqlite:///{tmp_path / 'truth.db'}")
+    with database.write() as connection:
+        found = [find_job(connection, f"j{number}") for number in (1, 2, 3)]
+        assert [(job.number, job.frame, job.map_number) for job in found] \
+            == [(11, 1, 1), (12, 2, 1), (13, 3, 1)]  # fmt: skip
+        assert [(key.name, key.grants, key.expires_at) for key in list_keys(connection)] \
+            == [("fleet", {"*": "admin"}, None)]  # fmt: skip
+        assert enqueue(connection, "sign", 2).number == 81
+        connection.execute(text("UPDATE frames SET state = 'deleted' WHERE number = 3"))
+        values = {
+            "blob": "b", "bytes": 1, "intrinsics": {}, "depth_scale": 1.0, "tags": [],
+            "depth_along_ray": False, "pose": None,
+        }  # fmt: skip
+        assert add_frame(connection, 1, values).number == 71
+        checked = connection.execute(text("PRAGMA foreign_keys")).scalar()
+    assert checked == 1
+    database.close()

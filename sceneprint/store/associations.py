@@ -1,0 +1,92 @@
+"""Frames of sessions in the order in which they were taken, and jobs that associate them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, Select, delete, select
+
+from sceneprint.schemas import FrameState
+from sceneprint.store.parts import remove_parts
+from sceneprint.store.records import JobRow
+from sceneprint.store.tables import frames, jobs
+
+#: Kind of the jobs.
+ASSOCIATE = "associate"
+#: Numbers that one statement asks for.
+_BLOCK = 500
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A frame of a run, as far as associations need it.
+
+    Parameters
+    ----------
+    number, id : of the frame
+    robot, session, captured_at : as far as is known
+    parent : that its pose leads to
+    pose : T_parent_sensor, or None
+    """
+
+    number: int
+    id: str
+    robot: str | None
+    session: str | None
+    captured_at: float | None
+    parent: str | None
+    pose: list[list[float]] | None
+
+
+def numbers_of_session(
+    connection: Connection, map_number: int, session: str, robot: str | None
+) -> list[int]:
+    """Numbers of the indexed frames of a session in the order of time, then as they came.
+
+    Those without a time come last.
+    """
+    asked = select(frames.c.number).where(
+        frames.c.map_number == map_number,
+        frames.c.state == FrameState.INDEXED,
+        frames.c.session == session,
+    )
+    if robot is not None:
+        asked = asked.where(frames.c.robot == robot)
+    time = frames.c.captured_at
+    return list(connection.execute(asked.order_by(time.is_(None), time, frames.c.number)).scalars())
+
+
+def stops_of(connection: Connection, numbers: Iterable[int]) -> dict[int, Stop]:
+    """Frames by their numbers; those that are deleted, or not indexed any more, are left out."""
+    wanted = list(numbers)
+    found: dict[int, Stop] = {}
+    for start in range(0, len(wanted), _BLOCK):
+        rows = connection.execute(
+            _asked().where(
+                frames.c.number.in_(wanted[start : start + _BLOCK]),
+                frames.c.state == FrameState.INDEXED,
+            )
+        )
+        found |= {row["number"]: Stop(**row) for row in rows.mappings()}
+    return found
+
+
+def remove_job(connection: Connection, job: JobRow) -> list[str]:
+    """Forget a job with all that it found; a worker that is at it finds its lease lost.
+
+    Returns
+    -------
+    blobs : that it referred to: sweep them when this is committed
+    """
+    blobs = remove_parts(connection, job.number)
+    connection.execute(delete(jobs).where(jobs.c.number == job.number))
+    return blobs
+
+
+def _asked() -> Select[Any]:
+    return select(
+        frames.c.number, frames.c.id, frames.c.robot, frames.c.session, frames.c.captured_at,
+        frames.c.pose_parent.label("parent"), frames.c.pose,
+    )  # fmt: skip

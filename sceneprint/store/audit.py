@@ -1,0 +1,69 @@
+"""Who changed what: the newest lines of it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, delete, insert, select
+
+from sceneprint.store.tables import audit
+
+#: Lines that are kept.
+KEPT = 100_000
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change.
+
+    Parameters
+    ----------
+    action : the operation
+    actor : name of the key that was shown; "" where none was asked for
+    address : where the request came from
+    map, target : what was changed
+    request_id : as in the log
+    data : more about it
+    at : seconds since 1970; None: now
+    number : of the line; 0 before it is one
+    """
+
+    action: str
+    actor: str
+    address: str | None = None
+    map: str | None = None
+    target: str | None = None
+    request_id: str | None = None
+    data: dict[str, Any] | None = None
+    at: float | None = None
+    number: int = 0
+
+
+def note(connection: Connection, change: Change, kept: int = KEPT) -> None:
+    """Add a line; the oldest go where there are too many."""
+    added = connection.execute(
+        insert(audit).values(
+            at=time.time() if change.at is None else change.at, actor=change.actor,
+            address=change.address, action=change.action, map=change.map,
+            target=None if change.target is None else change.target[:128],
+            request_id=change.request_id, data=change.data or {},
+        )
+    ).inserted_primary_key  # fmt: skip
+    assert added is not None
+    connection.execute(delete(audit).where(audit.c.number <= added[0] - kept))
+
+
+def list_changes(
+    connection: Connection, before: int | None, limit: int, actor: str | None, map_name: str | None
+) -> list[Change]:
+    """Changes, the newest first, from below number `before` on."""
+    asked = select(audit).order_by(audit.c.number.desc()).limit(limit)
+    if before is not None:
+        asked = asked.where(audit.c.number < before)
+    if actor is not None:
+        asked = asked.where(audit.c.actor == actor)
+    if map_name is not None:
+        asked = asked.where(audit.c.map == map_name)
+    return [Change(**row) for row in connection.execute(asked).mappings()]

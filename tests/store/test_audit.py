@@ -1,0 +1,47 @@
+"""The audit log: bounded, in order, and found by who and where."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sceneprint.store import open_store
+from sceneprint.store.audit import Change, list_changes, note
+
+
+def test_the_newest_lines_are_kept(tmp_path: Path) -> None:
+    store = open_store(f"sqlite:///{tmp_path}/a.db", tmp_path / "blobs")
+    with store.database.write() as connection:
+        for number in range(9):
+            note(connection, Change(f"a{number}", "boss", at=float(number)), kept=4)
+    with store.database.read() as connection:
+        found = list_changes(connection, None, 99, None, None)
+    assert [(one.action, one.at) for one in found] == [
+        ("a8", 8.0), ("a7", 7.0), ("a6", 6.0), ("a5", 5.0),
+    ]  # fmt: skip
+    store.database.close()
+
+
+def test_lines_are_found_by_actor_and_map(tmp_path: Path) -> None:
+    store = open_store(f"sqlite:///{tmp_path}/a.db", tmp_path / "blobs")
+    with store.database.write() as connection:
+        note(connection, Change("make", "boss", map="hall", data={"n": 1}))
+        note(connection, Change("make", "robot", map="yard", target="t" * 200))
+        note(connection, Change("edit", "robot", map="hall"))
+
+    def found(*asked: object) -> list[tuple[str, str, str | None]]:
+        with store.database.read() as connection:
+            lines = list_changes(connection, *asked)  # type: ignore[arg-type]
+        return [(one.action, one.actor, one.map) for one in lines]
+
+    made, moved, edited = ("make", "boss", "hall"), ("make", "robot", "yard"), (
+        "edit", "robot", "hall",
+    )  # fmt: skip
+    assert found(None, 9, None, None) == [edited, moved, made]
+    assert found(3, 1, None, None) == [moved]
+    assert found(None, 9, "robot", None) == [edited, moved]
+    assert found(None, 9, None, "hall") == [edited, made]
+    assert found(None, 9, "robot", "hall") == [edited]
+    with store.database.read() as connection:
+        _, second, first = list_changes(connection, None, 9, None, None)
+    assert (first.data, second.target) == ({"n": 1}, "t" * 128)
+    store.database.close()

@@ -1,0 +1,243 @@
+"""Lists of frames and of sessions, against plain Python over random metadata."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import Connection, event, update
+
+from sceneprint.schemas import FrameState
+from sceneprint.schemas.browsing import FrameListing, Run
+from sceneprint.store import Store
+from sceneprint.store.browsing import list_frames
+from sceneprint.store.editing import write_frame
+from sceneprint.store.maps import add_map
+from sceneprint.store.records import FrameRow, MapRow
+from sceneprint.store.sessions import count_run, list_runs, poses_of_run
+from sceneprint.store.tables import frames
+
+Received = Callable[..., FrameRow]
+START = datetime(2026, 11, 16, 9, 30, tzinfo=UTC)
+
+
+def drawn(rng: np.random.Generator) -> dict[str, Any]:
+    """Metadata of a frame; times and names are few, so that bounds and equals are met."""
+    pose = np.eye(4)
+    pose[:3, 3] = rng.integers(-2, 3, 3)
+    parent = rng.choice([None, "p1", "p2"], p=[0.2, 0.5, 0.3])
+    at = None if rng.random() < 0.2 else START + timedelta(seconds=int(rng.integers(20)))
+    return {
+        "robot": rng.choice([None, "r1", "r2"]),
+        "session": rng.choice([None, "s1", "s2"], p=[0.2, 0.5, 0.3]),
+        "captured_at": None if at is None else at.timestamp(),
+        "tags": [tag for tag in ("door", "é", "c") if rng.random() < 0.5],
+        "pose_parent": parent, "pose": None if parent is None else pose.tolist(),
+    }  # fmt: skip
+
+
+@pytest.fixture
+def mixed(store: Store, hall: MapRow, received: Received) -> list[FrameRow]:
+    """Frames of a map in all states, some edited since; another map has frames as well."""
+    rng = np.random.default_rng(4)
+    with store.database.write() as connection:
+        other = add_map(connection, "other", None, hall.model_id)
+    rows = []
+    for i in range(60):
+        if i % 6 == 0:
+            received(f"o{i}", other, **drawn(rng))
+        rows.append(received(f"{i % 50:064d}", **drawn(rng)))
+    with store.database.write() as connection:
+        for i, row in enumerate(rows):
+            state = str(rng.choice(["indexed", "indexed", "received", "rejected", "deleted"]))
+            values = {"state": state, "received_at": START.timestamp() + i // 2}
+            own = frames.c.number == row.number
+            connection.execute(update(frames).where(own).values(**values))
+        for row in rows[::3]:
+            write_frame(connection, hall, row, drawn(rng))
+    with store.database.read() as connection:
+        found = [
+            one
+            for state in FrameState
+            for one in list_frames(connection, hall.number, None, 99, FrameListing(state=state))
+        ]
+    assert len(found) == 60
+    return sorted(found, key=lambda row: row.number)
+
+
+def passes(one: FrameRow, w: FrameListing) -> bool:
+    """By the sentences of `FrameListing`, condition by condition."""
+    at = None if one.captured_at is None else datetime.fromtimestamp(one.captured_at, UTC)
+    came = datetime.fromtimestamp(one.received_at, UTC)
+    return (
+        (one.state != "deleted" if w.state is None else one.state == w.state)
+        and (not w.robot or one.robot in w.robot)
+        and (not w.session or one.session in w.session)
+        and set(w.tag) <= set(one.tags)
+        and (w.captured_after is None or (at is not None and at >= w.captured_after))
+        and (w.captured_before is None or (at is not None and at <= w.captured_before))
+        and (w.received_after is None or came >= w.received_after)
+        and (w.received_before is None or came <= w.received_before)
+        and (w.parent_frame is None or one.pose_parent == w.parent_frame)
+        and (w.has_pose is None or (one.pose is not None) == w.has_pose)
+        and (w.content_id is None or one.content_id == w.content_id)
+    )
+
+
+def some_listing(rng: np.random.Generator) -> FrameListing:
+    a, b, c, d = (START + timedelta(seconds=int(n)) for n in rng.integers(0, 30, 4))
+    every: dict[str, Any] = {
+        "state": rng.choice(["indexed", "rejected", "deleted"]),
+        "robot": ["r1"] if rng.random() < 0.5 else ["r2", "r1"],
+        "session": str(rng.choice(["s1", "s2", "nobody"])),
+        "tag": rng.permutation(["door", "é", "c"])[: rng.integers(1, 3)].tolist(),
+        "captured_after": a, "captured_before": b, "received_after": c, "received_before": d,
+        "parent_frame": "p1", "has_pose": bool(rng.random() < 0.5),
+        "content_id": f"{rng.integers(0, 50):064d}",
+    }  # fmt: skip
+    names = rng.permutation(list(every))[: rng.integers(0, 4)]
+    given = {name: every[name] for name in names}
+    return FrameListing.model_validate({**given, "order": rng.choice(["asc", "desc"])})
+
+
+def test_every_list_is_that_of_plain_python(
+    store: Store, hall: MapRow, mixed: list[FrameRow]
+) -> None:
+    rng, sizes = np.random.default_rng(9), Counter[bool]()
+    with store.database.read() as connection:
+        for _ in range(150):
+            wanted, limit = some_listing(rng), int(rng.integers(1, 9))
+            expected = [one for one in mixed if passes(one, wanted)]
+            if wanted.order == "desc":
+                expected.reverse()
+            found: list[FrameRow] = []
+            while True:  # pages follow each other without a gap or a double
+                last = found[-1].number if found else None
+                page = list_frames(connection, hall.number, last, limit, wanted)
+                found += page
+                if len(page) < limit:
+                    break
+            assert found == expected, wanted
+            sizes[len(expected) > 0] += 1
+    assert min(sizes.values()) > 20  # neither all empty nor all full
+
+
+def test_sessions_are_those_of_plain_python(
+    store: Store, hall: MapRow, mixed: list[FrameRow]
+) -> None:
+    expected: dict[tuple[str, str], list[FrameRow]] = {}
+    for one in mixed:
+        if one.state != "deleted":
+            expected.setdefault((one.session or "", one.robot or ""), []).append(one)
+    with store.database.read() as connection:
+        runs = list_runs(connection, hall.number, None, 99)
+        paged, after = [], None
+        while found := list_runs(connection, hall.number, after, 2):
+            paged += found
+            after = (found[-1].session or "", found[-1].robot or "")
+    assert paged == runs
+    assert [(run.session or "", run.robot or "") for run in runs] == sorted(expected)
+    for run in runs:
+        own = expected[run.session or "", run.robot or ""]
+        times = [one.captured_at for one in own if one.captured_at is not None]
+        assert run.states == Counter(one.state for one in own)
+        assert run.posed == sum(one.pose is not None for one in own)
+        assert (run.first, run.last) == (min(times, default=None), max(times, default=None))
+        assert run.parents == Counter(o.pose_parent for o in own if o.pose_parent is not None)
+
+
+def test_poses_of_a_run_are_those_of_plain_python(
+    store: Store, hall: MapRow, mixed: list[FrameRow]
+) -> None:
+    since = START + timedelta(seconds=5)
+    for run in (
+        Run(session="s1", parent_frame="p1"),
+        Run(session="s1", robot="r1", parent_frame="p2"),
+        Run(session="s2", parent_frame="p1", captured_after=since),
+        Run(session="s1", parent_frame="p1", captured_before=since),
+    ):
+        own = [
+            one
+            for one in mixed
+            if one.session == run.session
+            and one.state != "deleted"
+            and run.robot in (None, one.robot)
+            and passes(one, FrameListing(
+                captured_after=run.captured_after, captured_before=run.captured_before
+            ))
+        ]  # fmt: skip
+        expected = [
+            one
+            for one in own
+            if one.pose_parent == run.parent_frame and one.captured_at is not None
+        ]
+        expected.sort(key=lambda one: (one.captured_at, one.number))
+        with store.database.read() as connection:
+            found = poses_of_run(connection, hall.number, run)
+            counted = count_run(connection, hall.number, run)
+        assert expected
+        assert [(one.frame_id, one.captured_at, one.pose) for one in found] == [
+            (one.id, one.captured_at, one.pose) for one in expected
+        ]
+        assert {(one.robot, one.parent): one.count for one in counted} == Counter(
+            (one.robot, one.pose_parent) for one in own
+        )
+
+
+@contextmanager
+def plans(connection: Connection) -> Iterator[list[str]]:
+    """How SQLite goes about every statement."""
+    told: list[str] = []
+
+    def explain(_: Any, cursor: Any, statement: str, parameters: Any, *__: Any) -> None:
+        cursor.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)
+        told.extend(row[3] for row in cursor.fetchall())
+
+    event.listen(connection, "before_cursor_execute", explain)
+    yield told
+    event.remove(connection, "before_cursor_execute", explain)
+
+
+SEARCHED = "USING COVERING INDEX ix_frames_searched"
+
+
+@pytest.mark.parametrize(
+    ("wanted", "way"),
+    [
+        ({}, "INDEX ix_frames_map_number_number"),
+        ({"order": "desc"}, "INDEX ix_frames_map_number_number"),
+        ({"state": "indexed"}, "INDEX ix_frames_map_number_number"),
+        ({"state": "rejected"}, f"{SEARCHED} (map_number=? AND state=?"),
+        ({"session": "s"}, f"{SEARCHED} (map_number=? AND state=? AND session=?"),
+        ({"session": "s", "robot": "r", "order": "desc"},
+         f"{SEARCHED} (map_number=? AND state=? AND session=? AND robot=?"),
+        ({"robot": "r"}, SEARCHED),
+        ({"captured_after": START}, SEARCHED),
+        ({"has_pose": True}, SEARCHED),
+        ({"parent_frame": "p"}, SEARCHED),
+        ({"tag": "a"}, "INDEX ix_frame_tags_tag_frame_number (tag=?)"),
+        ({"content_id": "a" * 64}, "INDEX ix_frames_map_number_content_id"),
+    ],
+)  # fmt: skip
+def test_each_list_takes_the_index_that_is_meant_for_it(
+    store: Store, hall: MapRow, wanted: dict[str, Any], way: str
+) -> None:
+    listing = FrameListing.model_validate(wanted)
+    for beyond in (None, 7):
+        with store.database.read() as connection, plans(connection) as told:
+            list_frames(connection, hall.number, beyond, 9, listing)
+        assert any(way in step for step in told), told
+        assert not any(step.startswith("SCAN") for step in told), told
+
+
+def test_sessions_are_counted_without_reading_a_row(store: Store, hall: MapRow) -> None:
+    with store.database.read() as connection, plans(connection) as told:
+        list_runs(connection, hall.number, ("a", "b"), 9)
+        count_run(connection, hall.number, Run(session="s"))
+    assert all(SEARCHED in step or step.startswith("USE TEMP B-TREE") for step in told), told
+    assert any("session=?" in step for step in told)

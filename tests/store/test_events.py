@@ -1,0 +1,166 @@
+"""Events: which are told, in which order, and which are removed."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from pathlib import Path
+
+import pytest
+from sqlalchemy import insert, select
+
+from sceneprint.schemas.events import KINDS
+from sceneprint.store import Store, open_store
+from sceneprint.store.events import (
+    Wanted,
+    anchor_of,
+    holds_anchor,
+    list_events,
+    newest_number,
+    remove_events,
+    spent_numbers,
+    tell,
+)
+from sceneprint.store.figures import count_events
+from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.tables import events
+
+ROOT = Path(__file__).resolve().parents[2]
+KEPT = ("frame.received", "frame.indexed", "map.created", "key.created")
+
+#: Each process commits events one by one, some transactions of several and some given up.
+WRITE = """
+from sceneprint.store import open_store
+from sceneprint.store.events import tell
+from pathlib import Path
+
+def work(i):
+    store = open_store(ARGS[0], Path(ARGS[1]))
+    for n in range(40):
+        try:
+            with store.database.write() as connection:
+                for part in range(1 + n % 3):
+                    tell(connection, "frame.received", "hall", f"{i}-{n}-{part}")
+                if n % 7 == 3:
+                    raise KeyError
+        except KeyError:
+            pass
+"""
+READ = """
+from sceneprint.store.events import Wanted
+from sceneprint.engine.happenings import read_on
+import time
+
+def read(store):
+    seen, place, until = [], 0, time.monotonic() + 60
+    while len(seen) < int(ARGS[2]) and time.monotonic() < until:
+        found, place = read_on(store.database, Wanted(), place, 5)
+        seen += [(one.number, one.frame_id) for one in found]
+    return seen
+
+writes = work
+def work(i):
+    return read(open_store(ARGS[0], Path(ARGS[1]))) if i == 3 else writes(i)
+"""
+
+
+@pytest.fixture
+def empty(tmp_path: Path) -> Store:
+    return open_store(f"sqlite:///{tmp_path / 'sceneprint.db'}", tmp_path / "blobs")
+
+
+def fill(store: Store, count: int) -> None:
+    with store.database.write() as connection:
+        keep_model(connection, "m" * 64, "small", b"")
+        for name in ("hall", "shop"):
+            add_map(connection, name, None, "m" * 64)
+        for i in range(count):
+            name = ("hall", "shop", None)[i % 3]
+            connection.execute(
+                insert(events).values(at=1000.0 + i, kind=KEPT[i % 4], map=name, data={})
+            )
+
+
+def test_who_reads_on_misses_nothing_of_several_writers(race, tmp_path):
+    url, blobs = f"sqlite:///{tmp_path / 'sceneprint.db'}", tmp_path / "blobs"
+    store = open_store(url, blobs)
+    sure = sum(1 + n % 3 for n in range(40) if n % 7 != 3) * 3
+    *_, seen = race(WRITE + READ, 4, url, blobs, sure)
+    with store.database.read() as connection:
+        rows = connection.execute(select(events.c.number, events.c.frame_id)).all()
+    assert [list(row) for row in rows] == seen
+    assert len(seen) == sure
+    for i in range(3):  # each writer's own in its order
+        own = [frame for _, frame in seen if frame.startswith(f"{i}-")]
+        assert own == [f"{i}-{n}-{k}" for n in range(40) if n % 7 != 3 for k in range(1 + n % 3)]
+
+
+def test_the_database_and_the_stream_pick_the_same(empty):
+    fill(empty, 60)
+    maps = (None, frozenset(("hall",)), frozenset(("hall", "shop")), frozenset())
+    kinds = ((), ("frame.",), ("frame.i", "key."), ("frame_",), ("map.created",))
+    with empty.database.read() as connection:
+        every = list_events(connection, Wanted())
+        assert [one.number for one in every] == list(range(1, 63))
+        for named, begun, of_maps in itertools.product(maps, kinds, (False, True)):
+            wanted = Wanted(named, begun, of_maps)
+            assert list_events(connection, wanted) == [one for one in every if wanted(one)]
+        newest = list_events(connection, Wanted(), before=50, limit=7, newest_first=True)
+        assert [one.number for one in newest] == list(range(49, 42, -1))
+
+
+def test_what_is_not_kept_goes_and_the_anchors_stay(empty):
+    fill(empty, 60)
+    with empty.database.read() as connection:
+        anchor = anchor_of(connection, "shop")
+        assert newest_number(connection) == 62
+        assert spent_numbers(connection, 62, (), 99) == []
+        # 1 and 2 made the maps; then hall, shop, none in turn: of 1 to 40 the last ones are 39
+        # and 40, and 17 is an anchor
+        found = spent_numbers(connection, 22, (17, 55), 99)
+        assert found == [n for n in range(1, 41) if n not in (39, 40, 17)]
+        assert spent_numbers(connection, 22, (17,), 5) == [1, 2, 3, 4, 5]
+    with empty.database.write() as connection:
+        remove_events(connection, found)
+        assert spent_numbers(connection, 22, (17,), 99) == []
+        assert holds_anchor(connection, anchor)
+        assert len(list_events(connection, Wanted())) == 62 - len(found)
+        # a map in which nothing happens keeps its last event, however many follow
+        for _ in range(100):
+            tell(connection, "key.created")
+        gone = spent_numbers(connection, 1, (), 999)
+        assert {39, 40} <= set(gone)
+        remove_events(connection, gone)
+        assert holds_anchor(connection, anchor)
+        assert anchor_of(connection, "shop") == anchor
+
+
+def test_events_are_counted_by_interval(empty):
+    fill(empty, 60)
+    with empty.database.read() as connection:
+        every = [one for one in list_events(connection, Wanted()) if one.at < 2000]
+        for start, width, name in (
+            (1000.0, 10.0, None),
+            (1007.5, 4.0, "hall"),
+            (1059.5, 1.0, None),
+        ):
+            counted = count_events(connection, KEPT, start, width, name)
+            naive: dict[tuple[int, str], int] = {}
+            for one in every:
+                if one.at >= start and name in (None, one.map):
+                    place = (int((one.at - start) // width), one.kind)
+                    naive[place] = naive.get(place, 0) + 1
+            recent = {key: n for key, n in counted.items() if key[0] < 1e6}  # not of the maps
+            assert recent == naive
+
+
+def test_every_kind_that_is_told_is_declared():
+    told, pattern = set(), re.compile(r"\b(?:tell|tell_of)\(\s*connection,\s*\"([\w.]+)\"")
+    declared_event = re.compile(r"\bevent=\"([\w.]+)\"")
+    for folder in ("sceneprint", "service", "worker"):
+        for path in (ROOT / folder).rglob("*.py"):
+            text = path.read_text()
+            told |= set(pattern.findall(text)) | set(declared_event.findall(text))
+    assert {"frame.indexed", "map.created", "key.revoked"} <= told
+    assert told <= set(KINDS)
+    assert all(re.fullmatch(r"[a-z_]+\.[a-z_]+", kind) and len(kind) <= 32 for kind in KINDS)

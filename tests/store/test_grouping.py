@@ -1,0 +1,111 @@
+"""Writers that come together are committed together, and one that fails fails alone."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import Connection, event, func, select
+
+from sceneprint.errors import FrameConflict, StoreFull
+from sceneprint.store import Database, open_database
+from sceneprint.store.events import tell
+from sceneprint.store.grouping import MOST, Grouping
+from sceneprint.store.tables import events
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Database:
+    return open_database(f"sqlite:///{tmp_path / 'x.db'}")
+
+
+def together(database: Database, works: list[Callable[[Connection], Any]]) -> tuple[list[Any], int]:
+    """What came of works that all waited for one writer, and how often was committed."""
+    group, commits = Grouping(database), [0]
+    event.listen(database._engine, "commit", lambda _: commits.__setitem__(0, commits[0] + 1))
+    found: list[Any] = [None] * len(works)
+
+    def run(i: int) -> None:
+        try:
+            found[i] = group.run(works[i])
+        except Exception as error:
+            found[i] = error
+
+    threads = [threading.Thread(target=run, args=(i,)) for i in range(len(works))]
+    with database.write():  # until this is over nobody else writes
+        for one in threads:
+            one.start()
+        while len(group._waiting) < len(works):
+            pass
+    for one in threads:
+        one.join()
+    return found, commits[0] - 1
+
+
+def count(database: Database, kind: str) -> int:
+    with database.read() as connection:
+        asked = select(func.count()).where(events.c.kind == kind)
+        return int(connection.execute(asked).scalar_one())
+
+
+def noting(kind: str, result: object) -> Callable[[Connection], Any]:
+    def work(connection: Connection) -> object:
+        tell(connection, kind, None, None)
+        return result
+
+    return work
+
+
+def test_who_waits_together_is_committed_together(database: Database) -> None:
+    found, commits = together(database, [noting("a", i) for i in range(MOST + 3)])
+    assert found == list(range(MOST + 3))
+    assert count(database, "a") == MOST + 3
+    assert commits == 2  # at most MOST in one
+
+
+def test_a_refusal_costs_no_other(database: Database) -> None:
+    def refuse(_: Connection) -> None:
+        raise FrameConflict("no")
+
+    found, commits = together(database, [noting("a", 0), refuse, noting("a", 2)])
+    assert (found[0], found[2], str(found[1])) == (0, 2, "no")
+    assert (count(database, "a"), commits) == (2, 1)
+
+
+def test_what_breaks_a_transaction_leaves_no_trace_and_the_others_their_own(
+    database: Database,
+) -> None:
+    def break_down(connection: Connection) -> None:
+        tell(connection, "broken", None, None)
+        raise ValueError("a mistake")
+
+    found, _ = together(database, [noting("a", 0), break_down, noting("a", 2)])
+    assert (found[0], found[2]) == (0, 2)
+    assert isinstance(found[1], ValueError)
+    assert (count(database, "a"), count(database, "broken")) == (2, 0)
+
+
+def test_a_full_disk_is_told_to_all(database: Database) -> None:
+    def full(connection: Connection) -> None:
+        tell(connection, "full", None, None)
+        raise StoreFull("no room")
+
+    found, _ = together(database, [noting("a", 0), full])
+    assert [type(one) for one in found] == [StoreFull, StoreFull]
+    assert (count(database, "a"), count(database, "full")) == (0, 0)
+
+
+def test_ctrl_c_ends_its_own_writer_alone(database: Database) -> None:
+    group, tries = Grouping(database), [0]
+
+    def stop(_: Connection) -> None:
+        tries[0] += 1
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        group.run(stop)
+    assert group.run(noting("a", 1)) == 1
+    assert (tries, count(database, "a")) == ([1], 1)
