@@ -13,6 +13,7 @@ import numpy as np
 from sceneprint.geometry.acceptance import Mode
 from sceneprint.geometry.association import preferred, voters
 from sceneprint.geometry.averaging import PoseAverage, average_poses
+from sceneprint.geometry.covariance import place_covariance, transported
 from sceneprint.geometry.retrieval import Ranking
 from sceneprint.geometry.validation import Validation, ValidationParameters
 from sceneprint.pipeline import validate
@@ -44,21 +45,24 @@ class Location:
     ----------
     parent : frame in which the pose is given
     average : T_parent_query with the spread of the votes and how many agree
+    covariance : (6, 6) of it, as `geometry.covariance` orders it; None where a vote has none
     """
 
     parent: str
     average: PoseAverage
+    covariance: Floats | None
 
 
 def associate(
     query: Geometry,
     ranking: Ranking,
     among: Sequence[int],
-    open_geometry: Callable[[int], Geometry],
+    open_geometry: Callable[[int], Geometry | None],
     k: int = 5,
     seed: int = 0,
     p: ValidationParameters | None = None,
     mode: Mode = "full",
+    go_on: Callable[[], bool] = lambda: True,
 ) -> list[Match]:
     """Candidates validated in the order of R until `k` are accepted: Sec. III-E.
 
@@ -67,9 +71,10 @@ def associate(
     query : geometry artifact
     ranking : R
     among : positions in R to try, rising: C, or the first of R
-    open_geometry : artifact of a row of the database
+    open_geometry : artifact of a row of the database; a row without one is passed over
     k : accepted ones after which to stop, at least 1
     seed, p, mode : see `validate`
+    go_on : asked before each; where it says no, the rest is left
 
     Returns
     -------
@@ -86,8 +91,13 @@ def associate(
     tried: list[Match] = []
     accepted = 0
     for position in among:
+        if not go_on():
+            break
         index = int(ranking.indices[position])
-        validation = validate(query, open_geometry(index), seed, p, mode)
+        geometry = open_geometry(index)
+        if geometry is None:
+            continue
+        validation = validate(query, geometry, seed, p, mode)
         tried.append(
             Match(
                 index,
@@ -133,8 +143,16 @@ def locate(
     accepted = [m for m in matches if m.validation.status == "accepted"]
     names = [parents[m.index] if parents is not None else "" for m in accepted]
     chosen = voters(names, [m.validation.strength == "strong" for m in accepted], views)
-    transforms = [(accepted[i].index, accepted[i].validation.T_match_query) for i in chosen]
-    votes = [poses[index] @ T for index, T in transforms if T is not None]
+    votes, told = [], []
+    for match in [accepted[i] for i in chosen]:
+        T, covariance = match.validation.T_match_query, match.validation.covariance
+        if T is not None:
+            votes.append(poses[match.index] @ T)
+            if covariance is not None:
+                told.append(transported(covariance, poses[match.index][:3, :3], np.zeros(3)))
     if not votes:
         return None
-    return Location(names[chosen[0]], average_poses(np.stack(votes)))
+    average, sure = average_poses(np.stack(votes)), None
+    if len(told) == len(votes):
+        sure = place_covariance(average, np.stack(votes), np.stack(told))
+    return Location(names[chosen[0]], average, sure)

@@ -16,6 +16,7 @@ from sceneprint.geometry.matching import MatchingParameters, correspondences
 from sceneprint.geometry.registration import (
     COARSE,
     FINE,
+    Refined,
     RefinementParameters,
     refine,
     refined_all,
@@ -48,12 +49,14 @@ class Alignment:
     others : (n, 4, 4) the other hypotheses that were refined, best first
     stiffness : least over largest eigenvalue of the information, 0 where a direction is free
     points : (N, 6) of the source that evidence is counted on
+    refined : the last refinement, with its information; None where it was lost
     """
 
     T: Floats
     others: Floats
     stiffness: float
     points: Floats32
+    refined: Refined | None
 
 
 def align(
@@ -94,10 +97,10 @@ def align(
     best, others = refined[order[0]], refined[order[1:]]
     fine = refine(sampled(source.surface, p.fine.stride), target.surface, best, p.fine)
     if fine is None:
-        return Alignment(best, others, 0.0, points)
+        return Alignment(best, others, 0.0, points, None)
     eigenvalues = np.linalg.eigvalsh(fine.information)
     stiffness = max(float(eigenvalues[0] / eigenvalues[-1]), 0.0)
-    return Alignment(fine.T, others, stiffness, points)
+    return Alignment(fine.T, others, stiffness, points, fine)
 
 
 def _scores(

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneprint.geometry.rigid import difference, nearest_rotation
 from sceneprint.types import Floats
@@ -33,6 +34,7 @@ class PoseAverage:
         there is one
     support : how many votes agree
     votes : how many there were
+    members : (support,) which of them agree, rising
     """
 
     T: Floats
@@ -40,6 +42,7 @@ class PoseAverage:
     spread_rad: float
     support: int
     votes: int
+    members: NDArray[np.intp]
 
 
 def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAverage:
@@ -72,4 +75,5 @@ def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAv
     T[:3, 3] = members[:, :3, 3].mean(axis=0)
     left = np.array([difference(T, one) for one in members])
     metres, radians = np.sqrt((left**2).mean(axis=0)).tolist()
-    return PoseAverage(T, metres, radians, len(members), len(poses))
+    which = np.flatnonzero(near[medoid])
+    return PoseAverage(T, metres, radians, len(members), len(poses), which)

@@ -49,11 +49,14 @@ class Refined:
     information : (6, 6) J^T W J per point used: turn (radians), then shift (metres), about the
         target's origin
     points : that took part in the last step
+    mean_square : weighted square of their residuals, per point used: the noise of this very pair,
+        in the weights of `information`
     """
 
     T: Floats
     information: Floats
     points: int
+    mean_square: float
 
 
 @kernel
@@ -79,13 +82,15 @@ def _nearest_pixel(
 def _accumulate(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
     gate: float, least_cosine: float, reference: float, A: Floats, g: Floats,
-) -> int:  # fmt: skip
-    """Normal equations of one Gauss-Newton step; returns how many points took part."""
+) -> tuple[int, float]:  # fmt: skip
+    """Normal equations of one Gauss-Newton step; returns how many points took part, and the sum
+    of their weighted squares.
+    """
     height, width = points.shape[0], points.shape[1]
     row = np.zeros(6)
     A[:] = 0.0
     g[:] = 0.0
-    used = 0
+    used, squares = 0, 0.0
     for i in range(len(source)):
         px, py, pz = source[i, 0], source[i, 1], source[i, 2]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
@@ -123,36 +128,41 @@ def _accumulate(
             g[a] -= wa * residual
             for b in range(a + 1):
                 A[a, b] += wa * row[b]
+        squares += weight * residual * residual
         used += 1
     for a in range(6):
         for b in range(a):
             A[b, a] = A[a, b]
-    return used
+    return used, squares
 
 
 @kernel
 def refine_in_place(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
     numbers: Floats, information: Floats,
-) -> int:  # fmt: skip
-    """Gauss-Newton on T; the points that took part in the last step, 0 where it was lost."""
+) -> tuple[int, float]:  # fmt: skip
+    """Gauss-Newton on T; the points that took part in the last step, 0 where it was lost, and
+    their mean weighted square before it.
+    """
     iterations, minimum = int(numbers[0]), int(numbers[5])
     A, g, step = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     before, turn = np.zeros((3, 3)), np.zeros((3, 3))
-    used = 0
+    used, squares = 0, 0.0
     for iteration in range(iterations):
         share = iteration / max(iterations - 1, 1)
         gate = numbers[1] * (numbers[2] / numbers[1]) ** share
-        used = _accumulate(source, points, normals, camera, T, gate, numbers[3], numbers[4], A, g)
+        used, squares = _accumulate(
+            source, points, normals, camera, T, gate, numbers[3], numbers[4], A, g
+        )
         if used < minimum:
-            return 0
+            return 0, 0.0
         for a in range(6):
             for b in range(6):
                 information[a, b] = A[a, b] / used
             # a little damping: a direction that no point holds does not move
             A[a, a] += 1e-6 * used
         if not solve_positive(A, g, step):
-            return 0
+            return 0, 0.0
         for a in range(3):
             for b in range(3):
                 before[a, b] = T[a, b]
@@ -164,7 +174,7 @@ def refine_in_place(
         x, y, z = T[0, 3], T[1, 3], T[2, 3]
         for a in range(3):
             T[a, 3] = turn[a, 0] * x + turn[a, 1] * y + turn[a, 2] * z + step[3 + a]
-    return used
+    return used, squares / max(used, 1)
 
 
 def numbers_of(p: RefinementParameters) -> Floats:
@@ -193,11 +203,11 @@ def refine(
     refined : or None where fewer than `minimum_points` stay within the gates, or they fix no step
     """
     T, information = np.array(T_target_source, float), np.zeros((6, 6))
-    used = refine_in_place(
+    used, mean_square = refine_in_place(
         source, target.points, target.normals, camera_of(target.intrinsics), T,
         numbers_of(p), information,
     )  # fmt: skip
-    return Refined(T, information, used) if used else None
+    return Refined(T, information, used, mean_square) if used else None
 
 
 def refined_all(
@@ -209,6 +219,9 @@ def refined_all(
     kept = []
     for hypothesis in hypotheses:
         T = hypothesis.copy()
-        if refine_in_place(points, target.points, target.normals, camera, T, numbers, information):
+        used, _ = refine_in_place(
+            points, target.points, target.normals, camera, T, numbers, information
+        )
+        if used:
             kept.append(T)
     return np.array(kept).reshape(-1, 4, 4)

@@ -26,6 +26,7 @@ from sceneprint.geometry.acceptance import (
 )
 from sceneprint.geometry.agreement import AgreementParameters, agreement, sampled
 from sceneprint.geometry.alignment import Alignment, AlignmentParameters, align
+from sceneprint.geometry.covariance import CovarianceParameters, pair_covariance
 from sceneprint.geometry.planes import explained, plane_view
 from sceneprint.geometry.registration import FINE, refine
 from sceneprint.geometry.rigid import inverse, inverses, nearest_rotation, rotation_angle
@@ -42,6 +43,7 @@ class ValidationParameters:
     rivals: RivalParameters = field(default_factory=RivalParameters)
     alignment: AlignmentParameters = field(default_factory=AlignmentParameters)
     agreement: AgreementParameters = field(default_factory=AgreementParameters)
+    covariance: CovarianceParameters = field(default_factory=CovarianceParameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +71,7 @@ class Validation:
         speaks for accepting; elsewhere it is 0
     T_rival : (4, 4) that rival, or None
     seed : of the random choices
+    covariance : (6, 6) of T_match_query where it is accepted, else None; see `covariance.py`
     """
 
     status: Status
@@ -84,6 +87,7 @@ class Validation:
     ambiguity: float
     T_rival: Floats | None
     seed: int
+    covariance: Floats | None = None
 
 
 def middle(a: Floats, b: Floats) -> Floats:
@@ -185,7 +189,10 @@ def _decided(
         voted = np.concatenate([there.others, inverses(back.others)])
         ambiguity, T_rival = best_rival(*views, T, voted, p.rivals, p.agreement)
         status, strength, reason = belief(e, ambiguity, p.acceptance)
+    covariance = None
+    if status == "accepted":
+        covariance = pair_covariance(there.refined, back.refined, T, p.covariance)
     return Validation(
         status, strength, reason, T, e.residual_m, e.residual_rad, e.overlap, e.plane_overlap,
-        e.violations, inliers, ambiguity, T_rival, seed,
+        e.violations, inliers, ambiguity, T_rival, seed, covariance,
     )  # fmt: skip

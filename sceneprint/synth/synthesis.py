@@ -67,7 +67,7 @@ def synthesise_room(
     MissingDependency : Embree cannot be imported.
     """
     room, rng = room_and_rng(seed, index)
-    sensor = _own(noise, intrinsics, rng) if noise else None
+    sensor = own_sensor(noise, intrinsics, rng) if noise else None
 
     def shots(poses: list[Floats]) -> list[tuple[Floats32, Floats]]:
         if sensor is None:
@@ -123,7 +123,7 @@ def _caster(scene: Room | Mesh | Caster) -> Caster:
     return Caster(scene) if isinstance(scene, Mesh) else scene
 
 
-def _own(noise: KinectNoise, intrinsics: Intrinsics, rng: np.random.Generator) -> KinectNoise:
+def own_sensor(noise: KinectNoise, intrinsics: Intrinsics, rng: np.random.Generator) -> KinectNoise:
     """The sensor of one room: no two are quite equal."""
     s = rng.uniform(0.8, 1.4)
     most = intrinsics.width // 18 if rng.random() < 0.4 else 0

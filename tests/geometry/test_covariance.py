@@ -1,0 +1,234 @@
+"""Covariances: transported, by definition, free where nothing holds, and of the right size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from benchmarks.uncertainty import line, near, places, square, votes_of
+from sceneprint.geometry.agreement import sampled
+from sceneprint.geometry.averaging import average_poses
+from sceneprint.geometry.covariance import (
+    CovarianceParameters,
+    Free,
+    adjoint,
+    error_of,
+    free_directions,
+    pair_covariance,
+    place_covariance,
+    transported,
+)
+from sceneprint.geometry.registration import FINE, Refined, refine
+from sceneprint.geometry.rigid import inverse
+from sceneprint.models import read_model
+from sceneprint.types import Floats, Surface
+
+
+def posed(rng: np.random.Generator) -> Floats:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    T[:3, 3] = rng.normal(size=3)
+    return T
+
+
+def with_error(T: Floats, error: Floats) -> Floats:
+    """The transform that is off by (x, y, z, rx, ry, rz), from the definition."""
+    result = T.copy()
+    result[:3, :3] = Rotation.from_rotvec(error[3:]).as_matrix() @ T[:3, :3]
+    result[:3, 3] += error[:3]
+    return result
+
+
+def some_covariance(rng: np.random.Generator, scale: float = 1.0) -> Floats:
+    root = rng.normal(size=(6, 6)) * scale
+    result: Floats = root @ root.T
+    return result
+
+
+def test_an_error_is_what_was_put_there() -> None:
+    rng = np.random.default_rng(1)
+    T = posed(rng)
+    for size in (0.0, 1e-12, 1e-6, 1e-2, 1.0):
+        error = size * rng.normal(size=6)
+        np.testing.assert_allclose(error_of(T, with_error(T, error)), error, rtol=1e-6, atol=1e-15)
+
+
+def test_transport_against_monte_carlo() -> None:
+    rng = np.random.default_rng(2)
+    T, before, after = posed(rng), posed(rng), posed(rng)
+    S = some_covariance(rng, 2e-3)
+    errors = rng.multivariate_normal(np.zeros(6), S, 8_000)
+    cases = (
+        (lambda A: before @ A, transported(S, before[:3, :3], np.zeros(3))),
+        (lambda A: A @ after, transported(S, np.eye(3), T[:3, :3] @ after[:3, 3])),
+        (inverse, transported(S, T[:3, :3].T, inverse(T)[:3, 3])),
+    )
+    some = [with_error(T, one) for one in errors]
+    for told, expected in cases:
+        there = told(T)
+        found = np.cov(np.array([error_of(there, told(one)) for one in some]).T)
+        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        np.testing.assert_allclose(found / scale, expected / scale, atol=0.06)
+
+
+def test_transports_follow_each_other() -> None:
+    rng = np.random.default_rng(3)
+    a, b = posed(rng), posed(rng)
+    one = adjoint(b[:3, :3], b[:3, 3]) @ adjoint(a[:3, :3], a[:3, 3])
+    both = adjoint(b[:3, :3] @ a[:3, :3], b[:3, 3] + b[:3, :3] @ a[:3, 3])
+    np.testing.assert_allclose(one, both, atol=1e-12)
+
+
+def left_twist(T: Floats, true: Floats) -> Floats:
+    """(turn, shift) with true = [exp(turn), shift] T, as refinement has it."""
+    D = true @ np.linalg.inv(T)
+    return np.concatenate([Rotation.from_matrix(D[:3, :3]).as_rotvec(), D[:3, 3]])
+
+
+@pytest.mark.parametrize("lost", [None, 0, 1])
+def test_a_pairs_covariance_from_the_definition(lost: int | None) -> None:
+    rng = np.random.default_rng(4)
+    T, p = posed(rng), CovarianceParameters()
+    refined = [Refined(T, some_covariance(rng) + np.eye(6), 500, s) for s in (3e-5, 1e-5)]
+    information, noise = np.zeros((6, 6)), []
+    step = 1e-6
+    for i, (one, told) in enumerate(zip(refined, (lambda A: A, np.linalg.inv), strict=True)):
+        if i == lost:
+            continue
+        J = np.array(
+            [
+                (left_twist(told(T), told(with_error(T, e)))
+                 - left_twist(told(T), told(with_error(T, -e)))) / (2 * step)
+                for e in step * np.eye(6)
+            ]
+        ).T  # fmt: skip
+        information += J.T @ one.information @ J
+        noise.append(one.mean_square)
+    expected = np.linalg.inv(information / len(noise)) * np.mean(noise) / p.independent
+    there, back = (None if i == lost else one for i, one in enumerate(refined))
+    found = pair_covariance(there, back, T)
+    assert found is not None
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-12)
+    assert (found == found.T).all()
+    # a radian may count as any number of metres: that only says what is free
+    other = pair_covariance(there, back, T, replace(p, lever=3.0))
+    np.testing.assert_allclose(other, expected, rtol=1e-5, atol=1e-12)
+
+
+def test_no_refinement_no_covariance() -> None:
+    assert pair_covariance(None, None, np.eye(4)) is None
+
+
+def of_itself(surface: Surface) -> tuple[Floats, Floats]:
+    """Covariance of a surface laid on itself, and points all over it."""
+    points = sampled(surface, FINE.stride)
+    one = refine(points, surface, np.eye(4), FINE)
+    S = pair_covariance(one, one, np.eye(4))
+    assert S is not None
+    return S, points.astype(float)
+
+
+def planes(
+    scenes: ModuleType, normals: list[Floats], places: list[Floats], farthest: float
+) -> Surface:
+    """What a camera at the origin sees inside these planes."""
+    q = np.array([scenes.plane(scenes.CAMERA, n, p) for n, p in zip(normals, places, strict=True)])
+    seen = q.argmax(axis=0)
+    near = np.where(q.max(axis=0) > 1 / farthest, q.max(axis=0), 0.0)
+    surface: Surface = scenes.lifted(scenes.CAMERA, near, np.array(normals)[seen])
+    return surface
+
+
+def displaced(free: Free, points: Floats) -> Floats:
+    """How far the error moves each point along its normal, per unit of it."""
+    moved = free.translation + np.cross(free.rotation, points[:, :3])
+    result: Floats = np.abs((moved * points[:, 3:]).sum(axis=1))
+    return result
+
+
+def test_a_plane_leaves_three_directions_free(scenes: ModuleType) -> None:
+    normal = scenes.unit(0.3, -0.2, -1.0)
+    S, points = of_itself(planes(scenes, [normal], [np.array([0.0, 0.0, 2.0])], 8.0))
+    free = free_directions(S)
+    assert len(free) == 3
+    for one in free:
+        assert displaced(one, points).max() < 1e-3
+        assert one.deviation == pytest.approx(CovarianceParameters().most, rel=0.05)
+    twists = np.array([[*one.translation, *one.rotation] for one in free])
+    np.testing.assert_allclose(twists @ twists.T, np.eye(3), atol=1e-9)
+    # the plane's motions: two shifts within it, and a turn about its normal
+    turn = twists[:, 3:]
+    assert np.linalg.matrix_rank(turn, tol=1e-3) == 1
+    np.testing.assert_allclose(np.cross(turn, normal), 0.0, atol=1e-3)
+
+
+def test_a_corridor_leaves_one_direction_free(scenes: ModuleType) -> None:
+    along = scenes.unit(0.25, 0.1, 1.0)
+    across = scenes.unit(*np.cross(along, [0.0, 1.0, 0.0]))
+    up = np.cross(across, along)
+    normals = [across, -across, up, -up]
+    S, points = of_itself(planes(scenes, normals, [-0.9 * n for n in normals], 6.0))
+    (one,) = free_directions(S)
+    assert abs(abs(float(one.translation @ along)) - 1) < 1e-3
+    assert np.linalg.norm(one.rotation) < 1e-2
+    assert displaced(one, points).max() < 1e-2
+
+
+def test_a_corner_holds_every_direction(scenes: ModuleType) -> None:
+    S, _ = of_itself(scenes.corner()[0])
+    assert free_directions(S) == ()
+    assert np.sqrt(np.linalg.eigvalsh(S).max()) < 0.01
+
+
+def test_free_directions_by_hand() -> None:
+    S = np.diag([1.0, 4.0, 899.0, 1.0, 1.0, 1.0]) * 1e-4
+    assert free_directions(S) == ()  # not quite 30 times the least
+    (one,) = free_directions(np.diag([1.0, 4.0, 901.0, 1.0, 1.0, 1.0]) * 1e-4)
+    assert (one.translation.tolist(), one.rotation.tolist()) == ([0, 0, 1], [0, 0, 0])
+    assert one.deviation == pytest.approx(0.01 * np.sqrt(901))
+    first, second = free_directions(np.diag([1.0, 1.0, 2000.0, 1.0, 1.0, 3000.0]) * 1e-6)
+    assert (first.rotation.tolist(), second.translation.tolist()) == ([0, 0, 1], [0, 0, 1])
+    assert first.deviation == pytest.approx(np.sqrt(3e-3))
+
+
+def test_what_a_radian_counts_says_what_is_free_and_not_how_far() -> None:
+    S = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 300.0]) * 1e-6
+    assert free_directions(S) == ()
+    (one,) = free_directions(S, replace(CovarianceParameters(), lever=2.0))
+    assert (one.translation.tolist(), one.rotation.tolist()) == ([0, 0, 0], [0, 0, 1])
+    assert one.deviation == pytest.approx(np.sqrt(3e-4))
+
+
+def test_a_place_from_its_votes() -> None:
+    poses = np.repeat(np.eye(4)[None], 4, axis=0)
+    poses[:, 0, 3] = (0.01, 0.02, 0.03, 5.0)  # the last is elsewhere
+    covariances = np.array([np.diag([s] * 6) for s in (1e-4, 2e-4, 3e-4, 7.0)])
+    average = average_poses(poses)
+    assert average.members.tolist() == [0, 1, 2]
+    found = place_covariance(average, poses, covariances)
+    expected = np.diag([2e-4 * (1 / 2 + 1 / 6)] * 6)
+    expected[0, 0] += 2 * 0.01**2 / (3 * 2)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    alone = average_poses(poses[3:])
+    assert (place_covariance(alone, poses[3:], covariances[3:]) == covariances[3]).all()
+
+
+def test_errors_are_as_large_as_is_told() -> None:
+    """On rooms that nothing was fitted to: seed 6303, where the scale is of 6101."""
+    model = read_model("compact")
+    votes = [one for room in (2, 3) for one in votes_of(6303, room, model) if near(one.error)]
+    found = np.array([square(one.error, one.covariance) for one in votes]) / 6
+    assert len(found) >= 25
+    assert 0.5 < found.mean() < 1.4
+    assert (found < chi2.ppf(0.95, 6) / 6).mean() > 0.85
+    averaged = np.array(places(votes)) / 6
+    assert len(averaged) >= 8
+    assert 0.2 < averaged.mean() < 1.1
+    told = line("pairs", (6 * found).tolist())
+    assert told.startswith(f"| pairs | {len(found)} | {found.mean():.2f} | ")
+    assert told.endswith(f"| {(found < chi2.ppf(0.99, 6) / 6).mean():.0%} |")
