@@ -1,0 +1,106 @@
+"""Traces: every point judged as the counts say, patches that coincide, and overlays."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.agreement import AgreementParameters, agreement, sampled
+from sceneprint.geometry.overlays import SOURCE, STEP_COLOURS, STEPS, TARGET, overlay
+from sceneprint.geometry.rigid import inverse
+from sceneprint.geometry.traces import AGREES, NEITHER, VIOLATES, judged, residual_steps, trace
+from sceneprint.types import Floats, Geometry, Patches, Surface
+
+P = AgreementParameters(stride=3)
+
+
+def shifted(x: float = 0.0, z: float = 0.0) -> Floats:
+    T = np.eye(4)
+    T[0, 3], T[2, 3] = x, z
+    return T
+
+
+def wall(scenes: ModuleType, z: float) -> Surface:
+    ahead = np.array([0.0, 0.0, -1.0])
+    q = scenes.plane(scenes.CAMERA, ahead, np.array([0.0, 0.0, z]))
+    surface: Surface = scenes.lifted(scenes.CAMERA, q, np.broadcast_to(ahead, (*q.shape, 3)))
+    return surface
+
+
+def patches(*rows: tuple[float, ...]) -> Patches:
+    """One for each x, y, z and, if its normal is not -z, the normal."""
+    means = np.array([row[:3] for row in rows], float)
+    normals = np.array([row[3:] or (0.0, 0.0, -1.0) for row in rows], float)
+    n = len(rows)
+    return Patches(means, normals, np.ones(n), np.ones(n, np.int32), np.ones(n))
+
+
+def framed(surface: Surface, of: Patches) -> Geometry:
+    return Geometry(surface, of, np.zeros((len(of), 4), np.uint8), "a" * 64)
+
+
+@pytest.mark.parametrize("T", [shifted(), shifted(0.04, 0.03), shifted(0.3, -0.3), shifted(z=9.0)])
+def test_every_point_is_judged_as_it_is_counted(scenes: ModuleType, T: Floats) -> None:
+    seen, _ = scenes.corner()
+    points = sampled(seen, P.stride)
+    counts, verdicts = agreement(points, seen, T, P), judged(points, seen, T, P)
+    assert (verdicts == AGREES).sum() == counts.inliers
+    assert (verdicts == VIOLATES).sum() == counts.violations
+    for i in range(0, len(points), 41):
+        alone = agreement(points[i : i + 1], seen, T, P)
+        assert verdicts[i] == (AGREES if alone.inliers else VIOLATES if alone.violations else 0)
+
+
+def test_a_wall_before_a_wall(scenes: ModuleType) -> None:
+    near, far = wall(scenes, 1.5), wall(scenes, 2.0)
+    assert set(judged(sampled(near, 3), far, shifted(), P).tolist()) == {VIOLATES}
+    assert set(judged(sampled(far, 3), near, shifted(), P).tolist()) == {NEITHER}
+
+
+def test_steps_by_hand(scenes: ModuleType) -> None:
+    seen = wall(scenes, 2.0)
+    points = sampled(seen, 3)
+    ahead = int(np.hypot(points[:, 0], points[:, 1]).argmin())
+    for z, step in ((0.0, 0), (0.009, 0), (0.011, 1), (-0.019, 1), (0.021, 2), (0.049, 2),
+                    (0.051, 3), (0.4, 3), (-0.09, 3), (-0.2, 4)):  # fmt: skip
+        assert residual_steps(points, seen, shifted(z=z), STEPS, P)[ahead] == step, z
+
+
+def test_patches_coincide_with_each_others_nearest(scenes: ModuleType) -> None:
+    T = shifted(1.0)
+    query = patches(
+        (0, 0, 2), (1, 0, 2), (1.05, 0, 2), (2, 0, 2), (3, 0, 2), (4, 0, 2, 0.6, 0.0, -0.8)
+    )
+    match = patches(
+        (5.1, 0, 2), (4.2, 0, 2), (3, 0, 2, 1.0, 0.0, 0.0), (2.04, 0, 2), (1.03, 0.04, 2)
+    )
+    surface = wall(scenes, 2.0)
+    found = trace(framed(surface, query), framed(surface, match), T, P)
+    # (1.05: at 2.05, nearer than 1's 2.0) (2: its normal differs) (3: 0.2 m off)
+    # (4: at 5.0 with cos 0.8)
+    assert found.pairs.tolist() == [[2, 3], [0, 4]]
+    assert found.distances == pytest.approx([0.01, 0.05])
+    assert (found.of_query == judged(found.query, surface, T, P)).all()
+    assert (found.of_match == judged(found.match, surface, inverse(T), P)).all()
+    nothing = trace(framed(surface, patches((0, 0, 9))), framed(surface, match), T, P)
+    assert (nothing.pairs.shape, nothing.distances.shape) == ((0, 2), (0,))
+
+
+def test_overlays_are_coloured(scenes: ModuleType) -> None:
+    near, far = wall(scenes, 1.5), wall(scenes, 2.0)
+    n = int(near.valid.sum())
+    points, normals, colours = overlay(near, far, shifted(z=0.5))
+    assert points[:n, 2] == pytest.approx(2.0)
+    assert points[n:, 2] == pytest.approx(2.0)
+    assert (normals == (0, 0, -1)).all()
+    assert (colours[:n] == SOURCE).all()
+    assert (colours[n:] == TARGET).all()
+    turned = np.diag([1.0, -1.0, -1.0, 1.0])
+    _, _, colours = overlay(near, far, turned, "normal")
+    assert (colours[:n] == (128, 128, 255)).all()
+    assert (colours[n:] == (128, 128, 0)).all()
+    _, _, colours = overlay(near, far, shifted(), "residual")
+    assert (colours[:n] == STEP_COLOURS[-1]).all()  # before what the other saw
+    assert (colours[n:] == STEP_COLOURS[-2]).all()  # behind it
