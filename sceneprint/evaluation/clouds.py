@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneprint.clouds import write_ply
 from sceneprint.evaluation.diversity import FARTHEST
 from sceneprint.evaluation.plots import new_figure
 from sceneprint.evaluation.records import Pair
+from sceneprint.geometry.levelling import levelling
 from sceneprint.geometry.rigid import inverse, moved
 from sceneprint.types import Bytes, Floats, Frame
 
@@ -98,17 +100,7 @@ def _oriented(frame: Frame) -> tuple[Floats, Floats]:
 
 def to_ply(cloud: Cloud) -> bytes:
     """Binary PLY: positions in metres, normals, colours."""
-    kinds = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    kinds += [(name, "u1") for name in ("red", "green", "blue")]
-    rows = np.empty(len(cloud.points), np.dtype(kinds))
-    for i, axis in enumerate("xyz"):
-        rows[axis], rows["n" + axis] = cloud.points[:, i], cloud.normals[:, i]
-    for i, name in enumerate(("red", "green", "blue")):
-        rows[name] = cloud.colours[:, i]
-    words = {"<f4": "float", "u1": "uchar"}
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    lines += [f"property {words[kind]} {name}" for name, kind in kinds]
-    return ("\n".join([*lines, "end_header"]) + "\n").encode() + rows.tobytes()
+    return write_ply(cloud.points, cloud.normals, cloud.colours)
 
 
 def cloud_figure(name: str, ranked: Cloud, diverse: Cloud, ratio: float | None) -> Figure:
@@ -132,31 +124,6 @@ def cloud_figure(name: str, ranked: Cloud, diverse: Cloud, ratio: float | None) 
         x=0.01, ha="left", fontsize=12, parse_math=False,
     )  # fmt: skip
     return figure
-
-
-def levelling(normals: Floats) -> Floats:
-    """Rotation that brings most of what looks up, to a camera held upright, to straight up.
-
-    Parameters
-    ----------
-    normals : (N, 3) unit length, camera axes: y down
-
-    Returns
-    -------
-    (3, 3), so that floors and tables become level; the identity where nothing looks up
-    """
-    upward = normals[-normals[:, 1] > 0.5]
-    if not len(upward):
-        return np.eye(3)
-    up = upward.mean(axis=0)
-    for _ in range(20):  # from the mean to the direction around which most gather
-        up = up / np.linalg.norm(up)
-        near = upward[upward @ up > math.cos(math.radians(20))]
-        up = near.mean(axis=0) if len(near) else up
-    down = -up / np.linalg.norm(up)
-    right = np.cross(down, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    return np.stack([right, down, np.cross(right, down)])
 
 
 def _turns() -> dict[str, Floats]:

@@ -1,0 +1,190 @@
+"""A frame as a small picture, for people: what the sensor saw, by view.
+
+Surface | labels  --view-->  (h, w, 3) colours and what they mean  --png-->  bytes
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.pictures import UNKNOWN, normal_colours
+from sceneprint.schemas.outputs import WIDTHS
+from sceneprint.types import Bytes, Floats, Ints32, Surface
+
+#: Most rows: a picture that would be higher is made narrower.
+MOST_ROWS = 2560
+
+#: Percentiles of depth that are called near and far: a stray sample must not darken all others.
+_RANGE = (1.0, 99.0)
+#: matplotlib's viridis at equal steps: between them it is straight to 6 of 255. The library
+#: itself takes a third of a second to load.
+_VIRIDIS = np.array(
+    [
+        (68, 1, 84), (72, 24, 106), (71, 45, 123), (66, 64, 134), (59, 82, 139), (51, 99, 141),
+        (44, 114, 142), (38, 130, 142), (33, 145, 140), (31, 160, 136), (40, 174, 128),
+        (63, 188, 115), (94, 201, 98), (132, 212, 75), (173, 220, 48), (216, 226, 25),
+        (253, 231, 37),
+    ],
+    np.float64,
+)  # fmt: skip
+#: Colours to choose from beyond one for each patch, so that the last ones have a choice too.
+_SPARE = 64
+#: Oklab to linear sRGB: to the cone responses' cube roots, then to the primaries.
+_TO_CONES = np.array(
+    [(1, 0.3963377774, 0.2158037573), (1, -0.1055613458, -0.0638541728),
+     (1, -0.0894841775, -1.2914855480)]
+)  # fmt: skip
+_TO_PRIMARIES = np.array(
+    [(4.0767416621, -3.3077115913, 0.2309699292), (-1.2684380046, 2.6097574011, -0.3413193965),
+     (-0.0041960863, -0.7034186147, 1.7076147010)]
+)  # fmt: skip
+
+
+def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
+    """Depth by a colour map of equal steps to the eye: near is yellow, far is violet.
+
+    Parameters
+    ----------
+    surface : (h, w) points, metres
+
+    Returns
+    -------
+    colours : (h, w, 3) uint8; dark grey where nothing is known
+    meaning : `near_m` and `far_m`, the depths of the ends of the colour map
+    """
+    z = surface.points[..., 2].astype(np.float64)
+    seen = z[surface.valid]
+    near, far = np.percentile(seen, _RANGE).tolist() if seen.size else (0.0, 0.0)
+    place = np.clip((far - z) / max(far - near, 1e-9), 0.0, 1.0) * (len(_VIRIDIS) - 1)
+    steps = np.arange(len(_VIRIDIS))
+    mixed = np.stack([np.interp(place, steps, _VIRIDIS[:, c]) for c in range(3)], axis=-1)
+    meaning = {
+        "near_m": f"{near:.4f}",
+        "far_m": f"{far:.4f}",
+        "Description": f"depth: yellow {near:.2f} m or nearer, violet {far:.2f} m or farther, "
+        "dark grey unknown",
+    }
+    return np.where(surface.valid[..., None], np.rint(mixed).astype(np.uint8), UNKNOWN), meaning
+
+
+def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
+    """Unit normals in the optical frame: red, green, blue are 127.5 (1 + x, y, z).
+
+    Parameters
+    ----------
+    surface : (h, w) normals
+
+    Returns
+    -------
+    colours : (h, w, 3) uint8; dark grey where nothing is known
+    meaning : in words
+    """
+    text = (
+        "normals in the optical frame: red, green, blue are 127.5 (1 + n) of x right, y down, "
+        "z ahead; dark grey unknown"
+    )
+    return normal_colours(surface.normals, surface.valid), {"Description": text}
+
+
+def patches_view(labels: Ints32) -> tuple[Bytes, dict[str, str]]:
+    """Patches, each in a colour of its own that is unlike those of its neighbours.
+
+    Parameters
+    ----------
+    labels : (h, w) index of each pixel's patch, -1 for none
+
+    Returns
+    -------
+    colours : (h, w, 3) uint8; dark grey where there is no patch. The same for the same labels
+    meaning : in words
+    """
+    count = int(labels.max(initial=-1)) + 1
+    palette = np.concatenate([_colours_of(labels, count), np.full((1, 3), UNKNOWN, np.uint8)])
+    text = f"{count} patches of the finest level, each a colour; dark grey none"
+    return palette[labels], {"patches": str(count), "Description": text}
+
+
+def picture(colours: Bytes, width: int, text: Mapping[str, str]) -> bytes:
+    """Colours as a PNG of a width; pixels are repeated or left out, never mixed.
+
+    Parameters
+    ----------
+    colours : (h, w, 3) uint8
+    width : columns; fewer where there would be more than MOST_ROWS rows
+    text : kept in the file's tEXt chunks
+
+    Raises
+    ------
+    ValueError : a width beyond WIDTHS.
+    """
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    if not WIDTHS[0] <= width <= WIDTHS[1]:
+        raise ValueError(f"width {width}: from {WIDTHS[0]} to {WIDTHS[1]}")
+    scale = min(width / colours.shape[1], MOST_ROWS / colours.shape[0])
+    rows, columns = (_chosen(n, max(round(n * scale), 1)) for n in colours.shape[:2])
+    info = PngInfo()
+    for name, value in text.items():
+        info.add_text(name, value)
+    buffer = io.BytesIO()
+    Image.fromarray(colours[rows[:, None], columns]).save(buffer, "PNG", pnginfo=info)
+    return buffer.getvalue()
+
+
+def _chosen(n: int, wanted: int) -> NDArray[np.intp]:
+    """Which of `n` pixels lie under the centres of so many."""
+    return ((np.arange(wanted) + 0.5) * n / wanted).astype(np.intp)
+
+
+def _colours_of(labels: Ints32, count: int) -> Bytes:
+    """A colour for each patch: of those left, the one most unlike its neighbours' so far."""
+    lab = _palette(count + _SPARE)
+    squares = (lab**2).sum(axis=1)[:, None]
+    neighbours = _neighbours(labels, count)
+    free = np.ones(len(lab), np.bool_)
+    chosen = np.full(count, -1, np.intp)
+    for patch in range(count):
+        beside = chosen[neighbours[patch]]
+        beside = beside[beside >= 0]
+        if len(beside):
+            apart = (squares - 2.0 * lab @ lab[beside].T + squares[beside, 0]).min(axis=1)
+            chosen[patch] = np.argmax(np.where(free, apart, -1.0))
+        else:
+            chosen[patch] = np.argmax(free)
+        free[chosen[patch]] = False
+    return _displayed(lab[chosen])
+
+
+def _neighbours(labels: Ints32, count: int) -> list[NDArray[np.intp]]:
+    """Patches that share an edge of pixels with each patch."""
+    across = np.stack([labels[:, :-1].ravel(), labels[:, 1:].ravel()], axis=1)
+    down = np.stack([labels[:-1].ravel(), labels[1:].ravel()], axis=1)
+    pairs = np.concatenate([across, down])
+    pairs = pairs[(pairs[:, 0] != pairs[:, 1]) & (pairs.min(axis=1) >= 0)]
+    pairs = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
+    ends = np.searchsorted(pairs[:, 0], np.arange(count + 1))
+    return [pairs[ends[i] : ends[i + 1], 1].astype(np.intp) for i in range(count)]
+
+
+def _palette(count: int) -> Floats:
+    """So many colours (count, 3) in Oklab, spread evenly over hues and lightnesses."""
+    n = np.arange(1, count + 1)
+    # the plastic number's powers: no two points of the square come near (Roberts 2018)
+    plastic = 1.32471795724474602596
+    lightness = 0.48 + 0.4 * ((0.5 + n / plastic) % 1.0)
+    hue = 2.0 * math.pi * ((0.5 + n / plastic**2) % 1.0)
+    return np.stack([lightness, 0.11 * np.cos(hue), 0.11 * np.sin(hue)], axis=1)
+
+
+def _displayed(lab: Floats) -> Bytes:
+    """Oklab (n, 3) as sRGB."""
+    linear = np.clip(((lab @ _TO_CONES.T) ** 3) @ _TO_PRIMARIES.T, 0.0, 1.0)
+    curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    colours: Bytes = np.rint(255.0 * curved).astype(np.uint8)
+    return colours

@@ -1,0 +1,115 @@
+"""Pictures of frames: pixels worked out by hand, and what every picture has."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sceneprint.previews import (
+    MOST_ROWS,
+    UNKNOWN,
+    depth_view,
+    normals_view,
+    patches_view,
+    picture,
+)
+from sceneprint.types import Floats32, Intrinsics, Surface
+
+
+def surface(z: list[list[float]], normals: Floats32 | None = None) -> Surface:
+    """Of these depths; 0 for none."""
+    depth = np.array(z, np.float32)
+    points = np.zeros((*depth.shape, 3), np.float32)
+    points[..., 2] = depth
+    if normals is None:
+        normals = np.zeros_like(points)
+        normals[..., 2] = -1
+    camera = Intrinsics(depth.shape[1], depth.shape[0], 100.0, 100.0, 0.0, 0.0)
+    return Surface(points, normals, depth > 0, np.ones_like(depth), camera)
+
+
+def test_depth_by_hand() -> None:
+    colours, text = depth_view(surface([[1.0, 2.0, 3.0, 0.0, 1.5]]))
+    # viridis of matplotlib at 1, 1/2, 0 and 3/4; percentiles 1 and 99 of 1, 1.5, 2, 3
+    near, far = np.percentile([1.0, 1.5, 2.0, 3.0], (1, 99))
+    assert colours[0, 0].tolist() == [253, 231, 37]
+    assert colours[0, 2].tolist() == [68, 1, 84]
+    assert colours[0, 3].tolist() == [UNKNOWN] * 3
+    assert (text["near_m"], text["far_m"]) == (f"{near:.4f}", f"{far:.4f}")
+    two, _ = depth_view(surface([[1.0] * 50 + [2.0, 3.0] + [3.0] * 49]))
+    assert two[0, 50].tolist() == [33, 145, 140]  # half way
+
+
+def test_depth_is_viridis() -> None:
+    """As the library has it, from far to near, to 6 of 255."""
+    from matplotlib import colormaps
+
+    z = np.linspace(1.0, 3.0, 401)
+    colours, text = depth_view(surface([z.tolist()]))
+    near, far = float(text["near_m"]), float(text["far_m"])
+    place = np.clip((far - z) / (far - near), 0, 1)
+    expected = 255 * np.array(colormaps["viridis"](place))[:, :3]
+    assert np.abs(colours[0] - expected).max() < 7
+
+
+def test_nothing_seen_is_grey_throughout() -> None:
+    blank = surface([[0.0, 0.0]])
+    colours, text = depth_view(blank)
+    assert (colours == UNKNOWN).all()
+    assert text["near_m"] == "0.0000"
+    assert (normals_view(blank)[0] == UNKNOWN).all()
+    colours, text = patches_view(np.full((2, 3), -1, np.int32))
+    assert (colours == UNKNOWN).all()
+    assert text["patches"] == "0"
+
+
+def test_normals_by_hand() -> None:
+    normals = np.array([[[0, 0, -1], [1, 0, 0], [0, -1, 0], [0, 0.6, -0.8]]], np.float32)
+    colours, _ = normals_view(surface([[1.0, 1.0, 1.0, 0.0]], normals))
+    assert colours[0].tolist() == [[128, 128, 0], [255, 128, 128], [128, 0, 128], [UNKNOWN] * 3]
+
+
+def test_patches_have_colours_of_their_own_unlike_their_neighbours() -> None:
+    """900 patches in a grid of 30 x 30, some of them torn in two, with holes between."""
+    rng = np.random.default_rng(3)
+    labels = np.kron(np.arange(900).reshape(30, 30), np.ones((4, 4), int)).astype(np.int32)
+    labels[rng.random(labels.shape) < 0.05] = -1
+    colours, text = patches_view(labels)
+    assert text["patches"] == "900"
+    assert np.array_equal(colours, patches_view(labels.copy())[0])
+    assert (colours[labels < 0] == UNKNOWN).all()
+    first = np.array([colours[labels == i][0] for i in range(900)], int)
+    assert all((colours[labels == i] == first[i]).all() for i in range(900))
+    assert len(np.unique(first, axis=0)) == 900
+    assert not (first == UNKNOWN).all(axis=1).any()
+    grid = first.reshape(30, 30, 3)
+    for beside in (np.abs(np.diff(grid, axis=0)), np.abs(np.diff(grid, axis=1))):
+        assert beside.max(axis=2).min() >= 40  # of 255, in the channel that differs most
+
+
+def test_a_picture_repeats_pixels_and_keeps_its_text() -> None:
+    colours = np.arange(2 * 64 * 3).reshape(2, 64, 3).astype(np.uint8)
+    data = picture(colours, 128, {"near_m": "0.5", "Description": "é"})
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    assert data == picture(colours, 128, {"near_m": "0.5", "Description": "é"})
+    with Image.open(io.BytesIO(data)) as image:
+        assert (image.size, image.mode) == ((128, 4), "RGB")
+        assert image.text == {"near_m": "0.5", "Description": "é"}  # type: ignore[attr-defined]
+        large = np.asarray(image)
+    assert np.array_equal(large, colours.repeat(2, axis=0).repeat(2, axis=1))
+    with Image.open(io.BytesIO(picture(large, 64, {}))) as image:
+        assert np.array_equal(np.asarray(image), colours)
+
+
+def test_no_picture_is_larger_than_it_may_be() -> None:
+    for shape in ((200_000, 1), (5000, 40)):
+        with Image.open(io.BytesIO(picture(np.zeros((*shape, 3), np.uint8), 1280, {}))) as image:
+            assert image.size[1] == MOST_ROWS
+    with Image.open(io.BytesIO(picture(np.zeros((1, 65535, 3), np.uint8), 64, {}))) as image:
+        assert image.size == (64, 1)
+    for width in (63, 1281):
+        with pytest.raises(ValueError, match="from 64 to 1280"):
+            picture(np.zeros((2, 2, 3), np.uint8), width, {})
