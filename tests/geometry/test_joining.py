@@ -1,0 +1,168 @@
+"""The consensus of associations: known transforms, planted outliers, and where there is none."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sceneprint.geometry.joining import JoiningParameters, Votes, join, votes_of
+from sceneprint.geometry.rigid import difference, inverse, inverses
+from sceneprint.types import Floats
+
+
+def rigid(rng: np.random.Generator, metres: float, degrees: float | None = None) -> Floats:
+    T = np.eye(4)
+    if degrees is None:
+        turn = Rotation.random(rng=rng)
+    else:
+        turn = Rotation.from_rotvec(rng.normal(0, math.radians(degrees), 3))
+    T[:3, :3], T[:3, 3] = turn.as_matrix(), rng.normal(0, metres, 3)
+    return T
+
+
+def seen(
+    rng: np.random.Generator, T_a_b: Floats, right: int, wrong: int,
+    metres: float = 0.01, degrees: float = 0.4,
+) -> Votes:  # fmt: skip
+    """Frames of run b, 20 m from its origin, found again in run a; some of them wrongly."""
+    n = right + wrong
+    away = rigid(rng, 20.0)
+    b = np.array([away @ rigid(rng, 1.5, 50.0) for _ in range(n)])
+    a = np.array([T_a_b @ pose @ rigid(rng, 0.2, 10.0) for pose in b])
+    transforms = np.array(
+        [inverse(a[i]) @ T_a_b @ b[i] @ rigid(rng, metres, degrees) for i in range(n)]
+    )
+    for i in range(right, n):
+        transforms[i] = rigid(rng, 1.0)
+    order = rng.permutation(n)
+    source = np.arange(n)
+    return votes_of(
+        transforms[order], b[order], a[order], source, source, rng.choice([0.5, 1.0], n)
+    )
+
+
+def at_places(votes: Votes, T: Floats, true: Floats) -> float:
+    """Most that two transforms differ by where the frames are."""
+    put, want = (votes.places @ one[:3, :3].T + one[:3, 3] for one in (T, true))
+    return float(np.linalg.norm(put - want, axis=1).max())
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_known_transform_among_as_many_outliers(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true = rigid(rng, 10.0)
+    votes = seen(rng, true, 30, 30)
+    found = join(votes, seed)
+    assert found.T is not None
+    assert (found.support, found.strength) == (30, "strong")
+    assert at_places(votes, found.T, true) < 0.02
+    assert difference(found.T, true)[1] < math.radians(0.4)
+    left = [difference(found.T @ place_of(p), T @ place_of(p))[0]
+            for T, p in zip(votes.transforms, votes.places, strict=True)]  # fmt: skip
+    inside = np.array(left)[found.agree]
+    assert found.spread_m == pytest.approx(math.sqrt((inside**2).mean()))
+
+
+def place_of(point: Floats) -> Floats:
+    T = np.eye(4)
+    T[:3, 3] = point
+    return T
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_support_is_that_of_an_exhaustive_search(seed: int) -> None:
+    """The largest set of votes that agree pairwise, of all sets there are."""
+    rng = np.random.default_rng(100 + seed)
+    true = rigid(rng, 5.0)
+    votes = seen(rng, true, 6, 5, 0.01, 0.3)
+    p = JoiningParameters()
+
+    def agree(i: int, j: int) -> bool:
+        return all(
+            difference(
+                votes.transforms[i] @ place_of(votes.places[k]),
+                votes.transforms[j] @ place_of(votes.places[k]),
+            )[0] <= p.agree_m
+            for k in (i, j)
+        ) and difference(votes.transforms[i], votes.transforms[j])[1] <= p.agree_rad  # fmt: skip
+
+    n = len(votes.transforms)
+    pairs = {(i, j) for i, j in combinations(range(n), 2) if agree(i, j)}
+    best = max(
+        (set(group) for size in range(1, n + 1) for group in combinations(range(n), size)
+         if all(pair in pairs for pair in combinations(group, 2))),
+        key=len,
+    )  # fmt: skip
+    assert set(np.flatnonzero(join(votes).agree)) == best
+    assert len(best) == 6
+
+
+def test_the_inverse_votes_for_the_inverse() -> None:
+    rng = np.random.default_rng(1)
+    true = rigid(rng, 10.0)
+    b = np.array([rigid(rng, 1.0) for _ in range(12)])
+    a = np.array([true @ pose for pose in b])
+    T = np.tile(np.eye(4), (12, 1, 1))
+    n = np.arange(12)
+    there = join(votes_of(T, b, a, n, n, np.ones(12)))
+    back = join(votes_of(inverses(T), a, b, n, n, np.ones(12)))
+    assert there.T is not None
+    assert back.T is not None
+    np.testing.assert_allclose(there.T, true, atol=1e-9)
+    np.testing.assert_allclose(back.T, inverse(true), atol=1e-9)
+
+
+def test_two_answers_with_as_many_votes_are_none() -> None:
+    rng = np.random.default_rng(2)
+    b = np.array([rigid(rng, 1.0, 20.0) for _ in range(20)])
+    first, second = rigid(rng, 3.0), rigid(rng, 3.0)
+    a = np.array([(first if i % 2 else second) @ pose for i, pose in enumerate(b)])
+    n, T = np.arange(20), np.tile(np.eye(4), (20, 1, 1))
+    found = join(votes_of(T, b, a, n, n, np.ones(20)))
+    assert (found.T, found.strength, found.support, found.rival) == (None, None, 10, 10)
+    assert "another transform" in found.reason
+    # of which one has half as much again, and a third of it: then it is believed
+    weights = np.where(n % 2, 1.0, 0.45)
+    assert join(votes_of(T, b, a, n, n, weights)).T is not None
+
+
+def test_too_few_votes_or_too_few_frames_are_none() -> None:
+    rng = np.random.default_rng(3)
+    true = rigid(rng, 3.0)
+    b = np.array([rigid(rng, 1.0, 20.0) for _ in range(12)])
+    a, T, n = true @ b, np.tile(np.eye(4), (12, 1, 1)), np.arange(12)
+    assert join(votes_of(T[:2], b[:2], a[:2], n[:2], n[:2], np.ones(2))).T is None
+    assert join(votes_of(T[:3], b[:3], a[:3], n[:3], n[:3], np.ones(3))).strength == "weak"
+    one = np.zeros(12, np.int64)
+    assert join(votes_of(T, b, a, one, n, np.ones(12))).T is None
+    assert join(votes_of(T, b, a, n, n, np.ones(12))).strength == "strong"
+    with pytest.raises(ValueError, match="nothing votes"):
+        join(votes_of(T[:0], b[:0], a[:0], n[:0], n[:0], np.ones(0)))
+
+
+def test_a_frame_that_was_found_often_counts_once() -> None:
+    rng = np.random.default_rng(4)
+    true, wrong = rigid(rng, 3.0), rigid(rng, 3.0)
+    b = np.array([rigid(rng, 1.0, 20.0) for _ in range(20)])
+    source = np.array([*range(8), *([8] * 6), *([9] * 6)])
+    b = b[source]
+    a = np.where((source < 8)[:, None, None], true @ b, wrong @ b)
+    found = join(votes_of(np.tile(np.eye(4), (20, 1, 1)), b, a, source, np.arange(20), np.ones(20)))
+    assert found.support == 8
+    assert found.T is not None
+    np.testing.assert_allclose(found.T, true, atol=1e-9)
+
+
+def test_many_votes_are_tried_by_lot_and_the_same_lot_again() -> None:
+    rng = np.random.default_rng(5)
+    true = rigid(rng, 5.0)
+    votes = seen(rng, true, 400, 400)
+    p = JoiningParameters(hypotheses=20)
+    found = join(votes, 7, p)
+    assert found.T is not None
+    assert found.support >= 395
+    np.testing.assert_array_equal(found.T, join(votes, 7, p).T)

@@ -1,0 +1,129 @@
+"""g2o: written, read back by a strict reader of our own and by one of others, and what it means."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sceneprint.geometry.rigid import inverse
+from sceneprint.graphs import GraphEdge, g2o, information_of
+from sceneprint.types import Floats
+
+
+def rigid(rng: np.random.Generator, metres: float = 2.0, radians: float = 2.0) -> Floats:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(rng.normal(0, radians, 3)).as_matrix()
+    T[:3, 3] = rng.normal(0, metres, 3)
+    return T
+
+
+def positive(rng: np.random.Generator) -> Floats:
+    A = rng.normal(0, 1, (6, 6))
+    return A @ A.T + np.eye(6)
+
+
+def a_graph(n: int = 5) -> tuple[list[Floats], list[GraphEdge]]:
+    rng = np.random.default_rng(3)
+    poses = [rigid(rng) for _ in range(n)]
+    edges = [
+        GraphEdge(i, j, inverse(poses[i]) @ poses[j] @ rigid(rng, 0.02, 0.02), positive(rng))
+        for i, j in [(0, 1), (1, 2), (3, 2), (2, 4), (4, 0)]
+    ]
+    return poses, edges
+
+
+def read_strictly(text: str) -> tuple[dict[int, Floats], list[tuple[int, int, Floats, Floats]]]:
+    """Vertices and edges; every line must be one, with all its numbers."""
+    assert text.endswith("\n")
+    vertices: dict[int, Floats] = {}
+    edges = []
+    for line in text[:-1].split("\n"):
+        kind, *rest = line.split(" ")
+        if kind == "VERTEX_SE3:QUAT":
+            assert len(rest) == 8
+            assert int(rest[0]) == len(vertices)
+            vertices[int(rest[0])] = np.array(rest[1:], float)
+            continue
+        assert kind == "EDGE_SE3:QUAT"
+        assert len(rest) == 2 + 7 + 21
+        assert {int(rest[0]), int(rest[1])} <= vertices.keys()
+        information = np.zeros((6, 6))
+        information[np.triu_indices(6)] = np.array(rest[9:], float)
+        information += np.triu(information, 1).T
+        edges.append((int(rest[0]), int(rest[1]), np.array(rest[2:9], float), information))
+    return vertices, edges
+
+
+def matrix(numbers: Floats) -> Floats:
+    T = np.eye(4)
+    assert np.linalg.norm(numbers[3:]) == pytest.approx(1.0, abs=1e-8)
+    T[:3, :3], T[:3, 3] = Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3]
+    return T
+
+
+def test_there_and_back() -> None:
+    poses, edges = a_graph()
+    vertices, read = read_strictly(g2o(poses, edges))
+    for pose, numbers in zip(poses, vertices.values(), strict=True):
+        np.testing.assert_allclose(matrix(numbers), pose, atol=1e-8)
+    scale = np.diag([1, 1, 1, 2, 2, 2])
+    for edge, (first, second, numbers, information) in zip(edges, read, strict=True):
+        assert (first, second) == (edge.first, edge.second)
+        np.testing.assert_allclose(matrix(numbers), edge.T, atol=1e-8)
+        np.testing.assert_allclose(information, scale @ edge.information @ scale, rtol=1e-8)
+
+
+def test_its_error_costs_what_the_information_says() -> None:
+    """g2o's cost of a small error, by its own definition, against ours in metres and radians."""
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        T, information = rigid(rng), positive(rng)
+        error = rng.normal(0, 1e-4, 6)
+        small = np.eye(4)
+        small[:3, :3], small[:3, 3] = Rotation.from_rotvec(error[3:]).as_matrix(), error[:3]
+        _, read = read_strictly(g2o([np.eye(4), T @ small], [GraphEdge(0, 1, T, information)]))
+        delta = inverse(T) @ T @ small
+        vector = Rotation.from_matrix(delta[:3, :3]).as_quat()[:3]
+        theirs = np.concatenate([delta[:3, 3], vector])
+        assert theirs @ read[0][3] @ theirs == pytest.approx(error @ information @ error, rel=1e-4)
+
+
+def test_information_of_a_covariance_in_other_axes() -> None:
+    """Drawn errors of the kind that `geometry.covariance` speaks of, told as T exp(xi)."""
+    rng = np.random.default_rng(2)
+    T = rigid(rng)
+    covariance = positive(rng) * 1e-8
+    found = []
+    for x in rng.multivariate_normal(np.zeros(6), covariance, 20_000):
+        true = np.eye(4)
+        true[:3, :3] = Rotation.from_rotvec(x[3:]).as_matrix() @ T[:3, :3]
+        true[:3, 3] = T[:3, 3] + x[:3]
+        xi = inverse(T) @ true
+        found.append([*xi[:3, 3], *Rotation.from_matrix(xi[:3, :3]).as_rotvec()])
+    expected = np.linalg.inv(information_of(covariance, T))
+    # sampling leaves about 1 % of the largest
+    assert np.abs(np.cov(np.array(found).T) - expected).max() < 0.04 * np.abs(expected).max()
+
+
+@pytest.mark.filterwarnings("ignore:spsolve requires A be CSC")  # of the reader's own solver
+def test_a_standard_reader_takes_it_and_optimises(tmp_path: Path) -> None:
+    graphslam = pytest.importorskip("graphslam.graph")
+    poses, edges = a_graph()
+    exact = [GraphEdge(e.first, e.second, inverse(poses[e.first]) @ poses[e.second], e.information)
+             for e in edges]  # fmt: skip
+    path = tmp_path / "graph.g2o"
+    path.write_text(g2o(poses, exact))
+    graph = graphslam.Graph.from_g2o(str(path))
+    assert (len(graph._vertices), len(graph._edges)) == (5, 5)
+    assert graph.calc_chi2() == pytest.approx(0.0, abs=1e-9)
+    rng = np.random.default_rng(4)
+    off = [pose @ rigid(rng, 0.05, math.radians(2.0)) for pose in poses]
+    path.write_text(g2o([poses[0], *off[1:]], exact))
+    graph = graphslam.Graph.from_g2o(str(path))
+    assert graph.calc_chi2() > 0.01
+    graph.optimize(tol=1e-12, max_iter=30, verbose=False)
+    assert graph.calc_chi2() < 1e-9
