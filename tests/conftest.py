@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +32,14 @@ def data_root() -> Path:
     if not root.is_dir():
         pytest.skip(f"no real recordings at {root} (set SCENEPRINT_DATA)")
     return root
+
+
+@pytest.fixture(scope="session")
+def with_open3d() -> None:
+    """Skips where Open3D's system libraries are missing: only reconstructions need them."""
+    done = subprocess.run([sys.executable, "-c", "import open3d"], capture_output=True, text=True)
+    if done.returncode != 0:
+        pytest.skip(f"Open3D cannot be imported: {done.stderr.strip().splitlines()[-1]}")
 
 
 @pytest.fixture(scope="session")

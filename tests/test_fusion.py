@@ -1,0 +1,221 @@
+"""Views of a box room fused: the surface lies where the walls are, and has their area."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import InvalidRequest, UselessFrame
+from sceneprint.fusion import FusionParameters, fuse, within
+from sceneprint.geometry.coverage import Mesh, added_areas, observed_volume, of_views, share_seen
+from sceneprint.geometry.levelling import levelling
+from sceneprint.rendering import PALETTE, reconstruction_picture, rendered, viewpoint
+from sceneprint.types import Frame, Intrinsics
+
+#: Half the room's width, height and depth, metres: x right, y down, z ahead; its centre at 0.
+ROOM = np.array([2.0, 1.25, 1.5])
+CAMERA = Intrinsics(160, 120, 80.0, 80.0, 79.5, 59.5)  # sees 90 by 74 degrees
+
+
+def view(yaw: float, at: tuple[float, float, float] = (0, 0, 0), pitch: float = 0.0) -> Frame:
+    """What a camera in the room sees of its walls, floor and ceiling."""
+    c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
+    e, f = np.cos(np.radians(pitch)), np.sin(np.radians(pitch))
+    T = np.eye(4)
+    T[:3, :3] = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ [[1, 0, 0], [0, e, -f], [0, f, e]]
+    T[:3, 3] = at
+    y, x = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
+    rays = np.stack([(x - CAMERA.cx) / CAMERA.fx, (y - CAMERA.cy) / CAMERA.fy, np.ones(x.shape)])
+    rays = np.moveaxis(rays, 0, -1) @ T[:3, :3].T
+    with np.errstate(divide="ignore"):
+        depth = ((np.where(rays > 0, ROOM, -ROOM) - T[:3, 3]) / rays).min(axis=-1)
+    return Frame(depth.astype(np.float32), CAMERA, f"yaw {yaw:g}", T)
+
+
+@pytest.fixture(scope="module")
+def around(with_open3d: None) -> list[Frame]:
+    """All walls of the room, the floor and the ceiling, seen from six sides."""
+    return [*(view(yaw) for yaw in (0, 90, 180, 270)), view(0, pitch=90), view(0, pitch=-90)]
+
+
+@pytest.fixture(scope="module")
+def room(around: list[Frame]) -> tuple[Mesh, float]:
+    return fuse(around, FusionParameters(voxel_m=0.026))
+
+
+def test_the_surface_lies_on_the_walls_and_has_their_area(around: list[Frame]) -> None:
+    """From the middle of the room in 26 directions: no part of a wall is unseen."""
+    whole = [view(yaw, pitch=pitch) for pitch in (-50, 0, 50) for yaw in range(0, 360, 45)]
+    mesh, voxel = fuse([*whole, *around[4:]], FusionParameters(voxel_m=0.026))
+    walls = 8 * (ROOM[0] * ROOM[1] + ROOM[1] * ROOM[2] + ROOM[0] * ROOM[2])
+    assert voxel == 0.026
+    # edges of the room are rounded off by voxels; elsewhere a pixel, 2 cm wide, sets the limit
+    off = np.sort(np.abs(np.abs(mesh.points) - ROOM), axis=1)
+    assert off[:, 0].max() < voxel
+    assert off[off[:, 1] > 3 * voxel, 0].max() < 0.02
+    assert np.quantile(off[:, 0], 0.9) < 0.012
+    assert mesh.areas().sum() == pytest.approx(walls, rel=0.01)
+    # normals look into the room, and triangles turn the same way
+    assert (np.einsum("ij,ij->i", mesh.normals, -mesh.points) > 0).all()
+    a, b, c = (mesh.points[mesh.triangles[:, i]] for i in range(3))
+    turning = np.einsum("ij,ij->i", np.cross(b - a, c - a), mesh.normals[mesh.triangles[:, 0]])
+    assert (turning > -1e-6).mean() > 0.999
+
+
+def test_the_same_views_give_the_same_bytes(around: list[Frame], room: tuple[Mesh, float]) -> None:
+    mesh, _ = fuse(around, FusionParameters(voxel_m=0.026))
+    for name in ("points", "normals", "triangles"):
+        assert getattr(mesh, name).tobytes() == getattr(room[0], name).tobytes()
+    assert (np.diff(mesh.points[:, 0]) >= 0).all()
+    assert (mesh.triangles[:, :1] <= mesh.triangles).all()
+
+
+def test_a_finer_voxel_is_taken_as_wanted_until_blocks_run_out(around: list[Frame]) -> None:
+    p = FusionParameters(voxel_m=0.05)
+    mesh, voxel = fuse(around[:1], p)
+    assert voxel == 0.05
+    assert len(mesh.points) > 0
+    with pytest.raises(InvalidRequest, match=r"Voxels of 0\.05 m take \d+ blocks") as refused:
+        fuse(around[:1], replace(p, most_blocks=40))
+    # what is advised suffices; unasked, a voxel is chosen that does
+    advised = float(str(refused.value).split("Ask for ")[1].split(" m")[0])
+    fuse(around[:1], replace(p, voxel_m=advised, most_blocks=40))
+    assert fuse(around[:1], FusionParameters(most_blocks=40))[1] > 0.05
+    # two pixels of the wall ahead, 1.5 m away
+    assert fuse(around[:1])[1] == pytest.approx(2 * 1.5 / 80, abs=0.001)
+
+
+def test_out_of_range_is_not_fused(around: list[Frame]) -> None:
+    with pytest.raises(UselessFrame, match=r"between 0\.3 and 1 m"):
+        fuse(around[:1], FusionParameters(farthest_m=1.0))
+    holes = replace(around[0], depth=np.where(np.eye(120, 160) > 0, np.nan, around[0].depth))
+    kept = within(holes, FusionParameters())
+    assert (kept.depth[np.eye(120, 160) > 0] == 0).all()
+
+
+def test_a_thinned_view_keeps_its_rays(around: list[Frame]) -> None:
+    thin = within(around[0], FusionParameters(most_samples=5000))
+    assert thin.depth.shape == (60, 80)
+    for x, y in ((0, 0), (17, 40), (79, 59)):
+        assert thin.depth[y, x] == around[0].depth[2 * y, 2 * x]
+        k, whole = thin.intrinsics, CAMERA
+        assert (x - k.cx) / k.fx == pytest.approx((2 * x - whole.cx) / whole.fx, abs=1e-12)
+        assert (y - k.cy) / k.fy == pytest.approx((2 * y - whole.cy) / whole.fy, abs=1e-12)
+
+
+def test_what_each_view_adds(around: list[Frame], room: tuple[Mesh, float]) -> None:
+    mesh, voxel = room
+    views = [around[0], around[0], around[2], *around[1:2], *around[3:]]
+    first = of_views(mesh, views, 2 * voxel)
+    added = added_areas(mesh, first, len(views))
+    assert added.sum() == pytest.approx(mesh.areas().sum())
+    assert added[1] == 0  # a duplicate adds nothing
+    assert added[0] == pytest.approx(added[2], rel=0.05)  # the room is alike before and behind
+    # the wall ahead is 4 m wide and 2.5 m high: 45 degrees to each side see 3 m, 37 up see 1.125
+    ahead = np.abs(mesh.points[mesh.triangles][..., 2].mean(axis=1) - ROOM[2]) < 0.02
+    seen = first[mesh.triangles].min(axis=1) == 0
+    assert mesh.areas()[ahead & seen].sum() == pytest.approx(3.0 * 2.25, rel=0.08)
+
+
+def test_first_seen_by_hand() -> None:
+    """One square of two triangles, the first seen by the second view alone."""
+    points = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1.0]])
+    mesh = Mesh(points, np.tile([0, 0, -1.0], (4, 1)), np.array([[0, 2, 1], [1, 2, 3]], np.int32))
+    assert mesh.areas().tolist() == [0.5, 0.5]
+    k = Intrinsics(3, 3, 1.0, 1.0, 1.0, 1.0)  # one pixel for each metre at a metre
+    near, far = np.full((3, 3), 1.0, np.float32), np.full((3, 3), 1.0, np.float32)
+    near[1, 1], near[1, 2], near[2, 1] = 0, 2.0, 2.0  # nothing known, and seen through
+    far[2, 2] = 0
+    views = [Frame(near, k, "a", np.eye(4)), Frame(far, k, "b", np.eye(4))]
+    first = of_views(mesh, views, 0.1)
+    assert first.tolist() == [1, 1, 1, 0]
+    assert added_areas(mesh, first, 2).tolist() == [0.5, 0.5]
+    assert share_seen(points, views[:1]) == 0.25
+    assert share_seen(points, views) == 1.0
+    assert share_seen(points, []) == 0.0
+    assert (
+        share_seen(points + np.array([0, 0, 0.0799]), views[1:]) == 0.75
+    )  # 5 cm and 3 % of 1.08 m
+    assert share_seen(points + np.array([0, 0, 0.0830]), views[1:]) == 0.0
+
+
+def test_the_observed_volume_is_that_of_the_view_cone(around: list[Frame]) -> None:
+    # a pyramid to a wall 1.5 m ahead, 160/80 * 1.5 wide and 120/80 * 1.5 high
+    ahead = replace(around[0], depth=np.full((120, 160), 1.5, np.float32))
+    volume, cell = observed_volume([ahead])
+    assert cell == 0.05
+    assert volume == pytest.approx(3.0 * 2.25 * 1.5 / 3, rel=0.08)
+    assert observed_volume([ahead, ahead])[0] == volume
+    # all directions are seen, but for those between the cones at the corners of the room
+    whole, _ = observed_volume([*around, *(view(yaw) for yaw in (45, 135, 225, 315))])
+    assert whole == pytest.approx(8 * ROOM.prod(), rel=0.08)
+    assert observed_volume([])[0] == 0.0
+
+
+def test_the_picture_shows_the_room_from_above_without_what_faces_away(
+    around: list[Frame], room: tuple[Mesh, float]
+) -> None:
+    mesh, voxel = room
+    first = of_views(mesh, around, 2 * voxel)
+    assert levelling(mesh.normals) == pytest.approx(np.eye(3), abs=0.02)
+    eye = viewpoint(mesh, np.zeros((1, 3)), 200, 160)
+    picture = rendered(mesh, first, [], eye).astype(int)
+    corners = eye.pixels(mesh.points)
+    assert corners[:, 0].min() > 0  # all is in view
+    assert corners[:, 0].max() < 199
+    assert corners[:, 1].min() > 0
+    assert corners[:, 1].max() < 159
+    assert (picture[0] == 255).all()
+    assert (picture[:, 0] == 255).all()
+
+    def colour_at(point: tuple[float, float, float]) -> int:
+        """Which view's colour has the pixel of a point, by its hue."""
+        x, y = np.rint(eye.pixels(np.array([point], float))[0, :2]).astype(int)
+        pixel = picture[y, x] - picture[y, x].mean()
+        hues = PALETTE.astype(float) - PALETTE.mean(axis=1, keepdims=True)
+        return int(np.linalg.norm(hues / 255 - pixel / 255, axis=1).argmin())
+
+    def view_at(point: tuple[float, float, float]) -> int:
+        return int(first[np.linalg.norm(mesh.points - point, axis=1).argmin()])
+
+    # the floor, through the ceiling, and the wall that is farther from the viewer
+    for point in ((0, ROOM[1], 0.2), (0.3, 0.2, ROOM[2])):
+        assert colour_at(point) == view_at(point)
+    drawn = rendered(mesh, first, around, eye)
+    x, y = np.rint(eye.pixels(np.zeros((1, 3)))[0, :2]).astype(int)
+    around_camera = (slice(y - 6, y + 7), slice(x - 6, x + 7))
+    assert (drawn[around_camera] != picture[around_camera]).any()
+
+
+def test_the_picture_is_a_png(around: list[Frame], room: tuple[Mesh, float]) -> None:
+    mesh, voxel = room
+    first = of_views(mesh, around, 2 * voxel)
+    added = added_areas(mesh, first, len(around)).tolist()
+    png = reconstruction_picture(mesh, first, around, added, "a $room")
+    assert png[:8] == b"\x89PNG\r\n\x1a\n"
+    assert png == reconstruction_picture(mesh, first, around, added, "a $room")
+
+
+def test_without_open3d_the_message_names_the_packages() -> None:
+    """A system library is missing: all else of the package works."""
+    code = """
+import sys
+class Without:
+    def find_spec(self, name, path=None, target=None):
+        if name == "open3d":
+            raise ImportError("libX11.so.6: cannot open shared object file")
+sys.meta_path.insert(0, Without())
+import sceneprint.cli, sceneprint.client, sceneprint.fusion, service.app, worker.loop
+from sceneprint.errors import MissingDependency
+try:
+    sceneprint.fusion.open3d()
+except MissingDependency as error:
+    print(error)
+"""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert "libX11.so.6" in ran.stdout
+    assert "apt-get install libgl1 libegl1 libx11-6 libusb-1.0-0 libgomp1" in ran.stdout
+    assert ran.stdout.count("\n") == 1
