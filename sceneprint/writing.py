@@ -40,13 +40,14 @@ def write_whole(path: Path, data: bytes) -> None:
     _put(path, data, durable=False)
 
 
-def write_durable(path: Path, data: bytes) -> None:
+def write_durable(path: Path, data: bytes, *, folder_is_new: bool = True) -> None:
     """As `write_whole`, and when it returns the file survives the loss of power.
 
     Parameters
     ----------
     path : of the file; its folder must exist
     data : all of it
+    folder_is_new : whether the folder may not be durable itself yet
 
     Raises
     ------
@@ -55,7 +56,8 @@ def write_durable(path: Path, data: bytes) -> None:
     """
     _put(path, data, durable=True)
     sync_folder(path.parent)
-    sync_folder(path.parent.parent)  # in which the folder itself may be new
+    if folder_is_new:
+        sync_folder(path.parent.parent)
 
 
 def make_folder(folder: Path) -> None:

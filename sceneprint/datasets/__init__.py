@@ -17,7 +17,13 @@ from sceneprint.datasets.poses import (
 )
 from sceneprint.datasets.records import FrameReference, Layout, Sequence, Split
 from sceneprint.datasets.sequences import find_sequences
-from sceneprint.datasets.writing import write_depth_png, write_intrinsics, write_pose
+from sceneprint.datasets.writing import (
+    trajectory_row,
+    trajectory_text,
+    write_depth_png,
+    write_intrinsics,
+    write_pose,
+)
 
 __all__ = [
     "Camera",
@@ -38,6 +44,8 @@ __all__ = [
     "read_pose",
     "read_trajectory",
     "rigid_transform",
+    "trajectory_row",
+    "trajectory_text",
     "write_depth_png",
     "write_intrinsics",
     "write_pose",

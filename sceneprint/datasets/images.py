@@ -166,6 +166,9 @@ def _metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
         )
     with np.errstate(all="ignore"):  # what overflows float32 is missing
         if samples.dtype.kind == "u" and samples.dtype.itemsize == 2:
+            values = np.arange(_MISSING + 1, dtype=np.uint16)
+            if samples.size > values.size:  # fewer values than samples: each is divided once
+                return np.ascontiguousarray(_metres(values[None], depth_scale)[0][samples])
             depth = (samples / depth_scale).astype(np.float32)
             depth[samples == _MISSING] = 0.0
         elif samples.dtype.kind == "f":

@@ -60,6 +60,12 @@ def decode_npy(data: bytes) -> Floats32:
         return np.array(samples, dtype=np.float32, order="C")
 
 
+def image_size(head: bytes) -> tuple[int, int]:
+    """Width and height that the header of an NPY file tells; UnreadableFrame if it is none."""
+    height, width = _shape(_header(head)[0]["shape"])
+    return width, height
+
+
 def _header(data: bytes) -> tuple[dict[str, object], int]:
     """Return the header and the place where the samples begin."""
     damaged = "The header of the NPY file cannot be read. Write the depth with numpy.save."

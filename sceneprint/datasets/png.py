@@ -3,8 +3,8 @@
     bytes  --decode_png-->  samples (H, W) uint16
 
 Pillow takes a PNG whose data end early as an image with black rows, and does not look at
-the check sums of the data. So the file is taken apart here, checked, and only its plain
-pixels are handed to Pillow, which knows the filters and the interlacing.
+the check sums of the data. So the file is taken apart and checked here, and Pillow, which knows
+interlacing, gets only plain pixels of those that are interlaced.
 """
 
 from __future__ import annotations
@@ -152,6 +152,22 @@ def _inflate(pixels: bytes, header: bytes) -> bytes:
 
 
 def _unfilter(header: bytes, rows: bytes) -> NDArray[np.uint16]:
+    """Undo the filters; what is interlaced, and rare, is left to Pillow."""
+    width, height, interlaced = *struct.unpack_from(">II", header), header[12]
+    if interlaced:
+        return _deinterlaced(header, rows)
+    from sceneprint.datasets.unfiltering import unfilter
+
+    samples = unfilter(np.frombuffer(rows, np.uint8).reshape(height, 1 + 2 * width))
+    if samples is None:
+        raise UnreadableFrame(
+            "The PNG is damaged: its rows do not decode, as one has a filter that PNG has not. "
+            "Write it again."
+        )
+    return samples
+
+
+def _deinterlaced(header: bytes, rows: bytes) -> NDArray[np.uint16]:
     """Undo filters and interlacing: Pillow on a PNG of nothing but header and pixels."""
     from PIL import Image
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from sceneprint.datasets.files import data_lines, read_text
 from sceneprint.datasets.layouts import layout_of, list_folder, references
 from sceneprint.datasets.records import Layout, Sequence, Split
-from sceneprint.errors import DatasetError
+from sceneprint.errors import DatasetError, SceneprintError
 
 _DEPTH = 4  #: folders below the one given that are looked into
 _MAXIMUM_FOLDERS = 10_000  #: that are looked into; more is no data set but a disk
@@ -57,10 +57,7 @@ def find_sequences(path: Path | str) -> tuple[Sequence, ...]:
         return (_single(root),)
     if not root.is_dir():
         raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
-    found = tuple(
-        _sequence(folder, files, layout, _name(folder, root))
-        for folder, files, layout in _walk(root)
-    )
+    found = tuple(_sequence(*one, _name(one[0], root)) for one in _walk(root))
     if not found:
         raise DatasetError(
             f"{path}: There is no depth image here or up to {_DEPTH} folders below. Name a "
@@ -69,6 +66,34 @@ def find_sequences(path: Path | str) -> tuple[Sequence, ...]:
         )
     _check_parent_frames(found)
     return found
+
+
+def find_each(root: Path) -> tuple[tuple[Sequence, ...], tuple[tuple[str, SceneprintError], ...]]:
+    """As `find_sequences`, where a sequence that is damaged must not cost the others.
+
+    Parameters
+    ----------
+    root : a folder, absolute
+
+    Returns
+    -------
+    sequences : that are sound; there may be none
+    refused : name of each other one, and why
+
+    Raises
+    ------
+    DatasetError : there are too many folders, or two scenes have one name.
+    """
+    found, refused = [], []
+    for one in _walk(root):
+        name = _name(one[0], root)
+        try:
+            found.append(_sequence(*one, name))
+        except SceneprintError as error:
+            refused.append((name, error))
+    sequences = tuple(found)
+    _check_parent_frames(sequences)
+    return sequences, tuple(refused)
 
 
 def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
@@ -97,10 +122,14 @@ def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
             yield folder, files, layout
         elif depth < _DEPTH:
             waiting += [
-                (folder / name, depth + 1)
-                for name in reversed(folders)
-                if not any(colour in name.lower() for colour in _COLOUR_FOLDERS)
+                (folder / name, depth + 1) for name in reversed(folders) if not is_of_colour(name)
             ]
+
+
+def is_of_colour(folder: str) -> bool:
+    """Whether a folder of that name is left out; rgbd_dataset_freiburg1_xyz is none of them."""
+    name = folder.lower().replace("rgbd", "")
+    return any(colour in name for colour in _COLOUR_FOLDERS)
 
 
 def _sequence(folder: Path, files: list[str], layout: Layout, name: str) -> Sequence:

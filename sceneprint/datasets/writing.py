@@ -1,6 +1,7 @@
 """Sequences out: the files that `find_sequences` reads, each whole or absent.
 
 Camera, depth (H, W), T_parent_sensor (4, 4)  -->  intrinsics.json, *.png, *.txt
+rows of `trajectory_row`  --trajectory_text-->  what `read_trajectory` reads
 """
 
 from __future__ import annotations
@@ -8,12 +9,14 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from sceneprint.datasets.intrinsics import FILE_NAME, Camera
 from sceneprint.datasets.poses import rigid_transform
+from sceneprint.geometry.quaternions import quaternion_of
 from sceneprint.types import Floats, Floats32
 from sceneprint.writing import write_whole
 
@@ -80,3 +83,23 @@ def write_pose(path: Path, T_parent_sensor: Floats) -> None:
     rows = rigid_transform(T_parent_sensor)
     text = "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows)
     write_whole(path, text.encode())
+
+
+def trajectory_row(stamp: float, T_parent_sensor: Floats) -> list[float]:
+    """A pose (4, 4) as TUM has it: t tx ty tz qx qy qz qw, seconds and metres."""
+    T = T_parent_sensor
+    return [stamp, *T[:3, 3].tolist(), *quaternion_of(T[:3, :3]).tolist()]
+
+
+def trajectory_text(rows: Iterable[Sequence[float]], comments: Iterable[str] = ()) -> str:
+    """A TUM trajectory as text, without loss.
+
+    Parameters
+    ----------
+    rows : of `trajectory_row`
+    comments : lines of the head: the frames of the poses belong there. What is no printable
+        ASCII is escaped
+    """
+    lines = [f"# {comment.encode('unicode_escape').decode('ascii')}" for comment in comments]
+    lines += [" ".join(repr(float(number)) for number in row) for row in rows]
+    return "\n".join([*lines, ""])

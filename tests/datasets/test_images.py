@@ -160,3 +160,21 @@ def test_no_array_is_the_callers_mistake() -> None:
 def test_intrinsics_of_another_image() -> None:
     with pytest.raises(InvalidIntrinsics, match="3 x 4 pixels, the intrinsics are of 4 x 3"):
         make_frame(SAMPLES.T, CAMERA)
+
+
+@pytest.mark.parametrize("scale", [1000.0, 5000.0, 1e-34, 3.7])
+def test_a_large_image_has_the_metres_of_its_samples_one_by_one(scale: float) -> None:
+    samples = np.random.default_rng(3).integers(0, 65536, (260, 256)).astype(np.uint16)
+    samples[0, :3] = (0, 1, 65535)
+    large = make_frame(samples, Intrinsics(256, 260, 9.0, 9.0, 1.0, 1.0), depth_scale=scale).depth
+    small = [
+        make_frame(row[None], Intrinsics(256, 1, 9.0, 9.0, 1.0, 1.0), depth_scale=scale).depth
+        for row in samples
+        if np.any((row > 0) & (row < 65535))
+    ]
+    np.testing.assert_array_equal(large, np.concatenate(small))
+    fortran = make_frame(
+        np.asfortranarray(samples), Intrinsics(256, 260, 9.0, 9.0, 1.0, 1.0), depth_scale=scale
+    )
+    np.testing.assert_array_equal(fortran.depth, large)
+    assert fortran.depth.flags.c_contiguous

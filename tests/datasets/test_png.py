@@ -161,8 +161,7 @@ def test_truncated_png_whatever_the_program_told_pillow(monkeypatch) -> None:
         with pytest.raises(UnreadableFrame):
             decode_png(BAD_PNG[case][0])
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1)  # a program's own, lower limit
-    with pytest.raises(UnreadableFrame, match="exceeds limit"):
-        decode_png(GOOD_PNG)
+    np.testing.assert_array_equal(decode_png(GOOD_PNG), SAMPLES)  # Pillow is not asked
 
 
 def frame_or_error(data: bytes) -> Frame | None:

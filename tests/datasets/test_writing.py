@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprint.datasets import decode_png, write_depth_png, write_pose
+from sceneprint.datasets import (
+    decode_png,
+    read_trajectory,
+    trajectory_row,
+    trajectory_text,
+    write_depth_png,
+    write_pose,
+)
+from sceneprint.geometry.quaternions import rotation_of
 
 
 def test_depth_by_hand(tmp_path: Path) -> None:
@@ -70,3 +78,32 @@ def test_bad_scale(scale: float, tmp_path: Path) -> None:
 def test_bad_shape(shape: tuple[int, ...], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not \\(H, W\\)"):
         write_depth_png(tmp_path / "a.png", np.ones(shape, np.float32), 1000.0)
+
+
+def test_a_trajectory_is_read_again_without_loss(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    poses = []
+    for i in range(20):
+        T = np.eye(4)
+        T[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        T[:3, 0] *= np.sign(np.linalg.det(T[:3, :3]))
+        T[:3, 3] = rng.normal(size=3) * 10.0 ** rng.integers(-6, 6)
+        poses.append((1763285400.123456 + i / 30, T))
+    text = trajectory_text([trajectory_row(*one) for one in poses], ["room 1\nq 2 3", "Küche"])
+    assert text.startswith("# room 1\\nq 2 3\n# K\\xfcche\n1763285400.123456 ")
+    (tmp_path / "a.tum").write_text(text)
+    read = read_trajectory(tmp_path / "a.tum")
+    assert read.stamps.tolist() == [stamp for stamp, _ in poses]
+    assert read.positions.tolist() == [T[:3, 3].tolist() for _, T in poses]
+    for q, (_, T) in zip(read.quaternions, poses, strict=True):
+        np.testing.assert_allclose(rotation_of(q), T[:3, :3], atol=1e-14)
+
+
+def test_a_trajectory_by_hand() -> None:
+    T = np.array([[0, -1, 0, 1], [1, 0, 0, -2], [0, 0, 1, 0.5], [0, 0, 0, 1]], float)  # 90 deg of z
+    (line,) = trajectory_text([trajectory_row(12.5, T)]).splitlines()
+    half = 0.5**0.5
+    assert [float(word) for word in line.split()] == pytest.approx(
+        [12.5, 1, -2, 0.5, 0, 0, half, half], abs=1e-15
+    )
+    assert trajectory_text([], ["nobody"]) == "# nobody\n"

@@ -1,0 +1,383 @@
+"""What is packed is found as in the folder; what is wrong in an archive costs only itself."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import lzma
+import os
+import random
+import shutil
+import struct
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sceneprint.datasets import (
+    Camera,
+    FrameReference,
+    Sequence,
+    archives,
+    find_sequences,
+    inflating,
+    write_depth_png,
+    write_intrinsics,
+    write_pose,
+)
+from sceneprint.datasets.archives import Archive, open_archive
+from sceneprint.datasets.inflating import Inflater, is_archive
+from sceneprint.errors import SceneprintError, UnreadableArchive
+from sceneprint.types import Intrinsics
+
+CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)
+DEPTH = np.arange(12, dtype=np.float32).reshape(3, 4) / 8
+PACKERS: dict[str, Callable[[bytes], bytes]] = {
+    "gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress,
+}  # fmt: skip
+
+
+def pose_at(x: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+@pytest.fixture(scope="module")
+def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene of 7-Scenes with two sequences and colour."""
+    scene = tmp_path_factory.mktemp("scenes") / "kitchen"
+    for number in (1, 2):
+        folder = scene / f"seq-{number:02d}"
+        folder.mkdir(parents=True)
+        for i in range(3):
+            depth = DEPTH + np.float32(i + 10 * number)
+            write_depth_png(folder / f"frame-{i:06d}.depth.png", depth, 1000.0)
+            write_pose(folder / f"frame-{i:06d}.pose.txt", pose_at(i))
+            (folder / f"frame-{i:06d}.color.png").write_bytes(b"colour")
+    (scene / "TrainSplit.txt").write_text("sequence1\n")
+    write_intrinsics(scene, CAMERA)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of TUM, whose name has `rgb` in it, with colour and a trajectory."""
+    folder = tmp_path_factory.mktemp("tum") / "rgbd_dataset_freiburg1_desk"
+    (folder / "depth").mkdir(parents=True)
+    (folder / "rgb").mkdir()
+    (folder / "rgb" / "1.png").write_bytes(b"colour")
+    lines = []
+    for i in range(2):
+        write_depth_png(folder / "depth" / f"{1305031453 + i}.png", DEPTH + np.float32(i), 5000.0)
+        lines.append(f"{1305031453 + i} depth/{1305031453 + i}.png")
+    (folder / "depth.txt").write_text("# list\n" + "\n".join(lines) + "\n")
+    rows = [f"{1305031453 + i / 20:.2f} {i / 20} 0 0 0 0 0 1" for i in range(21)]
+    (folder / "groundtruth.txt").write_text("\n".join(rows) + "\n")
+    write_intrinsics(folder, Camera(CAMERA.intrinsics, 5000.0))
+    return folder
+
+
+def zipped(folder: Path, **options: int) -> bytes:
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w", options.get("method", zipfile.ZIP_DEFLATED)) as packed:
+        for path in sorted(folder.rglob("*")):
+            packed.write(path, path.relative_to(folder.parent))
+    return made.getvalue()
+
+
+def tarred(folder: Path, form: int = tarfile.GNU_FORMAT) -> bytes:
+    made = io.BytesIO()
+    with tarfile.open(fileobj=made, mode="w", format=form) as packed:
+        packed.add(folder, folder.name)
+    return made.getvalue()
+
+
+def tar_of(*members: tuple[str, bytes] | tarfile.TarInfo) -> bytes:
+    made = io.BytesIO()
+    with tarfile.open(fileobj=made, mode="w", format=tarfile.GNU_FORMAT) as packed:
+        for one in members:
+            if isinstance(one, tarfile.TarInfo):
+                packed.addfile(one, io.BytesIO(bytes(one.size)))
+                continue
+            info = tarfile.TarInfo(one[0])
+            info.size = len(one[1])
+            packed.addfile(info, io.BytesIO(one[1]))
+    return made.getvalue()
+
+
+def inflated(data: bytes, most: int = 1 << 30, step: int = 1 << 16) -> bytes:
+    inflater = Inflater(most)
+    parts = [p for i in range(0, len(data), step) for p in inflater.pieces(data[i : i + step])]
+    return b"".join([*parts, *inflater.end()])
+
+
+@contextmanager
+def looked_into(data: bytes, folder: Path, name: str = "import") -> Iterator[Archive]:
+    with open_archive(io.BytesIO(inflated(data)), folder, name) as archive:
+        yield archive
+
+
+def said(sequence: Sequence, frame: FrameReference, data: bytes) -> tuple[object, ...]:
+    """All that is known of a frame."""
+    pose = None if frame.pose is None else frame.pose.tolist()
+    of_all = (sequence.name, sequence.parent_frame, sequence.layout, sequence.split)
+    return (*of_all, frame.name, frame.camera, frame.timestamp, pose, data)
+
+
+def told(archive: Archive) -> list[object]:
+    return [said(s, f, archive.data_of(f)) for s in archive.sequences for f in s.frames]
+
+
+def oracle(folder: Path) -> list[object]:
+    return [said(s, f, f.path.read_bytes()) for s in find_sequences(folder) for f in s.frames]
+
+
+@pytest.mark.parametrize("kind", ["zip", "stored", "tar", "pax", "ustar", "gz", "bz2", "xz"])
+@pytest.mark.parametrize("which", ["kitchen", "desk"])
+def test_it_is_read_as_the_folder_is(
+    kind: str, which: str, kitchen: Path, desk: Path, tmp_path: Path
+) -> None:
+    folder = {"kitchen": kitchen, "desk": desk}[which]
+    forms = {"pax": tarfile.PAX_FORMAT, "ustar": tarfile.USTAR_FORMAT}
+    if kind in ("zip", "stored"):
+        data = zipped(folder, method=zipfile.ZIP_STORED if kind == "stored" else 8)
+    else:
+        data = PACKERS.get(kind, bytes)(tarred(folder, forms.get(kind, tarfile.GNU_FORMAT)))
+    assert is_archive(data[:512])
+    with looked_into(data, tmp_path) as archive:
+        assert told(archive) == oracle(folder)
+        assert archive.refused == []
+        assert archive.ignored == (6 if which == "kitchen" else 1)
+        first = archive.sequences[0].frames[0]
+        assert archive.name_of(first).startswith(f"{folder.name}/")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_several_streams_and_any_chunks_are_one_tar(kitchen: Path) -> None:
+    plain = tarred(kitchen)
+    for pack in PACKERS.values():
+        data = pack(plain[:5000]) + pack(plain[5000:]) + bytes(8)
+        for step in (1, 511, 1 << 20):
+            assert inflated(data, step=step) == plain
+
+
+def test_what_has_no_folder_is_named_by_the_caller(kitchen: Path, tmp_path: Path) -> None:
+    members = [(p.name, p.read_bytes()) for p in sorted((kitchen / "seq-01").glob("*.depth.png"))]
+    camera = ("intrinsics.json", (kitchen / "intrinsics.json").read_bytes())
+    with looked_into(tar_of(camera, *members), tmp_path, "hall") as archive:
+        assert [(s.name, s.parent_frame) for s in archive.sequences] == [("hall", "hall")]
+    nested = [(f"seq-01/{name}", data) for name, data in members]
+    with looked_into(tar_of(("seq-01/intrinsics.json", camera[1]), *nested), tmp_path, "hall") as a:
+        assert [(s.name, s.parent_frame) for s in a.sequences] == [("seq-01", "hall")]
+
+
+def test_a_camera_is_not_looked_for_outside_the_archive(kitchen: Path, tmp_path: Path) -> None:
+    write_intrinsics(tmp_path, CAMERA)  # beside the private folder
+    image = (kitchen / "seq-01" / "frame-000000.depth.png").read_bytes()
+    with looked_into(tar_of(("a.png", image)), tmp_path) as archive:
+        assert archive.sequences == ()
+        [(name, reason)] = archive.refused
+    assert name == "import"
+    assert "There is no intrinsics.json" in reason
+    assert str(tmp_path) not in reason
+
+
+def test_names_that_lead_elsewhere_are_refused_and_the_rest_is_taken(
+    kitchen: Path, tmp_path: Path
+) -> None:
+    image = (kitchen / "seq-01" / "frame-000000.depth.png").read_bytes()
+    camera = (kitchen / "intrinsics.json").read_bytes()
+    link, device = tarfile.TarInfo("s/link.png"), tarfile.TarInfo("s/tty.png")
+    link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
+    device.type = tarfile.CHRTYPE
+    odd = ["/etc/a.png", "../../b.png", "s/../../c.png", "C:\\d.png", "s/e\n.png", "s/\udcff.png"]
+    deep, long = "x/" * 20 + "f.png", "s/" + "y" * 300 + ".png"
+    data = tar_of(
+        ("s/intrinsics.json", camera), ("./s/good.png", image), link, device,
+        *((name, image) for name in [*odd, deep, long]), ("s/good.png", b"another"),
+        ("s/good.png/below.png", image),
+    )  # fmt: skip
+    with looked_into(data, tmp_path) as archive:
+        assert [f.name for s in archive.sequences for f in s.frames] == [
+            "s/good", "s/link", "s/tty",
+        ]  # fmt: skip
+        good, linked, _ = archive.sequences[0].frames
+        assert archive.data_of(good) == image
+        with pytest.raises(UnreadableArchive, match=r"s/link.png: it is a link"):
+            archive.data_of(linked)
+        reasons = dict(archive.refused)
+        assert len(archive.refused) == len(odd) + 4
+    assert "absolute" in reasons["/etc/a.png"]
+    assert "absolute" in reasons["C:\\d.png"]
+    assert "leads out" in reasons["../../b.png"]
+    assert "leads out" in reasons["s/../../c.png"]
+    assert "cannot be printed" in reasons["s/e\\n.png"]
+    assert "cannot be printed" in reasons["s/\\udcff.png"]
+    assert "16 folders" in reasons[deep]
+    assert "another member of this name" in reasons["s/good.png"]
+    assert "name of its folder" in reasons["s/good.png/below.png"]
+    assert {p.name for p in tmp_path.iterdir()} == set()
+
+
+def test_a_damaged_member_costs_itself_alone(kitchen: Path, tmp_path: Path) -> None:
+    data = bytearray(zipped(kitchen, method=zipfile.ZIP_STORED))
+    with zipfile.ZipFile(io.BytesIO(data)) as packed:
+        places = {i.filename: i.header_offset for i in packed.infolist()}
+    for name in ("seq-01/frame-000001.depth.png", "seq-02/frame-000002.pose.txt"):
+        data[places[f"kitchen/{name}"] + 30 + len(f"kitchen/{name}") + 20] ^= 1
+    with looked_into(bytes(data), tmp_path) as archive:
+        frames = {f.name: f for s in archive.sequences for f in s.frames}
+        assert len(frames) == 6
+        with pytest.raises(UnreadableArchive, match=r"000001.depth.png: it is damaged: its check"):
+            archive.data_of(frames["seq-01/frame-000001"])
+        assert [name for name, _ in archive.refused] == ["kitchen/seq-02/frame-000002.pose.txt"]
+        with pytest.raises(SceneprintError, match="pose") as caught:
+            _ = frames["seq-02/frame-000002"].pose
+        assert archive.told(caught.value).startswith("import/kitchen/seq-02/frame-000002.pose.txt")
+        assert frames["seq-02/frame-000001"].pose is not None
+
+
+def test_a_sequence_without_a_camera_costs_itself_alone(kitchen: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "two"
+    shutil.copytree(kitchen / "seq-01", scene / "a")
+    shutil.copytree(kitchen / "seq-02", scene / "b")
+    write_intrinsics(scene / "b", CAMERA)
+    (tmp_path / "work").mkdir()
+    with looked_into(zipped(scene), tmp_path / "work") as archive:
+        assert [s.name for s in archive.sequences] == ["b"]
+        assert [name for name, _ in archive.refused] == ["a"]
+
+
+def test_a_tar_that_ends_early_gives_what_it_has(kitchen: Path, tmp_path: Path) -> None:
+    plain = tarred(kitchen)
+    with tarfile.open(fileobj=io.BytesIO(plain)) as packed:
+        last = max(i.offset_data for i in packed.getmembers() if i.name.endswith("depth.png"))
+    with looked_into(plain[: last + 20], tmp_path) as archive:
+        assert sum(len(s.frames) for s in archive.sequences) >= 5
+        cut = [f for s in archive.sequences for f in s.frames if f.path.name[:12] == "frame-000002"]
+        with pytest.raises(UnreadableArchive, match="the archive ends within it"):
+            _ = [archive.data_of(one) for one in cut]
+    torn = bytearray(plain)
+    torn[last - 512 + 150] ^= 1  # the sum of its header
+    with looked_into(bytes(torn), tmp_path) as archive:
+        assert "the rest cannot be found" in archive.refused[-1][1]
+
+
+def test_encrypted_and_strangely_packed_members_are_told(kitchen: Path, tmp_path: Path) -> None:
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as packed:
+        packed.write(kitchen / "intrinsics.json", "s/intrinsics.json")
+        image = (kitchen / "seq-01" / "frame-000000.depth.png").read_bytes()
+        packed.writestr("s/1.png", image)
+        packed.writestr("s/2.png", image, zipfile.ZIP_LZMA)
+    data = bytearray(made.getvalue())
+    entry = data.rindex(b"PK\x01\x02", 0, data.index(b"s/1.png", data.index(b"PK\x01\x02")))
+    data[entry + 8] |= 1
+    with looked_into(bytes(data), tmp_path) as archive:
+        locked, strange = archive.sequences[0].frames
+        with pytest.raises(UnreadableArchive, match="encrypted"):
+            archive.data_of(locked)
+        with pytest.raises(UnreadableArchive, match="method 14"):
+            archive.data_of(strange)
+
+
+def test_a_zip_of_64_bits_is_read(kitchen: Path, tmp_path: Path) -> None:
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as packed:
+        for path in sorted(kitchen.rglob("*.*")):
+            with packed.open(str(path.relative_to(kitchen)), "w", force_zip64=True) as member:
+                member.write(path.read_bytes())
+    with looked_into(made.getvalue(), tmp_path, "kitchen") as archive:
+        assert [s.name for s in archive.sequences] == ["seq-01", "seq-02"]
+        expected = [path.read_bytes() for path in sorted(kitchen.glob("*/*.depth.png"))]
+        assert [archive.data_of(f) for s in archive.sequences for f in s.frames] == expected
+
+
+def test_bombs_are_refused_while_they_burst(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (inflating, archives):  # the same with less to write
+        monkeypatch.setattr(module, "FREE", 1 << 20)
+    info = tarfile.TarInfo("s/a.npy")
+    info.size = 1 << 28
+    for pack in PACKERS.values():
+        bomb = pack(info.tobuf() + bytes(3 << 20))
+        with pytest.raises(UnreadableArchive, match="50 times what it weighs"):
+            inflated(bomb)
+        with pytest.raises(UnreadableArchive, match="holds more than 4096 bytes"):
+            inflated(bomb, most=4096)
+    twice = gzip.compress(gzip.compress(tar_of(("a.png", b"x"))))
+    with pytest.raises(UnreadableArchive, match="is no tar"):
+        inflated(twice + bytes(512))
+    # a zip whose 900 entries are one member, of which each announces 1 MB
+    body = zlib.compressobj(9, zlib.DEFLATED, -15)
+    packed = body.compress(bytes(1 << 20)) + body.flush()
+    local = struct.pack(
+        "<4sHHHHHIIIHH", b"PK\x03\x04", 20, 0, 8, 0, 0, 0, len(packed), 1 << 20, 0, 0
+    )
+    entries = b"".join(
+        struct.pack("<4sBBHHHHHIIIHHHHHII", b"PK\x01\x02", 20, 3, 20, 0, 8, 0, 0, 0, len(packed),
+                    1 << 20, len(f"{i}.npy"), 0, 0, 0, 0, 0, 0) + f"{i}.npy".encode()
+        for i in range(900)
+    )  # fmt: skip
+    start = len(local) + len(packed)
+    end = struct.pack("<4sHHHHIIH", b"PK\x05\x06", 0, 0, 900, 900, len(entries), start, 0)
+    with (
+        pytest.raises(UnreadableArchive, match="times what it weighs"),
+        looked_into(local + packed + entries + end, tmp_path),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "no archive that is read"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(600), "no archive that is read"),
+        (bytes(1024), "no archive that is read"),
+        (b"PK\x03\x04" + bytes(600), "ends early, and has no directory"),
+        (gzip.compress(b""), "is no tar"),
+        (gzip.compress(tar_of(("a.png", b"x")))[:-9], "ends early"),
+        (gzip.compress(tar_of(("a.png", b"x"))) + b"more", "damaged"),
+        (b"\x1f\x8b" + bytes(600), "damaged"),
+        (tar_of(("notes.txt", b"nothing")), "There is no depth image"),
+        (tar_of(("inner.zip", b"PK\x03\x04")), "archives within it"),
+    ],
+)
+def test_what_is_no_archive_of_frames_says_so(data: bytes, reason: str, tmp_path: Path) -> None:
+    with pytest.raises(UnreadableArchive, match=reason), looked_into(data, tmp_path):
+        pass
+
+
+def test_no_mutation_surprises(kitchen: Path, desk: Path, tmp_path: Path) -> None:
+    seeds = [zipped(kitchen), zipped(desk), tarred(kitchen), tarred(desk, tarfile.PAX_FORMAT)]
+    seeds += [gzip.compress(seeds[2]), lzma.compress(seeds[3])]
+    draw, refused = random.Random(6), 0
+    for i in range(120):
+        data = bytearray(seeds[i % len(seeds)])
+        for _ in range(draw.choice((1, 3, 30))):
+            place = draw.randrange(len(data))
+            if draw.random() < 0.1:
+                del data[place : place + draw.randrange(len(data) // 4)]
+            else:
+                data[place] = draw.choice((0, 1, 0x7F, 0xFF, draw.randrange(256)))
+        try:
+            with looked_into(bytes(data), tmp_path) as archive:
+                refused += bool(archive.refused)
+                for reference in (f for s in archive.sequences for f in s.frames):
+                    try:
+                        archive.data_of(reference)
+                        assert reference.pose is None or reference.pose.shape == (4, 4)
+                    except SceneprintError:
+                        refused += 1
+        except SceneprintError:
+            refused += 1
+    assert refused > 50
+    assert os.listdir(tmp_path) == []  # noqa: PTH208
