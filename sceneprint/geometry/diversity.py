@@ -102,10 +102,38 @@ def diversify(
         raise ValueError(f"k = {k}, distances {to_query.shape} (rising) and {among.shape}")
     if n == 0:
         return Selection(np.empty(0, np.intp), np.empty(0))
-    upper = among[np.triu_indices(n, 1)]
-    sigma = p.sigma * float(np.median(upper)) if upper.size else 0.0
+    sigma = _sigma(among, p)
     omega = p.omega * float(to_query[-1] - to_query[0])
     return _greedy(_log_quality(to_query, omega), among, sigma, min(k, n))
+
+
+def remaining(
+    among: Distances, taken: NDArray[np.intp], p: DiversityParameters | None = None
+) -> Floats:
+    """What diversity each of a ranking would still bring to a selection of it.
+
+    Parameters
+    ----------
+    among : (R, R) distances within the ranking
+    taken : (k,) positions of the selection
+    p : that it was selected with
+
+    Returns
+    -------
+    gains : (R,) variance given all that were taken, in [0, 1]; 0 for those themselves
+    """
+    among = np.asarray(among, np.float64)
+    similarity = similar(among, _sigma(among, p or DiversityParameters()))
+    known = similarity[taken]
+    explained = np.einsum("kr,kr->r", known, np.linalg.solve(known[:, taken], known))
+    gains: Floats = np.clip(1.0 - explained, 0.0, 1.0)
+    gains[taken] = 0.0
+    return gains
+
+
+def _sigma(among: Floats, p: DiversityParameters) -> float:
+    upper = among[np.triu_indices(len(among), 1)]
+    return p.sigma * float(np.median(upper)) if upper.size else 0.0
 
 
 def _log_quality(to_query: Floats, omega: float) -> Floats:

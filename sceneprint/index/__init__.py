@@ -13,7 +13,7 @@ from sceneprint.index.codes import Code, fit_code
 from sceneprint.index.generations import Generation, newest, newest_number
 from sceneprint.index.publishing import publish
 from sceneprint.index.scrubbing import scrub
-from sceneprint.index.search import SHORTLIST, Hits, search
+from sceneprint.index.search import SHORTLIST, Hits, is_compared, search
 from sceneprint.index.segments import Segment, open_segment, write_segment
 from sceneprint.index.tails import Tail, signatures_of
 
@@ -25,6 +25,7 @@ __all__ = [
     "Segment",
     "Tail",
     "fit_code",
+    "is_compared",
     "newest",
     "newest_number",
     "open_segment",

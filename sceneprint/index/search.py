@@ -80,17 +80,52 @@ def search(
     keys, found, whole = tail.keys[alive], distances(query, tail.signatures, rows=alive), True
     if generation is not None and len(generation):
         free = _free(generation, np.concatenate([gone, tail.keys]), among)
-        positions = np.flatnonzero(free)
-        proposed = max(shortlist, size)
-        whole = exact or len(positions) <= proposed
-        if not whole:
-            code = generation.code.encode(query[None])[0]
-            nearest = generation.coarse.nearest(code, proposed, np.flatnonzero(~free))
-            positions = np.sort(nearest)
+        positions, whole = _proposed(query, generation, free, max(shortlist, size), exact)
         keys = np.concatenate([keys, generation.keys[positions]])
         found = np.concatenate([found, _compare(query, generation, positions)])
     first = _nearest(keys, found, size)
     return Hits(keys[first], found[first], whole, len(keys))
+
+
+def is_compared(
+    query: Bytes,
+    generation: Generation | None,
+    tail: Tail,
+    size: int,
+    key: int,
+    *,
+    dead: frozenset[int] = frozenset(),
+    among: Keys | None = None,
+    exact: bool = False,
+    shortlist: int = SHORTLIST,
+) -> bool:
+    """Whether `search` computes the exact distance of one frame, or its shortlist misses it.
+
+    Parameters
+    ----------
+    key : of the frame
+    query, generation, tail, size, dead, among, exact, shortlist : as of `search`
+    """
+    gone, wanted = np.fromiter(dead, np.int64, len(dead)), np.array([key], np.int64)
+    at = _known(tail.places, wanted)
+    if len(at):
+        return bool(_free(tail, gone, among)[at[0]])
+    if generation is None or not len(at := _known(generation.places, wanted)):
+        return False
+    free = _free(generation, np.concatenate([gone, tail.keys]), among)
+    positions, _ = _proposed(query, generation, free, max(shortlist, size), exact)
+    return bool(free[at[0]]) and at[0] in positions
+
+
+def _proposed(
+    query: Bytes, generation: Generation, free: NDArray[np.bool_], most: int, exact: bool
+) -> tuple[NDArray[np.int64], bool]:
+    """Positions in a generation that are compared, rising, and whether these are all."""
+    positions = np.flatnonzero(free)
+    if exact or len(positions) <= most:
+        return positions, True
+    code = generation.code.encode(query[None])[0]
+    return np.sort(generation.coarse.nearest(code, most, np.flatnonzero(~free))), False
 
 
 def _free(part: Generation | Tail, gone: Keys, among: Keys | None) -> NDArray[np.bool_]:

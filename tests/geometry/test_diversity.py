@@ -9,7 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.geometry.diversity import DiversityParameters, diversify, kernel_matrix
+from sceneprint.geometry.diversity import (
+    DiversityParameters,
+    diversify,
+    kernel_matrix,
+    remaining,
+)
 from sceneprint.geometry.retrieval import Metric, distances, pairwise_distances, rank
 from sceneprint.types import Floats
 
@@ -136,3 +141,27 @@ def test_empty_and_wrong_input() -> None:
     ):
         with pytest.raises(ValueError, match="distances"):
             diversify(*arguments)
+
+
+@pytest.mark.parametrize("k", [1, 3, 6])
+def test_what_is_left_is_what_a_determinant_would_gain(k: int) -> None:
+    to_query, among = ranking(11, 15)
+    p = DiversityParameters(sigma=0.8)
+    taken = diversify(to_query, among, k, p).indices
+    found = remaining(among, taken, p)
+    likeness = np.exp(-among / (0.8 * np.median(among[np.triu_indices(15, 1)])))
+    for i in range(15):
+        both = [*taken.tolist(), i]
+        whole = np.linalg.det(likeness[np.ix_(both, both)])
+        gain = whole / np.linalg.det(likeness[np.ix_(taken, taken)])
+        assert found[i] == (0.0 if i in taken else pytest.approx(gain, abs=1e-9))
+    assert len(set(found.tolist())) == 15 - k + 1
+
+
+def test_a_duplicate_has_nothing_left_to_bring() -> None:
+    among = ranking(3, 5)[1]
+    twice = np.ix_([0, 1, 2, 2, 4], [0, 1, 2, 2, 4])
+    taken = np.array([0, 2], np.intp)
+    found = remaining(among[twice], taken)
+    assert found[[0, 2, 3]] == pytest.approx(0.0, abs=1e-12)
+    assert (found[[1, 4]] > 0.01).all()

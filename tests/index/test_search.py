@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.index import SHORTLIST, Generation, Hits, Tail, search, signatures_of
+from sceneprint.index import (
+    SHORTLIST,
+    Generation,
+    Hits,
+    Tail,
+    is_compared,
+    search,
+    signatures_of,
+)
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -222,3 +230,26 @@ def test_mistakes_are_refused(published: Publish, walk: Walk) -> None:
         Tail(np.array([4, 3, 4]), signatures[:3])
     with pytest.raises(ValueError, match="keys"):
         Tail(np.arange(3), signatures[:2])
+
+
+def test_what_is_compared_is_what_a_search_could_find(walk: Walk, published: Publish) -> None:
+    """With a ranking as long as all that is compared, found and compared are the same frames."""
+    signatures, keys = walk(400), np.arange(400, dtype=np.int64)
+    generation = published(keys[:380], signatures[:380])
+    tail = Tail(keys[376:], signatures[376:])  # four of them in both
+    query, dead = walk(1, seed=3)[0], frozenset([5, 6, 379, 390])
+    for among in (None, keys[::2]):
+        how = {"dead": dead, "among": among, "shortlist": 40}
+        hits = search(query, generation, tail, 1, **how)
+        assert (hits.exact, hits.compared) == (False, 40 + (22 if among is None else 11))
+        told = [key for key in range(410) if is_compared(query, generation, tail, 1, key, **how)]
+        assert len(told) == hits.compared
+        by_search = search(query, generation, Tail.empty(LENGTH), 40, **how).keys.tolist()
+        of_tail = {k for k in range(376, 400) if k not in dead and (among is None or k % 2 == 0)}
+        assert {*told} >= of_tail
+        near = [k for k in told if k < 376]
+        assert len(near) == 40
+        assert {k for k in by_search if k < 376} <= {*near}
+    assert is_compared(query, generation, tail, 1, 7, exact=True, shortlist=1)
+    assert not is_compared(query, generation, tail, 1, 5, dead=dead, exact=True)
+    assert not is_compared(query, None, tail, 1, 7)
