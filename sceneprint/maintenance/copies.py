@@ -23,12 +23,14 @@ from sceneprint.store.sealed import Sealed, sealed_file
 
 #: Seconds to wait for whoever recovers the database.
 BUSY_S = 30.0
-#: What every blob that has to be there is for: (digest, number of the frame, upload | geometry).
+#: What every blob that has to be there is for: (digest, number of the frame, upload | geometry);
+#: and of those that are of jobs: (digest, number of the job, job).
 _USES = (
     "SELECT blob AS digest, number, 'upload' AS role FROM frames WHERE state NOT IN"
     f" ('{FrameState.DELETED}', '{FrameState.REDUNDANT}')"
     " UNION ALL SELECT geometry, frame_number, 'geometry' FROM signatures"
 )
+_USES_OF_JOBS = "SELECT blob AS digest, job_number AS number, 'job' AS role FROM job_files"
 
 
 def database_file(url: str) -> Path:
@@ -140,7 +142,8 @@ def counts(connection: sqlite3.Connection) -> dict[str, Any]:
 
 def referred(connection: sqlite3.Connection) -> Iterator[str]:
     """Digests of all blobs that have to be there, each once, in order."""
-    for (digest,) in connection.execute(f"SELECT DISTINCT digest FROM ({_USES}) ORDER BY digest"):
+    every = f"{_USES} UNION ALL {_USES_OF_JOBS}" if _has_job_files(connection) else _USES
+    for (digest,) in connection.execute(f"SELECT DISTINCT digest FROM ({every}) ORDER BY digest"):
         yield digest
 
 
@@ -152,7 +155,22 @@ def uses(connection: sqlite3.Connection, digest: str) -> tuple[Use, ...]:
         " JOIN maps ON maps.number = frames.map_number WHERE digest = ? ORDER BY frames.number",
         (digest,),
     )
-    return tuple(Use(map=name, frame=frame, role=role) for name, frame, role in rows)
+    of_frames = [Use(map=name, frame=frame, role=role) for name, frame, role in rows]
+    if not _has_job_files(connection):
+        return tuple(of_frames)
+    rows = connection.execute(
+        "SELECT maps.name, jobs.id FROM"
+        f" ({_USES_OF_JOBS}) AS used JOIN jobs ON jobs.number = used.number"
+        " JOIN maps ON maps.number = jobs.map_number WHERE digest = ? ORDER BY jobs.number",
+        (digest,),
+    )
+    return (*of_frames, *(Use(map=name, job=job, role="job") for name, job in rows))
+
+
+def _has_job_files(connection: sqlite3.Connection) -> bool:
+    """Whether the database is of a version that lets jobs refer to blobs."""
+    asked = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name = 'job_files'"
+    return bool(connection.execute(asked).fetchone()[0])
 
 
 def _connect(path: Path, how: str) -> sqlite3.Connection:

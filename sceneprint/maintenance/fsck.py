@@ -20,6 +20,7 @@ from sceneprint.maintenance.blobs import check_artifacts, check_uploads
 from sceneprint.maintenance.files import check_files
 from sceneprint.maintenance.findings import Finding, Folder, Progress, is_of_rows
 from sceneprint.maintenance.generations import check_indexes
+from sceneprint.maintenance.products import check_products
 from sceneprint.maintenance.rows import check_rows
 from sceneprint.maintenance.signatures import check_signatures
 from sceneprint.maintenance.tables import check_tables
@@ -37,7 +38,7 @@ GRACE_S = 3600.0
 
 _CHECKS: tuple[Callable[[Folder], Iterator[Finding]], ...] = (
     check_database, check_models, check_rows, check_signatures, check_uploads, check_artifacts,
-    check_files, check_indexes, check_tables,
+    check_products, check_files, check_indexes, check_tables,
 )  # fmt: skip
 
 

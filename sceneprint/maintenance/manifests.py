@@ -55,8 +55,9 @@ class Use(_Record):
     """What a blob is for."""
 
     map: str
-    frame: str
-    role: Literal["upload", "geometry"]
+    frame: str | None = None
+    job: str | None = None
+    role: Literal["upload", "geometry", "job"]
 
 
 class LostBlob(_Record):

@@ -166,7 +166,7 @@ def _write(
             continue
         writer.add(BLOBS + digest, len(data), iter([data]))
         count, size = count + 1, size + len(data)
-    lines = "".join(one.model_dump_json() + "\n" for one in damaged).encode()
+    lines = "".join(one.model_dump_json(exclude_none=True) + "\n" for one in damaged).encode()
     writer.add(DAMAGED, len(lines), iter([lines]))
     manifest = draft.model_copy(
         update={

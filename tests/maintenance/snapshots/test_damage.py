@@ -241,7 +241,7 @@ def test_databases_that_are_none_of_ours(archive, tmp_path, refused):
     assert "a later one wrote it" in refused(with_database(later), kind=NewerSchema)
     refused(
         with_database(lambda database: database.execute("DELETE FROM maps")),
-        "a row of frames refers to one of maps that is missing",
+        "a row of (frames|jobs) refers to one of maps that is missing",
     )
     sql = "UPDATE frames SET state = 'failed' WHERE state = 'received'"
     refused(with_database(lambda database: database.execute(sql)), "another than its manifest says")

@@ -1,0 +1,75 @@
+"""Files of long jobs: checked, taken along, and forgotten where they are lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.maintenance.fsck import fsck
+from sceneprint.maintenance.restoring import restore_snapshot
+from sceneprint.maintenance.snapshots import take_snapshot
+from sceneprint.schemas import NewMap
+from sceneprint.settings import Settings
+from sceneprint.store import Store
+from sceneprint.store.listing import find_job
+from sceneprint.store.parts import JobFile, add_files, files_of
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    return Settings(data_dir=tmp_path / "data", cache_dir=tmp_path / "cache", database_url=None)
+
+
+@pytest.fixture
+def made(settings: Settings) -> tuple[str, str]:
+    """A job with two files; ids of the job and of the first blob."""
+    with Engine(settings) as engine:
+        engine.create_map(NewMap(name="hall", model="compact"))
+        job = engine.tasks.begin("reconstruct", "hall", {})
+        blob = engine.store.blobs.put(b"a mesh")
+        other = engine.store.blobs.put(b"a picture")
+        with engine.store.database.write() as connection:
+            files = [
+                JobFile("mesh.ply", blob, 6, "model/ply"),
+                JobFile("picture.png", other, 9, "image/png"),
+            ]
+            add_files(connection, find_job(connection, job.job_id).number, files)
+    return job.job_id, blob
+
+
+def names(store: Store, job_id: str) -> list[str]:
+    with store.database.read() as connection:
+        return list(files_of(connection, find_job(connection, job_id).number))
+
+
+def test_sound_files_of_jobs_are_no_finding_and_belong_to_a_snapshot(settings, made, tmp_path):
+    assert list(fsck(settings, grace_s=0)) == []
+    take_snapshot(settings, tmp_path / "all.tar")
+    restore_snapshot(tmp_path / "all.tar", tmp_path / "again")
+    with Engine(Settings(data_dir=tmp_path / "again", database_url=None)) as engine:
+        assert names(engine.store, made[0]) == ["mesh.ply", "picture.png"]
+        assert engine.store.blobs.get(made[1]) == b"a mesh"
+
+
+@pytest.mark.parametrize("condition", ["damaged", "missing"])
+def test_a_lost_file_of_a_job_is_named_and_forgotten(settings, made, condition):
+    job_id, blob = made
+    path = settings.blob_dir / blob[:2] / blob
+    if condition == "missing":
+        path.unlink()
+    else:
+        path.chmod(0o600)
+        path.write_bytes(b"a mush")
+    (found,) = fsck(settings, grace_s=0)
+    assert (found.finding.kind, found.finding.map) == (f"{condition}-job-file", "hall")
+    assert found.finding.what == f"mesh.ply of job {job_id} (reconstruct)"
+    (done,) = fsck(settings, grace_s=0, repair=True)
+    assert done.done is not None
+    assert done.done.endswith("the job has it no more")
+    assert list(fsck(settings, grace_s=0)) == []
+    with Engine(settings) as engine:
+        assert names(engine.store, job_id) == ["picture.png"]
+    kept = [one.read_bytes() for one in settings.data_dir.rglob(f"quarantine/*{blob}*")]
+    assert kept == ([b"a mush"] if condition == "damaged" else [])
