@@ -4,6 +4,7 @@ Field names, units and words are those of the JSON; docs/api.md has examples.
 """
 
 from sceneprint.schemas.base import Page, Problem
+from sceneprint.schemas.explanations import ExplainedFrame, Explanation
 from sceneprint.schemas.filters import Filter, Region
 from sceneprint.schemas.frames import (
     Added,
@@ -11,20 +12,20 @@ from sceneprint.schemas.frames import (
     Frame,
     FrameMeta,
     GivenPose,
-    Job,
 )
+from sceneprint.schemas.jobs import Job, Progress
+from sceneprint.schemas.localization import Localization
 from sceneprint.schemas.maps import Map, NewMap, Reencoding
-from sceneprint.schemas.queries import (
-    Answer,
-    AnswerStatus,
-    Counts,
-    Location,
-    Match,
-    Query,
-    Residual,
+from sceneprint.schemas.matches import Location, Match, Residual, Validation
+from sceneprint.schemas.options import (
+    Diversity,
+    FrameName,
+    NamedFrame,
     Stage,
-    Validation,
+    ValidationOptions,
 )
+from sceneprint.schemas.queries import Answer, AnswerStatus, Counts, OfMap, Query, SeveralQuery
+from sceneprint.schemas.similarities import Comparison, Similarity
 from sceneprint.schemas.states import FrameState, JobState
 from sceneprint.schemas.transforms import Quaternion, Transform, Vector
 
@@ -33,27 +34,39 @@ __all__ = [
     "Answer",
     "AnswerStatus",
     "CameraIntrinsics",
+    "Comparison",
     "Counts",
+    "Diversity",
+    "ExplainedFrame",
+    "Explanation",
     "Filter",
     "Frame",
     "FrameMeta",
+    "FrameName",
     "FrameState",
     "GivenPose",
     "Job",
     "JobState",
+    "Localization",
     "Location",
     "Map",
     "Match",
+    "NamedFrame",
     "NewMap",
+    "OfMap",
     "Page",
     "Problem",
+    "Progress",
     "Quaternion",
     "Query",
     "Reencoding",
     "Region",
     "Residual",
+    "SeveralQuery",
+    "Similarity",
     "Stage",
     "Transform",
     "Validation",
+    "ValidationOptions",
     "Vector",
 ]

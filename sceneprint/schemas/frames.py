@@ -1,4 +1,4 @@
-"""Frames and jobs as JSON."""
+"""Frames as JSON."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AwareDatetime, Field, field_validator, model_validator
 
 from sceneprint.schemas.base import Given, Label, Told
-from sceneprint.schemas.states import FrameState, JobState
+from sceneprint.schemas.states import FrameState
 from sceneprint.schemas.transforms import Transform
 
 #: A frame's priority is a whole number from minus this to this.
@@ -45,23 +45,36 @@ class GivenQuaternion(GivenVector):
     w: float
 
 
-class GivenPose(Given):
+class GivenTransform(Given):
+    """A rigid transform, as `translation` and `rotation` or as `matrix`."""
+
+    translation: GivenVector | None = None
+    rotation: GivenQuaternion | None = None
+    matrix: Annotated[list[Row4], Field(min_length=4, max_length=4)] | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> GivenTransform:
+        parts = (self.translation is not None, self.rotation is not None)
+        if parts not in ((True, True), (False, False)) or parts[0] == (self.matrix is not None):
+            raise ValueError("give translation and rotation, or matrix")
+        return self
+
+
+class GivenPose(GivenTransform):
     """T_parent_sensor, as `translation` and `rotation` or as `matrix`."""
 
     parent_frame: Label | None = Field(
         default=None,
         description="Poses are combined within one parent frame; default: ROBOT/SESSION.",
     )
-    translation: GivenVector | None = None
-    rotation: GivenQuaternion | None = None
-    matrix: Annotated[list[Row4], Field(min_length=4, max_length=4)] | None = None
 
-    @model_validator(mode="after")
-    def _one_way(self) -> GivenPose:
-        parts = (self.translation is not None, self.rotation is not None)
-        if parts not in ((True, True), (False, False)) or parts[0] == (self.matrix is not None):
-            raise ValueError("give translation and rotation, or matrix")
-        return self
+
+class GivenBase(GivenTransform):
+    """T_base_sensor: where the camera sits on the robot; x_base = T_base_sensor @ x_sensor."""
+
+    base_frame: Label = Field(
+        default="base_link", description="What the robot calls the frame of its base."
+    )
 
 
 class FrameMeta(Given):
@@ -83,6 +96,10 @@ class FrameMeta(Given):
         description="When, with its time zone.",
     )
     pose: GivenPose | None = None
+    T_base_sensor: GivenBase | None = Field(
+        default=None,
+        description="Where the camera sits on the robot: answers then also say where its base is.",
+    )
     tags: list[Label] = Field(default=[], max_length=32)
 
     @field_validator("captured_at")
@@ -133,24 +150,13 @@ class Frame(Told):
     received_at: datetime
     indexed_at: datetime | None
     pose: Transform | None
-    tags: list[str]
-
-
-class Job(Told):
-    """A piece of work in the queue."""
-
-    job_id: str
-    kind: Literal["sign", "reencode"] = Field(
-        description="`reencode` signs an indexed frame once more, with the model to come or as "
-        "what was made of it is damaged."
+    base_frame: str | None = Field(default=None, description="Frame of the robot's base.")
+    T_base_sensor: Transform | None = Field(
+        default=None, description="Where the camera sits on the robot, as it was sent."
     )
-    state: JobState
-    map: str
-    frame_id: str
-    priority: int = Field(description="Jobs of a greater one are done first.")
-    attempts: int
-    created_at: datetime
-    started_at: datetime | None = Field(description="Of the latest try.")
-    finished_at: datetime | None
-    error: str | None
-    traceback: str | None
+    tags: list[str]
+    etag: str | None = Field(
+        default=None,
+        description="Stands for what PATCH can change: sent in If-Match, with quotes around it, "
+        "it keeps an edit from overwriting another.",
+    )

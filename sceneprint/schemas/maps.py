@@ -58,3 +58,8 @@ class Map(Told):
     created_at: datetime
     revision: int = Field(description="Grows with every frame that is indexed or deleted.")
     frames: dict[str, int] = Field(description="How many frames are in each state.")
+    etag: str | None = Field(
+        default=None,
+        description="Stands for what PATCH can change: sent in If-Match, with quotes around it, "
+        "it keeps an edit from overwriting another.",
+    )

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
 from sceneprint.schemas.base import Given, Told
+from sceneprint.schemas.explanations import ExplainedFrame, Explanation
 from sceneprint.schemas.filters import Filter, parsed
-from sceneprint.schemas.transforms import Transform
-
-Stage = Literal["retrieve", "diversify", "validate"]
-STAGES: tuple[Stage, ...] = ("retrieve", "diversify", "validate")
+from sceneprint.schemas.matches import Location, Match
+from sceneprint.schemas.options import (
+    MOST_MAPS,
+    STAGES,
+    Diversity,
+    FrameName,
+    JsonText,
+    Named,
+    NamedFrame,
+    Stage,
+    ValidationOptions,
+)
 
 AnswerStatus = Literal["found", "ambiguous", "not_found", "unvalidated"]
-ValidationStatus = Literal["accepted", "rejected", "ambiguous", "skipped"]
 
 
 class Query(Given):
@@ -36,6 +44,38 @@ class Query(Given):
     )
     seed: int = Field(
         default=0, ge=0, lt=2**32, description="Of the random choices; the answer echoes it."
+    )
+    candidates: int | None = Field(
+        default=None,
+        ge=1,
+        le=200,
+        description="How many of the ranking are selected and validated until `k` are accepted, "
+        "some 20 ms each; default: 10, or `k` where that is more. Without validation `k` counts.",
+    )
+    diversity: Annotated[Diversity | None, JsonText] = Field(
+        default=None, description="The scales of the selection."
+    )
+    validation: Annotated[ValidationOptions | None, JsonText] = Field(
+        default=None, description="What a match must stand to be accepted."
+    )
+    deadline_ms: int | None = Field(
+        default=None,
+        ge=1,
+        le=600_000,
+        description="Counted from when the request came. No candidate is begun that would likely "
+        "be validated too late; the ranking and the selection are always made.",
+    )
+    explain: bool = Field(
+        default=False, description="Say of every frame of the ranking how far it came, and why."
+    )
+    explain_frame: Named | None = Field(
+        default=None,
+        description="A frame of the map: say where it was lost. It is compared and validated for "
+        "this even where the query did not.",
+    )
+    keep: bool = Field(
+        default=True,
+        description="Keep the answer for a while, so that GET /v1/queries/{query_id} has it.",
     )
 
     @field_validator("stages", mode="before", json_schema_input_type=str | tuple[Stage, ...])
@@ -64,67 +104,23 @@ class Query(Given):
         return stages
 
 
-class Residual(Told):
-    """Both directions composed: the identity if they agreed."""
+class SeveralQuery(Query):
+    """How to ask several maps of one model at once."""
 
-    translation_m: float
-    rotation_deg: float
-
-
-class Validation(Told):
-    """What came of aligning the query with a match."""
-
-    status: ValidationStatus = Field(description="`skipped`: enough others had been accepted.")
-    strength: Literal["strong", "weak"] | None = Field(
-        default=None, description="Of an accepted match."
+    maps: Literal["*"] | Annotated[list[Named], Field(min_length=1, max_length=MOST_MAPS)] = Field(
+        description=f"Their names, at most {MOST_MAPS}; `*` for all that you may read. A form and "
+        "a query string have them with commas between."
     )
-    reason: str
-    residual: Residual | None = None
-    overlap: float | None = Field(
-        default=None, description="Share of both frames' points that agree."
-    )
-    plane_overlap: float | None = Field(
-        default=None, description="The same, every plane counting alike."
-    )
-    free_space_violations: float | None = Field(
-        default=None, description="Share that lies where the other frame saw through."
-    )
-    inliers: int | None = Field(default=None, description="Points of both frames that agree.")
-    ambiguity: float | None = Field(
-        default=None,
-        description="Share that the best rival explains.",
+    frame: NamedFrame | None = Field(
+        default=None, description="A stored frame, in place of an upload; it does not find itself."
     )
 
-
-class Match(Told):
-    """A database frame returned for a query."""
-
-    frame_id: str
-    map: str
-    robot: str | None
-    session: str | None
-    rank: int = Field(description="Place in the ranking R, from 1.")
-    distance: int = Field(description="L1 distance of the stored signatures.")
-    similarity: float = Field(description="1 - distance / that of unrelated frames, 0 to 1.")
-    selected: bool | None = Field(
-        description="In the diverse selection C; null without that stage."
-    )
-    diversity_gain: float | None = Field(description="1 for the first; near 0 for a duplicate.")
-    validation: Validation
-    transform: Transform | None = Field(description="Query to match; believe it where accepted.")
-    pose_in_map: Transform | None = Field(
-        description="The query in the parent frame of the match's pose, where that is known."
-    )
-
-
-class Location(Told):
-    """The query's pose averaged over its accepted matches."""
-
-    pose: Transform
-    support: int = Field(description="Matches that agree on it.")
-    votes: int = Field(description="Matches that were asked.")
-    spread_m: float
-    spread_deg: float
+    @field_validator("maps", mode="before")
+    @classmethod
+    def _names(cls, maps: object) -> object:
+        if isinstance(maps, str) and maps.strip() != "*":
+            return [one.strip() for one in maps.split(",")]
+        return maps.strip() if isinstance(maps, str) else maps
 
 
 class Counts(Told):
@@ -139,13 +135,21 @@ class Counts(Told):
     accepted: int
 
 
+class OfMap(Told):
+    """What one of several maps had of a query."""
+
+    index_generation: int = Field(description="0 where it is scanned without an index.")
+    counts: Counts
+
+
 class Answer(Told):
     """What a query comes back with."""
 
     query_id: str
     status: AnswerStatus = Field(
         description="`found`: at least one match is accepted. `ambiguous`: none is, and one fits "
-        "in several ways. `unvalidated`: validation was not asked for."
+        "in several ways. `unvalidated`: validation was not asked for, or the deadline came "
+        "before a match was accepted."
     )
     matches: list[Match] = Field(
         description="Accepted ones first, strong before weak; then the others that were tried."
@@ -153,10 +157,29 @@ class Answer(Told):
     location: Location | None = Field(description="Where accepted matches have poses.")
     seed: int
     model: str
-    index_generation: int = Field(description="0 where the map is scanned without an index.")
+    index_generation: int = Field(
+        description="0 where the map is scanned without an index; of several maps the least."
+    )
     exact: bool = Field(description="Every frame that passes the filter was compared.")
     counts: Counts
     milliseconds: dict[str, float] = Field(
         description="`prepare` (signature and geometry of the query), `retrieve`, `diversify`, "
         "`validate`, `total`."
+    )
+    maps: list[str] = Field(default=[], description="The maps that were asked.")
+    frame: FrameName | None = Field(
+        default=None, description="The stored frame that was asked for; null for an upload."
+    )
+    per_map: dict[str, OfMap] | None = Field(
+        default=None, description="What each of several maps had; null where one was asked."
+    )
+    deadline_reached: bool | None = Field(
+        default=None,
+        description="Whether candidates were left out for want of time; null without a deadline.",
+    )
+    explanations: list[Explanation] | None = Field(
+        default=None, description="With `explain`: every frame of the ranking, the nearest first."
+    )
+    explained_frame: ExplainedFrame | None = Field(
+        default=None, description="With `explain_frame`: what became of that one."
     )

@@ -1,0 +1,44 @@
+"""What of a frame and of a map can be edited: JSON merge patches (RFC 7396)."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import AwareDatetime, Field
+
+from sceneprint.schemas.base import Given, Label
+from sceneprint.schemas.frames import GivenBase, GivenPose
+
+
+class FrameEdit(Given):
+    """What to change of a frame: what is left out stays, null removes.
+
+    Samples, camera and how they are read are what a frame is, and cannot be edited: delete it and
+    upload it again.
+    """
+
+    robot: Label | None = Field(default=None, description="Who took the frame.")
+    session: Label | None = Field(
+        default=None,
+        description="In which run. The parent frame of a pose that was named after it stays.",
+    )
+    captured_at: AwareDatetime | None = Field(default=None, description="When, with its zone.")
+    tags: Annotated[list[Label], Field(max_length=32)] | None = Field(
+        default=None, description="All of them: they are replaced together."
+    )
+    pose: GivenPose | None = Field(
+        default=None,
+        description="T_parent_sensor. `parent_frame` alone renames it; `translation` or "
+        "`rotation` alone leave the other; each of them is replaced as a whole.",
+    )
+    T_base_sensor: GivenBase | None = Field(
+        default=None, description="Where the camera sits on the robot; parts of it as of `pose`."
+    )
+
+
+class MapEdit(Given):
+    """What to change of a map: what is left out stays, null removes."""
+
+    title: Annotated[str, Field(max_length=200)] | None = Field(
+        default=None, description="For people."
+    )

@@ -1,0 +1,137 @@
+"""How a service does, and what it signs with, as JSON."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic import Field
+
+from sceneprint.schemas.base import Given, Label, Told
+
+
+class Sizes(Told):
+    """Disk space, bytes."""
+
+    database: int | None = Field(description="With its log; null where it is no file.")
+    blobs: int = Field(
+        description="Uploads and what was made of them. Of many files some are measured, and the "
+        "rest is taken to be like them."
+    )
+    index: int = Field(description="Search indexes of this machine; a cache.")
+    free: int = Field(description="Left on the disk of the data folder.")
+
+
+class IndexState(Told):
+    """How far the search index of a map is behind the map; queries read the rest themselves."""
+
+    map: str
+    generation: int | None = Field(
+        description="Null: the map has none; it is searched without, which is right for small ones."
+    )
+    tail: int = Field(
+        description="Indexed frames that the generation lacks. Above the setting `tail_frames`, "
+        "and not going down: see that workers run."
+    )
+
+
+class WorkerSeen(Told):
+    """A process that signs frames, or does other jobs, at this moment."""
+
+    name: str = Field(description="Its host and process id.")
+    job_id: str | None = Field(description="What it is at.")
+
+
+class Latency(Told):
+    """Times within which so many of the answers came, seconds; right to a tenth."""
+
+    p50: float
+    p95: float
+    p99: float
+
+
+class Counted(Told):
+    """What happened in some time."""
+
+    received: int = Field(description="Frames stored, or queued once more.")
+    indexed: int
+    rejected: int = Field(description="In which nothing can be signed.")
+    redundant: int
+    failed: int
+    deleted: int
+    queries: dict[str, int] | None = Field(
+        description="Queries by the status of their answer. Of the whole service alone: null where "
+        "a map was asked for, as are the following."
+    )
+    latency: Latency | None = Field(description="Of queries that were answered; null: none were.")
+    requests: int | None = Field(description="Requests under /v1, answered or refused.")
+    refused: int | None = Field(description="Of these, with 4xx.")
+    busy: int | None = Field(description="Of these, with 503: come back later.")
+    broken: int | None = Field(description="Of these, with any other 5xx.")
+
+
+class Minute(Counted):
+    """What happened in one minute; requests count for the minute in which they were written
+    down, up to ten seconds later.
+    """
+
+    at: datetime = Field(description="When it began.")
+
+
+class Stats(Told):
+    """How the service, or one map, does now and did lately."""
+
+    at: datetime
+    map: str | None = Field(description="Of which alone this tells; null: of all.")
+    maps: int
+    frames: dict[str, int] = Field(description="How many frames are in each state.")
+    jobs: dict[str, int] = Field(description="How many jobs are in each state.")
+    waiting: int = Field(description="Jobs that wait for a worker.")
+    oldest_waiting_s: float | None = Field(
+        description="Seconds since the job was queued that waits for longest; null: none waits."
+    )
+    indexes: list[IndexState] = Field(
+        description="Of the maps that changed most; 200 at most, those with the longest tail first."
+    )
+    workers: list[WorkerSeen] | None = Field(
+        description="On this machine, and elsewhere where at a job. Null where a map was asked for."
+    )
+    bytes: Sizes | None = Field(description="Null where a map was asked for.")
+    total: Counted = Field(description="All minutes together.")
+    minutes: list[Minute] = Field(description="The oldest first; the last is not over yet.")
+
+
+class ModelInfo(Told):
+    """A model: all that decides what signatures look like."""
+
+    model_id: str
+    label: str = Field(description="Name and first digits of the id, as maps and answers tell it.")
+    name: str
+    preset: bool = Field(description="Whether it ships with this version.")
+    components: int = Field(description="G, of the mixture.")
+    levels: int = Field(description="H, of the hierarchy of patches.")
+    signature_bytes: int = Field(description="25 G H.")
+    unrelated_distance: float = Field(
+        description="d0, median distance of unrelated frames: similarity = 1 - distance / d0."
+    )
+    parameters: dict[str, Any] = Field(description="The numbers of every stage.")
+    provenance: dict[str, Any] = Field(description="What it was trained on and with.")
+    maps: list[str] = Field(
+        description="Those that you may read and that are signed with it, or are about to be."
+    )
+
+
+class NewModel(Given):
+    """Which model a map is to be signed with from now on."""
+
+    model: Label = Field(
+        description="`paper`, `compact`, or the id or label of a model that GET /v1/models lists.",
+        examples=["compact"],
+    )
+
+
+#: Ends that a frame can come to, by the kind of the event that tells it.
+Outcome = Literal["received", "indexed", "rejected", "redundant", "failed", "deleted"]
+OUTCOMES: tuple[Outcome, ...] = (
+    "received", "indexed", "rejected", "redundant", "failed", "deleted"
+)  # fmt: skip
