@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import re
 from pathlib import Path
+from typing import Annotated
 
 import platformdirs
-from pydantic import Field, SecretStr
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import Field, SecretStr, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from sceneprint.models import default_cache_dir
 
@@ -54,6 +56,18 @@ class Settings(BaseSettings):
     waiting: int = Field(default=64, ge=0, le=10_000)
     #: Largest body of a request, bytes.
     upload_bytes: int = Field(default=72 << 20, ge=1024)
+    #: Largest archive that is imported, bytes; inflated it may have four times as many.
+    import_bytes: int = Field(default=4 << 30, ge=1024)
+    #: Seconds for a body of hardly any bytes; each MiB of it may take 4 s more.
+    body_s: float = Field(default=30.0, ge=1, le=3600)
+    #: Ask callers for a key on a loopback address as well, as behind a proxy.
+    require_keys: bool = False
+    #: Requests a second of each key, over five seconds; 0 for no limit.
+    requests_per_s: float = Field(default=200.0, ge=0, le=1e6)
+    #: Wrong keys a minute from each address; 0 for no limit.
+    failed_keys_per_minute: float = Field(default=60.0, ge=0, le=1e6)
+    #: Origins whose web pages may ask, with commas between: https://fleet.example; * for all.
+    cors_origins: Annotated[tuple[str, ...], NoDecode] = ()
     #: Seconds after which a silent worker loses its job.
     lease_s: float = Field(default=60.0, ge=0.1, le=3600)
     #: Longest time for one job, seconds; a worker that takes longer hangs, and is ended.
@@ -63,8 +77,38 @@ class Settings(BaseSettings):
     worker_bytes: int = Field(default=2 << 30, ge=0)
     #: Frames newer than the index above which a worker publishes a new one.
     tail_frames: int = Field(default=1000, ge=1, le=100_000)
+    #: Snapshots taken over the service that are kept; the oldest are removed.
+    snapshots_kept: int = Field(default=5, ge=1, le=1000)
     #: Seconds after which a worker reads all index files again, to see that they are sound.
     scrub_s: float = Field(default=3600.0, ge=1, le=31_536_000)
+    #: Room for answers that can be looked at afterwards, bytes; the oldest are removed. 0 for none.
+    query_bytes: int = Field(default=256 << 20, ge=0)
+    #: Seconds for which an answer can be looked at afterwards.
+    query_s: float = Field(default=3600.0, ge=1, le=31_536_000)
+    #: Streams of events that one service process keeps open at once; more are refused (503).
+    event_streams: int = Field(default=64, ge=0, le=10_000)
+    #: Newest events that are kept; older ones are removed, 200 bytes each.
+    events_kept: int = Field(default=1_000_000, ge=1000)
+
+    @field_validator("cors_origins", mode="before")
+    @classmethod
+    def _origins(cls, given: object) -> object:
+        if not isinstance(given, str):
+            return given
+        return tuple(one.strip() for one in given.split(",") if one.strip())
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _are_origins(cls, given: tuple[str, ...]) -> tuple[str, ...]:
+        for one in given:
+            if one != "*" and not re.fullmatch(r"https?://[^/?#@\s*]+", one):
+                raise ValueError(f"{one!r:.80} is no origin such as https://fleet.example")
+        return given
+
+    @property
+    def asks_for_keys(self) -> bool:
+        """Whether callers must show a key."""
+        return self.require_keys or not is_loopback(self.host)
 
     @property
     def database(self) -> str:
@@ -81,6 +125,16 @@ class Settings(BaseSettings):
     def blob_dir(self) -> Path:
         """Folder of uploads and geometry artifacts."""
         return self.data_dir / "blobs"
+
+    @property
+    def query_dir(self) -> Path:
+        """Folder of answers that can be looked at afterwards. Deleting it loses only those."""
+        return self.data_dir / "queries"
+
+    @property
+    def snapshot_dir(self) -> Path:
+        """Folder of snapshots taken over the service."""
+        return self.data_dir / "snapshots"
 
     @property
     def bell_dir(self) -> Path:

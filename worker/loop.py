@@ -9,9 +9,12 @@ import random
 import socket
 import time
 
+from sceneprint.descriptors import raise_descriptors
 from sceneprint.engine import Engine
 from sceneprint.errors import SceneprintError
-from sceneprint.logs import log_as_json
+from sceneprint.logs import log_as_json, of_request
+from sceneprint.maintenance.shelf import LONGEST_S as SNAPSHOT_S
+from sceneprint.maintenance.shelf import SNAPSHOT, snapshot_handler
 from sceneprint.settings import Settings
 from sceneprint.store.bell import Listener
 from worker.limits import Stop, limit_memory
@@ -44,12 +47,15 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
     """
     log_as_json()
     os.nice(NICENESS)
+    raise_descriptors()
     trace.watch()
     stop = Stop()
     with Engine(settings) as engine, engine.bell.listen() as listener:
         engine.warm()
+        engine.tasks.register(SNAPSHOT, snapshot_handler(settings), SNAPSHOT_S)
         limit_memory(settings.worker_bytes)
         worker = Worker(engine, listener, trace, stop)
+        engine.operations.statistics.began(worker.name)
         log.info("worker ready", extra={"worker": worker.name})
         while not (stop.asked or worker.unsound) and os.getppid() == parent:
             worker.turn()
@@ -98,7 +104,10 @@ class Worker:
             self._engine.put_back(claimed)
             return True
         held = claimed.claim
-        with self._trace.job(held.job.id, held.token, self._engine.settings.job_s):
+        asked = (held.job.data or {}).get("request_id")
+        usual_s = self._engine.settings.job_s
+        seconds = self._engine.tasks.longest_s(held.job.kind, usual_s)
+        with of_request(asked), self._trace.job(held.job.id, held.token, seconds):
             self._engine.run(claimed, self._break)
         return True
 

@@ -3,23 +3,38 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection, Mapping
+from datetime import datetime
 from pathlib import Path
 
 from sceneprint.engine import jobs, keys, maps, reencoding
+from sceneprint.engine.associating import Associating
+from sceneprint.engine.associations import Associations
+from sceneprint.engine.audit import Audit
+from sceneprint.engine.imports import Imports
+from sceneprint.engine.inspecting import Inspection
+from sceneprint.engine.kept import KeptQueries
+from sceneprint.engine.operations import Operations
+from sceneprint.engine.outputs import Outputs
+from sceneprint.engine.querying import Queries
 from sceneprint.engine.readers import Readers
+from sceneprint.engine.reconstructions import Reconstructions
 from sceneprint.engine.reencoding import Reencoding
 from sceneprint.engine.signers import Signers
+from sceneprint.engine.tasks import Tasks
 from sceneprint.engine.upkeep import Upkeep
-from sceneprint.engine.uploads import sweep_deleted
+from sceneprint.engine.uploads import Uploads, sweep_deleted
 from sceneprint.engine.warming import warm
 from sceneprint.engine.wire import tell_map
 from sceneprint.errors import ModelError
-from sceneprint.models import PRESETS, read_model
+from sceneprint.models import PRESETS, Model, read_model
 from sceneprint.schemas import Job, JobState, Map, NewMap, Page
+from sceneprint.schemas.keys import Key, MadeKey, Scope
 from sceneprint.settings import Settings
 from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import open_store
+from sceneprint.store.associations import ASSOCIATE
 from sceneprint.store.bell import Bell
 from sceneprint.store.reencoding import models_of
 
@@ -49,9 +64,22 @@ class Administration:
         )
         self._reencoding = Reencoding(self.store, self._upkeep)
         self._readers = Readers(self.signers, settings.indexes)
+        self.kept = KeptQueries(settings.query_dir, settings.query_s, settings.query_bytes)
+        self.inspection = Inspection(self.store, self.signers, self.kept)
+        self.queries = Queries(self.store, self.signers, self._readers, self.kept)
         # threads of the service work side by side, and sums have one order: the same bytes always
         self._limits = threadpool_limits(1)
         self.bell = Bell(settings.bell_dir)
+        self.uploads = Uploads(self.store, self.bell, settings.concurrency)
+        self.tasks = Tasks(self.store, self.bell)
+        self.imports = Imports(self.store, self.tasks, self.uploads, settings.import_bytes)
+        self.associations = Associations(self.store, self.tasks)
+        associating = Associating(self.store, self.signers, self._readers)
+        self.tasks.register(ASSOCIATE, associating)
+        self.audit = Audit(self.store)
+        self.outputs = Outputs(self.store, self.signers)
+        self.reconstructions = Reconstructions(self.store, self.tasks)
+        self.operations = Operations(self.store, settings, self.bell)
 
     def close(self) -> None:
         """Give back what was opened."""
@@ -94,11 +122,16 @@ class Administration:
         self._readers.forget(name)
         sweep_deleted(self.store, blobs)
 
-    def reencode(self, name: str, model: str | Path) -> Map:
+    def reencode(self, name: str, model: str | Path | Model) -> Map:
         """Have a map signed with another model, to which it then switches; see `begin`."""
         told = reencoding.begin(self.store, name, model)
         self.bell.ring()
         return told
+
+    def forget_gone(self) -> None:
+        """Give up what is held of maps that another process deleted."""
+        with self.store.database.read() as connection:
+            self._readers.tidy(connection)
 
     def cancel_reencode(self, name: str) -> Map:
         """Let a map keep the model it has; see `reencoding.cancel`."""
@@ -111,10 +144,11 @@ class Administration:
         return jobs.get_job(self.store, job_id)
 
     def list_jobs(
-        self, state: JobState | None = None, cursor: str | None = None, limit: int = 100
-    ) -> Page[Job]:
-        """Jobs of all maps, the newest first; see `jobs.list_jobs`."""
-        return jobs.list_jobs(self.store, state, cursor, limit)
+        self, state: JobState | None = None, cursor: str | None = None, limit: int = 100,
+        kind: str | None = None, map_names: Collection[str] | None = None,
+    ) -> Page[Job]:  # fmt: skip
+        """Jobs, the newest first; see `jobs.list_jobs`."""
+        return jobs.list_jobs(self.store, state, cursor, limit, kind, map_names)
 
     def cancel_job(self, job_id: str) -> Job:
         """Give up a job that is not over; see `jobs.cancel`."""
@@ -129,21 +163,23 @@ class Administration:
 
     # keys
 
-    def create_key(self, name: str) -> str:
-        """Make a key and return its secret; see `keys.create_key`."""
-        return keys.create_key(self.store, name)
+    def create_key(
+        self, name: str, grants: Mapping[str, Scope] | None = None,
+        expires_at: datetime | None = None,
+    ) -> MadeKey:  # fmt: skip
+        """Make a key, and show its secret; see `keys.create_key`."""
+        return keys.create_key(self.store, name, grants, expires_at)
 
-    def list_keys(self) -> list[tuple[str, float]]:
-        """Name of every key, and when it was made."""
-        with self.store.database.read() as connection:
-            return stored_keys.list_keys(connection)
+    def list_keys(self, cursor: str | None = None, limit: int = 100) -> Page[Key]:
+        """Keys by name; see `keys.list_keys`."""
+        return keys.list_keys(self.store, cursor, limit)
 
     def revoke_key(self, name: str) -> None:
         """Let a key open nothing any more; UnknownKey where there is none."""
         with self.store.database.write() as connection:
             stored_keys.revoke_key(connection, name)
 
-    def key_name(self, secret: str) -> str | None:
-        """Name of the key with that secret, or None."""
+    def find_key(self, secret: str) -> stored_keys.KeyRow | None:
+        """The key with that secret, or None; also one that has expired."""
         with self.store.database.read() as connection:
-            return stored_keys.key_name(connection, secret)
+            return stored_keys.find_key(connection, secret)

@@ -1,6 +1,6 @@
 """A query to its answer: R, C, C_vld, and the pose of the query.
 
-signature, Geometry, View  --answer-->  Answer
+signature, Geometry, Places  --answer-->  Answer
 """
 
 from __future__ import annotations
@@ -10,32 +10,21 @@ import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
-from sceneprint.artifacts import read_geometry
 from sceneprint.engine.asking import Asked
+from sceneprint.engine.deadlines import Deadline
+from sceneprint.engine.explaining import explain
 from sceneprint.engine.healing import sign_again
-from sceneprint.engine.readers import View
+from sceneprint.engine.searching import Place, Searched, search_maps
 from sceneprint.engine.telling import Found, tell_location, tell_matches
-from sceneprint.errors import DamagedBlob, UnreadableGeometry
-from sceneprint.geometry.diversity import Selection, diversify
-from sceneprint.geometry.retrieval import Ranking, pairwise_distances, ranking_size, similarity
-from sceneprint.index import search, signatures_of
-from sceneprint.index.keys import Keys
-from sceneprint.matches import Match, associate
+from sceneprint.engine.validating import Validated, validated, wanted_of
+from sceneprint.engine.why import Asking, why
+from sceneprint.geometry.diversity import DiversityParameters, diversify
+from sceneprint.geometry.retrieval import pairwise_distances
+from sceneprint.matches import Match
 from sceneprint.models import Model
-from sceneprint.schemas import Answer, AnswerStatus, Counts, Filter, Query
+from sceneprint.schemas import Answer, AnswerStatus, Counts, FrameName, OfMap, Query
 from sceneprint.store import Store
-from sceneprint.store.filters import passing
 from sceneprint.store.frames import frames_of
-from sceneprint.store.records import MapRow
-from sceneprint.store.signatures import geometry_blobs
-from sceneprint.types import Geometry
-
-#: Candidates that are selected and validated, unless more matches are wanted: more cost time.
-CANDIDATES = 10
-#: Frames up to which a map is compared whole: a shortlist saves next to nothing there.
-WHOLE = 4000
 
 
 @dataclass
@@ -52,106 +41,125 @@ class _Clock:
 
 
 def answer(
-    store: Store, row: MapRow, model: Model, view: View, asked: Asked, query: Query
-) -> Answer:
-    """Ask a map.
+    store: Store, places: Sequence[Place], model: Model, asked: Asked, query: Query,
+    deadline: Deadline,
+) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
+    """Ask maps; the answer, and the numbers of the frames of R.
 
     Parameters
     ----------
     store : see Store
-    row, model : of the map
-    view : of the map
+    places : the maps, one or more of one model
+    model : of all of them
     asked, query : what is sought, and how
+    deadline : see Deadline
+
+    Raises
+    ------
+    UnknownFrame : there is none of the id that is to be explained.
     """
-    sign_again(store, row, sorted(view.damaged), row.model_id)
+    for place in places:
+        sign_again(store, place.row, sorted(place.view.damaged), place.row.model_id)
     clock = _Clock({"prepare": round(asked.prepare_ms, 2)})
-    dead = view.dead if asked.frame is None else view.dead | {asked.frame[0]}
-    size = max(view.size - (asked.frame is not None), 0)  # it may just have been deleted
-    among = None if query.filter is None else _among(store, row, view, dead, asked, query.filter)
-    passed = size if among is None else len(among)
-    hits = search(
-        asked.vector, view.generation, view.tail, ranking_size(passed), dead=dead, among=among,
-        exact=query.exact or passed <= WHOLE,
-    )  # fmt: skip
-    shares = similarity(hits.distances, model.unrelated_distance)
-    ranking = Ranking(hits.keys.astype(np.intp), hits.distances, shares)
+    searched = search_maps(store, places, asked, query, model)
+    ranking, wanted = searched.ranking, wanted_of(query)
     clock.stage("retrieve")
-    wanted = max(CANDIDATES, query.k) if "validate" in query.stages else query.k
-    selection = _selection(view, ranking, wanted) if "diversify" in query.stages else None
+    among, selection, scales = None, None, None
+    if "diversify" in query.stages:
+        if query.diversity is not None:
+            scales = DiversityParameters(query.diversity.sigma, query.diversity.omega)
+        among = pairwise_distances(searched.signatures())
+        selection = diversify(ranking.distances, among, wanted, scales)
     clock.stage("diversify")
     chosen = range(min(wanted, len(ranking))) if selection is None else selection.indices.tolist()
-    matches, unreadable = _validated(store, row, ranking, chosen, asked.geometry, query)
+    tried = validated(store, searched, chosen, asked.geometry, query, deadline)
     clock.stage("validate")
-    clock.spent["total"] = round(sum(clock.spent.values()), 2)
+    shown = range(len(ranking)) if query.explain else chosen
     with store.database.read() as connection:
-        rows = frames_of(connection, ranking.indices[list(chosen)].tolist())
-    matches = [match for match in matches if match.index in rows]  # the rest was deleted meanwhile
-    found = Found(row.name, ranking, selection, rows, unreadable, asked.frame)
-    statuses = [match.validation.status for match in matches]
-    return Answer(
+        rows = frames_of(connection, ranking.indices[list(shown)].tolist())
+    matches = [one for one in tried.matches if one.index in rows]  # the rest was deleted meanwhile
+    names = {place.row.number: place.row.name for place in places}
+    found = Found(
+        names, ranking, selection, rows, tried.unreadable, tried.untried, asked.frame, asked.base
+    )
+    explanations = explained = None
+    if query.explain:
+        explanations = explain(found, tried, among, scales)
+    if query.explain_frame is not None:
+        asking = Asking(store, searched, asked, query, found, tried, model, deadline)
+        explained = why(asking, query.explain_frame)
+    if query.explain or explained is not None:
+        clock.stage("explain")
+    clock.spent["total"] = round(sum(clock.spent.values()), 2)
+    counts = [_counts(searched, i, found, tried, matches) for i in range(len(places))]
+    per_map = {
+        place.row.name: OfMap(index_generation=_generation(place), counts=own)
+        for place, own in zip(places, counts, strict=True)
+    }
+    told = Answer(
         query_id=uuid.uuid4().hex,
-        status=_status(statuses) if "validate" in query.stages else "unvalidated",
-        matches=tell_matches(found, chosen, matches, validated="validate" in query.stages),
+        status=_status(matches, query, deadline),
+        matches=tell_matches(found, chosen, matches),
         location=tell_location(found, matches),
         seed=query.seed,
         model=model.label,
-        index_generation=0 if view.generation is None else view.generation.number,
-        exact=hits.exact,
-        counts=Counts(
-            map=size,
-            passed=passed,
-            compared=hits.compared,
-            ranked=len(ranking),
-            selected=0 if selection is None else len(selection.indices),
-            validated=len(matches),
-            accepted=statuses.count("accepted"),
-        ),
+        index_generation=min(map(_generation, places)),
+        exact=searched.exact,
+        counts=_sum(counts),
         milliseconds=clock.spent,
+        maps=[place.row.name for place in places],
+        frame=_name(asked),
+        per_map=per_map if len(places) > 1 else None,
+        deadline_reached=deadline.reached,
+        explanations=explanations,
+        explained_frame=explained,
+    )
+    return told, tuple(ranking.indices.tolist())
+
+
+def _counts(
+    searched: Searched, i: int, found: Found, tried: Validated, matches: Sequence[Match]
+) -> Counts:
+    """What each stage saw of one of the maps."""
+    part, hits = searched.parts[i], searched.hits[i]
+    number = part.place.row.number
+    statuses = [
+        one.validation.status for one in matches if found.rows[one.index].map_number == number
+    ]
+    own = searched.owners == i
+    return Counts(
+        map=part.size,
+        passed=part.passed,
+        compared=hits.compared,
+        ranked=int(own.sum()),
+        selected=0 if found.selection is None else int(own[list(tried.chosen)].sum()),
+        validated=len(statuses),
+        accepted=statuses.count("accepted"),
     )
 
 
-def _among(
-    store: Store, row: MapRow, view: View, dead: frozenset[int], asked: Asked, wanted: Filter
-) -> Keys:
-    """Frames of a view that pass a filter; the database may be newer or older than the view."""
-    with store.database.read() as connection:
-        numbers = passing(connection, row.number, wanted, asked.taken)
-    known = view.tail.places.of(numbers) >= 0
-    if view.generation is not None:
-        known |= view.generation.places.of(numbers) >= 0
-    return numbers[known & ~np.isin(numbers, list(dead))]
+def _sum(counts: Sequence[Counts]) -> Counts:
+    return Counts(**{name: sum(getattr(one, name) for one in counts)
+                     for name in Counts.model_fields})  # fmt: skip
 
 
-def _selection(view: View, ranking: Ranking, wanted: int) -> Selection:
-    """C, from the stored signatures of R."""
-    rows = signatures_of(ranking.indices.astype(np.int64), view.generation, view.tail)
-    return diversify(ranking.distances, pairwise_distances(rows), wanted)
+def _generation(place: Place) -> int:
+    generation = place.view.generation
+    return 0 if generation is None else generation.number
 
 
-def _validated(
-    store: Store, row: MapRow, ranking: Ranking, chosen: Sequence[int],
-    query_geometry: Geometry | None, query: Query,
-) -> tuple[list[Match], dict[int, str]]:  # fmt: skip
-    """Candidates tried in the order of R, and those whose artifact cannot be read."""
-    if query_geometry is None:
-        return [], {}
-    with store.database.read() as connection:
-        numbers = ranking.indices[list(chosen)].tolist()
-        blobs = geometry_blobs(connection, numbers, row.model_id)
-    opened: dict[int, Geometry] = {}
-    unreadable: dict[int, str] = {}
-    for number, blob in blobs.items():  # those deleted in the meantime are not among them
-        try:
-            opened[number] = read_geometry(store.blobs.get(blob))
-        except (DamagedBlob, UnreadableGeometry) as error:  # one frame must not cost the answer
-            unreadable[number] = str(error)
-    sign_again(store, row, sorted(unreadable), row.model_id)
-    among = [i for i in chosen if int(ranking.indices[i]) in opened]
-    matches = associate(query_geometry, ranking, among, opened.__getitem__, query.k, query.seed)
-    return matches, unreadable
+def _name(asked: Asked) -> FrameName | None:
+    if asked.frame is None or asked.home is None:
+        return None
+    return FrameName(map=asked.home.name, frame_id=asked.frame[1])
 
 
-def _status(statuses: Sequence[str]) -> AnswerStatus:
+def _status(matches: Sequence[Match], query: Query, deadline: Deadline) -> AnswerStatus:
+    statuses = [match.validation.status for match in matches]
     if "accepted" in statuses:
         return "found"
-    return "ambiguous" if "ambiguous" in statuses else "not_found"
+    if "validate" not in query.stages:
+        return "unvalidated"
+    if "ambiguous" in statuses:
+        return "ambiguous"
+    return "unvalidated" if deadline.reached else "not_found"

@@ -13,6 +13,7 @@ import numpy as np
 from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.engine.frames import read_upload
 from sceneprint.engine.healing import sign_again
+from sceneprint.engine.transforms import pose_matrix
 from sceneprint.errors import (
     DamagedBlob,
     DamagedSignature,
@@ -26,8 +27,9 @@ from sceneprint.store import Store
 from sceneprint.store.filters import Taken
 from sceneprint.store.frames import find_frame, refers_to
 from sceneprint.store.maps import find_map
+from sceneprint.store.records import MapRow
 from sceneprint.store.signatures import geometry_blobs, stored_vector
-from sceneprint.types import Bytes, Geometry
+from sceneprint.types import Bytes, Floats, Geometry
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,9 @@ class Asked:
     taken : by whom, in which run and when
     frame : its number and id, if it is one of the map: it does not find itself
     prepare_ms : what making it ready took
+    home : the map that frame is in
+    base : what the robot's base is called, and T_base_query (4, 4); None where it is not known
+    artifact : `geometry` as bytes
     """
 
     model_id: str
@@ -50,6 +55,9 @@ class Asked:
     taken: Taken
     frame: tuple[int, str] | None
     prepare_ms: float
+    home: MapRow | None = None
+    base: tuple[str, Floats] | None = None
+    artifact: bytes | None = None
 
 
 def ask_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -> Asked:
@@ -57,20 +65,27 @@ def ask_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -> As
 
     Raises
     ------
-    FrameError : see `read_upload`; UselessFrame where nothing in it can be signed.
+    FrameError : see `read_upload`; UselessFrame where nothing in it can be signed; InvalidPose
+        where T_base_sensor is none.
     InvalidRequest : the filter asks for distance from its session, and `meta` lacks it or a time.
     """
     start = time.perf_counter()
     at = None if meta.captured_at is None else meta.captured_at.timestamp()
     taken = _checked(Taken(meta.robot, meta.session, at), query)
+    given, base = meta.T_base_sensor, None
+    if given is not None:
+        base = given.base_frame, pose_matrix(given, "T_base_sensor")
     frame = read_upload(data, meta)
     if "validate" not in query.stages:
         vector = sign(frame, signer).vector
-        return Asked(signer.model.id, vector, None, taken, None, _since(start))
+        return Asked(signer.model.id, vector, None, taken, None, _since(start), base=base)
     signature, seen = prepare(frame, signer)
     # as it would be read back: the same answer as when the frame is in the map
-    geometry = read_geometry(write_geometry(seen))
-    return Asked(signature.model_id, signature.vector, geometry, taken, None, _since(start))
+    artifact = write_geometry(seen)
+    return Asked(
+        signature.model_id, signature.vector, read_geometry(artifact), taken, None, _since(start),
+        base=base, artifact=artifact,
+    )  # fmt: skip
 
 
 def ask_stored(store: Store, map_name: str, frame_id: str, query: Query) -> Asked:
@@ -101,10 +116,13 @@ def ask_stored(store: Store, map_name: str, frame_id: str, query: Query) -> Aske
             (("frame_id", f"is {frame.state}"),),
         )
     taken = _checked(Taken(frame.robot, frame.session, frame.captured_at), query)
-    geometry = None
+    geometry = artifact = base = None
+    if frame.base is not None:
+        base = str(frame.base_frame), np.array(frame.base)
     if "validate" in query.stages:
         try:
-            geometry = read_geometry(store.blobs.get(blobs[frame.number]))
+            artifact = store.blobs.get(blobs[frame.number])
+            geometry = read_geometry(artifact)
         except (DamagedBlob, UnreadableGeometry):
             with store.database.read() as connection:
                 if not refers_to(connection, blobs[frame.number]):
@@ -115,7 +133,7 @@ def ask_stored(store: Store, map_name: str, frame_id: str, query: Query) -> Aske
             raise
     own = (frame.number, frame.id)
     asked = np.frombuffer(vector, np.uint8)
-    return Asked(row.model_id, asked, geometry, taken, own, _since(start))
+    return Asked(row.model_id, asked, geometry, taken, own, _since(start), row, base, artifact)
 
 
 def _checked(taken: Taken, query: Query) -> Taken:

@@ -9,15 +9,13 @@ from types import TracebackType
 from sceneprint.engine import jobs
 from sceneprint.engine import work as working
 from sceneprint.engine.administration import Administration
-from sceneprint.engine.answers import answer
-from sceneprint.engine.asking import Asked, ask_stored, ask_upload
-from sceneprint.engine.cursors import row_of
+from sceneprint.engine.browsing import list_frames
 from sceneprint.engine.endings import Work, put_back
 from sceneprint.engine.readers import View
-from sceneprint.engine.switches import check_model, steadily
-from sceneprint.engine.uploads import sweep_deleted, upload
+from sceneprint.engine.tasks import Task
+from sceneprint.engine.uploads import Upload, sweep_deleted
 from sceneprint.engine.wire import tell_frames
-from sceneprint.errors import BusyIndex, UnknownMap
+from sceneprint.errors import BusyIndex
 from sceneprint.models import Model
 from sceneprint.schemas import (
     Added,
@@ -26,9 +24,11 @@ from sceneprint.schemas import (
     FrameMeta,
     FrameState,
     JobState,
+    NamedFrame,
     Page,
     Query,
 )
+from sceneprint.schemas.browsing import FrameListing
 from sceneprint.store import frames as stored_frames
 from sceneprint.store import listing, queue
 from sceneprint.store import maps as stored_maps
@@ -64,30 +64,31 @@ class Engine(Administration):
         self, map_name: str, data: bytes, meta: FrameMeta, priority: int = 0,
         if_novel: float | None = None,
     ) -> tuple[Added, bool]:  # fmt: skip
-        """Take a frame into a map; see `upload`."""
-        added, new = upload(self.store, map_name, data, meta, priority, if_novel)
-        if new:
-            self.bell.ring()
-        return added, new
+        """Take a frame into a map; see `Uploads.add`."""
+        upload = Upload(data, meta, priority, if_novel)
+        outcome, _ = self.uploads.add(map_name, upload)
+        return outcome.taken, outcome.new
 
     def list_frames(
         self, map_name: str, cursor: str | None = None, limit: int = 100,
-        state: FrameState | None = None,
+        state: FrameState | None = None, wanted: FrameListing | None = None,
     ) -> Page[Frame]:  # fmt: skip
         """Frames of a map in the order they came, deleted ones only where asked for.
+
+        Parameters
+        ----------
+        map_name : of the map
+        cursor : of the page before
+        limit : most frames
+        state : in this one; None for all but deleted ones
+        wanted : more that must hold, `state` with it
 
         Raises
         ------
         UnknownMap : no such map.
         InvalidRequest : a cursor that was not given out.
         """
-        after = row_of(cursor)
-        with self.store.database.read() as connection:
-            row = stored_maps.find_map(connection, map_name)
-            found = stored_frames.list_frames(connection, row.number, after or 0, limit + 1, state)
-            more = len(found) > limit
-            items = tell_frames(connection, row, found[:limit])
-        return Page[Frame](items=items, next_cursor=str(found[limit - 1].number) if more else None)
+        return list_frames(self.store, map_name, wanted or FrameListing(state=state), cursor, limit)
 
     def get_frame(self, map_name: str, frame_id: str) -> Frame:
         """A frame; UnknownMap or UnknownFrame where there is none."""
@@ -112,23 +113,18 @@ class Engine(Administration):
 
     # queries
 
-    def query_upload(self, map_name: str, data: bytes, meta: FrameMeta, query: Query) -> Answer:
-        """Look a frame up that is not kept; see `ask_upload`."""
+    def query_upload(
+        self, map_name: str, data: bytes, meta: FrameMeta, query: Query, since: float | None = None
+    ) -> Answer:
+        """Look a frame up that is not kept; see `Queries.upload`."""
+        return self.queries.upload([map_name], data, meta, query, since)
 
-        def ask(row: MapRow) -> Answer:
-            signer = self.signers(row.model_id)
-            return self._answer(row, ask_upload(data, meta, signer, query), query)
-
-        return steadily(self.store, map_name, ask)
-
-    def query_frame(self, map_name: str, frame_id: str, query: Query) -> Answer:
-        """Look a frame of the map up among the others; see `ask_stored`."""
-
-        def ask(row: MapRow) -> Answer:
-            self.signers(row.model_id)  # while no connection is held: a crowd would hold all
-            return self._answer(row, ask_stored(self.store, map_name, frame_id, query), query)
-
-        return steadily(self.store, map_name, ask)
+    def query_frame(
+        self, map_name: str, frame_id: str, query: Query, since: float | None = None
+    ) -> Answer:
+        """Look a frame of the map up among the others; see `Queries.stored`."""
+        frame = NamedFrame.model_construct(map=map_name, frame_id=frame_id)
+        return self.queries.stored([map_name], frame, query, since)
 
     def view(self, map_name: str) -> tuple[MapRow, Model, View]:
         """A map with its model and all its signatures, as they are now; UnknownMap."""
@@ -144,21 +140,9 @@ class Engine(Administration):
         with self.store.database.read() as connection:
             return stored_maps.find_map(connection, map_name)
 
-    def _answer(self, asked_of: MapRow, asked: Asked, query: Query) -> Answer:
-        with self.store.database.read() as connection:
-            row = stored_maps.find_map(connection, asked_of.name)
-            if row.number != asked_of.number:
-                raise UnknownMap(
-                    f"Map {row.name!r} was deleted and made anew while it was asked. Ask again."
-                )
-            check_model(asked.model_id, row.model_id)
-            view = self._readers.view(connection, row)
-        check_model(view.model_id, row.model_id)
-        return answer(self.store, row, self.signers(row.model_id).model, view, asked, query)
-
     # work
 
-    def claim(self, worker: str) -> Work | None:
+    def claim(self, worker: str) -> Work | Task | None:
         """Take the next job, or None; see `work.claim`."""
         return working.claim(self.store, worker, self.settings.lease_s)
 
@@ -167,8 +151,10 @@ class Engine(Administration):
         with self.store.database.read() as connection:
             return queue.next_due(connection)
 
-    def run(self, work: Work, broke: Callable[[], None] | None = None) -> JobState | None:
-        """Do a claimed job; see `work.run`."""
+    def run(self, work: Work | Task, broke: Callable[[], None] | None = None) -> JobState | None:
+        """Do a claimed job, or a slice of a long one; see `work.run` and `Tasks.run`."""
+        if isinstance(work, Task):
+            return self.tasks.run(work, self.settings.lease_s, self.settings.job_s, broke)
         return working.run(
             self.store, self.signers, self._readers, work, self.settings.lease_s,
             self.settings.job_s, broke,
@@ -180,9 +166,12 @@ class Engine(Administration):
         """Take a job from a worker that died over it; see `jobs.worker_died`."""
         return jobs.worker_died(self.store, job_id, token, error, traceback, counts=counts)
 
-    def put_back(self, work: Work) -> None:
+    def put_back(self, work: Work | Task) -> None:
         """Return a claimed job undone."""
-        put_back(self.store, work)
+        if isinstance(work, Task):
+            self.tasks.put_back(work)
+        else:
+            put_back(self.store, work)
         self.bell.ring()
 
     def counts(self) -> tuple[dict[str, int], dict[str, int]]:
@@ -191,11 +180,13 @@ class Engine(Administration):
             return stored_frames.count_states(connection), listing.count_jobs(connection)
 
     def publish_due(self) -> int:
-        """Bring maps on to their next models, publish the indexes that have fallen behind, and
-        verify a little; returns how many were published.
+        """Bring maps on to their next models, publish the indexes that have fallen behind, verify
+        a little, and remove what is no longer kept; returns how many were published.
         """
         self._reencoding.run()
-        return self._upkeep.run()
+        published = self._upkeep.run()
+        self.operations.tidy()
+        return published
 
     def rebuild_index(self, map_name: str) -> int:
         """Publish the index of a map from nothing; returns the number of its generation.

@@ -22,10 +22,12 @@ def read_upload(data: bytes, meta: FrameMeta) -> Frame:
 
     Raises
     ------
-    FrameError : undecodable samples, a camera that is none or of another image, a pose that is
-        not rigid, or no sample at all.
+    FrameError : undecodable samples, a camera that is none or of another image, a pose or
+        T_base_sensor that is not rigid, or no sample at all.
     """
     pose = None if meta.pose is None else pose_matrix(meta.pose)
+    if meta.T_base_sensor is not None:
+        pose_matrix(meta.T_base_sensor, "T_base_sensor")
     return decode_frame(
         data,
         _camera(meta.intrinsics),
@@ -56,7 +58,7 @@ def content_id(frame: Frame) -> str:
 
 def columns(meta: FrameMeta, frame: Frame) -> dict[str, Any]:
     """What of an upload's metadata is stored with it, by the columns of the table."""
-    parent = None
+    parent, base = None, meta.T_base_sensor
     if meta.pose is not None:
         own = meta.session if meta.robot is None else f"{meta.robot}/{meta.session}"
         parent = meta.pose.parent_frame or own  # two robots may call their runs alike
@@ -70,6 +72,8 @@ def columns(meta: FrameMeta, frame: Frame) -> dict[str, Any]:
         "tags": meta.tags,
         "pose_parent": parent,
         "pose": None if frame.pose is None else frame.pose.tolist(),
+        "base_frame": None if base is None else base.base_frame,
+        "base": None if base is None else pose_matrix(base).tolist(),
     }
 
 

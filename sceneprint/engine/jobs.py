@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
 
 from sqlalchemy import Connection
 
@@ -26,8 +27,18 @@ _BEING_SIGNED = (FrameState.RECEIVED, FrameState.SIGNING)
 _GIVEN_UP = (FrameState.FAILED, FrameState.REJECTED)
 
 
-def list_jobs(store: Store, state: JobState | None, cursor: str | None, limit: int) -> Page[Job]:
-    """Jobs of all maps, the newest first.
+def list_jobs(
+    store: Store, state: JobState | None, cursor: str | None, limit: int, kind: str | None = None,
+    map_names: Collection[str] | None = None,
+) -> Page[Job]:  # fmt: skip
+    """Jobs, the newest first.
+
+    Parameters
+    ----------
+    store : see Store
+    state, kind : that are wanted; default: all
+    cursor, limit : of the page
+    map_names : whose jobs are wanted; default: of all maps, and of none
 
     Raises
     ------
@@ -35,7 +46,7 @@ def list_jobs(store: Store, state: JobState | None, cursor: str | None, limit: i
     """
     before = row_of(cursor)
     with store.database.read() as connection:
-        found = list_stored(connection, before, limit + 1, state)
+        found = list_stored(connection, before, limit + 1, state, kind, map_names)
     items = [tell_job(one.job, one.frame_id, one.map_name) for one in found[:limit]]
     more = str(found[limit - 1].job.number) if len(found) > limit else None
     return Page[Job](items=items, next_cursor=more)
@@ -81,7 +92,9 @@ def retry(store: Store, job_id: str) -> tuple[Job, bool]:
     """
     with store.database.write() as connection:
         job = listing.find_job(connection, job_id)
-        frame = frame_of(connection, job.frame_number)
+        if job.frame_number is None:
+            return _retry_task(connection, job)
+        frame = frame_of(connection, job.frame)
         row = map_of(connection, frame.map_number)
         latest = listing.last_of(connection, job.kind, frame.number, job.model_id) or job
         if latest.number != job.number and not latest.state.over:
@@ -130,10 +143,12 @@ def worker_died(
         job = fail_of_dead(connection, job_id, token, error, traceback, counts=counts)
         if job is None:
             return None
-        if job.state == JobState.DEAD:
+        if job.frame_number is None:
+            pass  # it is of no single frame
+        elif job.state == JobState.DEAD:
             _fail_frame(connection, job, error)
-        elif frame_of(connection, job.frame_number).state == FrameState.SIGNING:
-            set_state(connection, job.frame_number, FrameState.RECEIVED)
+        elif frame_of(connection, job.frame).state == FrameState.SIGNING:
+            set_state(connection, job.frame, FrameState.RECEIVED)
     about = {"job_id": job_id, "state": job.state, "attempt": job.attempts, "error": error}
     log.error("worker died over a job", extra={**about, "traceback": traceback})
     return job.state
@@ -141,13 +156,26 @@ def worker_died(
 
 def _fail_frame(connection: Connection, job: JobRow, reason: str) -> None:
     """A frame that will not be signed; one that is indexed, or gone, stays so."""
-    frame = frame_of(connection, job.frame_number)
+    if job.frame_number is None:
+        return
+    frame = frame_of(connection, job.frame)
     if frame.state in _BEING_SIGNED:
         set_state(connection, frame.number, FrameState.FAILED, reason)
         name = map_of(connection, frame.map_number).name
         tell(connection, "frame.failed", name, frame.id, job.id)
 
 
+def _retry_task(connection: Connection, job: JobRow) -> tuple[Job, bool]:
+    """A long job goes on where it stood, as the same job: what it found so far is kept."""
+    if not job.state.over:
+        return _told(connection, job), False
+    if job.state == JobState.SUCCEEDED:
+        raise CannotRetry(f"Job {job.id} is {job.state}: nothing was given up.")
+    queue.revive(connection, job)
+    return _told(connection, listing.find_job(connection, job.id)), True
+
+
 def _told(connection: Connection, job: JobRow) -> Job:
-    frame = frame_of(connection, job.frame_number)
-    return tell_job(job, frame.id, map_of(connection, frame.map_number).name)
+    frame_id = None if job.frame_number is None else frame_of(connection, job.frame).id
+    name = None if job.map_number is None else map_of(connection, job.map_number).name
+    return tell_job(job, frame_id, name)

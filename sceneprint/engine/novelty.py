@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.answers import WHOLE
 from sceneprint.engine.readers import Readers
+from sceneprint.engine.searching import WHOLE
 from sceneprint.errors import LostLease, UnknownMap
 from sceneprint.geometry.retrieval import distances
 from sceneprint.index import search

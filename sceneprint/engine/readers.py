@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from sqlalchemy import Connection
+from sqlalchemy import Connection, select
 
 from sceneprint.engine.growing import Growing
 from sceneprint.engine.signers import Signers
@@ -23,6 +23,7 @@ from sceneprint.index import Generation, Tail, newest, newest_number
 from sceneprint.store.events import holds_anchor
 from sceneprint.store.records import MapRow
 from sceneprint.store.signatures import Change, changes_since, count_indexed
+from sceneprint.store.tables import maps
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +34,8 @@ _LOOK_S = 1.0
 #: Bytes of a generation's signatures up to which all are verified when it is opened: it takes a
 #: second a gigabyte. Larger ones are verified by workers, in the background.
 VERIFIED_BYTES = 256 << 20
+#: Seconds between two looks for maps that are held and no longer there.
+_TIDY_S = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,6 +212,7 @@ class Readers:
         self._signers, self._indexes = signers, indexes
         self._lock = threading.Lock()
         self._open: OrderedDict[str, tuple[tuple[int, str], Reader]] = OrderedDict()
+        self._tidied = time.monotonic()
 
     def view(self, connection: Connection, row: MapRow) -> View:
         """A map as of the row's revision, or later."""
@@ -224,6 +228,9 @@ class Readers:
             # the one that was asked longest ago first, and never the one that is asked now
             while len(self._open) > 1 and self._bytes_held() > HELD_BYTES:
                 self._open.popitem(last=False)
+            is_time = time.monotonic() - self._tidied >= _TIDY_S
+        if is_time:
+            self.tidy(connection)
         return reader.view(connection, row)
 
     def _bytes_held(self) -> int:
@@ -233,3 +240,15 @@ class Readers:
         """Give up what is held of a map that was deleted."""
         with self._lock:
             self._open.pop(name, None)
+
+    def tidy(self, connection: Connection) -> None:
+        """Give up what is held of maps that another process deleted, or gave another model.
+
+        Their files are gone, but take room on the disk and a descriptor each while mapped.
+        """
+        asked = select(maps.c.name, maps.c.number, maps.c.model_id)
+        there = {row.name: (row.number, row.model_id) for row in connection.execute(asked)}
+        with self._lock:
+            self._tidied = time.monotonic()
+            for name in [name for name, (held, _) in self._open.items() if there.get(name) != held]:
+                del self._open[name]

@@ -26,7 +26,7 @@ from sceneprint.errors import (
     UnknownMap,
 )
 from sceneprint.index import Generation
-from sceneprint.models import read_model, write_model
+from sceneprint.models import Model, read_model, write_model
 from sceneprint.schemas import Map
 from sceneprint.store import Store, stale
 from sceneprint.store import reencoding as stored
@@ -39,14 +39,14 @@ log = logging.getLogger(__name__)
 TIDY_S = 2.0
 
 
-def begin(store: Store, map_name: str, model: str | Path) -> Map:
+def begin(store: Store, map_name: str, model: str | Path | Model) -> Map:
     """Have a map signed with another model; where that is under way, try again what broke down.
 
     Parameters
     ----------
     store : see Store
     map_name : of the map
-    model : a preset or a model file
+    model : a preset or a model file, or one that was read
 
     Raises
     ------
@@ -54,7 +54,7 @@ def begin(store: Store, map_name: str, model: str | Path) -> Map:
     UnreadableModel : no such model.
     Conflict : it is the map's model, or the map is being signed with a third one.
     """
-    wanted = read_model(model)
+    wanted = model if isinstance(model, Model) else read_model(model)
     with store.database.write() as connection:
         row = find_map(connection, map_name)
         if row.next_model_id not in (None, wanted.id):

@@ -2,48 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 from sceneprint.errors import Busy, ModelMismatch, SceneprintError, UnknownMap
-from sceneprint.schemas import Answer
 from sceneprint.store import Store
 from sceneprint.store.maps import find_map
 from sceneprint.store.records import MapRow
+
+T = TypeVar("T")
 
 #: Times that a query is asked while its map switches from model to model.
 TRIES = 5
 
 
-def steadily(store: Store, map_name: str, ask: Callable[[MapRow], Answer]) -> Answer:
-    """Ask a map, and once more where it switched to another model meanwhile.
+def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]) -> T:
+    """Ask maps, and once more where one of them switched to another model meanwhile.
 
     Parameters
     ----------
     store : see Store
-    map_name : of the map
-    ask : signs the query with the model of the row, and answers it from a map of that model
+    maps : their names
+    ask : signs the query with the model of the rows, and answers it from maps of that model
 
     Raises
     ------
-    UnknownMap : no such map.
-    Busy : the map switched again and again.
+    UnknownMap : one of them is none.
+    Busy : a map switched again and again.
     """
     with store.database.read() as connection:
-        row = find_map(connection, map_name)
+        rows = [find_map(connection, name) for name in maps]
     for _ in range(TRIES):
         try:
-            found = ask(row)
+            found = ask(rows)
         except SceneprintError:
-            now = _other_model(store, row)
+            now = _other_models(store, rows)
             if now is None:
                 raise
         else:
             # also where all went well: artifacts of the former model may have been missed
-            now = _other_model(store, row)
+            now = _other_models(store, rows)
             if now is None:
                 return found
-        row = now
-    raise Busy(f"Map {map_name!r} changed its model again and again while it was asked. Ask again.")
+        rows = now
+    raise Busy(
+        f"Map {', '.join(map(repr, maps))} changed its model again and again while it was asked. "
+        "Ask again."
+    )
 
 
 def check_model(one: str, other: str) -> None:
@@ -59,11 +64,14 @@ def check_model(one: str, other: str) -> None:
         )
 
 
-def _other_model(store: Store, row: MapRow) -> MapRow | None:
-    """The map where it has another model by now, or None."""
+def _other_models(store: Store, rows: Sequence[MapRow]) -> list[MapRow] | None:
+    """The maps where one of them has another model by now, or None."""
     try:
         with store.database.read() as connection:
-            now = find_map(connection, row.name)
+            now = [find_map(connection, row.name) for row in rows]
     except UnknownMap:
         return None
-    return now if now.number == row.number and now.model_id != row.model_id else None
+    pairs = list(zip(now, rows, strict=True))
+    if any(one.number != row.number for one, row in pairs):
+        return None
+    return now if any(one.model_id != row.model_id for one, row in pairs) else None

@@ -10,14 +10,18 @@ import numpy as np
 
 from sceneprint.engine.transforms import transform
 from sceneprint.engine.wire import camera_frame
+from sceneprint.geometry.covariance import PAIR_METHOD, PLACE_METHOD, Method, free_directions
 from sceneprint.geometry.diversity import Selection
 from sceneprint.geometry.retrieval import Ranking
+from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation import Validation
 from sceneprint.matches import Match, locate
 from sceneprint.schemas import Location as ToldLocation
 from sceneprint.schemas import Match as ToldMatch
-from sceneprint.schemas import Residual
+from sceneprint.schemas import Residual, Transform
 from sceneprint.schemas import Validation as ToldValidation
+from sceneprint.schemas.matches import FreeDirection, Uncertainty
+from sceneprint.schemas.transforms import Vector
 from sceneprint.store.records import FrameRow
 from sceneprint.types import Floats
 
@@ -28,30 +32,39 @@ class Found:
 
     Parameters
     ----------
-    map : its name
+    maps : names of all that were asked, by number
     ranking : R, of frame numbers
     selection : C, or None where diversification was not asked for
     rows : frames of the candidates by number; those deleted in the meantime are not among them
     unreadable : numbers of frames whose artifact cannot be read, and why
+    untried : why the other candidates were not tried
     own : number and id of the query, if it is a frame of the map
+    base : what the robot's base is called, and T_base_query (4, 4); None where it is not known
     """
 
-    map: str
+    maps: dict[int, str]
     ranking: Ranking
     selection: Selection | None
     rows: dict[int, FrameRow]
     unreadable: dict[int, str]
+    untried: str
     own: tuple[int, str] | None
+    base: tuple[str, Floats] | None = None
 
     @property
     def query_frame(self) -> str:
         """What the query's camera frame is called."""
         return camera_frame("query" if self.own is None else self.own[1])
 
+    def base_of(self, T_parent_query: Floats | None, parent: str) -> Transform | None:
+        """Where the robot's base is, by where its camera is."""
+        if self.base is None or T_parent_query is None:
+            return None
+        name, T_base_query = self.base
+        return transform(T_parent_query @ inverse(T_base_query), parent, name)
 
-def tell_matches(
-    found: Found, chosen: Sequence[int], matches: Sequence[Match], *, validated: bool
-) -> list[ToldMatch]:
+
+def tell_matches(found: Found, chosen: Sequence[int], matches: Sequence[Match]) -> list[ToldMatch]:
     """What was validated, in the order of belief, then the other candidates in the order of R.
 
     Parameters
@@ -59,7 +72,6 @@ def tell_matches(
     found : see Found
     chosen : positions in R of the candidates
     matches : of `associate`
-    validated : whether validation was asked for
     """
     position = {int(found.ranking.indices[i]): i for i in chosen}
     tried = {match.index: match.validation for match in matches}
@@ -69,12 +81,11 @@ def tell_matches(
         if number not in found.rows:
             continue
         if number in tried:
-            validation = _validation(tried[number])
+            validation = tell_validation(tried[number])
         elif number in found.unreadable:
             validation = ToldValidation(status="skipped", reason=found.unreadable[number])
         else:
-            reason = "enough were accepted before it" if validated else "not asked for"
-            validation = ToldValidation(status="skipped", reason=reason)
+            validation = ToldValidation(status="skipped", reason=found.untried)
         told.append(_match(found, position[number], number, tried.get(number), validation))
     return told
 
@@ -84,17 +95,24 @@ def tell_location(found: Found, matches: Sequence[Match]) -> ToldLocation | None
     posed = {
         number: np.array(row.pose) for number, row in found.rows.items() if row.pose is not None
     }
-    parents = {number: str(found.rows[number].pose_parent) for number in posed}
+    # a parent frame is one map's: another map may call its own the same
+    parents = {
+        number: f"{found.rows[number].map_number} {found.rows[number].pose_parent}"
+        for number in posed
+    }
     location = locate([match for match in matches if match.index in posed], posed, parents)
     if location is None:
         return None
-    average = location.average
+    average, (number, _, parent) = location.average, location.parent.partition(" ")
     return ToldLocation(
-        pose=transform(average.T, location.parent, found.query_frame),
+        pose=transform(average.T, parent, found.query_frame),
+        map=found.maps[int(number)],
         support=average.support,
         votes=average.votes,
         spread_m=average.spread_m,
         spread_deg=math.degrees(average.spread_rad),
+        uncertainty=tell_uncertainty(location.covariance, PLACE_METHOD),
+        base=found.base_of(average.T, parent),
     )
 
 
@@ -110,7 +128,7 @@ def _match(
     in_map: Floats | None = None if T is None or row.pose is None else np.array(row.pose) @ T
     return ToldMatch(
         frame_id=row.id,
-        map=found.map,
+        map=found.maps[row.map_number],
         robot=row.robot,
         session=row.session,
         rank=position + 1,
@@ -123,10 +141,33 @@ def _match(
         pose_in_map=(
             None if in_map is None else transform(in_map, str(row.pose_parent), found.query_frame)
         ),
+        uncertainty=None if tried is None else tell_uncertainty(tried.covariance, PAIR_METHOD),
+        base_in_map=found.base_of(in_map, str(row.pose_parent)),
     )
 
 
-def _validation(v: Validation) -> ToldValidation:
+def tell_uncertainty(covariance: Floats | None, method: Method) -> Uncertainty | None:
+    """A covariance (6, 6) with the directions that it leaves free."""
+    if covariance is None:
+        return None
+    free = [
+        FreeDirection(
+            translation=_vector(one.translation),
+            rotation=_vector(one.rotation),
+            deviation=one.deviation,
+        )
+        for one in free_directions(covariance)
+    ]
+    return Uncertainty(covariance=covariance.ravel().tolist(), method=method, degenerate=free)
+
+
+def _vector(v: Floats) -> Vector:
+    x, y, z = v.tolist()
+    return Vector(x=x, y=y, z=z)
+
+
+def tell_validation(v: Validation) -> ToldValidation:
+    """What came of an alignment."""
     residual = None
     if math.isfinite(v.residual_m):
         residual = Residual(translation_m=v.residual_m, rotation_deg=math.degrees(v.residual_rad))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from sceneprint.datasets import rigid_transform
+from sceneprint.datasets.files import naming
 from sceneprint.errors import InvalidPose
 from sceneprint.geometry.quaternions import quaternion_of, rotation_of
-from sceneprint.schemas import GivenPose, Quaternion, Transform, Vector
+from sceneprint.schemas import Quaternion, Transform, Vector
+from sceneprint.schemas.frames import GivenTransform
 from sceneprint.types import Floats
 
 #: How far from 1 the length of a given quaternion may be.
@@ -26,13 +28,23 @@ def transform(T: Floats, parent_frame: str, child_frame: str) -> Transform:
     )
 
 
-def pose_matrix(pose: GivenPose) -> Floats:
-    """T_parent_sensor (4, 4) of a pose given either way.
+def pose_matrix(pose: GivenTransform, what: str = "") -> Floats:
+    """T_parent_sensor (4, 4) of a pose or another transform given either way.
+
+    Parameters
+    ----------
+    pose : see GivenTransform
+    what : to begin an error with, where it is no pose
 
     Raises
     ------
     InvalidPose : not a rigid transform, or a quaternion that is not of unit length.
     """
+    with naming(what):
+        return _matrix(pose)
+
+
+def _matrix(pose: GivenTransform) -> Floats:
     if pose.matrix is not None:
         return rigid_transform(np.array(pose.matrix))
     t, r = pose.translation, pose.rotation

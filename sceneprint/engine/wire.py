@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
+from sceneprint.engine.tags import frame_tag, map_tag
 from sceneprint.engine.transforms import transform
-from sceneprint.schemas import CameraIntrinsics, Frame, Job, Map, Reencoding
+from sceneprint.schemas import CameraIntrinsics, Frame, Job, Map, Progress, Reencoding
 from sceneprint.store.listing import jobs_of
 from sceneprint.store.maps import count_frames, model_names
 from sceneprint.store.records import FrameRow, JobRow, MapRow
-from sceneprint.store.reencoding import REENCODE, standing
+from sceneprint.store.reencoding import standing
 
 
 def when(seconds: float | None) -> Any:
@@ -48,6 +49,7 @@ def tell_map(connection: Connection, row: MapRow) -> Map:
         created_at=when(row.created_at),
         revision=row.revision,
         frames=count_frames(connection, row.number),
+        etag=map_tag(row),
     )
 
 
@@ -57,11 +59,14 @@ def tell_frames(connection: Connection, row: MapRow, found: list[FrameRow]) -> l
     return [_frame(row, frame, jobs[frame.number]) for frame in found]
 
 
-def tell_job(job: JobRow, frame_id: str, map_name: str) -> Job:
+def tell_job(job: JobRow, frame_id: str | None, map_name: str | None) -> Job:
     """A job, and the names of what it is about."""
+    progress = None
+    if job.progress is not None:
+        progress = Progress(done=job.progress.get("done", 0), total=job.progress.get("total"))
     return Job(
         job_id=job.id,
-        kind="reencode" if job.kind == REENCODE else "sign",
+        kind=job.kind,
         state=job.state,
         map=map_name,
         frame_id=frame_id,
@@ -72,6 +77,8 @@ def tell_job(job: JobRow, frame_id: str, map_name: str) -> Job:
         finished_at=when(job.finished_at),
         error=job.error,
         traceback=job.traceback,
+        progress=progress,
+        result=job.result,
     )
 
 
@@ -79,6 +86,9 @@ def _frame(row: MapRow, frame: FrameRow, job: JobRow) -> Frame:
     pose = None
     if frame.pose is not None and frame.pose_parent is not None:
         pose = transform(np.array(frame.pose), frame.pose_parent, camera_frame(frame.id))
+    base = None
+    if frame.base is not None and frame.base_frame is not None:
+        base = transform(np.array(frame.base), frame.base_frame, camera_frame(frame.id))
     return Frame(
         frame_id=frame.id,
         map=row.name,
@@ -96,5 +106,8 @@ def _frame(row: MapRow, frame: FrameRow, job: JobRow) -> Frame:
         received_at=when(frame.received_at),
         indexed_at=when(frame.indexed_at),
         pose=pose,
+        base_frame=frame.base_frame,
+        T_base_sensor=base,
         tags=frame.tags,
+        etag=frame_tag(frame),
     )

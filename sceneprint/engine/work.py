@@ -23,6 +23,7 @@ from sceneprint.engine.leases import renewed
 from sceneprint.engine.novelty import Stale, judge, look
 from sceneprint.engine.readers import Readers
 from sceneprint.engine.signers import Signers
+from sceneprint.engine.tasks import Task
 from sceneprint.engine.uploads import sweep
 from sceneprint.errors import DamagedBlob, FrameError, LostLease, SceneprintError, UnusableStore
 from sceneprint.pipeline import prepare
@@ -42,8 +43,10 @@ from sceneprint.store.signatures import (
 log = logging.getLogger(__name__)
 
 
-def claim(store: Store, worker: str, lease_s: float) -> Work | None:
+def claim(store: Store, worker: str, lease_s: float) -> Work | Task | None:
     """Take the next job, or None where there is none; gives up those that kill every worker.
+
+    A job of no single frame comes as a Task.
 
     Parameters
     ----------
@@ -56,16 +59,19 @@ def claim(store: Store, worker: str, lease_s: float) -> Work | None:
             return None
     with store.database.write() as connection:
         for job in queue.bury(connection):
-            if job.kind == REENCODE:
+            if job.kind == REENCODE or job.frame_number is None:
                 continue
-            frame = frame_of(connection, job.frame_number)
+            frame = frame_of(connection, job.frame)
             set_state(connection, frame.number, FrameState.FAILED, job.error)
             name = map_of(connection, frame.map_number).name
             tell(connection, "frame.failed", name, frame.id, job.id)
         held = queue.claim(connection, worker, lease_s)
         if held is None:
             return None
-        frame = frame_of(connection, held.job.frame_number)
+        if held.job.frame_number is None:
+            number = held.job.map_number
+            return Task(held, None if number is None else map_of(connection, number))
+        frame = frame_of(connection, held.job.frame)
         if held.job.kind != REENCODE:
             set_state(connection, frame.number, FrameState.SIGNING)
         return Work(held, frame, map_of(connection, frame.map_number))

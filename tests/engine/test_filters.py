@@ -281,20 +281,20 @@ def test_frames_between_view_and_filter_do_no_harm(
     make_engine: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One is deleted, and one indexed, after the view was made and before the filter is asked."""
-    from sceneprint.engine import answers
+    from sceneprint.engine import searching
 
     engine = make_engine()
     engine.create_map(NewMap(name="hall", model="compact"))
     frames = fill(engine, 20, 6)
-    passing, gone = answers.passing, frames[3]
+    passing, gone = searching.passing, frames[3]
 
     def late(*given: Any) -> Any:
-        monkeypatch.setattr(answers, "passing", passing)
+        monkeypatch.setattr(searching, "passing", passing)
         engine.delete_frame("hall", gone.id)
         fill(engine, 5, 7)
         return passing(*given)
 
-    monkeypatch.setattr(answers, "passing", late)
+    monkeypatch.setattr(searching, "passing", late)
     answer = ask(engine, frames[0], Filter())
     left = [one for one in frames if one is not gone]
     assert [m.frame_id for m in answer.matches] == [i for i, _ in ranked(left, frames[0], Filter())]
@@ -305,7 +305,7 @@ def test_frames_between_view_and_filter_do_no_harm(
         engine.delete_frame("hall", frames[4].id)
         return numbers
 
-    monkeypatch.setattr(answers, "passing", early)
+    monkeypatch.setattr(searching, "passing", early)
     answer = ask(engine, frames[0], Filter())
     assert frames[4].id not in {m.frame_id for m in answer.matches}  # though it was compared
     assert len(answer.matches) == 22

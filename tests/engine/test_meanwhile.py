@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from sceneprint.engine import Engine, answers, readers, upkeep
+from sceneprint.engine import Engine, readers, searching, upkeep, validating
 from sceneprint.engine.asking import ask_stored
+from sceneprint.engine.deadlines import Deadline
 from sceneprint.errors import DamagedBlob, UnknownMap
 from sceneprint.matches import associate
 from sceneprint.schemas import NewMap, Query
@@ -71,7 +72,7 @@ def test_a_damaged_artifact_costs_its_match_and_no_other(
 def test_what_is_deleted_while_a_query_runs_is_not_told(
     full: Engine, uploads: Any, ids: Ids, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names, search = ids(full), answers.search
+    names, search = ids(full), searching.search
     gone = [names[6], names[1]]
 
     def then_delete(*given: Any, **more: Any) -> Any:
@@ -80,7 +81,7 @@ def test_what_is_deleted_while_a_query_runs_is_not_told(
             full.delete_frame("hall", gone.pop())
         return hits
 
-    monkeypatch.setattr(answers, "search", then_delete)
+    monkeypatch.setattr(searching, "search", then_delete)
     for query, missing in ((Query(), names[1]), (R, names[6])):
         answer = full.query_upload("hall", uploads[1].data, uploads[1].meta, query)
         assert missing not in [m.frame_id for m in answer.matches]
@@ -97,7 +98,7 @@ def test_a_frame_deleted_after_it_was_asked_for_is_answered(
     row = empty._row("hall")
     asked = ask_stored(empty.store, "hall", name, Query())
     empty.delete_frame("hall", name)
-    answer = empty._answer(row, asked, Query())
+    answer = empty.queries.answer([row], asked, Query(), Deadline(None))
     assert (answer.status, answer.matches, answer.counts.map) == ("not_found", [], 0)
 
 
@@ -111,7 +112,7 @@ def test_a_map_made_anew_while_it_was_asked_is_not_answered_for(
     empty.delete_map("hall")
     empty.create_map(NewMap(name="hall", model="paper"))  # whose signatures are longer
     with pytest.raises(UnknownMap, match="made anew while it was asked"):
-        empty._answer(row, asked, Query())
+        empty.queries.answer([row], asked, Query(), Deadline(None))
 
 
 def test_matches_that_are_deleted_while_they_are_validated_are_not_found(
@@ -127,7 +128,7 @@ def test_matches_that_are_deleted_while_they_are_validated_are_not_found(
         empty.delete_frame("hall", name)
         return found
 
-    monkeypatch.setattr(answers, "associate", then_delete)
+    monkeypatch.setattr(validating, "associate", then_delete)
     answer = empty.query_upload("hall", uploads[0].data, uploads[0].meta, Query())
     assert (answer.status, answer.matches, answer.location) == ("not_found", [], None)
     assert (answer.counts.validated, answer.counts.accepted) == (0, 0)

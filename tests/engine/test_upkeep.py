@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine, administration, answers, readers
+from sceneprint.engine import Engine, administration, readers, searching
 from sceneprint.errors import UnreadableModel
 from sceneprint.index import search
 from sceneprint.schemas import JobState, NewMap, Query
@@ -144,9 +144,9 @@ def test_a_shortlist_is_taken_in_large_maps_alone_and_where_exactness_is_not_ask
     shutil.copytree(signed_folder, tmp_path / "data")
     engine = make_engine(tmp_path / "data", tail_frames=1)
     assert engine.publish_due() == 1
-    monkeypatch.setattr(answers, "search", partial(search, shortlist=3))
-    monkeypatch.setattr(answers, "ranking_size", lambda n: min(n, 3))
-    monkeypatch.setattr(answers, "WHOLE", whole)
+    monkeypatch.setattr(searching, "search", partial(search, shortlist=3))
+    monkeypatch.setattr(searching, "ranking_size", lambda n: min(n, 3))
+    monkeypatch.setattr(searching, "WHOLE", whole)
     query = Query(stages=("retrieve",), k=3, exact=exact)
     answer = engine.query_upload("hall", uploads[4].data, uploads[4].meta, query)
     assert (answer.counts.map, answer.counts.compared) == (12, compared)

@@ -1,0 +1,277 @@
+"""A session against another, or against itself, frame by frame: a job in slices.
+
+plan --> frame, frame, ... a slice at a time --> edges --conclude--> verdicts, joins
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sceneprint.artifacts import read_geometry
+from sceneprint.engine.concluding import conclude
+from sceneprint.engine.healing import sign_again
+from sceneprint.engine.readers import Readers, View
+from sceneprint.engine.signers import Signers
+from sceneprint.engine.tasks import Outcome, Task
+from sceneprint.engine.validating import thresholds
+from sceneprint.errors import DamagedBlob, InvalidRequest, UnreadableGeometry
+from sceneprint.geometry.diversity import diversify
+from sceneprint.geometry.retrieval import Ranking, pairwise_distances, ranking_size, similarity
+from sceneprint.index import search, signatures_of
+from sceneprint.index.keys import Keys
+from sceneprint.matches import Match, associate
+from sceneprint.models import Model
+from sceneprint.schemas.associations import APART, NewAssociation
+from sceneprint.store import Store
+from sceneprint.store.associations import Stop, numbers_of_session, stops_of
+from sceneprint.store.filters import Taken, passing
+from sceneprint.store.frames import frames_of
+from sceneprint.store.maps import find_map, unknown_map
+from sceneprint.store.parts import items_of
+from sceneprint.store.records import MapRow
+from sceneprint.store.signatures import geometry_blobs, stored_signatures
+from sceneprint.types import Geometry
+
+#: Most frames of both sessions together: more are hours, and edges past what a page holds.
+MOST_FRAMES = 5000
+#: Artifacts that a slice keeps opened, of some 600 kB each.
+_OPENED = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a job goes through, fixed when it begins.
+
+    Parameters
+    ----------
+    source, target : numbers of the frames, in the order of time; the same for loop closures
+    taken : when each of `source` was taken, seconds since 1970; None where that is not known
+    """
+
+    source: list[int]
+    target: list[int]
+    taken: list[float | None]
+
+
+def sessions_of(asked: NewAssociation) -> list[tuple[str, str | None]]:
+    """Session and robot of both sides; one for loop closures."""
+    robots: list[str | None] = [*(asked.robots or [])] or [None] * len(asked.sessions)
+    return list(zip(asked.sessions, robots, strict=True))
+
+
+def runs_of(store: Store, row: MapRow, asked: NewAssociation) -> list[list[Stop]]:
+    """Frames of each of the sessions that pass the filter, in the order of time.
+
+    Raises
+    ------
+    InvalidRequest : a session has no indexed frame, or frames of several robots; or there are too
+        many frames.
+    """
+    sides, found = sessions_of(asked), []
+    with store.database.read() as connection:
+        numbers = [numbers_of_session(connection, row.number, *side) for side in sides]
+        if asked.filter is not None:
+            passed = passing(connection, row.number, asked.filter, Taken(None, None, None))
+            kept = set(passed.tolist())
+            numbers = [[number for number in own if number in kept] for own in numbers]
+        if sum(map(len, numbers)) > MOST_FRAMES:
+            raise InvalidRequest(
+                f"The sessions have {sum(map(len, numbers))} frames, and an association takes at "
+                f"most {MOST_FRAMES}. Narrow them with `filter`, such as by captured_after and "
+                "captured_before.",
+                (("sessions", "too many frames"),),
+            )
+        for own in numbers:
+            stops = stops_of(connection, own)
+            found.append([stops[number] for number in own if number in stops])
+    for stops_found, (session, robot) in zip(found, sides, strict=True):
+        robots = sorted({stop.robot or "" for stop in stops_found})
+        if not robots:
+            whose = "" if robot is None else f" of robot {robot!r:.80}"
+            raise InvalidRequest(
+                f"Session {session!r:.80}{whose} has no indexed frame that passes in map "
+                f"{row.name!r}. See GET /v1/maps/{row.name}/sessions.",
+                (("sessions", "no indexed frame"),),
+            )
+        if len(robots) > 1:
+            raise InvalidRequest(
+                f"Session {session!r:.80} is of several robots: {', '.join(robots)!r:.200}. "
+                "Name one in `robots`.",
+                (("robots", "needed"),),
+            )
+    return found
+
+
+class Associating:
+    """The handler of the jobs.
+
+    Parameters
+    ----------
+    store, signers, readers : of the engine
+    """
+
+    def __init__(self, store: Store, signers: Signers, readers: Readers) -> None:
+        self._store, self._signers, self._readers = store, signers, readers
+
+    def __call__(self, task: Task, until: float) -> Outcome:
+        """A slice: at least one frame, or the conclusion."""
+        asked = NewAssociation.model_validate(task.data)
+        progress = dict(task.progress) or self._begin(task, asked)
+        plan = Plan(progress["source"], progress["target"], progress["taken"])
+        items: list[dict[str, Any]] = []
+        opened = _Opened(self._store)
+        while progress["done"] < len(plan.source):
+            edges, tried = self._frame(task, asked, plan, progress["done"], opened)
+            items += edges
+            progress["validated"] += tried or 0
+            progress["skipped"] += tried is None
+            progress["done"] += 1
+            if time.monotonic() >= until:
+                return Outcome(False, progress, items)
+        with self._store.database.read() as connection:
+            found = items_of(connection, task.claim.job.number) + items
+            stops = stops_of(connection, {*plan.source, *plan.target})
+        end = conclude(found, plan.source, plan.target, stops, asked)
+        result = {
+            "frames": len(plan.source), "skipped": progress["skipped"],
+            "validated": progress["validated"], "edges": len(found), **end.counts,
+            "joins": end.joins,
+        }  # fmt: skip
+        return Outcome(
+            True, progress, items + end.verdicts, result=result, event="association.found"
+        )
+
+    def _begin(self, task: Task, asked: NewAssociation) -> dict[str, Any]:
+        runs = runs_of(self._store, task.of_map, asked)
+        source, target = runs[0], runs[-1]
+        return {
+            "done": 0, "total": len(source), "validated": 0, "skipped": 0,
+            "source": [stop.number for stop in source],
+            "target": [stop.number for stop in target],
+            "taken": [stop.captured_at for stop in source],
+        }  # fmt: skip
+
+    def _frame(
+        self, task: Task, asked: NewAssociation, plan: Plan, place: int, opened: _Opened
+    ) -> tuple[list[dict[str, Any]], int | None]:
+        """Edges of one frame, and how many candidates were tried; None where it is gone."""
+        number = plan.source[place]
+        among = eligible(asked, plan, place)
+        if not len(among):
+            return [], 0
+        row, model, view = self._view(task.of_map)
+        with self._store.database.read() as connection:
+            vectors = stored_signatures(connection, [number], row.model_id)
+            alive = number in frames_of(connection, [number])
+        geometry = opened.geometry(row, number)
+        if number not in vectors or not alive or geometry is None:
+            if alive:  # damaged, and made again behind this
+                sign_again(self._store, row, [number], row.model_id)
+            return [], None
+        among = _known(view, among)
+        hits = search(
+            np.frombuffer(vectors[number], np.uint8), view.generation, view.tail,
+            ranking_size(len(among)), dead=view.dead, among=among, exact=True,
+        )  # fmt: skip
+        if not len(hits):
+            return [], 0
+        shares = similarity(hits.distances, model.unrelated_distance)
+        ranking = Ranking(hits.keys.astype(np.intp), hits.distances, shares)
+        distances = pairwise_distances(signatures_of(hits.keys, view.generation, view.tail))
+        chosen = diversify(ranking.distances, distances, asked.candidates).indices.tolist()
+        matches = associate(
+            geometry, ranking, chosen, lambda key: opened.geometry(row, key), asked.k,
+            asked.seed, *thresholds(asked.validation),
+        )  # fmt: skip
+        order = {number: i for i, number in enumerate(ranking.indices.tolist())}
+        accepted = sorted(
+            (one for one in matches if one.validation.status == "accepted"),
+            key=lambda one: order[one.index],
+        )
+        # a frame that is deleted from here on is left out where edges are told
+        edges = [
+            _item(number, one) for one in accepted if one.validation.overlap >= asked.min_overlap
+        ]
+        return edges, len(matches)
+
+    def _view(self, of: MapRow) -> tuple[MapRow, Model, View]:
+        """The map as it is now: frames of it may be deleted, and its model may change.
+
+        Raises
+        ------
+        UnknownMap : it was deleted, whether or not another has its name.
+        """
+        row = of
+        while True:  # its signer opened while no connection is held
+            model = self._signers(row.model_id).model
+            with self._store.database.read() as connection:
+                row = find_map(connection, of.name)
+                if row.number != of.number:
+                    raise unknown_map(of.name)
+                if row.model_id == model.id:
+                    return row, model, self._readers.view(connection, row)
+
+
+class _Opened:
+    """Artifacts that were opened lately: frames near each other have the same candidates."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._held: OrderedDict[tuple[int, str], Geometry] = OrderedDict()
+
+    def geometry(self, row: MapRow, number: int) -> Geometry | None:
+        """The artifact of a frame; None where it is gone or damaged."""
+        key = (number, row.model_id)
+        if key not in self._held:
+            with self._store.database.read() as connection:
+                blob = geometry_blobs(connection, [number], row.model_id).get(number)
+            if blob is None:
+                return None
+            try:
+                self._held[key] = read_geometry(self._store.blobs.get(blob))
+            except (DamagedBlob, UnreadableGeometry):  # one frame must not cost the others
+                sign_again(self._store, row, [number], row.model_id)
+                return None
+        self._held.move_to_end(key)
+        while len(self._held) > _OPENED:
+            self._held.popitem(last=False)
+        return self._held[key]
+
+
+def eligible(asked: NewAssociation, plan: Plan, place: int) -> Keys:
+    """Frames that one may be found to be near, rising: of the other session, or before it."""
+    if len(asked.sessions) == 2:
+        return np.sort(np.array(plan.target, np.int64))
+    apart = asked.apart or (1 if asked.not_within_s is not None else APART)
+    before = np.array(plan.target[: max(place - apart + 1, 0)], np.int64)
+    if asked.not_within_s is not None:
+        taken = np.array(plan.taken, float)  # NaN where not known, which is before nothing
+        before = before[taken[: len(before)] < taken[place] - asked.not_within_s]
+    return np.sort(before)
+
+
+def _known(view: View, numbers: Keys) -> Keys:
+    """Those of some frames that a view has."""
+    known = view.tail.places.of(numbers) >= 0
+    if view.generation is not None:
+        known |= view.generation.places.of(numbers) >= 0
+    return numbers[known & ~np.isin(numbers, list(view.dead))]
+
+
+def _item(number: int, match: Match) -> dict[str, Any]:
+    """An edge as it is kept."""
+    v = match.validation
+    T = np.eye(4) if v.T_match_query is None else v.T_match_query  # an accepted one has one
+    return {
+        "from": number, "to": match.index, "T": T.ravel().tolist(),
+        "covariance": None if v.covariance is None else v.covariance.ravel().tolist(),
+        "overlap": v.overlap, "residual_m": v.residual_m,
+        "residual_deg": math.degrees(v.residual_rad), "strength": v.strength,
+        "inliers": v.inliers, "ambiguity": v.ambiguity, "similarity": match.similarity,
+    }  # fmt: skip

@@ -1,0 +1,278 @@
+"""Archives of sequences into a map: taken whole at the door, and frame by frame by a worker.
+
+    chunks  --Receiver-->  a blob that can be sought in  --begin-->  job  --handler-->  items
+
+A frame goes the way of every upload, so that what is done again after a crash finds it there.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sceneprint.datasets import FrameReference
+from sceneprint.datasets.archives import Archive, open_archive
+from sceneprint.datasets.inflating import Inflater
+from sceneprint.datasets.metas import meta_of, parent_frame_of, session_of
+from sceneprint.datasets.records import Sequence as FrameSequence
+from sceneprint.engine.cursors import row_of
+from sceneprint.engine.jobs import get_job
+from sceneprint.engine.replaying import Outcome as Taken
+from sceneprint.engine.replaying import item_of
+from sceneprint.engine.tasks import Outcome, Task, Tasks
+from sceneprint.engine.uploads import Upload, Uploads, sweep_deleted
+from sceneprint.errors import SceneprintError, StoreError, UnreadableArchive
+from sceneprint.schemas import Job, Page
+from sceneprint.schemas.ingest import ImportItem, ImportOptions
+from sceneprint.store import Store
+from sceneprint.store.blobs import IncomingBlob
+from sceneprint.store.faults import unusable
+from sceneprint.store.idempotency import Once
+from sceneprint.store.listing import find_job, unknown_job
+from sceneprint.store.maps import find_map
+from sceneprint.store.parts import JobFile, files_of, items_of, remove_parts
+
+KIND, FILE = "import", "archive"
+#: Frames that are taken in one commit.
+_AT_ONCE = 16
+#: How much more a compressed tar may hold than the largest archive that is taken.
+_UNPACKED = 4
+
+
+class Receiver:
+    """An archive on its way in; see `Imports.receive`.
+
+    Parameters
+    ----------
+    blob : that it becomes, compressed tars inflated
+    most_bytes : that it may have
+    """
+
+    def __init__(self, blob: IncomingBlob, most_bytes: int) -> None:
+        self._blob, self._inflater = blob, Inflater(most_bytes)
+
+    def write(self, chunk: bytes) -> None:
+        """Take the next part.
+
+        Raises
+        ------
+        UnreadableArchive : it is no archive, is damaged, or holds more than it may.
+        StoreFull, UnusableStore : it cannot be written.
+        """
+        for piece in self._inflater.pieces(chunk):
+            self._blob.write(piece)
+
+    def end(self) -> JobFile:
+        """Keep it, durable; raises as `write`."""
+        for piece in self._inflater.end():
+            self._blob.write(piece)
+        return JobFile(FILE, self._blob.keep(), self._blob.size, "application/octet-stream")
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A frame of an archive, or why there is none."""
+
+    name: str
+    sequence: FrameSequence | None = None
+    reference: FrameReference | None = None
+    refused: SceneprintError | None = None
+
+
+class Imports:
+    """Imports of archives.
+
+    Parameters
+    ----------
+    store, tasks, uploads : see there
+    most_bytes : of an archive, as it is sent
+    """
+
+    def __init__(self, store: Store, tasks: Tasks, uploads: Uploads, most_bytes: int) -> None:
+        self._store, self._tasks, self._uploads = store, tasks, uploads
+        self._most = most_bytes
+        tasks.register(KIND, self.handle)
+
+    @contextmanager
+    def receive(self, map_name: str) -> Iterator[Receiver]:
+        """Take an archive in parts; what is not kept by `Receiver.end` is removed.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        ReadOnlyStore, StoreFull, UnusableStore : nothing can be kept.
+        """
+        with self._store.database.read() as connection:
+            find_map(connection, map_name)
+        self._store.database.require_writable()
+        with self._store.blobs.incoming() as blob:
+            yield Receiver(blob, _UNPACKED * self._most)
+
+    def begin(
+        self, map_name: str, archive: JobFile, options: ImportOptions, once: Once | None = None
+    ) -> tuple[Job, bool]:
+        """Queue the import of an archive that was received.
+
+        Returns
+        -------
+        job : that imports it
+        replayed : whether `once` began it before
+
+        Raises
+        ------
+        UnknownMap, IdempotencyConflict : see `Tasks.begin_once`; the archive is removed.
+        """
+        data = options.model_dump(mode="json")
+        try:
+            job, again = self._tasks.begin_once(
+                KIND, map_name, data, options.priority, [archive], once
+            )
+        except SceneprintError:
+            sweep_deleted(self._store, [archive.blob])
+            raise
+        if again:
+            sweep_deleted(self._store, [archive.blob])
+        return job, again
+
+    def get(self, map_name: str, job_id: str) -> Job:
+        """An import of a map; UnknownMap or UnknownJob where there is none."""
+        with self._store.database.read() as connection:
+            find_map(connection, map_name)
+        job = get_job(self._store, job_id)
+        if job.kind != KIND or job.map != map_name:
+            raise unknown_job(job_id)
+        return job
+
+    def items(
+        self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100
+    ) -> Page[ImportItem]:
+        """What came of the members of an archive so far, in their order.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : there is none.
+        InvalidRequest : a cursor that was not given out.
+        """
+        self.get(map_name, job_id)
+        first = row_of(cursor) or 0
+        with self._store.database.read() as connection:
+            number = find_job(connection, job_id).number
+            found = items_of(connection, number, first, limit + 1)
+        more = str(first + limit) if len(found) > limit else None
+        return Page[ImportItem](
+            items=[ImportItem(**one) for one in found[:limit]], next_cursor=more
+        )
+
+    def handle(self, task: Task, until: float) -> Outcome:
+        """Import a part of an archive: frames until the time is over, at least some."""
+        options = ImportOptions.model_validate(task.data)
+        with self._store.database.read() as connection:
+            file = files_of(connection, task.claim.job.number).get(FILE)
+        if file is None:
+            raise UnreadableArchive("The archive was removed when its import failed. Send it anew.")
+        try:
+            with self._opened(file, options.name) as archive:
+                return self._slice(task, archive, options, until)
+        except UnreadableArchive:  # trying again cannot help, and it may be large
+            with self._store.database.write() as connection:
+                number = task.claim.job.number
+                gone = remove_parts(connection, number, items=False, files=[FILE])
+            sweep_deleted(self._store, gone)
+            raise
+
+    @contextmanager
+    def _opened(self, file: JobFile, name: str) -> Iterator[Archive]:
+        path = self._store.blobs.path(file.blob)
+        try:
+            with (
+                path.open("rb") as opened,
+                open_archive(opened, Path(tempfile.gettempdir()), name) as archive,
+            ):
+                yield archive
+        except FileNotFoundError as error:
+            raise UnreadableArchive(
+                "The archive is gone from the store. Send it once more."
+            ) from error
+        except OSError as error:
+            raise unusable("The archive cannot be unpacked", error) from error
+
+    def _slice(self, task: Task, archive: Archive, options: ImportOptions, until: float) -> Outcome:
+        steps = list(_steps(archive, options.every))
+        progress = {"done": 0, "received": 0, "there": 0, "refused": 0} | task.progress
+        progress["total"] = len(steps)
+        items: list[dict[str, Any]] = []
+        while progress["done"] < len(steps) and (not items or time.monotonic() < until):
+            some = steps[progress["done"] :][:_AT_ONCE]
+            for item in self._taken(task.of_map.name, archive, some, options):
+                items.append(item.model_dump(mode="json"))
+                what = {202: "received", 200: "there"}.get(item.status, "refused")
+                progress[what] += 1
+            progress["done"] += len(some)
+        over = progress["done"] >= len(steps)
+        counts = {name: progress[name] for name in ("received", "there", "refused")}
+        result = {"sequences": len(archive.sequences), **counts, "ignored": archive.ignored}
+        return Outcome(
+            over, progress, items, drop=[FILE] if over else (), result=result if over else None,
+            event="import.done" if over else None,
+        )  # fmt: skip
+
+    def _taken(
+        self, map_name: str, archive: Archive, steps: Sequence[_Step], options: ImportOptions
+    ) -> list[ImportItem]:
+        """Take some frames in one commit."""
+        outcomes: list[Taken | None] = []
+        uploads = []
+        for step in steps:
+            try:
+                uploads.append(_upload(archive, step, options))
+                outcomes.append(None)
+            except StoreError:
+                raise
+            except SceneprintError as error:
+                outcomes.append(Taken(None, error=type(error)(archive.told(error))))
+        rest = iter(self._uploads.add_all(map_name, uploads)[0] if uploads else [])
+        return [
+            _item(step.name, outcome or next(rest))
+            for step, outcome in zip(steps, outcomes, strict=True)
+        ]
+
+
+def _steps(archive: Archive, every: int) -> Iterator[_Step]:
+    """All there is to tell of an archive, in the same order each time."""
+    for name, reason in archive.refused:
+        yield _Step(name, refused=UnreadableArchive(reason))
+    for sequence in archive.sequences:
+        for reference in sequence.frames[::every]:
+            yield _Step(archive.name_of(reference), sequence, reference)
+
+
+def _upload(archive: Archive, step: _Step, options: ImportOptions) -> Upload:
+    if step.sequence is None or step.reference is None:
+        raise step.refused or ValueError("neither a frame nor refused")
+    meta = meta_of(
+        step.reference,
+        robot=options.robot,
+        session=options.session or session_of(step.sequence),
+        tags=options.tags,
+        with_pose=options.with_poses,
+        parent_frame=options.parent_frame or parent_frame_of(step.sequence, options.robot),
+        base=options.T_base_sensor,
+    )
+    data = archive.data_of(step.reference)
+    return Upload(data, meta, options.priority, options.if_novel)
+
+
+def _item(name: str, outcome: Taken) -> ImportItem:
+    item = item_of(outcome)
+    return ImportItem(
+        name=name,
+        status=item.status,
+        frame_id=None if item.frame is None else item.frame.frame_id,
+        job_id=None if item.frame is None else item.frame.job_id,
+        problem=item.problem,
+    )

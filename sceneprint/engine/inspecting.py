@@ -1,0 +1,270 @@
+"""What one can look at after a query: its points, its ranking, and any match with its evidence.
+
+query id  --Inspection-->  Answer | PLY | Similarities | MatchDetails
+
+A match is validated once more, with the seed and the options of the query: the same answer.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sceneprint.artifacts import read_geometry
+from sceneprint.clouds import points_of, write_ply
+from sceneprint.engine.healing import sign_again
+from sceneprint.engine.kept import Kept, KeptQueries
+from sceneprint.engine.signers import Signers
+from sceneprint.engine.telling import tell_uncertainty, tell_validation
+from sceneprint.engine.transforms import transform
+from sceneprint.engine.validating import thresholds
+from sceneprint.engine.wire import camera_frame
+from sceneprint.errors import (
+    DamagedBlob,
+    InvalidRequest,
+    NotIndexed,
+    UnknownFrame,
+    UnreadableGeometry,
+)
+from sceneprint.geometry.covariance import PAIR_METHOD
+from sceneprint.geometry.overlays import overlay
+from sceneprint.geometry.retrieval import pairwise_distances, similarity
+from sceneprint.geometry.traces import AGREES, VIOLATES, Traces, Verdicts, trace
+from sceneprint.geometry.validation import Validation
+from sceneprint.pipeline import validate
+from sceneprint.schemas import Answer, FrameState
+from sceneprint.schemas import Match as ToldMatch
+from sceneprint.schemas.kept import (
+    MOST_POINTS,
+    Coincidences,
+    MatchDetails,
+    OverlayColour,
+    OverlayTransform,
+    Points,
+    Similarities,
+)
+from sceneprint.schemas.options import FrameName
+from sceneprint.schemas.outputs import Triple
+from sceneprint.store import Store
+from sceneprint.store.frames import find_frame, frames_of, refers_to
+from sceneprint.store.maps import find_map, list_maps
+from sceneprint.store.signatures import geometry_blobs, stored_signatures
+from sceneprint.types import Bytes, Floats, Floats32, Geometry
+
+
+class Inspection:
+    """Answers that are kept, and what is behind them.
+
+    Parameters
+    ----------
+    store, signers : of the engine
+    kept : the answers
+    """
+
+    def __init__(self, store: Store, signers: Signers, kept: KeptQueries) -> None:
+        self._store, self._signers, self._kept = store, signers, kept
+
+    def answer(self, query_id: str) -> Answer:
+        """The answer again; UnknownQuery where it is not kept, or no longer."""
+        return self._kept.find(query_id).answer
+
+    def cloud(self, query_id: str) -> bytes:
+        """The query's points and normals as PLY, in its optical frame.
+
+        Raises
+        ------
+        UnknownQuery : it is not kept, or no longer.
+        NotIndexed : it was asked without validation, for which alone its points are made.
+        """
+        kept = self._kept.find(query_id)
+        points, normals = points_of(_geometry(kept).surface)
+        comments = [
+            f"frame {_optical(kept)}", f"points of query {query_id}, metres",
+            f"model {kept.answer.model}",
+        ]  # fmt: skip
+        return write_ply(points, normals, comments=comments)
+
+    def similarities(self, query_id: str, limit: int = 50) -> Similarities:
+        """How alike the query and the first of its ranking are, each to each; UnknownQuery."""
+        kept = self._kept.find(query_id)
+        wanted = kept.ranked[:limit]
+        with self._store.database.read() as connection:
+            rows = frames_of(connection, wanted)
+            vectors = stored_signatures(connection, rows, kept.model_id)
+            names = {row.number: row.name for row in list_maps(connection)}
+        # a frame's number is used once, but its map may be one that the caller cannot know
+        there = [
+            n for n in wanted if n in vectors and names[rows[n].map_number] in kept.answer.maps
+        ]
+        stacked: Bytes = np.stack(
+            [kept.vector, *(np.frombuffer(vectors[n], np.uint8) for n in there)]
+        )
+        model = self._signers(kept.model_id).model
+        shares = similarity(pairwise_distances(stacked), model.unrelated_distance)
+        return Similarities(
+            query_id=query_id,
+            model=kept.answer.model,
+            frames=[FrameName(map=names[rows[n].map_number], frame_id=rows[n].id) for n in there],
+            similarity=shares.round(4).tolist(),
+        )
+
+    def match(self, query_id: str, frame_id: str, map_name: str | None = None) -> MatchDetails:
+        """One match, validated once more, with what its figures were counted on.
+
+        Parameters
+        ----------
+        query_id, frame_id : of an answer, and of one of its matches
+        map_name : where matches of several maps have that id; default: the first of them
+
+        Raises
+        ------
+        UnknownQuery : it is not kept, or no longer.
+        UnknownMap, UnknownFrame : no match has that id, or it was deleted since.
+        NotIndexed : there are no points to validate it with: the query was asked without
+            validation, or the map has changed its model since.
+        DamagedBlob, UnreadableGeometry : the match's artifact is damaged; it is made again.
+        """
+        kept = self._kept.find(query_id)
+        match = _match_of(kept, frame_id, map_name)
+        query, other = _geometry(kept), self._geometry(kept, match)
+        v = _validated(kept, query, other)
+        names = camera_frame(match.frame_id), _optical(kept)
+        T, rival = v.T_match_query, v.T_rival
+        traces = None if T is None else trace(query, other, T)
+        return MatchDetails(
+            query_id=query_id,
+            frame_id=match.frame_id,
+            map=match.map,
+            validation=tell_validation(v),
+            transform=None if T is None else transform(T, *names),
+            uncertainty=tell_uncertainty(v.covariance, PAIR_METHOD),
+            rival=None if rival is None else transform(rival, *names),
+            patches=None if traces is None else _coincidences(traces, query, other),
+            query=None if traces is None else _points(traces.query, traces.of_query),
+            match=None if traces is None else _points(traces.match, traces.of_match),
+            seed=kept.query.seed,
+        )
+
+    def overlay(
+        self, query_id: str, frame_id: str, map_name: str | None = None,
+        colour: OverlayColour = "source", by: OverlayTransform = "aligned",
+    ) -> bytes:  # fmt: skip
+        """The query's points and a match's as PLY, in the match's optical frame; see `match`.
+
+        Parameters
+        ----------
+        query_id, frame_id, map_name : see `match`
+        colour : by where a point is from, by its normal, or by how far it is from the other's
+            surface
+        by : the transform that was found, its best rival, or none: both clouds as they are
+
+        Raises
+        ------
+        UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : see `match`.
+        InvalidRequest : there is no such transform.
+        """
+        kept = self._kept.find(query_id)
+        match = _match_of(kept, frame_id, map_name)
+        query, other = _geometry(kept), self._geometry(kept, match)
+        T = np.eye(4)
+        if by != "none":
+            v = _validated(kept, query, other)
+            found = v.T_match_query if by == "aligned" else v.T_rival
+            if found is None:
+                what = "no transform" if by == "aligned" else "no rival"
+                raise InvalidRequest(
+                    f"Frame {frame_id} has {what} with query {query_id}: {v.reason}. Ask for "
+                    "transform=none to see both as they are.",
+                    (("transform", f"there is {what}"),),
+                )
+            T = found
+        points, normals, colours = overlay(query.surface, other.surface, T, colour)
+        comments = [
+            f"frame {camera_frame(match.frame_id)}",
+            f"query {query_id} and frame {match.frame_id} of map {match.map}, metres",
+            f"transform {by}, colours by {colour}", f"model {kept.answer.model}",
+        ]  # fmt: skip
+        return write_ply(points, normals, colours, comments=comments)
+
+    def _geometry(self, kept: Kept, match: ToldMatch) -> Geometry:
+        """A match's artifact, if it is still the frame that was matched."""
+        with self._store.database.read() as connection:
+            row = find_map(connection, match.map)
+            frame = find_frame(connection, row, match.frame_id)
+            blobs = geometry_blobs(connection, [frame.number], kept.model_id)
+        if frame.state == FrameState.DELETED or frame.number not in kept.ranked:
+            raise _deleted(match)
+        if frame.number not in blobs:
+            raise NotIndexed(
+                f"Map {match.map!r} has changed its model since the query, and a frame of one "
+                "model cannot be compared with one of another. Ask again."
+            )
+        try:
+            return read_geometry(self._store.blobs.get(blobs[frame.number]))
+        except (DamagedBlob, UnreadableGeometry):
+            with self._store.database.read() as connection:
+                if not refers_to(connection, blobs[frame.number]):
+                    raise _deleted(match) from None
+            if row.model_id == kept.model_id:
+                sign_again(self._store, row, [frame.number], row.model_id)
+            raise
+
+
+def _optical(kept: Kept) -> str:
+    frame = kept.answer.frame
+    return camera_frame("query" if frame is None else frame.frame_id)
+
+
+def _geometry(kept: Kept) -> Geometry:
+    if kept.geometry is None:
+        raise NotIndexed(
+            f"Query {kept.answer.query_id} was asked without validation, so its points were not "
+            "kept. Ask again with the stage `validate`."
+        )
+    return read_geometry(kept.geometry)
+
+
+def _deleted(match: ToldMatch) -> UnknownFrame:
+    return UnknownFrame(
+        f"Frame {match.frame_id} of map {match.map!r} was deleted since it was matched."
+    )
+
+
+def _match_of(kept: Kept, frame_id: str, map_name: str | None) -> ToldMatch:
+    for one in kept.answer.matches:
+        if one.frame_id == frame_id and map_name in (None, one.map):
+            return one
+    raise UnknownFrame(
+        f"Query {kept.answer.query_id} has no match {frame_id!r:.80}"
+        f"{'' if map_name is None else f' in map {map_name!r:.80}'}. Its answer lists them."
+    )
+
+
+def _validated(kept: Kept, query: Geometry, match: Geometry) -> Validation:
+    p, mode = thresholds(kept.query.validation)
+    return validate(query, match, kept.query.seed, p, mode)
+
+
+def _coincidences(traces: Traces, query: Geometry, match: Geometry) -> Coincidences:
+    pairs = traces.pairs[:MOST_POINTS]
+    of_query, of_match = pairs[:, 0], pairs[:, 1]
+    return Coincidences(
+        query=of_query.tolist(),
+        match=of_match.tolist(),
+        query_mean=_triples(query.patches.means[of_query]),
+        query_normal=_triples(query.patches.normals[of_query]),
+        match_mean=_triples(match.patches.means[of_match]),
+        match_normal=_triples(match.patches.normals[of_match]),
+        distance_m=traces.distances[:MOST_POINTS].round(4).tolist(),
+    )
+
+
+def _points(points: Floats32, verdicts: Verdicts) -> Points:
+    return Points(
+        sampled=len(points),
+        inliers=_triples(points[verdicts == AGREES, :3][:MOST_POINTS].astype(float)),
+        violations=_triples(points[verdicts == VIOLATES, :3][:MOST_POINTS].astype(float)),
+    )
+
+
+def _triples(rows: Floats) -> list[Triple]:
+    return [(x, y, z) for x, y, z in rows.round(4).tolist()]

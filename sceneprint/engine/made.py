@@ -1,0 +1,60 @@
+"""Something that can be made of a frame, and how it is told.
+
+patches --level_of--> JSON;  signature --npy_of--> NPY file;  upload --upload_type--> media type
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from sceneprint.schemas.outputs import PatchLevel
+from sceneprint.types import Patches
+
+T = TypeVar("T")
+
+PLY, PNG, NPY, BYTES, JSON = (
+    "application/ply", "image/png", "application/x-npy", "application/octet-stream",
+    "application/json",
+)  # fmt: skip
+_MAGIC_PNG = b"\x89PNG"
+
+
+@dataclass(frozen=True, eq=False)
+class Output(Generic[T]):
+    """Something that can be made of a frame.
+
+    Parameters
+    ----------
+    tag : the same as long as what is made is the same, and another otherwise
+    make : makes it; takes some 100 ms at most
+    """
+
+    tag: str
+    make: Callable[[], T]
+
+
+def upload_type(data: bytes) -> str:
+    """Media type of an upload."""
+    return PNG if data.startswith(_MAGIC_PNG) else NPY
+
+
+def level_of(patches: Patches) -> PatchLevel:
+    """Patches as JSON tells them."""
+    return PatchLevel(
+        mean=[(x, y, z) for x, y, z in patches.means.round(4).tolist()],
+        normal=[(x, y, z) for x, y, z in patches.normals.round(4).tolist()],
+        area_m2=patches.areas.round(5).tolist(),
+        size=patches.sizes.tolist(),
+    )
+
+
+def npy_of(vector: bytes) -> bytes:
+    """Bytes as an NPY file of uint8."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.frombuffer(vector, np.uint8), allow_pickle=False)
+    return buffer.getvalue()

@@ -1,0 +1,173 @@
+"""What operators and dashboards ask of a store: events, figures, models; and its housekeeping."""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from sceneprint.engine import happenings
+from sceneprint.engine.catalogue import Catalogue
+from sceneprint.engine.cursors import row_of
+from sceneprint.engine.lags import anchors
+from sceneprint.engine.statistics import Statistics
+from sceneprint.engine.wire import when
+from sceneprint.errors import InvalidRequest, SceneprintError
+from sceneprint.schemas.events import Event, EventPage
+from sceneprint.schemas.operations import ModelInfo
+from sceneprint.settings import Settings
+from sceneprint.store import Store
+from sceneprint.store.bell import Bell
+from sceneprint.store.events import (
+    EventRow,
+    Wanted,
+    list_events,
+    newest_number,
+    remove_events,
+    spent_numbers,
+)
+from sceneprint.store.maps import find_map
+
+log = logging.getLogger(__name__)
+
+#: Seconds between two looks for events that are no longer kept, and how many are removed in one
+#: commit, and after one look.
+TIDY_S = 60.0
+AT_ONCE, AT_MOST = 2_000, 20_000
+#: Most beginnings of kinds that may be asked for; and events read at once.
+MOST_KINDS, AT_A_TIME = 20, 500
+
+
+class Operations:
+    """Events, figures and models of one store.
+
+    Parameters
+    ----------
+    store, settings, bell : see there
+    """
+
+    def __init__(self, store: Store, settings: Settings, bell: Bell) -> None:
+        self._store, self._settings = store, settings
+        self.statistics = Statistics(store, settings, bell)
+        self.catalogue = Catalogue(store.database)
+        self._tidied = time.monotonic()
+
+    def wanted(self, map_name: str | None = None, kinds: Sequence[str] = ()) -> Wanted:
+        """Which events are meant.
+
+        Parameters
+        ----------
+        map_name : only of this map
+        kinds : beginnings of the kinds; none: all
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : too many kinds, or one that cannot be one.
+        """
+        if len(kinds) > MOST_KINDS or not all(re.fullmatch(r"[a-z_.]{1,32}", k) for k in kinds):
+            raise InvalidRequest(
+                f"The kinds {', '.join(kinds)!r:.80} are none. Give the beginning of one, such as "
+                f"frame. or frame.indexed, and {MOST_KINDS} at most.",
+                (("kind", "not a kind"),),
+            )
+        if map_name is None:
+            return Wanted(None, tuple(kinds))
+        with self._store.database.read() as connection:
+            row = find_map(connection, map_name)
+        return Wanted(frozenset((row.name,)), tuple(kinds))
+
+    def begin(self, after: int | None) -> tuple[int, list[Event]]:
+        """See `happenings.begin`."""
+        place, found = happenings.begin(self._store.database, self._settings.events_kept, after)
+        return place, [tell_event(one) for one in found]
+
+    def read_on(self, wanted: Wanted, place: int) -> tuple[list[Event], int]:
+        """See `happenings.read_on`."""
+        found, place = happenings.read_on(self._store.database, wanted, place, AT_A_TIME)
+        return [tell_event(one) for one in found], place
+
+    def events(
+        self, wanted: Wanted, *, after: int = 0, cursor: str | None = None, limit: int = 100,
+        newest_first: bool = False,
+    ) -> EventPage:  # fmt: skip
+        """A page of events.
+
+        Parameters
+        ----------
+        wanted : which
+        after : only those with a greater number
+        cursor : `next_cursor` of the page before
+        limit : at most so many
+        newest_first : else the oldest first
+
+        Raises
+        ------
+        InvalidRequest : a cursor that was not given out.
+        """
+        place, before = row_of(cursor), None
+        if place is not None:
+            after, before = (after, place) if newest_first else (max(after, place), None)
+        with self._store.database.read() as connection:
+            newest = newest_number(connection)
+            found = list_events(
+                connection, wanted, after=after, before=before, limit=limit + 1,
+                newest_first=newest_first,
+            )  # fmt: skip
+        more = len(found) > limit
+        return EventPage(
+            items=[tell_event(one) for one in found[:limit]],
+            next_cursor=str(found[limit - 1].number) if more else None,
+            newest=newest,
+        )
+
+    def models(self, may_read: Callable[[str], bool] = lambda _: True) -> list[ModelInfo]:
+        """Models that maps can be signed with, each with the maps that may be named."""
+        return self.catalogue.tell(may_read)
+
+    def tidy(self) -> int:
+        """Remove events that are no longer kept, if it is time; returns how many.
+
+        Where that cannot be written, nothing is lost: it is tried again the next time.
+        """
+        if time.monotonic() - self._tidied < TIDY_S:
+            return 0
+        self._tidied = time.monotonic()
+        try:
+            return self.remove_spent()
+        except SceneprintError as error:
+            log.warning("no events removed", extra={"error": str(error)})
+            return 0
+
+    def remove_spent(self) -> int:
+        """Remove events that are no longer kept, a few at a time; returns how many."""
+        removed, indexes = 0, Path(self._settings.indexes)
+        while removed < AT_MOST:
+            with self._store.database.read() as connection:  # most often there is none: no lock
+                if not spent_numbers(connection, self._settings.events_kept, (), 1):
+                    break
+                numbers = spent_numbers(
+                    connection, self._settings.events_kept, anchors(indexes), AT_ONCE
+                )
+            if numbers:
+                with self._store.database.write() as connection:
+                    remove_events(connection, numbers)
+            removed += len(numbers)
+            if len(numbers) < AT_ONCE:
+                break
+        return removed
+
+
+def tell_event(row: EventRow) -> Event:
+    """An event as JSON tells it."""
+    return Event(
+        id=row.number,
+        at=when(row.at),
+        kind=row.kind,
+        map=row.map,
+        frame_id=row.frame_id,
+        job_id=row.job_id,
+        data=row.data,
+    )

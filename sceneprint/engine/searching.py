@@ -1,0 +1,178 @@
+"""A query to R, one ranking over all maps that are asked: Sec. III-C.
+
+signature, Places  --search_maps-->  Searched
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.engine.asking import Asked
+from sceneprint.engine.readers import View
+from sceneprint.geometry.retrieval import Ranking, ranking_size, similarity
+from sceneprint.index import Hits, is_compared, search, signatures_of
+from sceneprint.index.keys import Keys
+from sceneprint.models import Model
+from sceneprint.schemas import Filter, Query
+from sceneprint.store import Store
+from sceneprint.store.filters import passing
+from sceneprint.store.records import MapRow
+from sceneprint.types import Bytes
+
+#: Frames up to which a map is compared whole: a shortlist saves next to nothing there.
+WHOLE = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A map that is asked: its row, and its frames as of one revision."""
+
+    row: MapRow
+    view: View
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What is searched of one map.
+
+    Parameters
+    ----------
+    place : the map
+    dead : frames that may not be found: deleted ones, and the query itself
+    among : frames that pass the filter; None without one
+    size : frames that can be found
+    exact : every frame that passes is compared, whatever the index would propose
+    """
+
+    place: Place
+    dead: frozenset[int]
+    among: Keys | None
+    size: int
+    exact: bool
+
+    @property
+    def passed(self) -> int:
+        """How many pass the filter; all without one."""
+        return self.size if self.among is None else len(self.among)
+
+
+@dataclass(frozen=True, eq=False)
+class Searched:
+    """R, and where it is from.
+
+    Parameters
+    ----------
+    parts : of each map
+    hits : of each map, in the same order
+    ranking : R, of frame numbers
+    owners : (r,) which part each of R is of
+    size : that R was to have
+    """
+
+    parts: tuple[Part, ...]
+    hits: tuple[Hits, ...]
+    ranking: Ranking
+    owners: NDArray[np.intp]
+    size: int
+
+    @property
+    def exact(self) -> bool:
+        """Every frame that passes was compared."""
+        return all(one.exact for one in self.hits)
+
+    def signatures(self) -> Bytes:
+        """Stored signatures (r, D) of R."""
+        keys = self.ranking.indices.astype(np.int64)
+        first = self.parts[0].place.view
+        if len(self.parts) == 1:
+            return signatures_of(keys, first.generation, first.tail)
+        rows = np.empty((len(keys), first.tail.signatures.shape[1]), np.uint8)
+        for number, part in enumerate(self.parts):
+            own = np.flatnonzero(self.owners == number)
+            view = part.place.view
+            if len(own):
+                rows[own] = signatures_of(keys[own], view.generation, view.tail)
+        return rows
+
+
+def search_maps(
+    store: Store, places: Sequence[Place], asked: Asked, query: Query, model: Model
+) -> Searched:
+    """The frames of all maps that are nearest to a query.
+
+    Parameters
+    ----------
+    store : see Store
+    places : the maps, one or more of one model
+    asked, query : what is sought, and how
+    model : of all of them
+    """
+    parts = tuple(_part(store, place, asked, query) for place in places)
+    size = ranking_size(sum(part.passed for part in parts))
+    hits = tuple(_searched(asked.vector, part, size) for part in parts)
+    keys = np.concatenate([one.keys for one in hits])
+    found = np.concatenate([one.distances for one in hits])
+    owners = np.repeat(np.arange(len(parts)), [len(one) for one in hits])
+    first = np.lexsort((keys, found))[:size]  # equal distances in the order in which frames came
+    distances = found[first]
+    shares = similarity(distances, model.unrelated_distance)
+    return Searched(parts, hits, Ranking(keys[first].astype(np.intp), distances, shares),
+                    owners[first], size)  # fmt: skip
+
+
+def is_shortlisted(searched: Searched, asked: Asked, part: Part, number: int) -> bool:
+    """Whether the search compared a frame with the query, or its shortlist missed it."""
+    view = part.place.view
+    return is_compared(
+        asked.vector, view.generation, view.tail, searched.size, number, dead=part.dead,
+        among=part.among, exact=part.exact,
+    )  # fmt: skip
+
+
+def rank_among_all(searched: Searched, asked: Asked, number: int, distance: int) -> int:
+    """The rank, from 1, of a distance among all frames that pass, each compared exactly."""
+    nearer = 0
+    for part in searched.parts:
+        view = part.place.view
+        hits = search(
+            asked.vector, view.generation, view.tail, max(part.passed, 1), dead=part.dead,
+            among=part.among, exact=True,
+        )  # fmt: skip
+        before = (hits.distances == distance) & (hits.keys < number)
+        nearer += int(((hits.distances < distance) | before).sum())
+    return nearer + 1
+
+
+def _searched(vector: Bytes, part: Part, size: int) -> Hits:
+    view = part.place.view
+    return search(
+        vector, view.generation, view.tail, size, dead=part.dead, among=part.among,
+        exact=part.exact,
+    )  # fmt: skip
+
+
+def _part(store: Store, place: Place, asked: Asked, query: Query) -> Part:
+    view, own = place.view, asked.frame
+    dead = view.dead if own is None else view.dead | {own[0]}
+    itself = asked.home is not None and asked.home.number == place.row.number
+    size = max(view.size - itself, 0)  # it may just have been deleted
+    among = None
+    if query.filter is not None:
+        among = _among(store, place, dead, asked, query.filter)
+    passed = size if among is None else len(among)
+    return Part(place, dead, among, size, query.exact or passed <= WHOLE)
+
+
+def _among(store: Store, place: Place, dead: frozenset[int], asked: Asked, wanted: Filter) -> Keys:
+    """Frames of a view that pass a filter; the database may be newer or older than the view."""
+    view = place.view
+    with store.database.read() as connection:
+        numbers = passing(connection, place.row.number, wanted, asked.taken)
+    known = view.tail.places.of(numbers) >= 0
+    if view.generation is not None:
+        known |= view.generation.places.of(numbers) >= 0
+    return numbers[known & ~np.isin(numbers, list(dead))]

@@ -1,0 +1,270 @@
+"""Jobs that are of no single frame: long ones, done in slices.
+
+    begin  -->  queued  --claim-->  Task  --handler, a slice at a time-->  Outcome, stored at once
+
+What a slice found, how far it came, and that the job goes on or is over, is one commit, fenced by
+the job's token. A slice whose worker died is done again from where the last one ended.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+from sceneprint.engine.leases import renewed
+from sceneprint.engine.uploads import sweep_deleted
+from sceneprint.engine.wire import tell_job
+from sceneprint.errors import (
+    Conflict,
+    FrameError,
+    InvalidRequest,
+    LostLease,
+    MissingDependency,
+    NotFound,
+    SceneprintError,
+    SnapshotError,
+    UnknownJob,
+    UnusableStore,
+)
+from sceneprint.schemas import Job, JobState
+from sceneprint.store import Store, queue
+from sceneprint.store.bell import Bell
+from sceneprint.store.events import tell
+from sceneprint.store.idempotency import Once
+from sceneprint.store.listing import find_job
+from sceneprint.store.maps import find_map, map_of
+from sceneprint.store.parts import JobFile, add_files, append_items, remove_parts
+from sceneprint.store.records import MapRow
+
+log = logging.getLogger(__name__)
+
+#: Seconds of a slice: frames that wait to be signed come between two.
+SLICE_S = 15.0
+#: Seconds until a job is tried again whose result could not be stored.
+LEFT_S = 5.0
+#: Errors that trying again cannot help: what was asked for cannot be done.
+HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, SnapshotError)
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A long job in hand.
+
+    Parameters
+    ----------
+    claim : on the job
+    map : that it is about; None where it is of none
+    """
+
+    claim: queue.Claim
+    map: MapRow | None
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """What was asked for."""
+        return self.claim.job.data or {}
+
+    @property
+    def progress(self) -> dict[str, Any]:
+        """How far the slices before have come: of the last `Outcome`; empty before the first."""
+        return self.claim.job.progress or {}
+
+    @property
+    def of_map(self) -> MapRow:
+        """The map, of a kind of job that always has one."""
+        if self.map is None:
+            raise ValueError(f"job {self.claim.job.id} is of no map")
+        return self.map
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a slice came to.
+
+    Parameters
+    ----------
+    over : whether the job is done
+    progress : `done` and `total` for people, and whatever the next slice needs to go on
+    items : found in this slice
+    files : made in this slice, blobs that are there
+    result : in short, at the end
+    drop : names of files of the job that are of no use any more
+    event : kind of the event that tells of the end, such as association.found; its data is `result`
+    """
+
+    over: bool
+    progress: dict[str, Any]
+    items: list[dict[str, Any]] = field(default_factory=list)
+    files: list[JobFile] = field(default_factory=list)
+    result: dict[str, Any] | None = None
+    drop: Collection[str] = ()
+    event: str | None = None
+
+
+#: Does a slice of a job until the time of `time.monotonic` that is given; may be done again.
+Handler = Callable[[Task, float], Outcome]
+
+
+class Tasks:
+    """Kinds of long jobs, each with what does it.
+
+    Parameters
+    ----------
+    store, bell : see there
+    """
+
+    def __init__(self, store: Store, bell: Bell) -> None:
+        self._store, self._bell = store, bell
+        self._handlers: dict[str, Handler] = {}
+        self._longest: dict[str, float] = {}
+
+    def register(self, kind: str, handler: Handler, longest_s: float | None = None) -> None:
+        """Let jobs of a kind be done by this process.
+
+        Parameters
+        ----------
+        kind, handler : see there
+        longest_s : that a slice may take, where that may be more than of other kinds
+        """
+        self._handlers[kind] = handler
+        if longest_s is not None:
+            self._longest[kind] = longest_s
+
+    def longest_s(self, kind: str, usual_s: float) -> float:
+        """Seconds after which a slice of that kind of job does not end any more."""
+        return max(self._longest.get(kind, 0.0), usual_s)
+
+    def begin(
+        self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
+        files: Collection[JobFile] = (),
+    ) -> Job:  # fmt: skip
+        """Queue a job of a kind.
+
+        Parameters
+        ----------
+        kind : such as associate
+        map_name : that it is about, or None
+        data : what is asked for, as JSON
+        priority : as of frames
+        files : that it works on
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        """
+        return self.begin_once(kind, map_name, data, priority, files)[0]
+
+    def begin_once(
+        self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
+        files: Collection[JobFile] = (), once: Once | None = None,
+    ) -> tuple[Job, bool]:  # fmt: skip
+        """As `begin`, with a flag: True where `once` began it before, and it is told as it is.
+
+        Raises
+        ------
+        IdempotencyConflict : something else was asked with the key of `once`.
+        """
+        with self._store.database.write() as connection:
+            row = None if map_name is None else find_map(connection, map_name)
+            before = None if once is None else once.found(connection)
+            if before is not None:
+                with suppress(UnknownJob):  # its map may have been deleted and made anew
+                    there = find_job(connection, before["job_id"])
+                    return tell_job(there, None, map_name), True
+            number = None if row is None else row.number
+            job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
+            add_files(connection, job.number, files)
+            if once is not None:
+                once.keep(connection, {"job_id": job.id})
+        self._bell.ring()
+        return tell_job(job, None, map_name), False
+
+    def run(
+        self, task: Task, lease_s: float, longest_s: float, broke: Callable[[], None] | None = None
+    ) -> JobState | None:
+        """Do a slice of a claimed job; see `work.run` for the rest."""
+        start, job = time.perf_counter(), task.claim.job
+        state: JobState | None
+        try:
+            longest_s = self.longest_s(job.kind, longest_s)
+            with renewed(self._store, task.claim, lease_s, longest_s):
+                handler = self._handlers.get(job.kind)
+                if handler is None:
+                    raise MissingDependency(
+                        f"This process cannot do jobs of kind {job.kind!r}. Let a worker of "
+                        "`sceneprint serve` or `sceneprint work` do it."
+                    )
+                outcome = handler(task, time.monotonic() + SLICE_S)
+                state = self._keep(task, outcome)
+        except LostLease as error:
+            log.warning("lease lost", extra=_about(task, error=str(error)))
+            return None
+        except HOPELESS as error:
+            state = self._fail(task, str(error))
+        except UnusableStore:  # a full disk is no fault of the job's, and costs it no try
+            self.put_back(task, LEFT_S)
+            raise
+        except Exception as error:
+            state = self._break_down(task, error)
+            if broke is not None and not isinstance(error, SceneprintError):
+                broke()
+        milliseconds = round(1e3 * (time.perf_counter() - start), 1)
+        log.info("job %s", state, extra=_about(task, state=state, milliseconds=milliseconds))
+        return state
+
+    def put_back(self, task: Task, after_s: float = 0.0) -> None:
+        """Return a claimed job undone."""
+        with suppress(LostLease, UnusableStore), self._store.database.write() as connection:
+            queue.give_back(connection, task.claim, after_s)
+
+    def _keep(self, task: Task, outcome: Outcome) -> JobState:
+        job = task.claim.job
+        with self._store.database.write() as connection:
+            append_items(connection, job.number, outcome.items)
+            add_files(connection, job.number, outcome.files)
+            gone = remove_parts(connection, job.number, items=False, files=outcome.drop)
+            if outcome.over:
+                queue.finish(
+                    connection, task.claim, JobState.SUCCEEDED, progress=outcome.progress,
+                    result=outcome.result,
+                )  # fmt: skip
+                if outcome.event is not None:
+                    name = None if task.map is None else map_of(connection, task.map.number).name
+                    tell(connection, outcome.event, name, None, job.id, **(outcome.result or {}))
+            else:
+                queue.go_on(connection, task.claim, outcome.progress)
+        sweep_deleted(self._store, gone)
+        if not outcome.over:
+            self._bell.ring()
+        return JobState.SUCCEEDED if outcome.over else JobState.QUEUED
+
+    def _fail(self, task: Task, reason: str) -> JobState | None:
+        try:
+            with self._store.database.write() as connection:
+                queue.finish(connection, task.claim, JobState.FAILED, reason)
+        except LostLease:
+            return None
+        return JobState.FAILED
+
+    def _break_down(self, task: Task, error: Exception) -> JobState | None:
+        known = isinstance(error, SceneprintError)
+        reason = str(error) if known else f"{type(error).__name__}: {error}"
+        trace = "".join(traceback.format_exception(error))
+        log.error("job broke down", extra=_about(task, error=reason, traceback=trace))
+        try:
+            with self._store.database.write() as connection:
+                return queue.fail(connection, task.claim, reason, trace)
+        except LostLease:
+            return None
+
+
+def _about(task: Task, **more: object) -> dict[str, object]:
+    """What a line of the log says of a job."""
+    job = task.claim.job
+    name = None if task.map is None else task.map.name
+    return {"job_id": job.id, "kind": job.kind, "map": name, "attempt": job.attempts, **more}

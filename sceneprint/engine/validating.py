@@ -1,0 +1,104 @@
+"""Candidates of R to matches, C_vld first, until enough are accepted or time is up: Sec. III-E.
+
+query Geometry, candidates  --validated-->  Validated
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sceneprint.artifacts import read_geometry
+from sceneprint.engine.deadlines import Deadline
+from sceneprint.engine.healing import sign_again
+from sceneprint.engine.searching import Searched
+from sceneprint.errors import DamagedBlob, UnreadableGeometry
+from sceneprint.geometry.acceptance import AcceptanceParameters, Mode
+from sceneprint.geometry.validation import ValidationParameters
+from sceneprint.matches import Match, associate
+from sceneprint.schemas import Query, ValidationOptions
+from sceneprint.store import Store
+from sceneprint.store.signatures import geometry_blobs
+from sceneprint.types import Geometry
+
+#: Candidates that are selected and validated, unless more matches are wanted: more cost time.
+CANDIDATES = 10
+#: Why no candidate was tried where validation was not asked for.
+NOT_ASKED = "not asked for"
+
+
+@dataclass(frozen=True, eq=False)
+class Validated:
+    """What came of the candidates.
+
+    Parameters
+    ----------
+    chosen : positions in R of the candidates
+    matches : those that were tried, of `associate`
+    unreadable : numbers of frames whose artifact cannot be read, and why
+    untried : why the others were not tried
+    """
+
+    chosen: Sequence[int]
+    matches: list[Match]
+    unreadable: dict[int, str]
+    untried: str
+
+
+def wanted_of(query: Query) -> int:
+    """How many candidates a query asks for."""
+    if "validate" not in query.stages:
+        return query.k
+    return query.candidates or max(CANDIDATES, query.k)
+
+
+def thresholds(given: ValidationOptions | None) -> tuple[ValidationParameters | None, Mode]:
+    """What a validation is done with, as `validate` takes it; None for the defaults."""
+    if given is None:
+        return None, "full"
+    own = given.model_dump(exclude={"mode", "residual_deg"})
+    acceptance = AcceptanceParameters(residual_rad=math.radians(given.residual_deg), **own)
+    return ValidationParameters(acceptance=acceptance), given.mode
+
+
+def validated(
+    store: Store, searched: Searched, chosen: Sequence[int], geometry: Geometry | None,
+    query: Query, deadline: Deadline,
+) -> Validated:  # fmt: skip
+    """Try candidates in the order of R.
+
+    Parameters
+    ----------
+    store : see Store
+    searched : see Searched
+    chosen : positions in R of the candidates
+    geometry : of the query; None where validation was not asked for
+    query, deadline : see there
+    """
+    if geometry is None:
+        return Validated(chosen, [], {}, NOT_ASKED)
+    ranking, model_id = searched.ranking, searched.parts[0].place.row.model_id
+    with store.database.read() as connection:
+        blobs = geometry_blobs(connection, ranking.indices[list(chosen)].tolist(), model_id)
+    unreadable: dict[int, str] = {}
+
+    def open_geometry(number: int) -> Geometry | None:
+        if number not in blobs:  # deleted in the meantime
+            return None
+        try:  # when its turn comes: 200 at once would be 125 MB
+            return read_geometry(store.blobs.get(blobs[number]))
+        except (DamagedBlob, UnreadableGeometry) as error:  # one frame must not cost the answer
+            unreadable[number] = str(error)
+            return None
+
+    matches = associate(
+        geometry, ranking, chosen, open_geometry, query.k, query.seed,
+        *thresholds(query.validation), deadline.allows,
+    )  # fmt: skip
+    owner = dict(zip(ranking.indices.tolist(), searched.owners.tolist(), strict=True))
+    for i, part in enumerate(searched.parts):
+        bad = sorted(number for number in unreadable if owner[number] == i)
+        sign_again(store, part.place.row, bad, model_id)
+    late = "the deadline came before it" if deadline.reached else "enough were accepted before it"
+    return Validated(chosen, matches, unreadable, late)

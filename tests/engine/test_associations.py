@@ -1,0 +1,373 @@
+"""Associations through the engine: two runs with origins of their own, slices that are lost."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import select, update
+
+from sceneprint.engine import Engine, associating
+from sceneprint.engine.associating import Associating
+from sceneprint.engine.tasks import Task
+from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
+from sceneprint.geometry.rigid import difference, inverse
+from sceneprint.schemas import Filter, JobState, NewMap
+from sceneprint.schemas.associations import Association, NewAssociation
+from sceneprint.settings import Settings
+from sceneprint.store.tables import events, frames, job_items, jobs
+from sceneprint.synth import synthesise_room
+from sceneprint.types import Floats
+
+BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
+
+
+def origin(seed: int) -> Floats:
+    rng = np.random.default_rng(seed)
+    u, _, vt = np.linalg.svd(rng.normal(size=(3, 3)))
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt, rng.normal(0, 4, 3)
+    return T
+
+
+#: Where the parent frames of both robots are in the room.
+ORIGINS = {"ann/a": origin(1), "bob/b": origin(2)}
+
+
+@pytest.fixture(scope="session")
+def two_runs(
+    tmp_path_factory: pytest.TempPathFactory, make_upload: Callable[..., Any],
+    work_off: Callable[[Engine], list[JobState | None]],
+) -> Path:  # fmt: skip
+    """A map `hall`: even frames of a path are ann's run a, odd ones bob's run b."""
+    folder = tmp_path_factory.mktemp("runs") / "data"
+    room = synthesise_room(21, 0, 12, along_path=True)
+    with Engine(Settings(data_dir=folder)) as engine:
+        engine.create_map(NewMap(name="hall", model="compact"))
+        for i, frame in enumerate(room.frames):
+            robot, session = (("ann", "a"), ("bob", "b"))[i % 2]
+            assert frame.pose is not None
+            pose = inverse(ORIGINS[f"{robot}/{session}"]) @ frame.pose
+            made = make_upload(
+                frame, room.name, robot=robot, session=session, pose={"matrix": pose.tolist()},
+                captured_at=BEGIN + timedelta(seconds=i),
+            )  # fmt: skip
+            engine.add_frame("hall", made.data, made.meta)
+        assert set(work_off(engine)) == {JobState.SUCCEEDED}
+    return folder
+
+
+@pytest.fixture
+def engine(two_runs: Path, tmp_path: Path, make_engine: Callable[..., Engine]) -> Engine:
+    shutil.copytree(two_runs, tmp_path / "data")
+    return make_engine()
+
+
+def done(engine: Engine, work_off: Callable[[Engine], Any], **asked: Any) -> Association:
+    begun = engine.associations.begin("hall", NewAssociation.model_validate(asked))
+    assert begun.state is JobState.QUEUED
+    work_off(engine)
+    return engine.associations.get("hall", begun.association_id)
+
+
+def stored(engine: Engine, association_id: str) -> list[Any]:
+    """Everything that a job found."""
+    with engine.store.database.read() as connection:
+        own = select(jobs.c.number).where(jobs.c.id == association_id).scalar_subquery()
+        asked = select(job_items.c.data).where(job_items.c.job_number == own)
+        return list(connection.execute(asked.order_by(job_items.c.number)).scalars())
+
+
+def test_two_robots_maps_are_joined(engine: Engine, work_off: Callable[[Engine], Any]) -> None:
+    told = done(engine, work_off, sessions=["a", "b"])
+    assert told.state is JobState.SUCCEEDED
+    assert told.progress is not None
+    assert (told.progress.done, told.progress.total) == (6, 6)
+    result = told.result
+    assert result is not None
+    assert result.frames == 6
+    assert result.edges >= 12
+    assert (result.consistent, result.inconsistent, result.unchecked) == (result.edges, 0, 0)
+    (join,) = result.joins
+    assert (join.from_parent, join.to_parent) == ("ann/a", "bob/b")
+    assert (join.support, join.votes, join.strength) == (result.edges, result.edges, "strong")
+    assert join.transform is not None
+    told_between = (join.transform.parent_frame, join.transform.child_frame)
+    assert told_between == ("bob/b", "ann/a")
+    # x_b = T_b_room T_room_a x_a
+    T, true = np.array(join.transform.matrix), inverse(ORIGINS["bob/b"]) @ ORIGINS["ann/a"]
+    for edge in engine.associations.edges("hall", told.association_id).items:
+        here = pose_of(engine, edge.from_frame)
+        assert difference(T @ here, true @ here)[0] < 0.02
+    assert difference(T, true)[1] < np.radians(0.5)
+    with engine.store.database.read() as connection:
+        kind = events.c.kind == "association.found"
+        data = connection.execute(select(events.c.data).where(kind)).scalar_one()
+    assert data["edges"] == result.edges
+
+
+def pose_of(engine: Engine, frame_id: str) -> Floats:
+    pose = engine.get_frame("hall", frame_id).pose
+    assert pose is not None
+    return np.array(pose.matrix)
+
+
+def test_edges_hold_against_the_truth(engine: Engine, work_off: Callable[[Engine], Any]) -> None:
+    told = done(engine, work_off, sessions=["a", "b"], k=2)
+    edges = engine.associations.edges("hall", told.association_id).items
+    assert [edge.number for edge in edges] == list(range(len(edges)))
+    assert {edge.from_session for edge in edges} == {"a"}
+    for edge in edges:
+        here = ORIGINS["ann/a"] @ pose_of(engine, edge.from_frame)
+        there = ORIGINS["bob/b"] @ pose_of(engine, edge.to_frame)
+        metres, radians = difference(inverse(there) @ here, np.array(edge.transform.matrix))
+        assert metres < 0.05
+        assert radians < np.radians(2.0)
+        assert edge.information is not None
+        information = np.array(edge.information).reshape(6, 6)
+        assert np.linalg.eigvalsh(information).min() > 0
+        assert edge.consistent
+        assert edge.loops == edge.closed
+    counted = [sum(one.from_frame == edge.from_frame for one in edges) for edge in edges]
+    assert max(counted) == 2
+
+
+def test_pages_and_filters_of_edges(engine: Engine, work_off: Callable[[Engine], Any]) -> None:
+    name = done(engine, work_off, sessions=["a", "b"]).association_id
+    every = engine.associations.edges("hall", name).items
+    found, cursor = [], None
+    while True:
+        page = engine.associations.edges("hall", name, cursor, 5)
+        found += page.items
+        cursor = page.next_cursor
+        assert (len(page.items) == 5) or cursor is None
+        if cursor is None:
+            break
+    assert found == every
+    middle = sorted(edge.overlap for edge in every)[len(every) // 2]
+    some = engine.associations.edges("hall", name, limit=4, min_overlap=middle)
+    assert [edge.number for edge in some.items] == [
+        edge.number for edge in every if edge.overlap >= middle
+    ][:4]
+    assert engine.associations.edges("hall", name, consistent=True).items == every
+    assert engine.associations.edges("hall", name, consistent=False).items == []
+    with pytest.raises(InvalidRequest):
+        engine.associations.edges("hall", name, "x")
+
+
+def test_a_slice_that_was_lost_is_done_again_with_the_same_edges(
+    engine: Engine, work_off: Callable[[Engine], Any], due_now: Callable[[Engine], None]
+) -> None:
+    whole = done(engine, work_off, sessions=["a", "b"])
+    begun = engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
+    handler = Associating(engine.store, engine.signers, engine._readers)
+    slices = 0
+    while True:  # a frame a slice, and each is lost once
+        lost = engine.claim("dies")
+        assert isinstance(lost, Task)
+        first = handler(lost, 0.0)
+        due_now(engine)
+        again = engine.claim("lives")
+        assert isinstance(again, Task)
+        assert engine.tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
+        second = handler(again, 0.0)
+        assert asdict(first) == asdict(second)
+        engine.tasks._keep(again, second)
+        slices += 1
+        told = engine.associations.get("hall", begun.association_id)
+        if told.state.over:
+            break
+        assert told.progress is not None
+        assert told.progress.done == slices
+    assert slices == 7  # the last concludes
+    assert told.result == whole.result
+    assert stored(engine, told.association_id) == stored(engine, whole.association_id)
+
+
+def test_loop_closures_are_with_frames_long_before(
+    engine: Engine, work_off: Callable[[Engine], Any]
+) -> None:
+    order = [frame.frame_id for frame in engine.list_frames("hall").items if frame.session == "a"]
+    told = done(engine, work_off, sessions=["a"], apart=2)
+    pairs = [
+        (order.index(edge.from_frame), order.index(edge.to_frame))
+        for edge in engine.associations.edges("hall", told.association_id).items
+    ]
+    assert pairs
+    assert min(i - j for i, j in pairs) == 2
+    assert told.result is not None
+    assert told.result.joins == []
+    # frames are two seconds apart: more than 4 s are three of them
+    timed = done(engine, work_off, sessions=["a"], not_within_s=4.0)
+    pairs = [
+        (order.index(edge.from_frame), order.index(edge.to_frame))
+        for edge in engine.associations.edges("hall", timed.association_id).items
+    ]
+    assert min(i - j for i, j in pairs) == 3
+    none = done(engine, work_off, sessions=["a"])  # 100 apart, and there are six
+    assert none.result is not None
+    assert (none.result.edges, none.result.frames, none.result.validated) == (0, 6, 0)
+
+
+@pytest.mark.parametrize("sessions", [["a", "b"], ["b", "a"]])
+def test_graphs(
+    engine: Engine, work_off: Callable[[Engine], Any], sessions: list[str]
+) -> None:  # the frame of ann is that of the graph, whichever way the join leads
+    name = done(engine, work_off, sessions=sessions).association_id
+    whole = json.loads(engine.associations.graph("hall", name, "json", odometry=True))
+    edges = len(engine.associations.edges("hall", name).items)
+    kinds = [edge["kind"] for edge in whole["edges"]]
+    assert (kinds.count("association"), kinds.count("odometry")) == (edges, 10)
+    assert [vertex["vertex"] for vertex in whole["vertices"]] == list(range(12))
+    assert {vertex["pose"]["parent_frame"] for vertex in whole["vertices"]} == {whole["frame"]}
+    poses = [np.array(vertex["pose"]["matrix"]) for vertex in whole["vertices"]]
+    for edge in whole["edges"]:  # all vertices are in one frame, and edges agree with them
+        T = inverse(poses[edge["first"]]) @ poses[edge["second"]]
+        metres, radians = difference(T, np.array(edge["matrix"]))
+        assert metres < (0.06 if edge["kind"] == "association" else 1e-9)
+        assert radians < (np.radians(2.0) if edge["kind"] == "association" else 1e-6)
+    text = engine.associations.graph("hall", name)
+    lines = [line.split()[0] for line in text.splitlines()]
+    assert (lines.count("VERTEX_SE3:QUAT"), lines.count("EDGE_SE3:QUAT")) == (12, edges)
+    rows = [
+        [float(number) for number in line.split()]
+        for line in engine.associations.graph("hall", name, "tum").splitlines()
+        if not line.startswith("#")
+    ]
+    assert [row[0] for row in rows] == [BEGIN.timestamp() + i for i in range(12)]
+    both = np.array(poses).reshape(2, 6, 4, 4)[:: 1 if sessions[0] == "a" else -1]
+    in_time = both.transpose(1, 0, 2, 3).reshape(12, 4, 4)
+    np.testing.assert_allclose([row[1:4] for row in rows], in_time[:, :3, 3], atol=1e-9)
+
+
+def test_deleted_frames_vanish(engine: Engine, work_off: Callable[[Engine], Any]) -> None:
+    begun = engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
+    handler = Associating(engine.store, engine.signers, engine._readers)
+    task = engine.claim("w")
+    assert isinstance(task, Task)
+    engine.tasks._keep(task, handler(task, time.monotonic() - 1))
+    name = begun.association_id
+    before = engine.associations.edges("hall", name).items
+    assert before
+    assert before[0].consistent is None
+    later = [frame.frame_id for frame in engine.list_frames("hall").items if frame.session == "a"]
+    engine.delete_frame("hall", later[3])
+    engine.delete_frame("hall", before[0].to_frame)
+    with pytest.raises(NotIndexed):
+        engine.associations.graph("hall", name)
+    work_off(engine)
+    told = engine.associations.get("hall", name)
+    assert told.result is not None
+    assert told.result.skipped == 1
+    gone = {later[3], before[0].to_frame}
+    edges = engine.associations.edges("hall", name).items
+    assert edges
+    assert not gone & {one for edge in edges for one in (edge.from_frame, edge.to_frame)}
+    whole = json.loads(engine.associations.graph("hall", name, "json"))
+    assert len(whole["vertices"]) == 10
+    assert not gone & {vertex["frame_id"] for vertex in whole["vertices"]}
+
+
+def test_listed_and_removed(engine: Engine, work_off: Callable[[Engine], Any]) -> None:
+    first = done(engine, work_off, sessions=["a", "b"], candidates=1, k=1)
+    second = engine.associations.begin("hall", NewAssociation(sessions=["b"]))
+    listed = engine.associations.list_all("hall")
+    assert [one.association_id for one in listed.items] == [
+        second.association_id, first.association_id,
+    ]  # fmt: skip
+    page = engine.associations.list_all("hall", limit=1)
+    rest = engine.associations.list_all("hall", page.next_cursor)
+    assert page.items + rest.items == listed.items
+    task = engine.claim("w")
+    assert isinstance(task, Task)
+    for one in (first, second):  # the second while a worker is at it
+        engine.associations.remove("hall", one.association_id)
+        assert stored(engine, one.association_id) == []
+        with pytest.raises(UnknownJob):
+            engine.associations.get("hall", one.association_id)
+    assert engine.run(task) is None
+    assert engine.associations.list_all("hall").items == []
+    with pytest.raises(UnknownMap):
+        engine.associations.list_all("nowhere")
+    signing = engine.list_jobs(kind="sign").items[0].job_id
+    with pytest.raises(UnknownJob, match="association"):
+        engine.associations.get("hall", signing)
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"sessions": ["a", "nobody"]}, "no indexed frame"),
+        ({"sessions": ["a"], "robots": ["bob"]}, "no indexed frame"),
+        ({"sessions": ["a"], "filter": Filter(robot=["bob"])}, "no indexed frame"),
+    ],
+)
+def test_what_cannot_be_associated(engine: Engine, asked: dict[str, Any], words: str) -> None:
+    with pytest.raises(InvalidRequest, match=words):
+        engine.associations.begin("hall", NewAssociation(**asked))
+
+
+def test_a_session_of_two_robots_needs_a_name(
+    engine: Engine, work_off: Callable[[Engine], Any]
+) -> None:
+    with engine.store.database.write() as connection:
+        connection.execute(update(frames).values(session="same"))
+    with pytest.raises(InvalidRequest, match="several robots: 'ann, bob'"):
+        engine.associations.begin("hall", NewAssociation(sessions=["same"]))
+    told = done(engine, work_off, sessions=["same", "same"], robots=["ann", "bob"], k=1)
+    assert told.result is not None
+    (join,) = told.result.joins
+    assert (join.from_robot, join.to_robot, join.from_session) == ("ann", "bob", "same")
+
+
+def test_too_many_frames_are_refused_in_words(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(associating, "MOST_FRAMES", 8)
+    with pytest.raises(InvalidRequest, match="have 12 frames, and an association takes at most 8"):
+        engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
+    late = Filter(captured_after=BEGIN + timedelta(seconds=4))
+    begun = engine.associations.begin("hall", NewAssociation(sessions=["a", "b"], filter=late))
+    assert begun.progress is not None
+    assert begun.progress.total == 4
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"sessions": ["a", "a"]}, "name it once"),
+        ({"sessions": ["a", "b"], "apart": 5}, "in one session"),
+        ({"sessions": ["a", "b"], "robots": ["ann"]}, "one for each session"),
+        ({"sessions": ["a"], "filter": {"not_within_s": 3}}, "beside the filter"),
+        ({"sessions": []}, "at least 1"),
+        ({"sessions": ["a"], "k": 11}, "less than or equal to 10"),
+    ],
+)
+def test_what_makes_no_sense(asked: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        NewAssociation.model_validate(asked)
+    assert NewAssociation(sessions=["a", "a"], robots=["ann", "bob"])
+
+
+def test_a_map_that_is_deleted_meanwhile_ends_the_job_quietly(engine: Engine) -> None:
+    engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
+    task = engine.claim("w")
+    assert isinstance(task, Task)
+    handler = Associating(engine.store, engine.signers, engine._readers)
+    engine.tasks._keep(task, handler(task, 0.0))
+    task = engine.claim("w")
+    assert isinstance(task, Task)
+    engine.delete_map("hall")
+    engine.create_map(NewMap(name="hall", model="compact"))
+    broke: list[bool] = []
+    assert engine.run(task, lambda: broke.append(True)) is None
+    assert broke == []
+    assert engine.associations.list_all("hall").items == []

@@ -1,0 +1,254 @@
+"""Metadata edited: what a patch changes, what it leaves, and who sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import select
+
+from sceneprint.engine import Engine
+from sceneprint.engine.edits import edit_frame, edit_map
+from sceneprint.errors import (
+    FrameConflict,
+    InvalidPose,
+    InvalidRequest,
+    PreconditionFailed,
+    UnknownFrame,
+    UnknownMap,
+)
+from sceneprint.maintenance.fsck import fsck
+from sceneprint.schemas import Filter, Frame, NewMap, Query
+from sceneprint.schemas.browsing import FrameListing
+from sceneprint.store.tables import events
+
+Ids = Callable[[Engine], list[str]]
+EDITABLE = ("robot", "session", "captured_at", "tags", "pose", "base_frame", "T_base_sensor")
+TURN = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]  # 90 degrees about z
+
+
+@pytest.fixture
+def edit(full: Engine, ids: Ids) -> Iterator[Callable[..., Frame]]:
+    """Edit the first frame of `hall`; in the end nothing contradicts."""
+    name = ids(full)[0]
+
+    def change(patch: dict[str, Any], *tags: str) -> Frame:
+        before = full.get_frame("hall", name)
+        told = edit_frame(full.store, "hall", name, patch, tags or None)
+        assert told == full.get_frame("hall", name)
+        rest = {n for n in Frame.model_fields if n not in (*EDITABLE, "etag")}
+        assert {n: getattr(told, n) for n in rest} == {n: getattr(before, n) for n in rest}
+        same = all(getattr(told, n) == getattr(before, n) for n in EDITABLE)
+        assert (told.etag == before.etag) == same
+        return told
+
+    yield change
+    assert list(fsck(full.settings)) == []
+
+
+def test_what_is_left_out_stays_and_null_removes(edit: Callable[..., Frame]) -> None:
+    at = "2026-11-16T10:30:00.250+01:00"
+    one = edit({"robot": "r1", "session": "monday", "captured_at": at, "tags": ["b", "a", "a"]})
+    assert (one.robot, one.session, one.tags) == ("r1", "monday", ["b", "a", "a"])
+    assert one.captured_at is not None
+    assert one.captured_at.isoformat() == "2026-11-16T09:30:00.250000+00:00"
+    two = edit({"session": None, "tags": ["c"]})
+    assert (two.robot, two.session, two.tags, two.captured_at) == (
+        "r1", None, ["c"], one.captured_at,
+    )  # fmt: skip
+    three = edit({"robot": None, "captured_at": None, "tags": None})
+    assert (three.robot, three.tags, three.captured_at) == (None, [], None)
+    assert edit({}) == three
+
+
+def test_a_pose_by_parts(edit: Callable[..., Frame], uploads: tuple[Any, ...]) -> None:
+    was = edit({}).pose
+    assert was is not None
+    renamed = edit({"pose": {"parent_frame": "building"}}).pose
+    assert renamed is not None
+    assert renamed.matrix == was.matrix  # not a digit has changed
+    assert renamed.parent_frame == "building"
+    put = edit({"pose": {"translation": {"x": 1, "y": 2, "z": 3}}}).pose
+    assert put is not None
+    assert np.array(put.matrix)[:3, 3].tolist() == [1, 2, 3]
+    np.testing.assert_allclose(np.array(put.matrix)[:3, :3], uploads[0].pose[:3, :3], atol=1e-12)
+    assert put.parent_frame == "building"
+    turned = edit({"pose": {"rotation": {"x": 0, "y": 0, "z": 1, "w": 0}}}).pose
+    assert turned is not None
+    np.testing.assert_allclose(
+        turned.matrix, [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-12
+    )
+    whole = edit({"pose": {"matrix": TURN}}).pose
+    assert whole is not None
+    assert (whole.matrix, whole.parent_frame) == (TURN, "building")
+    assert edit({"pose": None}).pose is None
+    told = edit({"session": "s", "robot": "r", "pose": {"matrix": TURN}}).pose
+    assert told is not None
+    assert told.parent_frame == "r/s"  # as with an upload
+    kept = edit({"session": "t"}).pose
+    assert kept is not None
+    assert kept.parent_frame == "r/s"  # it stays what it was named then
+    again = edit({"pose": {"parent_frame": None}}).pose
+    assert again is not None
+    assert (again.parent_frame, again.matrix) == ("r/t", TURN)
+
+
+def test_where_the_camera_sits(edit: Callable[..., Frame], full: Engine) -> None:
+    one = edit({"T_base_sensor": {"matrix": TURN}})
+    assert one.T_base_sensor is not None
+    assert (one.base_frame, one.T_base_sensor.matrix) == ("base_link", TURN)
+    two = edit({"T_base_sensor": {"base_frame": "chassis"}})
+    assert two.T_base_sensor is not None
+    assert (two.base_frame, two.T_base_sensor.matrix) == ("chassis", TURN)
+    ply = full.outputs.cloud("hall", one.frame_id, "base").make()
+    optical = full.outputs.cloud("hall", one.frame_id).make()
+    assert b"comment frame chassis\n" in ply
+    a, b = (
+        np.frombuffer(data.partition(b"end_header\n")[2], "<f4").reshape(-1, 6)
+        for data in (optical, ply)
+    )
+    np.testing.assert_allclose(b[:, 0], 1 - a[:, 1], atol=1e-5)
+    np.testing.assert_allclose(b[:, 1], 2 + a[:, 0], atol=1e-5)
+    np.testing.assert_allclose(b[:, 3:], np.stack([-a[:, 4], a[:, 3], a[:, 5]], 1), atol=1e-6)
+    three = edit({"T_base_sensor": None})
+    assert (three.base_frame, three.T_base_sensor) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("patch", "text"),
+    [
+        ({"intrinsics": {}}, "`intrinsics` is part of what the frame is"),
+        ({"depth_scale": 5000}, "`depth_scale` is part of what the frame is"),
+        ({"depth_along_ray": None}, "`depth_along_ray` is part of what the frame is"),
+        ({"state": "indexed"}, "a field 'state' that is not known. Its fields are robot, session"),
+        ({"robot": ""}, "robot: "),
+        ({"robot": 5}, "robot: "),
+        ({"tags": "a"}, "tags: "),
+        ({"tags": ["a"] * 33}, "tags: "),
+        ({"captured_at": "2026-11-16T10:30:00"}, "captured_at: "),
+        ({"pose": 5}, "pose: "),
+        ({"pose": {"translation": {"x": 1}}}, "pose.translation.y: "),
+        ({"pose": {"matrix": TURN, "translation": {"x": 1, "y": 2, "z": 3}}}, "pose: give "),
+        ({"pose": {"nose": 1}}, "pose.nose: "),
+        ({"pose": {"parent_frame": None}}, "name its parent_frame, or the session"),
+        ({"T_base_sensor": {"base_frame": "b"}}, "T_base_sensor: give "),
+    ],
+)
+def test_what_cannot_be_is_refused_and_nothing_changes(
+    full: Engine, ids: Ids, patch: dict[str, Any], text: str
+) -> None:
+    name = ids(full)[0]
+    before = full.get_frame("hall", name)
+    with pytest.raises(InvalidRequest) as told:
+        edit_frame(full.store, "hall", name, {"tags": ["x"], **patch})
+    assert text in str(told.value)
+    assert told.value.fields
+    assert full.get_frame("hall", name) == before
+
+
+def test_a_pose_that_is_not_rigid_is_refused(full: Engine, ids: Ids) -> None:
+    with pytest.raises(InvalidPose):
+        edit_frame(full.store, "hall", ids(full)[0], {"pose": {"matrix": np.ones((4, 4)).tolist()}})
+    with pytest.raises(InvalidPose):
+        edit_frame(
+            full.store, "hall", ids(full)[0],
+            {"pose": {"rotation": {"x": 0, "y": 0, "z": 0, "w": 2}}},
+        )  # fmt: skip
+
+
+def test_lists_and_queries_see_it_at_once(full: Engine, ids: Ids) -> None:
+    first, second, *_ = ids(full)
+    asked = Query(stages=("retrieve",), filter=Filter(tags=["seen"]))
+    assert full.query_frame("hall", second, asked).matches == []
+    edit_frame(full.store, "hall", first, {"tags": ["seen"], "pose": {"parent_frame": "p"}})
+    assert [one.frame_id for one in full.query_frame("hall", second, asked).matches] == [first]
+    for wanted in (FrameListing(tag=["seen"]), FrameListing(parent_frame="p")):
+        assert [one.frame_id for one in full.list_frames("hall", wanted=wanted).items] == [first]
+    box = {"parent_frame": "p", "min": {"x": 6, "y": 6, "z": 6}, "max": {"x": 8, "y": 8, "z": 8}}
+    inside = Query.model_validate({"stages": ["retrieve"], "filter": {"region": box}})
+    assert full.query_frame("hall", second, inside).matches == []
+    edit_frame(full.store, "hall", first, {"pose": {"translation": {"x": 7, "y": 7, "z": 7}}})
+    assert [one.frame_id for one in full.query_frame("hall", second, inside).matches] == [first]
+    edit_frame(full.store, "hall", first, {"pose": None, "tags": []})
+    assert full.query_frame("hall", second, inside).matches == []
+    assert full.query_frame("hall", second, asked).matches == []
+
+
+def test_events_tell_what_was_edited(full: Engine, ids: Ids) -> None:
+    name = ids(full)[0]
+    edit_frame(full.store, "hall", name, {"robot": "r", "tags": []})  # it had no tags
+    edit_frame(full.store, "hall", name, {"robot": "r"})
+    edit_map(full.store, "hall", {"title": "The hall"})
+    edit_map(full.store, "hall", {"title": "The hall"})
+    with full.store.database.read() as connection:
+        edited = events.c.kind.like("%.edited")
+        found = connection.execute(select(events).where(edited).order_by(events.c.number)).all()
+    assert [(one.kind, one.map, one.frame_id, one.data) for one in found] == [
+        ("frame.edited", "hall", name, {"fields": ["robot"]}),
+        ("map.edited", "hall", None, {"fields": ["title"]}),
+    ]
+
+
+def test_an_upload_is_compared_with_what_it_is_by_now(full: Engine, uploads: Any, ids: Ids) -> None:
+    one, name = uploads[0], ids(full)[0]
+    edit_frame(full.store, "hall", name, {"robot": "r1"})
+    with pytest.raises(FrameConflict, match="other robot"):
+        full.add_frame("hall", one.data, one.meta)
+    now = one.meta.model_copy(update={"robot": "r1"})
+    added, new = full.add_frame("hall", one.data, now)
+    assert (added.frame_id, new) == (name, False)
+
+
+def test_of_many_who_read_the_same_one_edits(full: Engine, ids: Ids) -> None:
+    name = ids(full)[0]
+    tag = full.get_frame("hall", name).etag
+    assert tag is not None
+
+    def one(i: int) -> bool:
+        with suppress(PreconditionFailed):
+            edit_frame(full.store, "hall", name, {"robot": f"r{i}"}, [tag])
+            return True
+        return False
+
+    with ThreadPoolExecutor(8) as pool:
+        won = list(pool.map(one, range(8)))
+    assert won.count(True) == 1
+    assert full.get_frame("hall", name).robot == f"r{won.index(True)}"
+    with pytest.raises(PreconditionFailed, match="has been edited since it was read") as told:
+        edit_frame(full.store, "hall", name, {"robot": None}, [tag])
+    now = full.get_frame("hall", name).etag
+    assert f'"{now}"' in str(told.value)
+    # back as it was: what was read is what is there
+    edit_frame(full.store, "hall", name, {"robot": None})
+    assert edit_frame(full.store, "hall", name, {"robot": "x"}, ["other", tag]).robot == "x"
+
+
+def test_a_map_has_a_title(full: Engine) -> None:
+    before = full.get_map("hall")
+    assert before.etag is not None
+    told = edit_map(full.store, "hall", {"title": "Küche"}, [before.etag])
+    assert (told.title, told) == ("Küche", full.get_map("hall"))
+    with pytest.raises(PreconditionFailed, match="Map 'hall' has been edited"):
+        edit_map(full.store, "hall", {"title": None}, [before.etag])
+    assert edit_map(full.store, "hall", {}) == told
+    assert edit_map(full.store, "hall", {"title": None}).title is None
+    for bad in ({"name": "x"}, {"title": "x" * 201}, {"title": 5}):
+        with pytest.raises(InvalidRequest):
+            edit_map(full.store, "hall", bad)
+    full.create_map(NewMap(name="other", model="compact"))
+    assert full.get_map("other").etag != full.get_map("hall").etag
+    with pytest.raises(UnknownMap):
+        edit_map(full.store, "nowhere", {"title": "x"})
+
+
+def test_a_deleted_frame_is_not_edited(full: Engine, ids: Ids) -> None:
+    name = ids(full)[0]
+    full.delete_frame("hall", name)
+    with pytest.raises(UnknownFrame, match="was deleted"):
+        edit_frame(full.store, "hall", name, {"robot": "r"})
+    with pytest.raises(UnknownFrame):
+        edit_frame(full.store, "hall", "nobody", {"robot": "r"})

@@ -1,0 +1,103 @@
+"""An import goes on where its last slice was stored, whatever was done in between."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+import time
+from typing import Any
+
+import pytest
+
+from sceneprint.engine import Engine, imports
+from sceneprint.engine.tasks import Task
+from sceneprint.errors import UnknownMap
+from sceneprint.schemas import Job, JobState
+from sceneprint.schemas.ingest import ImportOptions
+from sceneprint.store.parts import files_of
+
+
+def packed(uploads: Any) -> bytes:
+    made = io.BytesIO()
+    camera = uploads[0].meta.intrinsics.model_dump(exclude={"distortion"})
+    with tarfile.open(fileobj=made, mode="w:gz") as archive:
+        members = {"run/intrinsics.json": json.dumps(camera).encode()}
+        members |= {f"run/{i}.png": one.data for i, one in enumerate(uploads)}
+        for name, data in members.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            archive.addfile(info, io.BytesIO(data))
+    return made.getvalue()
+
+
+def begun(engine: Engine, data: bytes, map_name: str = "hall") -> Job:
+    with engine.imports.receive(map_name) as receiver:
+        receiver.write(data)
+        archive = receiver.end()
+    return engine.imports.begin(map_name, archive, ImportOptions())[0]
+
+
+def claimed(engine: Engine) -> Task:
+    while True:  # frames that wait to be signed are left waiting
+        work = engine.claim("test")
+        if isinstance(work, Task):
+            return work
+        assert work is not None
+
+
+def test_a_slice_that_was_lost_is_done_again(
+    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(imports, "_AT_ONCE", 2)
+    job = begun(empty, packed(uploads[:5]))
+    task = claimed(empty)
+    over = time.monotonic() - 1  # at least some are taken, so that it comes to an end
+    lost = empty.imports.handle(task, over)  # and is never stored: its worker died
+    assert [one["status"] for one in lost.items] == [202, 202]
+    assert lost.progress["done"] == 2
+    assert list(empty.imports.items("hall", job.job_id).items) == []
+    again = empty.imports.handle(task, over)
+    assert [one["status"] for one in again.items] == [200, 200]
+    assert [one["frame_id"] for one in again.items] == [one["frame_id"] for one in lost.items]
+    assert empty.run(task) == JobState.SUCCEEDED  # there is time for all now
+    told = empty.imports.get("hall", job.job_id)
+    assert told.result == {
+        "sequences": 1, "received": 3, "there": 2, "refused": 0, "ignored": 0,
+    }  # fmt: skip
+    page = empty.imports.items("hall", job.job_id, limit=3)
+    rest = empty.imports.items("hall", job.job_id, page.next_cursor, 3)
+    assert [one.name for one in (*page.items, *rest.items)] == [f"run/{i}.png" for i in range(5)]
+    assert rest.next_cursor is None
+    assert len(empty.list_frames("hall").items) == 5
+
+
+def test_an_archive_stays_until_its_import_is_over_and_no_longer(
+    empty: Engine, uploads: Any
+) -> None:
+    data = packed(uploads[:1])
+    begun(empty, data)
+    task = claimed(empty)
+    with empty.store.database.read() as connection:
+        [file] = files_of(connection, task.claim.job.number).values()
+    assert empty.store.blobs.holds(file.blob)
+    assert file.bytes == empty.store.blobs.size(file.blob)
+    assert empty.run(task) == JobState.SUCCEEDED
+    assert not empty.store.blobs.holds(file.blob)
+    job = begun(empty, data)  # the same archive again, which is damaged meanwhile
+    task = claimed(empty)
+    empty.store.blobs.path(file.blob).write_bytes(b"no tar")
+    assert empty.run(task) == JobState.FAILED
+    assert "neither a zip nor a tar" in str(empty.get_job(job.job_id).error)
+    assert not empty.store.blobs.holds(file.blob)
+
+
+def test_nothing_is_left_of_an_archive_that_was_refused(empty: Engine, uploads: Any) -> None:
+    before = sorted(empty.store.blobs.digests())
+    with pytest.raises(UnknownMap):
+        begun(empty, packed(uploads[:1]), "nowhere")
+    with pytest.raises(OSError, match="gone"), empty.imports.receive("hall") as receiver:  # noqa: PT012
+        receiver.write(packed(uploads[:1])[:3000])
+        raise ConnectionError("gone")
+    assert sorted(empty.store.blobs.digests()) == before
+    assert list(empty.settings.blob_dir.glob(".*")) == []

@@ -1,0 +1,252 @@
+"""After a query: the same answer, its points, its ranking, and what a match rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.clouds import points_of
+from sceneprint.engine import Engine
+from sceneprint.engine.transforms import transform
+from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
+from sceneprint.geometry.covariance import adjoint
+from sceneprint.pipeline import Signature, distance, validate
+from sceneprint.schemas import Answer, Query, ValidationOptions
+from sceneprint.store.frames import find_frame
+from sceneprint.store.maps import find_map
+from sceneprint.store.signatures import geometry_blobs
+from sceneprint.types import Geometry
+
+Prepared = list[tuple[Signature, Geometry]]
+Ids = Callable[[Engine], list[str]]
+
+
+def vertices(data: bytes) -> tuple[list[str], np.ndarray[Any, Any]]:
+    """Comments and rows of a PLY file of points, normals and, if it has them, colours."""
+    head, body = data.split(b"end_header\n", 1)
+    lines = head.decode("ascii").splitlines()
+    kinds = [(line.split()[2], "u1" if " uchar " in line else "<f4")
+             for line in lines if line.startswith("property")]  # fmt: skip
+    return [one[8:] for one in lines if one.startswith("comment ")], np.frombuffer(body, kinds)
+
+
+def xyz(rows: np.ndarray[Any, Any], of: tuple[str, ...] = ("x", "y", "z")) -> Any:
+    return np.stack([rows[name] for name in of], axis=1)
+
+
+@pytest.fixture
+def asked(full: Engine, ids: Ids) -> Answer:
+    return full.query_frame("hall", ids(full)[3], Query(k=2, seed=5))
+
+
+def test_the_answer_is_had_again(full: Engine, uploads: Any, asked: Answer) -> None:
+    again = full.inspection.answer(asked.query_id)
+    assert again.model_dump_json() == asked.model_dump_json()
+    one = uploads[2]
+    silent = full.query_upload("hall", one.data, one.meta, Query(k=1, keep=False))
+    with pytest.raises(UnknownQuery, match="no answer"):
+        full.inspection.answer(silent.query_id)
+
+
+def test_the_cloud_is_what_the_query_saw(
+    full: Engine, uploads: Any, prepared: Prepared, asked: Answer, ids: Ids
+) -> None:
+    comments, rows = vertices(full.inspection.cloud(asked.query_id))
+    points, normals = points_of(prepared[3][1].surface)
+    assert xyz(rows).tobytes() == points.tobytes()
+    assert xyz(rows, ("nx", "ny", "nz")).tobytes() == normals.tobytes()
+    assert comments[0] == f"frame {ids(full)[3]}.optical"
+    unseen = full.query_frame("hall", ids(full)[3], Query(k=1, stages=("retrieve",)))
+    for call in (
+        lambda: full.inspection.cloud(unseen.query_id),
+        lambda: full.inspection.match(unseen.query_id, unseen.matches[0].frame_id),
+    ):
+        with pytest.raises(NotIndexed, match="without validation"):
+            call()
+
+
+def test_similarities_are_those_of_the_signatures(
+    full: Engine, prepared: Prepared, asked: Answer, ids: Ids, signer: Any
+) -> None:
+    told = full.inspection.similarities(asked.query_id)
+    numbers = {frame_id: i for i, frame_id in enumerate(ids(full))}
+    ranked = [numbers[one.frame_id] for one in told.frames]
+    assert len(ranked) == 11
+    assert sorted(ranked) == [i for i in range(12) if i != 3]
+    for match in asked.matches:
+        assert told.frames[match.rank - 1].frame_id == match.frame_id
+    every = [3, *ranked]
+    scale = signer.model.unrelated_distance
+    for i, a in enumerate(every):
+        for j, b in enumerate(every):
+            share = 1 - distance(prepared[a][0], prepared[b][0]) / scale
+            assert told.similarity[i][j] == pytest.approx(min(max(share, 0), 1), abs=5e-5)
+    full.delete_frame("hall", told.frames[0].frame_id)
+    fewer = full.inspection.similarities(asked.query_id, 3)
+    assert fewer.frames == told.frames[1:3]
+    assert fewer.similarity == [[told.similarity[i][j] for j in (0, 2, 3)] for i in (0, 2, 3)]
+
+
+def test_a_match_is_validated_as_the_query_was(full: Engine, prepared: Prepared, ids: Ids) -> None:
+    strict = ValidationOptions(residual_m=1e-6)
+    names = ids(full)
+    answer = full.query_frame("hall", names[3], Query(k=2, seed=5, validation=strict))
+    assert {one.validation.status for one in answer.matches} == {"rejected"}
+    for match in answer.matches[:3]:
+        told = full.inspection.match(answer.query_id, match.frame_id)
+        assert told.validation == match.validation
+        assert told.transform == match.transform
+        assert (told.seed, told.map, told.uncertainty) == (5, "hall", None)
+
+
+def test_what_a_match_rests_on(full: Engine, prepared: Prepared, asked: Answer, ids: Ids) -> None:
+    names, best = ids(full), asked.matches[0]
+    told = full.inspection.match(asked.query_id, best.frame_id)
+    query, match = prepared[3][1], prepared[names.index(best.frame_id)][1]
+    v = validate(query, match, 5)
+    assert told.validation == best.validation
+    assert (told.transform, told.uncertainty) == (best.transform, best.uncertainty)
+    assert told.uncertainty is not None
+    assert v.covariance is not None
+    assert told.uncertainty.covariance == v.covariance.ravel().tolist()
+    named = f"{best.frame_id}.optical", f"{names[3]}.optical"
+    assert told.rival == (None if v.T_rival is None else transform(v.T_rival, *named))
+    assert told.query is not None
+    assert told.match is not None
+    counted = len(told.query.inliers) + len(told.match.inliers)
+    assert counted == v.inliers
+    against = len(told.query.violations) + len(told.match.violations)
+    assert against / max(against + counted, 1) == pytest.approx(v.violations)
+    assert told.patches is not None
+    T, pairs = v.T_match_query, told.patches
+    assert T is not None
+    assert len(pairs.query) == len(set(pairs.query)) == len(set(pairs.match)) > 20
+    for k, (i, j) in enumerate(zip(pairs.query, pairs.match, strict=True)):
+        there = T[:3, :3] @ query.patches.means[i] + T[:3, 3]
+        apart = np.linalg.norm(there - match.patches.means[j])
+        assert pairs.distance_m[k] == pytest.approx(apart, abs=6e-5)
+        assert pairs.query_mean[k] == pytest.approx(query.patches.means[i], abs=6e-5)
+        assert pairs.match_normal[k] == pytest.approx(match.patches.normals[j], abs=6e-5)
+
+
+def test_overlays_lie_in_the_frame_of_the_match(
+    full: Engine, prepared: Prepared, asked: Answer, ids: Ids
+) -> None:
+    names, best = ids(full), asked.matches[0]
+    query, match = prepared[3][1], prepared[names.index(best.frame_id)][1]
+    ours, theirs = points_of(query.surface)[0], points_of(match.surface)[0]
+    comments, rows = vertices(full.inspection.overlay(asked.query_id, best.frame_id))
+    assert comments[0] == f"frame {best.frame_id}.optical"
+    assert len(rows) == len(ours) + len(theirs)
+    assert best.transform is not None
+    T = np.array(best.transform.matrix)
+    np.testing.assert_allclose(
+        xyz(rows)[: len(ours)], ours.astype(float) @ T[:3, :3].T + T[:3, 3], atol=1e-5
+    )
+    assert xyz(rows)[len(ours) :].tobytes() == theirs.tobytes()
+    colours = xyz(rows, ("red", "green", "blue"))
+    assert len(np.unique(colours[: len(ours)], axis=0)) == 1
+    assert len(np.unique(colours[len(ours) :], axis=0)) == 1
+    assert (colours[0] != colours[-1]).any()
+    _, apart = vertices(
+        full.inspection.overlay(asked.query_id, best.frame_id, by="none", colour="residual")
+    )
+    assert xyz(apart)[: len(ours)].tobytes() == ours.tobytes()
+    _, laid = vertices(full.inspection.overlay(asked.query_id, best.frame_id, colour="residual"))
+
+    def green(rows: Any) -> float:
+        return float((rows["green"] == 130).mean())
+
+    assert green(laid) > 3 * green(apart)
+    _, shaded = vertices(full.inspection.overlay(asked.query_id, best.frame_id, colour="normal"))
+    np.testing.assert_allclose(
+        xyz(shaded, ("red", "green", "blue")) / 127.5 - 1, xyz(shaded, ("nx", "ny", "nz")),
+        atol=0.5 / 127 + 1e-3,
+    )  # fmt: skip
+
+
+def test_what_is_not_there_is_refused(full: Engine, asked: Answer, ids: Ids) -> None:
+    look, best = full.inspection, asked.matches[0].frame_id
+    elsewhere = ids(full)[6:]
+    far = next(m for m in asked.matches if m.frame_id in elsewhere)
+    with pytest.raises(InvalidRequest, match="has no rival"):
+        look.overlay(asked.query_id, far.frame_id, by="rival")
+    with pytest.raises(UnknownFrame, match="has no match"):
+        look.match(asked.query_id, ids(full)[3])
+    with pytest.raises(UnknownFrame, match="in map 'attic'"):
+        look.match(asked.query_id, best, "attic")
+    full.delete_frame("hall", best)
+    for call in (look.match, look.overlay):
+        with pytest.raises(UnknownFrame, match="was deleted"):
+            call(asked.query_id, best)
+    assert look.answer(asked.query_id) == asked
+
+
+def test_a_damaged_match_is_made_again(
+    full: Engine, asked: Answer, work_off: Callable[[Engine], Any]
+) -> None:
+    best = asked.matches[0]
+    with full.store.database.read() as connection:
+        row = find_map(connection, "hall")
+        number = find_frame(connection, row, best.frame_id).number
+        blob = geometry_blobs(connection, [number], row.model_id)[number]
+    full.store.blobs.path(blob).write_bytes(b"damaged")
+    with pytest.raises(DamagedBlob):
+        full.inspection.match(asked.query_id, best.frame_id)
+    assert len(work_off(full)) == 1
+    assert full.inspection.match(asked.query_id, best.frame_id).transform == best.transform
+
+
+def test_answers_speak_of_the_robots_base(
+    full: Engine, make_upload: Callable[..., Any], uploads: Any
+) -> None:
+    base = np.eye(4)  # the camera looks ahead, 0.2 m before the base's middle and 0.5 m above
+    base[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    base[:3, 3] = (0.2, 0.0, 0.5)
+    sent = {"T_base_sensor": {"base_frame": "base", "matrix": base.tolist()}}
+    one = make_upload(replace(uploads[8].frame, pose=uploads[8].pose), "room-001", **sent)
+    answer = full.query_upload("hall", one.data, one.meta, Query(k=2))
+    best, there = answer.matches[0], answer.location
+    assert there is not None
+    for camera, robot in ((best.pose_in_map, best.base_in_map), (there.pose, there.base)):
+        assert camera is not None
+        assert robot is not None
+        assert (robot.parent_frame, robot.child_frame) == (camera.parent_frame, "base")
+        np.testing.assert_allclose(
+            np.array(robot.matrix) @ base, np.array(camera.matrix), atol=1e-12
+        )
+        # where the camera is, as the base sees it
+        back = np.linalg.inv(robot.matrix) @ np.array(camera.matrix)
+        np.testing.assert_allclose(back[:3, 3], (0.2, 0.0, 0.5), atol=1e-12)
+    told = full.inspection.answer(answer.query_id)
+    assert told.location == there
+    plain = full.query_upload("hall", uploads[8].data, uploads[8].meta, Query(k=1))
+    assert plain.matches[0].base_in_map is None
+    assert plain.location is not None
+    assert plain.location.base is None
+
+
+def test_the_uncertainty_of_a_place_is_told_in_its_axes(full: Engine, uploads: Any) -> None:
+    one = uploads[8]
+    answer = full.query_upload("hall", one.data, one.meta, Query(k=1))
+    (match,) = [m for m in answer.matches if m.validation.status == "accepted"]
+    assert answer.location is not None
+    assert answer.location.uncertainty is not None
+    assert match.uncertainty is not None
+    assert match.pose_in_map is not None
+    assert match.transform is not None
+    own = np.array(match.uncertainty.covariance).reshape(6, 6)
+    told = np.array(answer.location.uncertainty.covariance).reshape(6, 6)
+    T_map_match = np.array(match.pose_in_map.matrix) @ np.linalg.inv(match.transform.matrix)
+    A = adjoint(T_map_match[:3, :3], np.zeros(3))
+    np.testing.assert_allclose(told, A @ own @ A.T, rtol=1e-6, atol=1e-12)
+    assert np.linalg.eigvalsh(told).min() > 0
+    assert 1e-3 < np.sqrt(np.trace(told[:3, :3])) < 0.1
+    assert answer.location.uncertainty.method == "votes-and-spread"
+    assert match.uncertainty.method == "information-scaled"
+    rest = [m for m in answer.matches if m.validation.status != "accepted"]
+    assert [m.uncertainty for m in rest] == [None] * len(rest)

@@ -1,0 +1,234 @@
+"""Figures, models, retention of events, and what is held of maps that are gone."""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import os
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from sqlalchemy import func, select, update
+
+from sceneprint.engine import Engine, readers, statistics
+from sceneprint.engine import sizes as measuring
+from sceneprint.engine.lags import anchors
+from sceneprint.engine.latencies import Latencies, bin_of
+from sceneprint.errors import Conflict, InvalidRequest, UnknownMap
+from sceneprint.models import PRESETS, read_model
+from sceneprint.schemas import NewMap, Query
+from sceneprint.store.events import Wanted, tell
+from sceneprint.store.samples import add_sample, samples_since
+from sceneprint.store.tables import events, jobs, samples
+
+Make = Callable[..., Engine]
+
+
+@pytest.fixture
+def data(signed_folder: Path, tmp_path: Path) -> Path:
+    shutil.copytree(signed_folder, tmp_path / "data")
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def noon(monkeypatch: pytest.MonkeyPatch) -> float:
+    """A time that does not go on, half a minute after a full one."""
+    at = 1_800_000_030.0
+    assert at % 60 == 30
+    monkeypatch.setattr(statistics.time, "time", lambda: at)
+    return at
+
+
+def test_history_is_that_of_all_processes(make_engine, noon):
+    engine = make_engine()
+    engine.create_map(NewMap(name="hall"))
+    times = {"a": [0.1] * 98 + [3.0, 3.0], "b": [0.1] * 100}
+    with engine.store.database.write() as connection:
+        connection.execute(events.delete())
+        for ago, kind, name in (
+            (5, "received", "hall"), (5, "indexed", "hall"), (65, "indexed", "hall"),
+            (65, "indexed", "shop"), (100, "deleted", "hall"), (700, "received", "hall"),
+        ):  # fmt: skip
+            tell(connection, f"frame.{kind}", name)
+            number = select(func.max(events.c.number)).scalar_subquery()
+            connection.execute(
+                update(events).where(events.c.number == number).values(at=noon - ago)
+            )
+        for process, ago, statuses, queries in (
+            ("a", 20, {"200": 7, "404": 2, "503": 1}, {"found": 3}),
+            ("b", 20, {"200": 1, "500": 4}, {"found": 2, "not_found": 5}),
+            ("a", 40, {"429": 6}, {}),
+            ("b", 700, {"200": 99}, {}),
+        ):
+            kept = Latencies()
+            for seconds in times[process] if ago == 20 else ():
+                kept.add(seconds)
+            told = {"statuses": statuses, "queries": queries, "latencies": kept.as_json()}
+            add_sample(connection, "service", process, told)
+            number = select(func.max(samples.c.number)).scalar_subquery()
+            connection.execute(
+                update(samples).where(samples.c.number == number).values(at=noon - ago)
+            )
+    stats = engine.operations.statistics.tell(3)
+    assert [one.at.timestamp() - noon for one in stats.minutes] == [-150, -90, -30]
+    assert [one.received for one in stats.minutes] == [0, 0, 1]
+    assert [one.indexed for one in stats.minutes] == [0, 2, 1]
+    assert [one.deleted for one in stats.minutes] == [1, 0, 0]  # 100 s ago: two minutes before
+    last = stats.minutes[-1]
+    assert last.queries == {"found": 5, "not_found": 5}
+    assert (last.requests, last.refused, last.busy, last.broken) == (15, 2, 1, 4)
+    assert (stats.minutes[1].requests, stats.minutes[1].refused) == (6, 6)
+    assert (stats.total.requests, stats.total.refused, stats.total.received) == (21, 8, 1)
+    assert stats.minutes[1].latency is None
+    assert last.latency is not None
+    assert bin_of(last.latency.p50) == bin_of(last.latency.p95) == bin_of(0.1)
+    assert bin_of(last.latency.p99) == bin_of(0.1)  # the 198th of 200; the 199th took 3 s
+    own = engine.operations.statistics.tell(3, "hall")
+    assert [one.indexed for one in own.minutes] == [0, 1, 1]
+    assert (own.total.queries, own.total.latency, own.workers, own.bytes) == (None,) * 4
+    with pytest.raises(UnknownMap):
+        engine.operations.statistics.tell(3, "shop")
+
+
+def test_what_waits_and_who_works(make_engine, uploads):
+    engine = make_engine()
+    for name in ("hall", "shop"):
+        engine.create_map(NewMap(name=name, model="compact"))
+    for i in range(3):
+        engine.add_frame("shop" if i else "hall", uploads[i].data, uploads[i].meta)
+    with engine.store.database.write() as connection:
+        for number in (1, 2, 3):
+            made = time.time() - 100 * number
+            connection.execute(update(jobs).where(jobs.c.number == number).values(created_at=made))
+    stats = engine.operations.statistics.tell(1)
+    assert (stats.maps, stats.frames, stats.jobs) == (2, {"received": 3}, {"queued": 3})
+    assert stats.waiting == 3
+    assert stats.oldest_waiting_s == pytest.approx(100, abs=20)  # that of the least number
+    of_shop = engine.operations.statistics.tell(1, "shop")
+    assert (of_shop.frames, of_shop.jobs, of_shop.waiting) == ({"received": 2}, {"queued": 2}, 2)
+    assert of_shop.oldest_waiting_s == pytest.approx(200, abs=20)
+    assert stats.workers == []
+    work = engine.claim("far:17")
+    with engine.bell.listen():
+        stats = engine.operations.statistics.tell(1)
+    assert work is not None
+    here = f"{os.uname().nodename}:{os.getpid()}"
+    assert stats.workers is not None
+    assert {one.name: one.job_id for one in stats.workers} == {
+        "far:17": work.claim.job.id, here: None
+    }  # fmt: skip
+    assert engine.operations.statistics.tell(1).workers == [stats.workers[0]]
+    engine.put_back(work)
+    assert engine.operations.statistics.tell(1).workers == []
+
+
+def test_indexes_and_sizes_are_told(data, make_engine):
+    engine = make_engine(data)
+    indexed = engine.get_map("hall").frames["indexed"]
+    (index,) = engine.operations.statistics.tell(1).indexes
+    assert (index.map, index.generation, index.tail) == ("hall", None, indexed)
+    engine.rebuild_index("hall")
+    (index,) = engine.operations.statistics.tell(1).indexes
+    assert (index.generation, index.tail) == (1, 0)
+    told = measuring.sizes(engine.settings)
+    assert told.index == sum(p.stat().st_size for p in (data / "index").rglob("*") if p.is_file())
+    assert told.blobs == sum(p.stat().st_size for p in (data / "blobs").rglob("*") if p.is_file())
+    assert told.database is not None
+    assert told.database >= (data / "sceneprint.db").stat().st_size
+    assert told.free == pytest.approx(shutil.disk_usage(data).free, rel=0.2)
+
+
+def test_many_blobs_are_measured_by_a_part_of_them(make_engine, monkeypatch):
+    engine = make_engine()
+    for i in range(600):
+        digest = hashlib.sha256(bytes([i % 256, i // 256])).hexdigest()  # unlike `put`, no fsync
+        path = engine.settings.blob_dir / digest[:2] / digest
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(bytes(1001))
+    assert measuring.sizes(engine.settings).blobs == 600 * 1001
+    monkeypatch.setattr(measuring, "MEASURED", 150)
+    assert measuring.sizes(engine.settings).blobs == pytest.approx(600 * 1001, rel=0.25)
+
+
+def test_samples_are_forgotten_after_two_hours(make_engine):
+    engine = make_engine()
+    with engine.store.database.write() as connection:
+        for ago in (7300.0, 7100.0, 0.0):
+            add_sample(connection, "service", "a", {"ago": ago})
+            number = select(func.max(samples.c.number)).scalar_subquery()
+            connection.execute(
+                update(samples).where(samples.c.number == number).values(at=time.time() - ago)
+            )
+        add_sample(connection, "service", "a", {"ago": -1})
+        found = [one.data["ago"] for one in samples_since(connection, "service", 0.0)]
+    assert found == [7100.0, 0.0, -1]
+
+
+def test_events_that_are_not_kept_go_and_no_index_is_doubted(data, make_engine):
+    engine = make_engine(data, events_kept=1000)
+    engine.rebuild_index("hall")
+    (anchor,) = anchors(engine.settings.indexes)
+    before = engine.operations.events(Wanted(), limit=1).newest
+    with engine.store.database.write() as connection:
+        for _ in range(2500):
+            tell(connection, "frame.received", "hall")
+    assert engine.operations.tidy() == 0  # it is not time yet
+    # of what was there before the newest 1000, the anchor stays, and the last of the map
+    floor = before + 1500
+    assert engine.operations.remove_spent() == floor - 2
+    assert engine.operations.remove_spent() == 0
+    page = engine.operations.events(Wanted(), limit=1000)
+    assert [one.id for one in page.items[:3]] == [anchor, floor, floor + 1]
+    other = make_engine(data)
+    answer = other.query_frame("hall", other.list_frames("hall").items[0].frame_id,
+                               Query(stages=("retrieve",)))  # fmt: skip
+    assert answer.index_generation == 1
+
+
+def test_a_map_that_another_process_deleted_is_let_go(data, make_engine, monkeypatch):
+    monkeypatch.setattr(readers, "_TIDY_S", 1e9)  # by `forget_gone` alone
+    engine, other = make_engine(data), make_engine(data)
+    engine.rebuild_index("hall")
+    frame = engine.list_frames("hall").items[0].frame_id
+    engine.query_frame("hall", frame, Query(stages=("retrieve",)))
+
+    def mapped() -> list[str]:
+        gc.collect()
+        index = str(data / "index")
+        return [line for line in Path("/proc/self/maps").read_text().splitlines() if index in line]
+
+    assert mapped()
+    engine.forget_gone()
+    assert mapped()  # it is there
+    other.delete_map("hall")
+    assert mapped()
+    engine.forget_gone()
+    assert mapped() == []
+
+
+def test_models_are_listed_with_the_maps_that_may_be_named(make_engine, small_model):
+    engine = make_engine()
+    for name in ("hall", "shop"):
+        engine.create_map(NewMap(name=name, model="compact"))
+    engine.reencode("shop", small_model)
+    found = {one.name: one for one in engine.operations.models(lambda name: name != "hall")}
+    assert list(found) == [*PRESETS, "small"]
+    compact, small = read_model("compact"), found["small"]
+    assert found["compact"].maps == ["shop"]
+    assert (small.maps, small.preset, found["compact"].preset) == (["shop"], False, True)
+    assert found["paper"].maps == []
+    assert (small.components, small.levels, small.signature_bytes) == (8, 2, 25 * 8 * 2)
+    assert small.unrelated_distance == 1000.0
+    assert small.parameters["segmentation"]["n_patches"] == 150
+    assert small.provenance == {"made": "by a test"}
+    assert found["compact"].model_id == compact.id
+    for name in ("small", "/etc/passwd", "", small_model.id[:12]):
+        with pytest.raises(InvalidRequest, match="There is no model"):
+            engine.operations.catalogue.find(name)
+    for name in (small_model.id, small_model.label):
+        assert engine.operations.catalogue.find(name).id == small_model.id
+    with pytest.raises(Conflict, match="is being signed with"):
+        engine.reencode("shop", engine.operations.catalogue.find("paper"))

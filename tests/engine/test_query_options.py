@@ -1,0 +1,310 @@
+"""Options of a query: each does what it says, and says why."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import update
+
+from sceneprint.engine import Engine, searching
+from sceneprint.engine.deadlines import FIRST_S, Deadline
+from sceneprint.errors import UnknownFrame
+from sceneprint.geometry.diversity import DiversityParameters, diversify
+from sceneprint.geometry.retrieval import distances, pairwise_distances
+from sceneprint.pipeline import Signature, Signer, retrieve, validate
+from sceneprint.schemas import Answer, Query
+from sceneprint.store.tables import frames
+from sceneprint.types import Geometry
+
+Prepared = list[tuple[Signature, Geometry]]
+Ids = Callable[[Engine], list[str]]
+VR = ("retrieve", "validate")
+
+
+def ask(engine: Engine, frame_id: str, **how: Any) -> Answer:
+    return engine.query_frame("hall", frame_id, Query.model_validate({"keep": False, **how}))
+
+
+def told(answer: Answer, *without: str) -> str:
+    """Its bytes, but for who it is and how long it took."""
+    return answer.model_dump_json(exclude={"query_id", "milliseconds", *without})
+
+
+def test_an_answer_without_options_has_none_of_their_fields(full: Engine, ids: Ids) -> None:
+    answer = ask(full, ids(full)[3])
+    new = ("per_map", "deadline_reached", "explanations", "explained_frame")
+    assert [getattr(answer, name) for name in new] == [None] * 4
+    assert answer.maps == ["hall"]
+    assert (answer.frame.map, answer.frame.frame_id) == ("hall", ids(full)[3])
+    same = ask(
+        full, ids(full)[3], candidates=10, diversity={"sigma": 1.0, "omega": 4.0},
+        validation={"mode": "full", "residual_deg": 5.0},
+    )  # fmt: skip
+    assert told(same) == told(answer)
+
+
+@pytest.mark.parametrize("candidates", [1, 3, 7])
+def test_so_many_candidates_are_selected_and_tried(full: Engine, ids: Ids, candidates: int) -> None:
+    names = ids(full)
+    for stages in (VR, ("retrieve", "diversify", "validate")):
+        answer = ask(full, names[0], candidates=candidates, k=50, stages=stages)
+        assert len(answer.matches) == answer.counts.validated == candidates
+        if stages == VR:
+            assert sorted(one.rank for one in answer.matches) == [*range(1, candidates + 1)]
+        else:
+            assert answer.counts.selected == candidates
+    assert len(ask(full, names[0], candidates=7, k=2, stages=["retrieve"]).matches) == 2
+
+
+def test_the_scales_of_diversity_are_those_of_the_library(
+    full: Engine, prepared: Prepared, ids: Ids
+) -> None:
+    names, chosen = ids(full), {}
+    vectors = np.stack([one.vector for one, _ in prepared[1:]])
+    d = distances(prepared[0][0].vector, vectors)
+    order = np.argsort(d, kind="stable")
+    for omega in (0.01, 4.0, 1000.0):
+        p = DiversityParameters(0.7, omega)
+        taken = diversify(d[order], pairwise_distances(vectors[order]), 4, p)
+        pairs = zip(taken.indices, taken.gains, strict=True)
+        wanted = {names[1 + order[i]]: gain for i, gain in pairs}
+        stages = ["retrieve", "diversify"]
+        answer = ask(full, names[0], k=4, stages=stages, diversity={"sigma": 0.7, "omega": omega})
+        assert {one.frame_id: one.diversity_gain for one in answer.matches} == wanted
+        chosen[omega] = set(wanted)
+    assert chosen[0.01] == {names[1 + i] for i in order[:4]}  # quality decides
+    assert chosen[1000.0] != chosen[0.01]
+
+
+def test_thresholds_decide_what_is_accepted(full: Engine, ids: Ids) -> None:
+    name = ids(full)[0]
+    before = {one.frame_id: one.validation for one in ask(full, name, k=50).matches}
+    accepted = {one for one, v in before.items() if v.status == "accepted"}
+    least = sorted(before[one].overlap for one in accepted)[1]
+    after = ask(full, name, k=50, validation={"evidence": least, "violation_weight": 0.0})
+    still = {one.frame_id for one in after.matches if one.validation.status == "accepted"}
+    assert still == {one for one in accepted if before[one].overlap >= least} != accepted
+    sure = ask(full, name, k=50, validation={"strong": 1.0})
+    assert {one.validation.strength for one in sure.matches[: len(accepted)]} == {"weak"}
+    assert {one.frame_id for one in sure.matches[: len(accepted)]} == accepted
+    tight = ask(full, name, k=50, validation={"residual_m": 1e-9})
+    assert tight.status == "not_found"
+    assert all("disagree" in one.validation.reason for one in tight.matches if one.transform)
+    paper = ask(full, name, k=50, validation={"mode": "paper"})
+    for one in paper.matches:
+        small = one.validation.residual is not None and (
+            one.validation.residual.translation_m <= 0.08
+            and one.validation.residual.rotation_deg <= 5.0
+        )
+        assert (one.validation.status == "accepted") is small
+
+
+def test_a_deadline_stops_validation_and_says_so(
+    full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = ids(full)[0]
+    whole = ask(full, name, k=50, deadline_ms=600_000)
+    assert whole.deadline_reached is False
+    assert told(whole, "deadline_reached") == told(ask(full, name, k=50), "deadline_reached")
+    none = ask(full, name, deadline_ms=1)
+    assert (none.deadline_reached, none.status, none.location) == (True, "unvalidated", None)
+    assert none.counts.selected == len(none.matches) == 10
+    assert {one.validation.reason for one in none.matches} == {"the deadline came before it"}
+    allows, asked = Deadline.allows, []
+
+    def thrice(self: Deadline) -> bool:
+        asked.append(allows(self))
+        self.reached = len(asked) > 3
+        return not self.reached
+
+    monkeypatch.setattr(Deadline, "allows", thrice)
+    some = ask(full, name, k=50, stages=VR, deadline_ms=600_000)
+    assert (some.counts.validated, some.deadline_reached) == (3, True)
+    full_told = {one.frame_id: one for one in whole.matches}
+    assert [one.rank for one in some.matches[3:]] == [*range(4, 12)]
+    assert some.status == "found"
+    for one in some.matches[:3]:
+        assert one.validation == full_told[one.frame_id].validation
+
+
+def test_no_candidate_is_begun_that_would_likely_end_too_late(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    deadline = Deadline(1000, since=99.5)  # ends at 100.5
+    steps = [0.1, 0.2, 0.05]  # what candidates take: after 0.35 s the longest no longer fits
+    seen = []
+    for step in [0.0, *steps]:
+        now[0] += step
+        seen.append(deadline.allows())
+    assert seen == [True, True, True, False]
+    assert deadline.reached is True
+    now[0] = 200.0
+    late = Deadline(100, since=200.1 - 0.1 - FIRST_S + 0.001)
+    assert late.allows() is True
+    assert Deadline(100, since=200.1 - 0.1 - 0.1 + FIRST_S / 2).allows() is False
+    assert (Deadline(None).allows(), Deadline(None).reached) == (True, None)
+
+
+def test_every_frame_of_the_ranking_is_explained(
+    full: Engine, prepared: Prepared, ids: Ids
+) -> None:
+    names = ids(full)
+    plain = ask(full, names[0], k=2, candidates=5, stages=["retrieve", "diversify", "validate"])
+    answer = ask(full, names[0], k=2, candidates=5, explain=True)
+    assert told(answer, "explanations") == told(plain, "explanations")
+    assert set(answer.milliseconds) - set(plain.milliseconds) == {"explain"}
+    found = answer.explanations
+    assert [one.rank for one in found] == [*range(1, 12)]
+    assert [one.frame_id for one in found] == [
+        one.frame_id for one in ask(full, names[0], k=50, stages=["retrieve"]).matches
+    ]
+    matches = {one.frame_id: one for one in answer.matches}
+    vectors = {name: one.vector for name, (one, _) in zip(names, prepared, strict=True)}
+    outcomes = set()
+    for one in found:
+        outcomes.add(one.outcome)
+        assert one.distance == distances(vectors[names[0]], vectors[one.frame_id][None])[0]
+        if one.frame_id not in matches:
+            assert (one.stage, one.outcome) == ("retrieve", "not_selected")
+            nearest = min(
+                (distances(vectors[one.frame_id], vectors[name][None])[0], match.rank, name)
+                for name, match in matches.items()
+            )
+            said = f"most like frame {nearest[2]} of the selection (distance {nearest[0]})"
+            assert one.reason.startswith(said)
+            continue
+        match = matches[one.frame_id]
+        assert (one.rank, one.similarity) == (match.rank, match.similarity)
+        if match.validation.status == "skipped":
+            assert (one.stage, one.outcome) == ("diversify", "skipped")
+            assert one.reason == "enough were accepted before it"
+        else:
+            assert (one.stage, one.outcome) == ("validate", match.validation.status)
+            assert one.reason.startswith(f"{one.outcome}: {match.validation.reason}")
+    assert {"not_selected", "skipped", "accepted"} <= outcomes
+    plain = ask(full, names[0], k=3, stages=["retrieve"], explain=True).explanations
+    assert [one.outcome for one in plain] == ["ranked"] * 3 + ["not_selected"] * 8
+    assert plain[3].reason == "beyond the first 3 of the ranking, which were the candidates"
+
+
+def test_a_frame_is_explained_where_it_was_lost(
+    full: Engine, prepared: Prepared, ids: Ids, signer: Signer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ids(full)
+    index = {name: i for i, name in enumerate(names)}
+    own = retrieve(prepared[0][0], [one for one, _ in prepared[1:]], signer.model)
+    rank = {names[1 + i]: place + 1 for place, i in enumerate(own.indices.tolist())}
+
+    def explained(frame_id: str, **how: Any) -> Any:
+        answer = ask(full, names[0], explain_frame=frame_id, **how)
+        plain = ask(full, names[0], **how)
+        assert told(answer, "explained_frame") == told(plain, "explained_frame")
+        one = answer.explained_frame
+        assert (one.frame_id, one.map, one.state) == (frame_id, "hall", "indexed")
+        return one
+
+    def right(one: Any) -> None:
+        """Its figures are those of the library, whatever the query did."""
+        i = index[one.frame_id]
+        d = distances(prepared[0][0].vector, prepared[i][0].vector[None])[0]
+        v = validate(prepared[0][1], prepared[i][1])
+        assert (one.distance, one.rank, one.of) == (d, rank[one.frame_id], 11)
+        assert (one.validation.status, one.validation.overlap) == (v.status, v.overlap)
+        if v.T_match_query is not None:
+            assert one.transform.matrix == v.T_match_query.tolist()
+            assert one.transform.child_frame == f"{names[0]}.optical"
+
+    near = [name for name, place in sorted(rank.items(), key=lambda one: one[1])]
+    match = explained(near[0])
+    right(match)
+    assert match.lost_at is None
+    assert (match.ranked, match.selected, match.shortlisted) == (True, True, True)
+    assert match.reason.startswith("it is a match, accepted: ")
+    far = explained(near[-1], k=50, stages=VR)
+    right(far)
+    assert (far.lost_at, far.selected, far.validation.status) == ("validation", True, "rejected")
+    assert far.reason.startswith(f"rejected: {far.validation.reason}")
+    turn = explained(near[5], k=1, stages=VR)
+    right(turn)
+    assert (turn.lost_at, turn.selected) == ("turn", True)
+    assert turn.reason.startswith("enough were accepted before it; aligned for this all the same")
+    missed = explained(near[4], candidates=2, stages=VR)
+    right(missed)
+    assert (missed.lost_at, missed.ranked, missed.selected) == ("selection", True, False)
+    barred = explained(near[2], filter={"exclude_frames": [near[2], near[8]]})
+    assert (barred.lost_at, barred.passes_filter, barred.ranked) == ("filter", False, False)
+    assert (barred.rank, barred.of) == (3, 9)
+    assert barred.validation.status == "accepted"
+    monkeypatch.setattr(searching, "ranking_size", lambda n: min(n, 4))
+    unranked = explained(near[6], stages=VR)
+    right(unranked)
+    assert (unranked.lost_at, unranked.ranked, unranked.shortlisted) == ("ranking", False, True)
+    bare = explained(near[6], stages=["retrieve"], k=1)
+    assert (bare.validation, bare.transform, bare.lost_at) == (None, None, "ranking")
+
+
+def test_what_the_shortlist_missed_is_said(
+    signed_folder: Path, tmp_path: Path, make_engine: Callable[..., Engine], ids: Ids,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    shutil.copytree(signed_folder, tmp_path / "data")
+    engine = make_engine(tail_frames=1)
+    assert engine.publish_due() == 1
+    for name in ("search", "is_compared"):
+        few = partial(getattr(searching, name), shortlist=3)
+        monkeypatch.setattr(searching, name, few)
+    monkeypatch.setattr(searching, "ranking_size", lambda n: min(n, 3))
+    monkeypatch.setattr(searching, "WHOLE", 0)
+    names, held = ids(engine), set()
+    for name in names[1:]:
+        answer = ask(engine, names[0], explain_frame=name, stages=["retrieve"], k=3)
+        assert (answer.exact, answer.counts.compared) == (False, 3)
+        one = answer.explained_frame
+        assert one.ranked is (name in {match.frame_id for match in answer.matches})
+        if one.shortlisted:
+            held.add(name)
+            assert one.lost_at is None
+        else:
+            assert (one.lost_at, one.ranked) == ("shortlist", False)
+            assert one.reason.startswith(
+                f"the index did not propose it, though it has rank {one.rank}"
+            )
+    assert held == {match.frame_id for match in answer.matches}
+
+
+def test_a_frame_that_is_not_searched_is_explained(full: Engine, ids: Ids) -> None:
+    names = ids(full)
+    itself = ask(full, names[0], explain_frame=names[0]).explained_frame
+    assert (itself.lost_at, itself.rank, itself.passes_filter) == ("query", None, None)
+    full.delete_frame("hall", names[4])
+    gone = ask(full, names[0], explain_frame=names[4]).explained_frame
+    assert (gone.lost_at, gone.state, gone.validation) == ("state", "deleted", None)
+    with full.store.database.write() as connection:
+        connection.execute(update(frames).where(frames.c.id == names[5]).values(state="rejected"))
+    bad = ask(full, names[0], explain_frame=names[5]).explained_frame
+    assert (bad.lost_at, bad.state) == ("state", "rejected")
+    with pytest.raises(UnknownFrame, match="'nobody' in map 'hall'"):
+        ask(full, names[0], explain_frame="nobody")
+
+
+def test_options_as_text_are_those_of_json() -> None:
+    given: dict[str, Any] = {
+        "candidates": 7, "diversity": {"sigma": 2.0}, "validation": {"mode": "paper"},
+        "deadline_ms": 50, "explain": True, "explain_frame": "f", "keep": False,
+    }  # fmt: skip
+    text = {name: one if isinstance(one, str) else json.dumps(one) for name, one in given.items()}
+    query = Query.model_validate(text)
+    assert query == Query.model_validate(given)
+    assert (query.diversity.sigma, query.diversity.omega) == (2.0, 4.0)
+    assert math.radians(query.validation.residual_deg) == math.radians(5.0)

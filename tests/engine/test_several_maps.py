@@ -1,0 +1,125 @@
+"""One query over several maps: one ranking, the same distances, nothing mixed that must not be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
+from sceneprint.schemas import Answer, NamedFrame, NewMap, Query, SeveralQuery
+
+Ids = Callable[[Engine], list[str]]
+MAPS = ["hall", "lab"]
+
+
+@pytest.fixture
+def two(full: Engine, uploads: Any, work_off: Any) -> Engine:
+    """`hall` with all twelve frames, and `lab` with two of each room."""
+    full.create_map(NewMap(name="lab", model="compact"))
+    for i in (1, 4, 7, 10):
+        full.add_frame("lab", uploads[i].data, uploads[i].meta)
+    work_off(full)
+    return full
+
+
+def names_of(engine: Engine, name: str) -> list[str]:
+    return [frame.frame_id for frame in engine.list_frames(name).items]
+
+
+def ask(engine: Engine, maps: list[str], upload: Any, **how: Any) -> Answer:
+    query = Query.model_validate({"keep": False, **how})
+    return engine.queries.upload(maps, upload.data, upload.meta, query)
+
+
+def test_the_ranking_is_that_of_both_maps_together(two: Engine, uploads: Any) -> None:
+    how: dict[str, Any] = {"stages": ["retrieve"], "k": 50}
+    alone = {name: ask(two, [name], uploads[1], **how) for name in MAPS}
+    both = ask(two, MAPS, uploads[1], **how)
+    listed = [(one.distance, one.map, one.frame_id, one.similarity)
+              for name in MAPS for one in alone[name].matches]  # fmt: skip
+    found = [(one.distance, one.map, one.frame_id, one.similarity) for one in both.matches]
+    assert sorted(found) == sorted(listed)
+    assert [one.distance for one in both.matches] == sorted(one[0] for one in listed)
+    assert [(one.distance, one.map) for one in both.matches[:2]] == [(0, "hall"), (0, "lab")]
+    assert (both.maps, both.per_map.keys()) == (MAPS, set(MAPS))
+    assert {name: part.counts for name, part in both.per_map.items()} == {
+        name: one.counts for name, one in alone.items()
+    }
+    for field in ("map", "passed", "compared", "ranked"):
+        assert getattr(both.counts, field) == 16
+    other_way = ask(two, MAPS[::-1], uploads[1], **how)
+    assert other_way.matches == both.matches
+    only = ask(two, MAPS, uploads[1], filter={"exclude_frames": names_of(two, "hall")}, **how)
+    assert {one.map for one in only.matches} == {"lab"}
+    assert (only.counts.passed, only.per_map["hall"].counts.passed) == (4, 0)
+
+
+def test_a_pose_is_of_one_map(two: Engine, uploads: Any) -> None:
+    both = ask(two, MAPS, uploads[8], k=50, candidates=50, stages=["retrieve", "validate"])
+    accepted = [one for one in both.matches if one.validation.status == "accepted"]
+    counts = {name: sum(one.map == name for one in accepted) for name in MAPS}
+    assert min(counts.values()) >= 1
+    assert {name: part.counts.accepted for name, part in both.per_map.items()} == counts
+    assert both.counts.accepted == sum(counts.values())
+    alone = ask(two, ["hall"], uploads[8], k=50, candidates=50, stages=["retrieve", "validate"])
+    # both maps call the parent frame the same, and still only the one with most strong votes
+    assert {one.pose_in_map.parent_frame for one in accepted} == {uploads[8].room}
+    assert both.location == alone.location
+    assert both.location.map == "hall"
+    diverse = ask(two, MAPS, uploads[8], k=3)
+    assert diverse.counts.selected == 10 == len(diverse.matches)
+    assert sum(part.counts.selected for part in diverse.per_map.values()) == 10
+    assert diverse.matches[0].rank == 1
+
+
+def test_a_stored_frame_does_not_find_itself_and_finds_others(two: Engine, ids: Ids) -> None:
+    own = ids(two)[4]
+    query = Query(stages=("retrieve",), k=50, keep=False)
+    both = two.queries.stored(MAPS, NamedFrame(map="hall", frame_id=own), query)
+    assert own not in [one.frame_id for one in both.matches]
+    assert (both.counts.map, len(both.matches)) == (15, 15)
+    assert (both.matches[0].distance, both.matches[0].map) == (0, "lab")
+    assert (both.frame.map, both.frame.frame_id) == ("hall", own)
+    away = two.queries.stored(["lab"], NamedFrame(map="hall", frame_id=own), query)
+    assert (away.maps, away.counts.map, away.per_map) == (["lab"], 4, None)
+    explain = query.model_copy(update={"explain_frame": names_of(two, "lab")[2]})
+    told = two.queries.stored(MAPS, NamedFrame(map="hall", frame_id=own), explain)
+    rank = next(one.rank for one in both.matches if one.frame_id == explain.explain_frame)
+    assert (told.explained_frame.map, told.explained_frame.rank) == ("lab", rank)
+    assert told.explained_frame.of == 15
+    with pytest.raises(UnknownFrame):
+        two.queries.stored(["lab"], NamedFrame(map="lab", frame_id=own), query)
+
+
+def test_maps_of_two_models_are_not_asked_as_one(two: Engine, uploads: Any, ids: Ids) -> None:
+    two.create_map(NewMap(name="big", model="paper"))
+    with pytest.raises(InvalidRequest, match=r"hall has compact-.*big has paper-") as caught:
+        ask(two, ["hall", "big"], uploads[0])
+    assert [field for field, _ in caught.value.fields] == ["maps.hall", "maps.big"]
+    stored = NamedFrame(map="hall", frame_id=ids(two)[0])
+    with pytest.raises(InvalidRequest, match=r"big has paper-.*hall has compact-"):
+        two.queries.stored(["big"], stored, Query())
+    with pytest.raises(UnknownMap, match="'attic'"):
+        ask(two, ["hall", "attic"], uploads[0])
+
+
+def test_maps_are_chosen_by_who_asks(two: Engine) -> None:
+    def of(maps: Any, *may: str) -> list[str]:
+        return two.queries.maps_of(SeveralQuery.model_validate({"maps": maps}), may.__contains__)
+
+    assert of("*", "lab", "hall") == ["hall", "lab"]
+    assert of("*", "lab") == ["lab"]
+    assert of("lab, hall,lab", "lab", "hall") == ["lab", "hall"]
+    for maps, may in ((["hall", "lab"], ["hall"]), (["hall", "attic"], ["hall", "attic"])):
+        with pytest.raises(UnknownMap) as caught:
+            two.queries.upload(of(maps, *may), b"", None, Query())  # type: ignore[arg-type]
+        assert str(caught.value).startswith(f"There is no map {maps[1]!r}.")
+    with pytest.raises(UnknownMap, match="no map to ask"):
+        of("*")
+    for i in range(63):
+        two.create_map(NewMap(name=f"m{i}", model="compact"))
+    with pytest.raises(InvalidRequest, match="65 maps, and 64"):
+        of("*", "hall", "lab", *(f"m{i}" for i in range(63)))

@@ -1,0 +1,149 @@
+"""Long jobs: slices, each stored once, whatever dies in between."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from sqlalchemy import select, update
+
+from sceneprint.engine import Engine
+from sceneprint.engine.tasks import Outcome, Task
+from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
+from sceneprint.schemas import Job, JobState, NewMap
+from sceneprint.store.listing import find_job
+from sceneprint.store.parts import JobFile, files_of, items_of
+from sceneprint.store.tables import events, jobs
+
+
+@pytest.fixture
+def engine(make_engine: Callable[..., Engine]) -> Engine:
+    engine = make_engine()
+    engine.create_map(NewMap(name="hall", model="compact"))
+    return engine
+
+
+def count_to(engine: Engine, most: int) -> Callable[[Task, float], Outcome]:
+    """A handler that finds one number a slice, and keeps a file of each."""
+
+    def handle(task: Task, _until: float) -> Outcome:
+        done = task.progress.get("done", 0)
+        blob = engine.store.blobs.put(f"part {done}".encode())
+        return Outcome(
+            over=done + 1 == most,
+            progress={"done": done + 1, "total": most},
+            items=[{"n": done}],
+            files=[JobFile("part", blob, 6, "text/plain")],
+            result={"sum": sum(range(most))} if done + 1 == most else None,
+            event="numbers.found",
+        )
+
+    return handle
+
+
+def items(engine: Engine, job: Job) -> list[int]:
+    with engine.store.database.read() as connection:
+        number = find_job(connection, job.job_id).number
+        return [item["n"] for item in items_of(connection, number)]
+
+
+def test_each_slice_is_kept_and_the_last_one_ends_the_job(engine, work_off):
+    engine.tasks.register("count", count_to(engine, 3))
+    job = engine.tasks.begin("count", "hall", {"to": 3})
+    assert (job.kind, job.map, job.frame_id, job.progress) == ("count", "hall", None, None)
+    claimed = engine.claim("w")
+    assert isinstance(claimed, Task)
+    assert (claimed.data, claimed.of_map.name) == ({"to": 3}, "hall")
+    assert engine.run(claimed) == JobState.QUEUED
+    between = engine.get_job(job.job_id)
+    assert (between.state, between.attempts, between.result) == (JobState.QUEUED, 0, None)
+    assert between.progress is not None
+    assert (between.progress.done, between.progress.total) == (1, 3)
+    assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
+    ended = engine.get_job(job.job_id)
+    assert (ended.state, ended.result) == (JobState.SUCCEEDED, {"sum": 3})
+    assert items(engine, job) == [0, 1, 2]
+    with engine.store.database.read() as connection:
+        number = find_job(connection, job.job_id).number
+        assert engine.store.blobs.get(files_of(connection, number)["part"].blob) == b"part 2"
+        asked = select(events.c.kind, events.c.data).where(events.c.job_id == job.job_id)
+        assert connection.execute(asked).all() == [("numbers.found", {"sum": 3})]
+
+
+def test_a_slice_of_a_worker_that_fell_silent_counts_once(engine, work_off):
+    engine.tasks.register("count", count_to(engine, 2))
+    job = engine.tasks.begin("count", "hall", {})
+    late = engine.claim("silent")
+    with engine.store.database.write() as connection:
+        connection.execute(update(jobs).values(leased_until=1.0))
+    assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
+    assert engine.run(late) is None  # its slice is refused whole
+    assert items(engine, job) == [0, 1]
+
+
+def test_what_cannot_be_done_fails_at_once_and_goes_on_when_retried(engine, work_off):
+    able = False
+
+    def handle(task: Task, until: float) -> Outcome:
+        if task.progress and not able:
+            raise InvalidRequest("the second step is impossible")
+        return count_to(engine, 3)(task, until)
+
+    engine.tasks.register("count", handle)
+    job = engine.tasks.begin("count", "hall", {})
+    assert work_off(engine) == [JobState.QUEUED, JobState.FAILED]
+    failed = engine.get_job(job.job_id)
+    assert (failed.error, failed.traceback) == ("the second step is impossible", None)
+    able = True
+    again, new = engine.retry_job(job.job_id)
+    assert (again.job_id, again.state, new) == (job.job_id, JobState.QUEUED, True)
+    assert engine.retry_job(job.job_id)[1] is False  # it waits already
+    assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
+    assert items(engine, job) == [0, 1, 2]
+    with pytest.raises(CannotRetry, match="nothing was given up"):
+        engine.retry_job(job.job_id)
+
+
+def test_what_breaks_down_is_tried_again_until_it_is_dead(engine, work_off):
+    def handle(_task: Task, _until: float) -> Outcome:
+        raise RuntimeError("no luck")
+
+    engine.tasks.register("count", handle)
+    job = engine.tasks.begin("count", None, {})
+    states = []
+    for _ in range(3):
+        with engine.store.database.write() as connection:
+            connection.execute(update(jobs).values(run_after=1.0))
+        states += work_off(engine)
+    assert states == [JobState.QUEUED, JobState.QUEUED, JobState.DEAD]
+    dead = engine.get_job(job.job_id)
+    assert (dead.map, dead.error) == (None, "RuntimeError: no luck")
+    assert dead.traceback is not None
+    assert "no luck" in dead.traceback
+
+
+def test_a_kind_that_nobody_does_says_so(engine, work_off):
+    job = engine.tasks.begin("dance", "hall", {})
+    assert work_off(engine) == [JobState.FAILED]
+    assert "kind 'dance'" in str(engine.get_job(job.job_id).error)
+    with pytest.raises(UnknownMap):
+        engine.tasks.begin("dance", "nowhere", {})
+
+
+def test_a_map_takes_its_long_jobs_and_their_files_along(engine, work_off):
+    engine.tasks.register("count", count_to(engine, 2))
+    job = engine.tasks.begin("count", "hall", {})
+    other = engine.tasks.begin("count", None, {})
+    claimed = engine.claim("w")
+    assert engine.run(claimed) == JobState.QUEUED
+    with engine.store.database.read() as connection:
+        blob = files_of(connection, find_job(connection, job.job_id).number)["part"].blob
+    assert engine.store.blobs.holds(blob)
+    engine.delete_map("hall")
+    assert not engine.store.blobs.holds(blob)
+    with pytest.raises(UnknownJob):
+        engine.get_job(job.job_id)
+    assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
+    assert engine.get_job(other.job_id).state == JobState.SUCCEEDED
+    assert [one.job_id for one in engine.list_jobs(map_names=["hall"]).items] == []
+    assert [one.job_id for one in engine.list_jobs(kind="count").items] == [other.job_id]
