@@ -4,22 +4,51 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
 
 from anyio import to_thread
 from fastapi import APIRouter, Depends, FastAPI
-from fastapi.openapi.utils import get_openapi
-from pydantic.json_schema import models_json_schema
 
 from sceneprint import __version__
 from sceneprint.engine import Engine
-from sceneprint.schemas import Filter, FrameMeta, NewMap, Problem
-from sceneprint.settings import Settings, is_loopback
+from sceneprint.settings import Settings
 from service import problems
-from service.context import Context, Gate, key_holder
+from service.access import caller
+from service.context import Context, Gate
+from service.cors import origins_of
+from service.document import openapi_of
+from service.feed import Feed
+from service.limits import Limits
 from service.metrics import Metrics
 from service.middleware import Around
-from service.routes import frames, health, jobs, maps, queries
+from service.routes import (
+    associations,
+    edits,
+    events,
+    frames,
+    health,
+    imports,
+    jobs,
+    kept,
+    keys,
+    maps,
+    operations,
+    outputs,
+    queries,
+    reconstructions,
+    sessions,
+    similarity,
+    snapshots,
+    uploads,
+)
+from service.sampling import housekeeping
+
+#: In the order in which the document lists them.
+ROUTES = (
+    maps, frames, uploads, outputs, edits, sessions, imports, queries, kept, similarity,
+    associations, reconstructions, jobs, events, operations, snapshots, keys,
+)  # fmt: skip
+#: Uploads that are in hand at once, so that one wait for the disk is enough for all of them.
+UPLOADS = 12
 
 DESCRIPTION = """\
 Where have I seen this before? Upload depth frames to a map, and ask where another was taken: pure
@@ -35,58 +64,38 @@ def create_app(settings: Settings) -> FastAPI:
 
     Parameters
     ----------
-    settings : see Settings; callers must show a key unless it listens on a loopback address
+    settings : see Settings; callers must show a key where it `asks_for_keys`
     """
-    figures, alone = Metrics(), is_loopback(settings.host)
+    figures = Metrics()
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         engine = await to_thread.run_sync(Engine, settings)
         try:
             await to_thread.run_sync(engine.warm)
-            gate, uploads = (Gate(settings.concurrency, settings.waiting) for _ in range(2))
-            app.state.context = Context(engine, gate, uploads, figures, keys=not alone)
-            yield
+            gate = Gate(settings.concurrency, settings.waiting)
+            # they mostly wait for the disk: the engine sees to how many are decoded at once
+            uploads = Gate(max(UPLOADS, settings.concurrency), settings.waiting)
+            feed = Feed(engine.store.database, settings.event_streams, settings.events_kept)
+            limits = Limits(settings.requests_per_s, settings.failed_keys_per_minute)
+            app.state.context = Context(
+                engine, gate, uploads, figures, settings.asks_for_keys, feed=feed, limits=limits
+            )
+            async with housekeeping(engine, figures.sampler):
+                yield
+            feed.close()
         finally:
             await to_thread.run_sync(engine.close)
 
     app = FastAPI(
         title="sceneprint", version=__version__, description=DESCRIPTION, lifespan=lifespan
     )
-    v1 = APIRouter(prefix="/v1", dependencies=[Depends(key_holder)])
-    for part in (maps, frames, queries, jobs):
+    v1 = APIRouter(prefix="/v1", dependencies=[Depends(caller)])
+    for part in ROUTES:
         v1.include_router(part.router)
     app.include_router(v1)
     app.include_router(health.router)
     problems.install(app)
-    app.add_middleware(Around, limit=settings.upload_bytes, metrics=figures, alone=alone)
-    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
+    app.add_middleware(Around, settings=settings, origins=origins_of(settings), metrics=figures)
+    app.openapi = lambda: openapi_of(app)  # type: ignore[method-assign]
     return app
-
-
-def _openapi(app: FastAPI) -> dict[str, Any]:
-    """The document, with the records that only bodies of our own reading use."""
-    if app.openapi_schema is None:
-        document = get_openapi(
-            title=app.title, version=app.version, description=app.description, routes=app.routes
-        )
-        template = "#/components/schemas/{model}"
-        _, own = models_json_schema(
-            [
-                (FrameMeta, "validation"),
-                (Filter, "validation"),
-                (NewMap, "validation"),
-                (Problem, "serialization"),
-            ],
-            ref_template=template,
-        )
-        schemas = document.setdefault("components", {}).setdefault("schemas", {})
-        for name, schema in own["$defs"].items():
-            schemas.setdefault(name, schema)
-        for operation in (one for path in document["paths"].values() for one in path.values()):
-            if "application/json" in operation["responses"].get("422", {}).get("content", {}):
-                del operation["responses"]["422"]  # FastAPI's guess: a name in a path is never so
-        for name in ("HTTPValidationError", "ValidationError"):
-            schemas.pop(name, None)
-        app.openapi_schema = document
-    return app.openapi_schema

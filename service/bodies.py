@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 import re
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Collection, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any, BinaryIO
@@ -12,20 +11,19 @@ from typing import Any, BinaryIO
 from fastapi import Request
 from pydantic import ValidationError
 from pydantic_core import from_json
-from starlette.datastructures import UploadFile
+from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException
 
 from sceneprint.errors import (
     InvalidRequest,
     MalformedBody,
-    StoreFull,
     TooLarge,
     UnsupportedType,
-    UnusableStore,
 )
 from sceneprint.schemas import FrameMeta
 from sceneprint.schemas.frames import MOST_PRIORITY
+from service import raw
 from service.problems import invalid
 
 #: Most bytes of a form field that is no file, and of a JSON body.
@@ -35,13 +33,13 @@ FORM = "multipart/form-data"
 
 @dataclass(frozen=True, eq=False)
 class Upload:
-    """A frame that came in a form.
+    """A frame that came in a form, or as the body.
 
     Parameters
     ----------
     file : its bytes, large ones on disk until they are read
     meta : what is known of it
-    fields : the other fields of the form
+    fields : what else the form or the query string says
     """
 
     file: BinaryIO
@@ -56,42 +54,26 @@ def media_type(request: Request) -> str:
 
 @asynccontextmanager
 async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
-    """Read a form with a file part `frame`, a field `meta`, and others that are named.
+    """Read a frame: a form with a file part `frame`, a field `meta`, and others that are named; or
+    the frame alone, with the same in the query string.
 
     Raises
     ------
-    UnsupportedType : no form.
-    MalformedBody : a form that cannot be parsed.
+    UnsupportedType : neither.
+    MalformedBody : a form or JSON that cannot be parsed.
     InvalidRequest : a part is missing or unknown, or `meta` is not as it should be.
     StoreFull, UnusableStore : the machine cannot keep it until it is read.
     """
-    if media_type(request) != FORM:
-        raise UnsupportedType(
-            f"The body is {media_type(request) or 'of no type'!r:.80}, and a frame comes as "
-            f"{FORM}: a file part `frame` and a field `meta` with JSON."
-        )
-    try:
-        form = await request.form(max_files=1, max_fields=16, max_part_size=FIELD_BYTES)
-    except (HTTPException, MultiPartException, UnicodeError) as error:  # of a strange charset
-        raise MalformedBody(
-            f"The form cannot be parsed ({getattr(error, 'detail', error)}). Send a file part "
-            "`frame` and a field `meta`, with a boundary as in RFC 7578."
-        ) from error
-    except OSError as error:  # what is too large for memory is spooled to a file meanwhile
-        kind = StoreFull if error.errno in (errno.ENOSPC, errno.EDQUOT) else UnusableStore
-        raise kind(
-            f"An upload cannot be kept in the folder of temporary files ({error}). Make room "
-            "there, or name another folder in TMPDIR."
-        ) from error
-    try:
+    if media_type(request) in raw.TYPES:
+        file, meta, others = await raw.received(request, fields)
+        try:
+            yield Upload(file.file, meta, others)
+        finally:
+            await file.close()
+        return
+    async with form_of(request, most_files=1) as form:
         known = {"frame", "meta", *fields}
-        for name in form:
-            if name not in known:
-                raise InvalidRequest(
-                    f"The form has a part {name!r:.80} that is not known. Its parts are "
-                    f"{', '.join(sorted(known))}.",
-                    ((name[:80], "not known"),),
-                )
+        check_parts(form, known)
         frame = form.get("frame")
         if not isinstance(frame, UploadFile) or len(form.getlist("frame")) != 1:
             raise InvalidRequest(
@@ -99,10 +81,53 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
                 "depth image in it, with a file name.",
                 (("frame", "not one file"),),
             )
-        texts = {name: _text(form.getlist(name), name) for name in form if name != "frame"}
+        texts = texts_of(form)
         yield Upload(frame.file, _meta(texts.pop("meta", None)), texts)
+
+
+@asynccontextmanager
+async def form_of(request: Request, most_files: int) -> AsyncIterator[FormData]:
+    """Read a form; its files are gone afterwards.
+
+    Raises
+    ------
+    UnsupportedType, MalformedBody, StoreFull, UnusableStore : as `uploaded`.
+    """
+    if media_type(request) != FORM:
+        raise UnsupportedType(
+            f"The body is {media_type(request) or 'of no type'!r:.80}, and a frame comes as "
+            f"{FORM}: a file part `frame` and a field `meta` with JSON. One frame may also be the "
+            f"whole body, as {', '.join(raw.TYPES)}."
+        )
+    try:
+        form = await request.form(max_files=most_files, max_fields=16, max_part_size=FIELD_BYTES)
+    except (HTTPException, MultiPartException, UnicodeError) as error:  # of a strange charset
+        raise MalformedBody(
+            f"The form cannot be parsed ({getattr(error, 'detail', error)}). Send a file part "
+            "`frame` and a field `meta`, with a boundary as in RFC 7578."
+        ) from error
+    except OSError as error:  # what is too large for memory is spooled to a file meanwhile
+        raise raw.unspoolable(error) from error
+    try:
+        yield form
     finally:
         await form.close()
+
+
+def check_parts(form: FormData, known: Collection[str]) -> None:
+    """See that a form has no part that would have no effect; InvalidRequest."""
+    for name in form:
+        if name not in known:
+            raise InvalidRequest(
+                f"The form has a part {name!r:.80} that is not known. Its parts are "
+                f"{', '.join(sorted(known))}.",
+                ((name[:80], "not known"),),
+            )
+
+
+def texts_of(form: FormData) -> dict[str, str]:
+    """The parts of a form that are no files, each once; InvalidRequest."""
+    return {name: _text(form.getlist(name), name) for name in form if name != "frame"}
 
 
 def priority_of(fields: Mapping[str, str]) -> int:

@@ -10,10 +10,11 @@ from typing import Annotated, TypeVar, cast
 import anyio
 from anyio import to_thread
 from fastapi import Depends, Request
-from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from sceneprint.engine import Engine
-from sceneprint.errors import Busy, KeyRequired
+from sceneprint.errors import Busy
+from service.feed import Feed
+from service.limits import Limits
 from service.metrics import Metrics
 
 T = TypeVar("T")
@@ -67,6 +68,8 @@ class Context:
     uploads : the gate of uploads, which wait for the disk and for other writers: of their own, so
         that no query waits behind them
     keys : whether callers must show one
+    feed : of events
+    limits : how often callers may ask
     """
 
     engine: Engine
@@ -74,6 +77,8 @@ class Context:
     uploads: Gate
     metrics: Metrics
     keys: bool
+    feed: Feed
+    limits: Limits
 
 
 def _context(request: Request) -> Context:
@@ -81,25 +86,3 @@ def _context(request: Request) -> Context:
 
 
 Here = Annotated[Context, Depends(_context)]
-
-_bearer = HTTPBearer(auto_error=False, description="A key made by `sceneprint keys`.")
-
-
-def key_holder(
-    here: Here, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
-) -> str | None:
-    """Name of the key that was shown; None where none is asked for.
-
-    Raises
-    ------
-    KeyRequired : none was shown, or an unknown one.
-    """
-    if not here.keys:
-        return None
-    name = None if given is None else here.engine.key_name(given.credentials)
-    if name is None:
-        raise KeyRequired(
-            "This service listens beyond its own machine, and asks for a key. Send the header "
-            "Authorization: Bearer KEY; `sceneprint keys --create NAME` makes one."
-        )
-    return name

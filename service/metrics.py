@@ -1,12 +1,30 @@
-"""Figures for Prometheus."""
+"""Figures for Prometheus.
+
+What one process counts (requests, answers, streams) adds up over processes; what is read from the
+store (frames, jobs, indexes, disk) is the same in each of them.
+"""
 
 from __future__ import annotations
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+import platform
 
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    generate_latest,
+)
+
+from sceneprint import __version__
+from sceneprint.engine.statistics import Figures
 from sceneprint.schemas import Answer, FrameState, JobState
+from service.sampling import Sampler
 
+EVENTS = "/v1/events"
 _SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
+#: Maps whose indexes have series of their own: those with the longest tails.
+MOST_MAPS = 20
 
 
 class Metrics:
@@ -14,6 +32,7 @@ class Metrics:
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
+        self.sampler = Sampler()
         self._requests = Counter(
             "sceneprint_requests", "Requests answered.", ("method", "route", "status"),
             registry=self.registry,
@@ -21,6 +40,10 @@ class Metrics:
         self._seconds = Histogram(
             "sceneprint_request_seconds", "Time to answer a request.", ("route",),
             buckets=_SECONDS, registry=self.registry,
+        )  # fmt: skip
+        self._received = Counter(
+            "sceneprint_received_bytes", "Bytes of bodies that were read.", ("route",),
+            registry=self.registry,
         )  # fmt: skip
         self._answers = Counter(
             "sceneprint_answers", "Queries by the status of their answer.", ("status",),
@@ -30,28 +53,75 @@ class Metrics:
             "sceneprint_stage_seconds", "Time of each stage of a query.", ("stage",),
             buckets=_SECONDS, registry=self.registry,
         )  # fmt: skip
-        self._frames = Gauge(
-            "sceneprint_frames", "Frames in each state.", ("state",), registry=self.registry
+        self._streams = self._gauge("event_streams", "Streams of events that are open.")
+        self._frames = self._gauge("frames", "Frames in each state.", "state")
+        self._jobs = self._gauge("jobs", "Jobs in each state.", "state")
+        self._maps = self._gauge("maps", "Maps.")
+        self._oldest = self._gauge(
+            "oldest_waiting_seconds", "Since the job was made that waits for longest; 0: none."
         )
-        self._jobs = Gauge(
-            "sceneprint_jobs", "Jobs in each state.", ("state",), registry=self.registry
+        self._generation = self._gauge(
+            "index_generation", "Newest index; of the maps with the longest tails.", "map"
         )
+        self._tail = self._gauge(
+            "index_tail_frames", "Indexed frames that the newest index lacks; of these maps.", "map"
+        )
+        self._workers = self._gauge("workers", "Workers seen, by what they do.", "state")
+        self._began = self._gauge(
+            "workers_began", "Workers that began in the last hour: more than there are, or once "
+            "more than asked for, is that many replaced."
+        )  # fmt: skip
+        self._events = self._gauge("newest_event", "Number of the newest event: grows for ever.")
+        self._disk = self._gauge("disk_bytes", "Disk space taken by each part.", "part")
+        self._free = self._gauge("disk_free_bytes", "Left on the disk of the data folder.")
+        self._gauge("build_info", "Version of the service.", "version", "python").labels(
+            __version__, platform.python_version()
+        ).set(1)
 
-    def request(self, method: str, route: str, status: int, seconds: float) -> None:
+    def _gauge(self, name: str, text: str, *labels: str) -> Gauge:
+        return Gauge(f"sceneprint_{name}", text, labels, registry=self.registry)
+
+    def request(
+        self, method: str, route: str, status: int, seconds: float, received: int = 0
+    ) -> None:
         """Count a request; `route` is a pattern, so that series stay few."""
         self._requests.labels(method, route, str(status)).inc()
-        self._seconds.labels(route).observe(seconds)
+        if received:
+            self._received.labels(route).inc(received)
+        if route != EVENTS:  # a stream takes as long as somebody listens
+            self._seconds.labels(route).observe(seconds)
+        if route.startswith("/v1/"):
+            self.sampler.request(status)
 
     def answer(self, answer: Answer) -> None:
         """Count a query."""
         self._answers.labels(answer.status).inc()
+        self.sampler.answer(answer)
         for stage, milliseconds in answer.milliseconds.items():
             self._stages.labels(stage).observe(milliseconds / 1e3)
 
-    def text(self, frames: dict[str, int], jobs: dict[str, int]) -> bytes:
+    def text(self, figures: Figures, streams: int) -> bytes:
         """All figures in Prometheus' text format."""
         for state in FrameState:
-            self._frames.labels(state).set(frames.get(state, 0))
+            self._frames.labels(state).set(figures.frames.get(state, 0))
         for kind in JobState:
-            self._jobs.labels(kind).set(jobs.get(kind, 0))
+            self._jobs.labels(kind).set(figures.jobs.get(kind, 0))
+        self._streams.set(streams)
+        self._maps.set(figures.maps)
+        self._oldest.set(figures.oldest_waiting_s)
+        for gauge in (self._generation, self._tail):
+            gauge.clear()  # maps come and go
+        for index in figures.indexes[:MOST_MAPS]:
+            self._generation.labels(index.map).set(index.generation or 0)
+            self._tail.labels(index.map).set(index.tail)
+        busy = sum(worker.job_id is not None for worker in figures.workers)
+        self._workers.labels("busy").set(busy)
+        self._workers.labels("idle").set(len(figures.workers) - busy)
+        self._began.set(figures.began)
+        self._events.set(figures.events)
+        sizes = figures.sizes
+        self._disk.labels("database").set(sizes.database or 0)
+        self._disk.labels("blobs").set(sizes.blobs)
+        self._disk.labels("index").set(sizes.index)
+        self._free.set(sizes.free)
         return generate_latest(self.registry)

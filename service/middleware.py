@@ -1,4 +1,4 @@
-"""Around every request: its id, whom it is for, its size, its time."""
+"""Around every request: its id, whom it is for, its body, what its answer always says, its time."""
 
 from __future__ import annotations
 
@@ -8,108 +8,145 @@ import time
 import uuid
 
 from starlette.requests import ClientDisconnect
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.hosts import stranger
+from sceneprint.errors import Busy, SceneprintError
+from sceneprint.logs import name_request
+from sceneprint.settings import Settings
+from service.audit import note
+from service.cors import Headers, Origins, is_preflight, preflight_headers
+from service.headers import guards
+from service.hosts import forwarded, stranger
+from service.limits import Standing
 from service.metrics import Metrics
 from service.problems import problem, status_of
+from service.slowness import Broken, Incoming, too_large
 
 log = logging.getLogger(__name__)
 
 _ID = re.compile(rb"[\w.-]{1,64}")
+#: Requests whose body is an archive.
+_IMPORTS = re.compile(r"/v1/maps/[^/]+/imports")
 #: What is counted by its name: a caller may invent others without end.
 _METHODS = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"))
 #: As noted where the caller hung up before there was an answer.
 _HUNG_UP = 499
-
-
-class _TooLargeWhileStreaming(Exception):
-    """Stops the reading of a body; nobody but `Around` sees it."""
+#: Requests that are answered at once, those that wait or stream among them.
+_MOST_AT_ONCE = 900
 
 
 class Around:
-    """Gives each request an id, sends strangers away, stops too large bodies, and notes it.
+    """Gives each request an id, sends strangers away, stops bodies, guards answers, and notes it.
 
     Parameters
     ----------
     app : the application
-    limit : bytes of a body
+    settings : see Settings
+    origins : whose pages may ask
     metrics : to count in
-    alone : whether only this machine is served; then by any other name it is not
     """
 
-    def __init__(self, app: ASGIApp, limit: int, metrics: Metrics, alone: bool) -> None:
-        self._app, self._limit, self._metrics, self._alone = app, limit, metrics, alone
+    def __init__(
+        self, app: ASGIApp, settings: Settings, origins: Origins, metrics: Metrics
+    ) -> None:
+        self._app, self._origins, self._metrics = app, origins, metrics
+        self._most, self._body_s = settings.upload_bytes, settings.body_s
+        self._most_of_import = settings.import_bytes
+        self._alone = not settings.asks_for_keys
+        self._at_once = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One request."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        headers = dict(scope["headers"])
+        headers: dict[bytes, bytes] = dict(scope["headers"])
         given = headers.get(b"x-request-id", b"")
         request_id = given.decode() if _ID.fullmatch(given) else uuid.uuid4().hex
-        scope.setdefault("state", {})["request_id"] = request_id
-        seen, status, too_large, start = 0, 0, False, time.perf_counter()
-
-        async def counted() -> Message:
-            nonlocal seen, too_large
-            message = await receive()
-            seen += len(message.get("body", b""))
-            if seen > self._limit:
-                too_large = True
-                raise _TooLargeWhileStreaming
-            return message
+        name_request(request_id)
+        own: Headers = [(b"x-request-id", request_id.encode())]
+        own += self._origins.headers(headers.get(b"origin"))
+        state = scope.setdefault("state", {})
+        state.update(request_id=request_id, headers=own, forwarded=forwarded(headers))
+        body = Incoming(receive, self._limit(scope), self._body_s)
+        status, start = 0, time.perf_counter()
 
         async def answered(message: Message) -> None:
             nonlocal status
-            if too_large and status == 0:
+            if body.fault is not None and status == 0:
                 return  # whatever the application makes of the broken body; ours follows
             if message["type"] == "http.response.start":
                 status = message["status"]
-                message["headers"] = [
+                standing: Standing | None = state.get("standing")
+                said = [
                     *message["headers"],
-                    (b"x-request-id", request_id.encode()),
-                    (b"x-content-type-options", b"nosniff"),
+                    *own,
+                    *([] if standing is None else standing.headers()),
                 ]
+                message["headers"] = said + guards(scope["path"], said)
+                await note(scope, status, said)
             await send(message)
 
-        length = headers.get(b"content-length", b"")
-        unwelcome = stranger(scope["headers"]) if self._alone else None
+        self._at_once += 1
         try:
-            if unwelcome is not None:
-                kind = type(unwelcome).__name__
-                told = problem(request_id, kind, status_of(unwelcome), str(unwelcome))
-                told.headers["Connection"] = "close"  # what is still coming is not read
-                await told(scope, receive, answered)
-            elif length.isdigit() and len(length) < 19 and int(length) > self._limit:
-                too_large = True  # said beforehand: not a byte is read
+            early = self._early(scope, headers)
+            if isinstance(early, SceneprintError):
+                await _refusal(request_id, early)(scope, receive, answered)
+            elif early is not None:
+                await early(scope, receive, answered)
             else:
-                await self._app(scope, counted, answered)
-        except _TooLargeWhileStreaming:
+                await self._app(scope, body.next, answered)
+        except Broken:
             pass
         except ClientDisconnect:
             status = _HUNG_UP  # nobody is left to be answered
         except Exception:  # answered further out, with 500
-            self._note(scope, request_id, 500, time.perf_counter() - start)
+            self._note(scope, request_id, 500, time.perf_counter() - start, body.received)
             raise
-        if too_large and status == 0:
-            detail = (
-                f"The body has more than {self._limit} bytes, the most that is taken. "
-                "Send the image at a lower resolution, or one frame at a time."
-            )
-            too_large = False
-            refused = problem(request_id, "TooLarge", 413, detail)
-            refused.headers["Connection"] = "close"  # what is still coming is not read
-            await refused(scope, receive, answered)
-        self._note(scope, request_id, status, time.perf_counter() - start)
+        finally:
+            self._at_once -= 1
+        if body.fault is not None and status == 0:
+            fault, body.fault = body.fault, None
+            await _refusal(request_id, fault)(scope, receive, answered)
+        self._note(scope, request_id, status, time.perf_counter() - start, body.received)
 
-    def _note(self, scope: Scope, request_id: str, status: int, seconds: float) -> None:
+    def _early(
+        self, scope: Scope, headers: dict[bytes, bytes]
+    ) -> SceneprintError | Response | None:
+        """The answer to what needs no application; no body is read for it."""
+        origin, length = headers.get(b"origin"), headers.get(b"content-length", b"")
+        known = origin is not None and self._origins.allows(origin)
+        if self._alone:
+            unwelcome = stranger(scope["headers"], self._origins.allows)
+            if unwelcome is not None:
+                return unwelcome
+        if known and is_preflight(scope["method"], headers):
+            return Response(status_code=204, headers=preflight_headers())
+        if self._at_once > _MOST_AT_ONCE:
+            return Busy(
+                "The service is answering as many requests as it can hold. Come back in a second."
+            )
+        most = self._limit(scope)
+        if length.isdigit() and (len(length) > 18 or int(length) > most):
+            return too_large(most)
+        return None
+
+    def _limit(self, scope: Scope) -> int:
+        """Most bytes of the body: whole archives go to disk as they come."""
+        is_import = scope["method"] == "POST" and _IMPORTS.fullmatch(scope["path"])
+        return self._most_of_import if is_import else self._most
+
+    def _note(
+        self, scope: Scope, request_id: str, status: int, seconds: float, received: int
+    ) -> None:
         route = getattr(scope.get("route"), "path", "other")
         if scope["path"].startswith("/v1/") and not route.startswith(("/v1", "other")):
             route = f"/v1{route}"  # a router's own pattern lacks the prefix it is mounted under
         method = scope["method"] if scope["method"] in _METHODS else "other"
-        self._metrics.request(method, route, status, seconds)
+        self._metrics.request(method, route, status, seconds, received)
+        if status in (401, 403):
+            self._note_refusal(scope, request_id, status)
         level = logging.DEBUG if route in ("/healthz", "/readyz", "/metrics") else logging.INFO
         log.log(
             level,
@@ -122,3 +159,26 @@ class Around:
                 "milliseconds": round(1e3 * seconds, 1),
             },
         )
+
+    @staticmethod
+    def _note_refusal(scope: Scope, request_id: str, status: int) -> None:
+        """Somebody tried what is not theirs to do: an operator may want to know who."""
+        client = scope.get("client")
+        log.warning(
+            "refused",
+            extra={
+                "request_id": request_id,
+                "key": scope["state"].get("caller", ""),
+                "address": None if client is None else client[0],
+                "method": scope["method"],
+                "path": scope["path"],
+                "status": status,
+            },
+        )
+
+
+def _refusal(request_id: str, error: SceneprintError) -> Response:
+    """A refusal, after which what is still coming is not read."""
+    told = problem(request_id, type(error).__name__, status_of(error), str(error))
+    told.headers["Connection"] = "close"
+    return told

@@ -16,6 +16,7 @@ from starlette.exceptions import HTTPException
 
 from sceneprint import errors
 from sceneprint.schemas import Problem
+from service.headers import guards
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +29,11 @@ STATUSES: dict[type[errors.SceneprintError], int] = {
     errors.MalformedBody: 400,
     errors.UnsupportedType: 415,
     errors.TooLarge: 413,
+    errors.SlowBody: 408,
+    errors.PreconditionFailed: 412,
     errors.KeyRequired: 401,
+    errors.Forbidden: 403,
+    errors.RateLimited: 429,
     errors.Misdirected: 421,
     errors.ForeignOrigin: 403,
     errors.Busy: 503,
@@ -38,7 +43,7 @@ STATUSES: dict[type[errors.SceneprintError], int] = {
 }
 #: Seconds after which to come back: at once where others are in the way, later where a person is
 #: needed first.
-RETRY_AFTER_S = {503: "1", 507: "30"}
+RETRY_AFTER_S = {429: "1", 503: "1", 507: "30"}
 LATER_S: dict[type[errors.SceneprintError], str] = {errors.ReadOnlyStore: "60"}
 #: What is told of a store that cannot be used: its errors name folders, which are the operator's.
 _LOG = "Its log says more under the request's id."
@@ -97,7 +102,7 @@ def declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"description": HTTPStatus(status).phrase, "content": content}
-        for status in (*statuses, 401, 403, 421, 500, 503, 507)
+        for status in (*statuses, 401, 403, 408, 421, 429, 500, 503, 507)
     }
 
 
@@ -114,6 +119,9 @@ def install(app: FastAPI) -> None:
         if isinstance(error, errors.UnusableStore):
             detail = next(UNUSABLE[kind] for kind in type(error).__mro__ if kind in UNUSABLE)
         answer = problem(_id(request), type(error).__name__, status, detail, fields)
+        standing = getattr(request.state, "standing", None)
+        if standing is not None and isinstance(error, errors.RateLimited):
+            answer.headers["Retry-After"] = str(standing.wait_s)
         if type(error) in LATER_S:
             answer.headers["Retry-After"] = LATER_S[type(error)]
         return answer
@@ -141,7 +149,10 @@ def install(app: FastAPI) -> None:
             "traceback under the request's id. Please report it."
         )
         answer = problem(_id(request), "InternalError", 500, detail)
-        answer.headers["X-Request-Id"] = _id(request)  # `Around` does not see this one
+        for name, value in getattr(request.state, "headers", ()):  # `Around` does not see this one
+            answer.headers[name.decode()] = value.decode()
+        for name, value in guards(request.url.path, answer.raw_headers):
+            answer.headers[name.decode()] = value.decode()
         answer.headers["Connection"] = "close"  # as uvicorn does, unsaid, after an exception
         return answer
 

@@ -9,10 +9,12 @@ from collections.abc import Callable
 
 import uvicorn
 
+from sceneprint.descriptors import raise_descriptors
 from sceneprint.engine import Engine
 from sceneprint.errors import UnusableStore
 from sceneprint.settings import Settings
 from service.app import create_app
+from service.connections import Connection, make_room
 
 log = logging.getLogger(__name__)
 
@@ -66,27 +68,42 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     listening = listen(settings)
     host, port = listening.getsockname()[:2]
     url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    app = create_app(settings)
     config = uvicorn.Config(
-        create_app(settings),
+        app,
         log_config=None,  # ours is JSON
         access_log=False,  # `Around` writes one line a request
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
         timeout_keep_alive=30,
-        limit_concurrency=1000,
+        http=Connection,  # which has the limits that uvicorn lacks
+        ws="none",
+        h11_max_incomplete_event_size=16 << 10,
+        proxy_headers=False,  # uvicorn would believe X-Forwarded-For of whoever is on this machine
     )
-    _Server(config, lambda: ready(url, read_only)).run(sockets=[listening])
+    raise_descriptors()
+    make_room()
+    _Server(config, lambda: ready(url, read_only), lambda: app.state.context.feed.close()).run(
+        sockets=[listening]
+    )
 
 
 class _Server(uvicorn.Server):
-    """A server that says when it has started."""
+    """A server that says when it has started, and when it is about to stop."""
 
-    def __init__(self, config: uvicorn.Config, started: Callable[[], None]) -> None:
+    def __init__(
+        self, config: uvicorn.Config, started: Callable[[], None], stopping: Callable[[], None]
+    ) -> None:
         super().__init__(config)
-        self._started = started
+        self._started, self._stopping = started, stopping
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start, and say so."""
         await super().startup(sockets)
         if self.started:
             self._started()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop; streams of events would else be waited for like any other answer."""
+        self._stopping()
+        await super().shutdown(sockets)

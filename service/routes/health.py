@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Depends, Response
 from prometheus_client import CONTENT_TYPE_LATEST
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from sceneprint import __version__
+from service.access import Guest, reads_every
 from service.context import Here
 from service.problems import declared
 
@@ -24,8 +25,10 @@ class Readiness(Health):
     """The service can work; `read_only`: it answers, and takes nothing."""
 
     read_only: bool
-    frames: dict[str, int]
-    jobs: dict[str, int]
+    frames: dict[str, int] | None = Field(
+        description="How many are in each state; null for who may not read all maps."
+    )
+    jobs: dict[str, int] | None = Field(description="As `frames`.")
 
 
 @router.get("/healthz", responses=declared())
@@ -35,16 +38,26 @@ async def healthz() -> Health:
 
 
 @router.get("/readyz", responses=declared())
-def readyz(here: Here) -> Readiness:
-    """Answers while the database does; 503 while it does not."""
+def readyz(here: Here, asking: Guest) -> Readiness:
+    """Answers while the database does; 503 while it does not. No key is asked for."""
     frames, jobs = here.engine.counts()
-    read_only = here.engine.store.database.read_only
+    told = asking is not None and asking.reads_every
     return Readiness(
-        status="ready", version=__version__, read_only=read_only, frames=frames, jobs=jobs
+        status="ready",
+        version=__version__,
+        read_only=here.engine.store.database.read_only,
+        frames=frames if told else None,
+        jobs=jobs if told else None,
     )
 
 
-@router.get("/metrics", response_class=Response, responses=declared())
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses=declared(),
+    dependencies=[Depends(reads_every)],
+)
 def metrics(here: Here) -> Response:
-    """Figures for Prometheus."""
-    return Response(here.metrics.text(*here.engine.counts()), media_type=CONTENT_TYPE_LATEST)
+    """Figures for Prometheus; a key, where one is asked for, must have `read` for `*`."""
+    figures = here.engine.operations.statistics.figures()
+    return Response(here.metrics.text(figures, here.feed.streams), media_type=CONTENT_TYPE_LATEST)

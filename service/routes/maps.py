@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from anyio import to_thread
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
 from pydantic import ValidationError
 
 from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint.schemas import Map, NewMap, Page
+from service.access import Asking, may_admin, may_read
 from service.bodies import media_type, read_json
 from service.context import Here
 from service.problems import declared, invalid
@@ -29,7 +30,7 @@ BODY: dict[str, Any] = {
     responses={200: {"model": Map}, **declared(400, 409, 413, 415, 422)},
     openapi_extra={"requestBody": BODY},
 )
-async def create_map(request: Request, here: Here, response: Response) -> Map:
+async def create_map(request: Request, here: Here, asking: Asking, response: Response) -> Map:
     """Make a map. One that is there as wanted is answered with 200."""
     # read by hand: FastAPI would read and parse all of it before it asks for a key
     if media_type(request) != "application/json":
@@ -38,6 +39,7 @@ async def create_map(request: Request, here: Here, response: Response) -> Map:
             "application/json."
         )
     new = _new(await read_json(request))
+    asking.require_new(new.name)
     made, is_new = await to_thread.run_sync(here.engine.create_map, new)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/maps/{made.name}"
@@ -45,18 +47,23 @@ async def create_map(request: Request, here: Here, response: Response) -> Map:
 
 
 @router.get("", responses=declared())
-def list_maps(here: Here) -> Page[Map]:
-    """All maps by name."""
-    return here.engine.list_maps()
+def list_maps(here: Here, asking: Asking) -> Page[Map]:
+    """All maps by name; those that the key may read."""
+    found = here.engine.list_maps().items
+    return Page[Map](items=[one for one in found if asking.may("read", one.name)])
 
 
-@router.get("/{map_name}", responses=declared(404))
-def get_map(map_name: str, here: Here) -> Map:
-    """A map, with how many frames are in each state."""
-    return here.engine.get_map(map_name)
+@router.get("/{map_name}", responses=declared(404), dependencies=[Depends(may_read)])
+def get_map(map_name: str, here: Here, response: Response) -> Map:
+    """A map, with how many frames are in each state. Its ETag stands for what PATCH can change."""
+    found = here.engine.get_map(map_name)
+    response.headers["ETag"] = f'"{found.etag}"'
+    return found
 
 
-@router.delete("/{map_name}", status_code=204, responses=declared(404))
+@router.delete(
+    "/{map_name}", status_code=204, responses=declared(404), dependencies=[Depends(may_admin)]
+)
 def delete_map(map_name: str, here: Here) -> None:
     """Remove a map with all that is in it, for good."""
     here.engine.delete_map(map_name)

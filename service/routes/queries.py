@@ -2,92 +2,94 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from functools import partial
 from typing import Any
 
-from fastapi import APIRouter, Request
-from pydantic import ValidationError
+from anyio import to_thread
+from fastapi import APIRouter, Depends, Request
 
-from sceneprint.errors import InvalidRequest, MalformedBody, UnsupportedType
-from sceneprint.schemas import Answer, Query
-from service.bodies import FORM, media_type, read_json, uploaded
+from sceneprint.engine.localizing import check_localizes, localization_of
+from sceneprint.schemas import Answer, Localization, Query, SeveralQuery
+from service.access import Asking, may_read
 from service.context import Context, Here
-from service.problems import declared, invalid
-from service.routes.frames import BODY as FRAME
+from service.problems import declared
+from service.questions import described, question, unnamed
 
-router = APIRouter(prefix="/maps/{map_name}/queries", tags=["queries"])
+router = APIRouter(tags=["queries"])
 
-_OPTIONS = tuple(Query.model_fields)
-
-
-def _body() -> dict[str, Any]:
-    """The two ways to ask, for the OpenAPI document."""
-    form = FRAME["content"][FORM]["schema"]
-    template = "#/components/schemas/{model}"
-    options = Query.model_json_schema(ref_template=template)["properties"]
-    stages = {"type": "string", "default": "retrieve,diversify,validate"}
-    of_form = {**options, "stages": options["stages"] | stages}
-    of_form["stages"].pop("anyOf")  # text or a list; a form has only text
-    of_form["filter"] = {
-        "type": "string",
-        "contentMediaType": "application/json",
-        "contentSchema": {"$ref": "#/components/schemas/Filter"},
-        "description": options["filter"]["description"],
-    }
-    by_id = {"frame_id": {"type": "string", "description": "A frame of the map."}, **options}
-    return {
-        "required": True,
-        "content": {
-            FORM: {"schema": form | {"properties": {**form["properties"], **of_form}}},
-            "application/json": {
-                "schema": {"type": "object", "required": ["frame_id"], "properties": by_id}
-            },
-        },
-    }
+_FRAME_ID: dict[str, Any] = {
+    "frame_id": {"type": "string", "description": "A frame of the map, in place of an upload."}
+}
+_BODY = described(Query, _FRAME_ID, ["frame_id"])
+_SEVERAL = described(SeveralQuery, {}, ["maps", "frame"])
+_STATUSES = declared(400, 404, 413, 415, 422)
 
 
 @router.post(
-    "", responses=declared(400, 404, 413, 415, 422), openapi_extra={"requestBody": _body()}
-)
+    "/maps/{map_name}/queries", responses=_STATUSES, openapi_extra=_BODY,
+    dependencies=[Depends(may_read)],
+)  # fmt: skip
 async def ask(map_name: str, request: Request, here: Here) -> Answer:
     """Where was this frame taken? Ask with a frame of your own, or with one of the map.
 
-    An uploaded frame is not kept. A frame of the map does not find itself.
+    An uploaded frame is not added to the map. A frame of the map does not find itself.
     """
-    async with here.gate.place():
-        answer = await _asked(map_name, request, here)
+    return await _asked(map_name, request, here, localizes=False)
+
+
+@router.post(
+    "/maps/{map_name}/localize", responses=_STATUSES, openapi_extra=_BODY,
+    dependencies=[Depends(may_read)],
+)  # fmt: skip
+async def localize(map_name: str, request: Request, here: Here) -> Localization:
+    """Where am I in this map? One status and one pose; ask as for a query.
+
+    The whole answer, with all candidates, is kept under `query_id` unless `keep` is false.
+    """
+    return localization_of(await _asked(map_name, request, here, localizes=True))
+
+
+@router.post("/queries", responses=_STATUSES, openapi_extra=_SEVERAL)
+async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
+    """In which of these maps was this frame taken? One ranking over all of them.
+
+    The maps must be of one model. A pose is averaged within one parent frame of one map, which
+    `location.map` names.
+    """
+    since, queries = time.perf_counter(), here.engine.queries
+    async with here.gate.place(), question(request, SeveralQuery, "frame") as asked:
+        query, upload, frame = asked.query, asked.upload, asked.query.frame
+        maps = await to_thread.run_sync(queries.maps_of, query, partial(asking.may, "read"))
+        if upload is not None:
+            answer = await here.gate.run(
+                lambda: queries.upload(maps, upload.file.read(), upload.meta, query, since)
+            )
+        elif frame is not None:
+            asking.require(frame.map, "read")
+            answer = await here.gate.run(lambda: queries.stored(maps, frame, query, since))
+        else:
+            raise unnamed("frame")
     here.metrics.answer(answer)
     return answer
 
 
-async def _asked(map_name: str, request: Request, here: Context) -> Answer:
-    engine = here.engine
-    if media_type(request) == "application/json":
-        given = await read_json(request)
-        if not isinstance(given, dict):
-            raise MalformedBody("The body is not a JSON object. Send an object.")
-        frame_id = given.pop("frame_id", None)
-        if not isinstance(frame_id, str):
-            raise InvalidRequest(
-                "The query names no frame. Give `frame_id`, or send a frame as a form.",
-                (("frame_id", "missing"),),
+async def _asked(map_name: str, request: Request, here: Context, *, localizes: bool) -> Answer:
+    since, engine = time.perf_counter(), here.engine
+    async with here.gate.place(), question(request, Query, "frame_id") as asked:
+        query, upload = asked.query, asked.upload
+        if localizes:
+            check_localizes(query)
+        if upload is None:
+            frame_id = asked.named["frame_id"]
+            if not isinstance(frame_id, str):
+                raise unnamed("frame_id")
+            answer = await here.gate.run(
+                lambda: engine.query_frame(map_name, frame_id, query, since)
             )
-        query = _query(given)
-        return await here.gate.run(lambda: engine.query_frame(map_name, frame_id, query))
-    if media_type(request) == FORM:
-        async with uploaded(request, *_OPTIONS) as upload:
-            query = _query(upload.fields)
-            return await here.gate.run(
-                lambda: engine.query_upload(map_name, upload.file.read(), upload.meta, query)
+        else:
+            answer = await here.gate.run(
+                lambda: engine.query_upload(map_name, upload.file.read(), upload.meta, query, since)
             )
-    raise UnsupportedType(
-        f"The body is {media_type(request) or 'of no type'!r:.80}. Send a frame as {FORM}, or "
-        "the id of one as application/json."
-    )
-
-
-def _query(fields: Mapping[str, Any]) -> Query:
-    try:
-        return Query.model_validate(fields)
-    except ValidationError as error:
-        raise invalid(error, "The query") from error
+    here.metrics.answer(answer)
+    return answer

@@ -19,9 +19,14 @@ import numpy as np
 import pytest
 
 from sceneprint.datasets import write_depth_png
+from sceneprint.engine import Engine
+from sceneprint.schemas.keys import Scope
+from sceneprint.settings import Settings
 from sceneprint.types import Floats32, Frame, Intrinsics
 
 BIN = Path(sys.executable).parent
+#: The origin whose pages may ask the server for all tests.
+FLEET = "https://fleet.example"
 #: Processors are few and shared: what takes longer than this does not come.
 PATIENCE_S = 90.0
 
@@ -159,7 +164,7 @@ def begin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Se
 @pytest.fixture(scope="session")
 def served(begin: Callable[..., Server]) -> Server:
     """One server for all tests that leave it as it was but for maps of their own."""
-    return begin()
+    return begin(cors_origins=FLEET)
 
 
 @dataclass(frozen=True)
@@ -242,3 +247,43 @@ def refused() -> Callable[..., dict[str, Any]]:
         return problem
 
     return check
+
+
+@dataclass(frozen=True)
+class Walled:
+    """A server that asks for keys, with some that were made on its folder."""
+
+    server: Server
+    secrets: dict[str, str]
+
+    def ask(self, key: str, method: str, path: str, **request: Any) -> httpx.Response:
+        """A request with the secret of a key."""
+        headers = {"Authorization": f"Bearer {self.secrets[key]}", **request.pop("headers", {})}
+        return self.server.client.request(method, path, headers=headers, **request)
+
+
+@pytest.fixture(scope="session")
+def wall(begin: Callable[..., Server]) -> Callable[..., Walled]:
+    """Begin a server that asks for keys; what each may do is given by its name."""
+
+    def start(keys: dict[str, dict[str, Scope]], *arguments: str, **settings: object) -> Walled:
+        server = begin("--host", "0.0.0.0", *arguments, **settings)
+        # the address that is printed is that of every interface; asked from here it is this one
+        server.client.base_url = server.url = server.url.replace("0.0.0.0", "127.0.0.1")
+        with Engine(Settings(data_dir=server.folder, database_url=None)) as engine:
+            made = {name: engine.create_key(name, grants) for name, grants in keys.items()}
+        return Walled(server, {name: key.secret for name, key in made.items()})
+
+    return start
+
+
+@pytest.fixture(scope="session")
+def walled(wall: Callable[..., Walled]) -> Walled:
+    """One server that asks for keys, for all tests that leave it as it was but for maps of their
+    own; `alpha` and `bravo` are those of test_isolation.
+    """
+    keys = {
+        "boss": {"*": "admin"}, "watcher": {"*": "read"}, "keeper": {"bravo": "admin"},
+        "admin": {"alpha": "admin"}, "writer": {"alpha": "write"}, "reader": {"alpha": "read"},
+    }  # fmt: skip
+    return wall(keys, requests_per_s=0, failed_keys_per_minute=0)

@@ -6,7 +6,7 @@ import os
 import socket
 import sqlite3
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import ExitStack, closing
 
 import httpx
 import pytest
@@ -15,7 +15,7 @@ import pytest
 @pytest.fixture(scope="module")
 def busy(begin, make_map, small_shots):
     """A server that works on one thing at a time, lets one wait, and has a map of two frames."""
-    server = begin(concurrency=1, waiting=1)
+    server = begin(concurrency=1, waiting=1, body_s=3)
     path = make_map(server, "hall")
     for shot in small_shots[:2]:
         sent = server.client.post(f"{path}/frames", **shot.form(), headers={"Prefer": "wait=60"})
@@ -109,6 +109,30 @@ def test_who_hangs_up_while_waiting_has_sent_a_frame_nevertheless(busy, until, s
     assert state() == "indexed"
     assert busy.client.get("/healthz").status_code == 200
     assert [line for line in busy.log() if line["level"] == "error"] == []
+
+
+def test_slow_uploads_hold_their_places_for_a_while_and_no_queries(busy, small_shots, refused):
+    """Two of them take both places for uploads, until their time is over."""
+    request = busy.client.build_request("POST", "/v1/maps/hall/frames", **small_shots[20].form())
+    lines = [f"POST {request.url.path} HTTP/1.1".encode()]
+    lines += [key + b": " + value for key, value in request.headers.raw]
+    whole = b"\r\n".join(lines) + b"\r\n\r\n" + request.read()
+    with ExitStack() as opened:
+        wires = []
+        for _ in range(2):
+            wire = socket.create_connection((request.url.host, request.url.port), timeout=60)
+            wires.append(opened.enter_context(wire))
+            wire.sendall(whole[: len(whole) // 2])
+        answers = [busy.client.post("/v1/maps/hall/frames", **small_shots[21].form())]
+        asked = busy.client.post("/v1/maps/hall/queries", **small_shots[0].form())
+        assert asked.status_code == 200
+        said = [wire.recv(65536) for wire in wires]
+    assert [one.startswith(b"HTTP/1.1 408 ") for one in said] == [True, True]
+    assert all(b"connection: close" in one.lower() for one in said)
+    while answers[-1].status_code == 503:  # the first may come before the slow heads are read
+        refused(answers[-1], 503, "busy")
+        answers.append(busy.client.post("/v1/maps/hall/frames", **small_shots[21].form()))
+    assert answers[-1].status_code in (200, 202)
 
 
 def test_where_none_may_wait_one_is_still_worked_on(begin, make_map, small_shots):

@@ -1,0 +1,177 @@
+"""One poller a process, and the streams of events that it feeds.
+
+    database  --poll-->  the newest events in memory  -->  every stream, each at its own place
+
+A stream that is further behind than memory reaches reads the database itself until it has caught
+up. So nobody who reads slowly costs memory, and nobody who waits costs a look at the database.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import AsyncGenerator, Callable
+from itertools import islice
+
+from anyio import to_thread
+
+from sceneprint.engine.happenings import begin, read_on
+from sceneprint.errors import Busy, SceneprintError
+from sceneprint.store import Database
+from sceneprint.store.events import EventRow, Wanted, list_events, newest_number
+
+log = logging.getLogger(__name__)
+
+#: Seconds between two looks at the database, and after one that failed.
+POLL_S, TROUBLE_S = 0.25, 1.0
+#: Seconds of silence after which a stream says that it lives.
+ALIVE_S = 15.0
+#: Events held in memory, and read or told at once.
+HELD, MOST = 4096, 500
+
+
+class Feed:
+    """The streams of one process.
+
+    Parameters
+    ----------
+    database : that is looked at while anybody listens
+    most : streams at once
+    kept : newest events that are kept for sure
+    """
+
+    def __init__(self, database: Database, most: int, kept: int) -> None:
+        self._database, self._most, self._kept = database, most, kept
+        self._streams = 0
+        self._closed = False
+        self._poller: asyncio.Task[None] | None = None
+        self._held: deque[EventRow] = deque()
+        # all that is newer than `_since` and known is held; None: nobody has looked yet
+        self._since: int | None = None
+        self._newest = 0
+        self._news = asyncio.Event()
+
+    @property
+    def streams(self) -> int:
+        """How many there are."""
+        return self._streams
+
+    def join(self) -> None:
+        """Take a place, to be given back by `leave`.
+
+        Raises
+        ------
+        Busy : as many listen as may.
+        """
+        if self._closed or self._streams >= self._most:
+            raise Busy(
+                f"{self._streams} streams of events are open, as many as the service keeps. Close "
+                "one, ask for a page of events instead, or come back later."
+            )
+        self._streams += 1
+
+    def leave(self) -> None:
+        """Give the place back; the last one who leaves stops the poller."""
+        self._streams -= 1
+        if self._streams == 0 and self._poller is not None:
+            self._poller.cancel()
+            self._poller = None
+            self._since = None
+            self._held.clear()
+
+    def close(self) -> None:
+        """End all streams."""
+        self._closed = True
+        self._wake()
+
+    async def batches(
+        self, wanted: Wanted, after: int | None, may_go_on: Callable[[], bool]
+    ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
+        """Events as they come, with the number up to which all have been told.
+
+        At first, and after ALIVE_S without any, the list may be empty.
+
+        Parameters
+        ----------
+        wanted : the others are passed over
+        after : number from which to go on; None: from now on
+        may_go_on : asked each time all was silent, in a thread; False ends the stream
+        """
+        try:
+            async for batch in self._batches(wanted, after, may_go_on):
+                yield batch
+        except SceneprintError as error:  # who listens comes back, and is told what is wrong
+            log.error("a stream of events ends", extra={"error": str(error)})
+
+    async def _batches(
+        self, wanted: Wanted, after: int | None, may_go_on: Callable[[], bool]
+    ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
+        if self._poller is None or self._poller.done():
+            self._poller = asyncio.create_task(self._poll())
+        place, first = await to_thread.run_sync(begin, self._database, self._kept, after)
+        yield first, place  # also where it is empty: the reader learns its place
+        while not self._closed:
+            news = self._news
+            if self._since is None or place < self._since:
+                found, place = await to_thread.run_sync(
+                    read_on, self._database, wanted, place, MOST
+                )
+                if found:
+                    yield found, place
+                    continue
+                if self._since is not None and place < self._since:
+                    continue
+            if self._since is not None and place < self._newest:
+                held, place = self._after(place)
+                found = [event for event in held if wanted(event)]
+                if found:
+                    yield found, place
+                continue
+            try:
+                await asyncio.wait_for(news.wait(), ALIVE_S)
+            except TimeoutError:
+                if not await to_thread.run_sync(may_go_on):
+                    return
+                yield [], place
+
+    def _after(self, place: int) -> tuple[list[EventRow], int]:
+        """The next of the events held, and the number up to which these are all."""
+        newer = sum(1 for event in reversed(self._held) if event.number > place)
+        start = len(self._held) - newer
+        found = list(islice(self._held, start, start + MOST))
+        return found, found[-1].number if found else self._newest
+
+    def _look(self) -> int:
+        with self._database.read() as connection:
+            return newest_number(connection)
+
+    def _more(self, place: int) -> list[EventRow]:
+        with self._database.read() as connection:
+            return list_events(connection, Wanted(), after=place, limit=MOST)
+
+    async def _poll(self) -> None:
+        """Look for what is new, as long as anybody listens."""
+        pause = 0.0
+        while True:
+            await asyncio.sleep(pause)
+            try:
+                if self._since is None:
+                    self._newest = self._since = await to_thread.run_sync(self._look)
+                    self._wake()
+                found = await to_thread.run_sync(self._more, self._newest)
+            except SceneprintError as error:
+                log.error("events cannot be read", extra={"error": str(error)})
+                pause = TROUBLE_S
+                continue
+            pause = 0.0 if len(found) == MOST else POLL_S
+            if found:
+                self._held.extend(found)
+                while len(self._held) > HELD:
+                    self._since = self._held.popleft().number
+                self._newest = found[-1].number
+                self._wake()
+
+    def _wake(self) -> None:
+        self._news.set()
+        self._news = asyncio.Event()

@@ -1,0 +1,137 @@
+"""Events: as a stream while they happen, or as pages of those that are kept."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import AsyncGenerator, Callable
+from contextlib import aclosing
+from dataclasses import replace
+from typing import Annotated, Literal
+
+from anyio import to_thread
+from fastapi import APIRouter, Header, Query, Request, Response
+
+from sceneprint.engine.cursors import row_of
+from sceneprint.engine.operations import MOST_KINDS, tell_event
+from sceneprint.errors import InvalidRequest
+from sceneprint.schemas.events import EventPage
+from sceneprint.store.events import Wanted
+from service.access import Asking, Caller
+from service.context import Context, Here
+from service.feed import Feed
+from service.problems import declared
+from service.sse import BEGIN, MEDIA_TYPE, EventStream, alive, message
+
+router = APIRouter(prefix="/events", tags=["operations"])
+
+_STREAM = {
+    "description": "A page of events; or, where `Accept` names text/event-stream, a stream that "
+    "goes on: each message has the event's number as `id` and the event as JSON in `data`. "
+    "A comment comes after 15 s of silence.",
+    "model": EventPage,
+    "content": {MEDIA_TYPE: {"schema": {"type": "string"}}},
+}
+
+
+@router.get("", response_model=EventPage, responses={200: _STREAM, **declared(404, 422)})
+async def events(
+    request: Request,
+    here: Here,
+    asking: Asking,
+    map_name: Annotated[str | None, Query(alias="map", description="Of this map alone.")] = None,
+    kind: Annotated[
+        list[str],
+        Query(
+            max_length=MOST_KINDS,
+            description="Beginning of the kinds that are wanted, such as `frame.` or "
+            "`frame.indexed`; more than once for several.",
+        ),
+    ] = [],  # noqa: B006  (FastAPI copies it)
+    after: Annotated[
+        int | None,
+        Query(
+            ge=0,
+            lt=2**62,
+            description="Only events with a greater number. Without it a stream begins with what "
+            "happens from now on.",
+        ),
+    ] = None,
+    order: Annotated[
+        Literal["newest", "oldest"] | None,
+        Query(description="Of a page: which come first; the oldest where `after` is given."),
+    ] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000, description="Of a page.")] = 100,
+    last_event_id: Annotated[
+        str | None,
+        Header(description="Of the last event that came: a stream goes on there. Goes before "
+               "`after`."),
+    ] = None,
+) -> EventPage | Response:  # fmt: skip
+    """What happened: frames that came, were indexed or deleted, maps made and removed.
+
+    With `Accept: text/event-stream` the events come as they happen, half a second late at most,
+    each once and in order, also where several processes work on the store. Who lost the stream
+    sends the number of the last event as `Last-Event-ID`, as browsers do by themselves, and
+    misses nothing. Where what is asked for is no longer kept, an event `events.missed` says so.
+
+    With a key, events of the maps that it may read; those of no map are for admins of all.
+    """
+    wanted = await to_thread.run_sync(_wanted, here, asking, map_name, kind)
+    last = after if last_event_id is None else _number(last_event_id)
+    row_of(cursor)  # a stream has no pages, and what was not given out is no cursor there either
+    if MEDIA_TYPE in request.headers.get("accept", ""):
+        here.feed.join()
+        return EventStream(
+            _told(here.feed, wanted, last, _still(request, here, asking)), here.feed.leave
+        )
+    newest_first = order == "newest" or (order is None and last is None)
+    return await to_thread.run_sync(
+        lambda: here.engine.operations.events(
+            wanted, after=last or 0, cursor=cursor, limit=limit, newest_first=newest_first
+        )
+    )
+
+
+def _wanted(here: Context, asking: Caller, map_name: str | None, kinds: list[str]) -> Wanted:
+    if map_name is not None:
+        asking.require(map_name, "read")
+    wanted = here.engine.operations.wanted(map_name, kinds)
+    if map_name is not None or asking.may("admin"):
+        return wanted
+    if asking.named is not None:
+        return replace(wanted, maps=frozenset(asking.named))
+    return replace(wanted, of_maps=True)
+
+
+def _number(last_event_id: str) -> int:
+    if not re.fullmatch(r"[0-9]{1,18}", last_event_id):
+        raise InvalidRequest(
+            f"The Last-Event-ID {last_event_id!r:.40} is none. Send the `id` of an event.",
+            (("Last-Event-ID", "not a number"),),
+        )
+    return int(last_event_id)
+
+
+def _still(request: Request, here: Context, asking: Caller) -> Callable[[], bool]:
+    """Asks whether the key that was shown still opens what it did."""
+    secret = request.headers.get("authorization", "").partition(" ")[2].strip()
+
+    def ask() -> bool:
+        if not asking.name:
+            return True  # none was asked for
+        key = here.engine.find_key(secret)
+        lasts = key is not None and (key.expires_at is None or key.expires_at > time.time())
+        return key is not None and lasts and dict(key.grants) == dict(asking.grants)
+
+    return ask
+
+
+async def _told(
+    feed: Feed, wanted: Wanted, after: int | None, still: Callable[[], bool]
+) -> AsyncGenerator[bytes, None]:
+    yield BEGIN
+    async with aclosing(feed.batches(wanted, after, still)) as batches:
+        async for found, place in batches:
+            yield b"".join(message(tell_event(one)) for one in found) if found else alive(place)

@@ -1,0 +1,181 @@
+"""What a frame is made of, as files and as JSON; a client that has it is told so with 304."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any, TypeVar
+
+from anyio import to_thread
+from fastapi import APIRouter, Depends, Query, Request, Response
+
+from sceneprint.engine.made import BYTES, JSON, NPY, PLY, PNG, Output, upload_type
+from sceneprint.schemas.outputs import (
+    WIDTH,
+    WIDTHS,
+    CloudFrame,
+    FramePatches,
+    FrameSignature,
+    View,
+)
+from service.access import may_read
+from service.conditions import chosen, is_known
+from service.context import Context, Here
+from service.problems import declared
+
+T = TypeVar("T")
+
+router = APIRouter(
+    prefix="/maps/{map_name}/frames/{frame_id}", tags=["frames"], dependencies=[Depends(may_read)]
+)
+
+
+def _files(
+    *kinds: str, model: Any = None, description: str, statuses: tuple[int, ...] = (404, 409)
+) -> dict[int | str, dict[str, Any]]:
+    """Responses of a route that sends files, for the OpenAPI document."""
+    headers = {
+        "ETag": {
+            "description": "Stands for these bytes: sent in If-None-Match, it saves them.",
+            "schema": {"type": "string"},
+        }
+    }
+    schema = {"schema": {"type": "string", "format": "binary"}}
+    content = dict.fromkeys(kinds, schema)
+    done: dict[str, Any] = {"description": description, "headers": headers, "content": content}
+    if model is not None:
+        done["model"] = model
+    known = {"description": "As the caller has it: its If-None-Match names this ETag."}
+    return {200: done, 304: known, **declared(*statuses)}
+
+
+@router.get(
+    "/cloud.ply",
+    response_class=Response,
+    responses=_files(
+        PLY,
+        description="Points and normals, binary little-endian, 32-bit; a comment names the frame "
+        "of the coordinates.",
+        statuses=(404, 409, 422),
+    ),
+)
+async def get_cloud(
+    map_name: str,
+    frame_id: str,
+    request: Request,
+    here: Here,
+    frame: Annotated[
+        CloudFrame,
+        Query(
+            description="Coordinates: `optical` of the camera, `parent` of its pose, or `base` of "
+            "the robot."
+        ),
+    ] = "optical",
+) -> Response:
+    """The surface that was seen, as a cloud of up to 160 x 120 points: smoothed, as validation
+    compares it. The samples themselves are in the upload.
+    """
+    found = await _found(lambda: here.engine.outputs.cloud(map_name, frame_id, frame))
+    return await _sent(request, here, found, PLY, name=f"{frame_id}-{frame}.ply")
+
+
+@router.get(
+    "/preview.png",
+    response_class=Response,
+    responses=_files(
+        PNG,
+        description="What its colours mean is in the tEXt chunks.",
+        statuses=(404, 409, 422),
+    ),
+)
+async def get_preview(
+    map_name: str,
+    frame_id: str,
+    request: Request,
+    here: Here,
+    view: Annotated[
+        View,
+        Query(
+            description="`depth`: yellow near, violet far. `normals`: red, green, blue are "
+            "127.5 (1 + n) of x right, y down, z ahead. `patches`: each of the finest level a "
+            "colour. Dark grey where nothing is known."
+        ),
+    ] = "depth",
+    width: Annotated[int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Columns.")] = WIDTH,
+) -> Response:
+    """A picture of a frame, for people."""
+    found = await _found(lambda: here.engine.outputs.preview(map_name, frame_id, view, width))
+    return await _sent(request, here, found, PNG, name=f"{frame_id}-{view}.png")
+
+
+@router.get(
+    "/patches",
+    response_class=Response,
+    responses=_files(model=FramePatches, description="The same, as lists of numbers."),
+)
+async def get_patches(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
+    """The surface patches of a frame, by level, and those that validation compares."""
+    found = await _found(lambda: here.engine.outputs.patches(map_name, frame_id))
+    told = Output(found.tag, lambda: found.make().model_dump_json().encode())
+    return await _sent(request, here, told, JSON)
+
+
+@router.get(
+    "/signature",
+    response_class=Response,
+    responses=_files(
+        BYTES,
+        NPY,
+        model=FrameSignature,
+        description="By Accept: JSON with the bytes as base64, the bytes, or an NPY file.",
+    ),
+)
+async def get_signature(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
+    """The signature of a frame. Signatures of one model are compared by the sum of absolute
+    differences of their bytes.
+    """
+    outputs, kind = here.engine.outputs, chosen(request, (JSON, BYTES, NPY))
+    if kind == JSON:
+        made = await _found(lambda: outputs.signature(map_name, frame_id))
+        told = Output(made.tag, lambda: made.make().model_dump_json().encode())
+    else:
+        told = await _found(lambda: outputs.vector(map_name, frame_id, kind))
+    return await _sent(request, here, told, kind, Vary="Accept")
+
+
+@router.get(
+    "/upload",
+    response_class=Response,
+    responses=_files(PNG, NPY, description="Byte for byte as it came."),
+)
+async def get_upload(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
+    """The frame's upload: what you sent in is yours to take out."""
+    found = await _found(lambda: here.engine.outputs.upload(map_name, frame_id))
+    return await _sent(request, here, found, None, name=frame_id)
+
+
+async def _found(find: Callable[[], Output[T]]) -> Output[T]:
+    return await to_thread.run_sync(find)
+
+
+async def _sent(
+    request: Request, here: Context, output: Output[bytes], kind: str | None,
+    name: str | None = None, **headers: str,
+) -> Response:  # fmt: skip
+    """An output; made only where the caller does not have it yet, and when it is its turn."""
+    headers |= {"ETag": f'"{output.tag}"', "Cache-Control": "private, no-cache"}
+    if is_known(request, output.tag):
+        return Response(None, 304, headers)
+    async with here.gate.place():
+        data = await here.gate.run(output.make)
+    if kind is None:
+        kind = upload_type(data)
+        name = f"{name}.{'png' if kind == PNG else 'npy'}"
+    if name is not None:
+        headers["Content-Disposition"] = f'inline; filename="{_safe(name)}"'
+    return Response(data, 200, headers, kind)
+
+
+def _safe(name: str) -> str:
+    """An id as a header may hold it."""
+    return "".join(one if one.isascii() and one.isprintable() and one not in '"\\/' else "_"
+                   for one in name)  # fmt: skip

@@ -1,0 +1,146 @@
+"""Reconstructions: the views of an answer, fused to a surface by a worker."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+from anyio import to_thread
+from fastapi import APIRouter, Request, Response
+from pydantic import ValidationError
+
+from sceneprint.engine.kept import Kept, unknown_query
+from sceneprint.engine.reconstructions import MEDIA_TYPES, MESH, PICTURE
+from sceneprint.errors import DamagedBlob, InvalidRequest, UnsupportedType
+from sceneprint.schemas.reconstructions import NewReconstruction, Reconstruction
+from sceneprint.store.listing import unknown_job
+from service.access import Asking, Caller
+from service.bodies import media_type, read_json
+from service.context import Context, Here
+from service.files import files, send_file
+from service.problems import declared, invalid
+
+router = APIRouter(tags=["reconstructions"])
+
+_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": False,
+        "content": {
+            "application/json": {"schema": {"$ref": "#/components/schemas/NewReconstruction"}}
+        },
+    }
+}
+
+
+@router.post(
+    "/queries/{query_id}/reconstruction",
+    status_code=202,
+    responses=declared(400, 404, 413, 415, 422),
+    openapi_extra=_BODY,
+)
+async def reconstruct(
+    query_id: str, request: Request, here: Here, asking: Asking, response: Response
+) -> Reconstruction:
+    """Fuse the accepted matches of an answer, moved into the query's camera frame, to a surface.
+
+    A worker does it, with Open3D. The answer may expire meanwhile. Ask under `Location` until
+    `state` is `succeeded`; then mesh.ply and picture.png are there. It takes the scope `write`.
+    """
+    kept = await to_thread.run_sync(lambda: _kept(here, asking, query_id))
+    wanted = await _wanted(request)
+    made = await to_thread.run_sync(lambda: here.engine.reconstructions.begin(kept, wanted))
+    response.headers["Location"] = f"/v1/reconstructions/{made.job_id}"
+    return made
+
+
+@router.get("/reconstructions/{job_id}", responses=declared(404))
+def get_reconstruction(job_id: str, here: Here, asking: Asking) -> Reconstruction:
+    """A reconstruction: how far it is, and what its views show together when it is done."""
+    return _found(here, asking, job_id)
+
+
+@router.get(
+    "/reconstructions/{job_id}/mesh.ply",
+    response_class=Response,
+    responses=files(
+        MEDIA_TYPES[MESH],
+        "Points with normals, coloured by the first view that saw them, and triangles unless a "
+        "cloud was asked for; binary little-endian. A comment names the frame of coordinates.",
+        409,
+    ),
+)
+def get_mesh(job_id: str, request: Request, here: Here, asking: Asking) -> Response:
+    """The surface, in the query's camera frame; 409 until the job has succeeded."""
+    return _file(request, here, asking, job_id, MESH)
+
+
+@router.get(
+    "/reconstructions/{job_id}/picture.png",
+    response_class=Response,
+    responses=files(
+        MEDIA_TYPES[PICTURE], "The surface from above, coloured by view, with the cameras.", 409
+    ),
+)
+def get_picture(job_id: str, request: Request, here: Here, asking: Asking) -> Response:
+    """A picture of the surface, and what each view adds to it; 409 until it is made."""
+    return _file(request, here, asking, job_id, PICTURE)
+
+
+@router.delete("/reconstructions/{job_id}", status_code=204, responses=declared(404))
+def delete_reconstruction(job_id: str, here: Here, asking: Asking) -> None:
+    """Remove a reconstruction with its files; one that is under way is given up."""
+    for name in _found(here, asking, job_id).maps:
+        asking.require(name, "write")
+    here.engine.reconstructions.delete(job_id)
+
+
+def _kept(here: Context, asking: Caller, query_id: str) -> Kept:
+    """The answer, for who may read the maps that it was asked of, and write to those it names."""
+    kept = here.engine.kept.find(query_id)
+    answer = kept.answer
+    matched = {match.map for match in answer.matches}
+    asked = {*answer.maps, *([] if answer.frame is None else [answer.frame.map])}
+    if not all(asking.may("read", name) for name in asked | matched):
+        raise unknown_query(query_id)
+    for name in sorted(matched):
+        asking.require(name, "write")
+    return kept
+
+
+def _found(here: Context, asking: Caller, job_id: str) -> Reconstruction:
+    found = here.engine.reconstructions.find(job_id)
+    if not all(asking.may("read", name) for name in found.maps):
+        raise unknown_job(job_id)
+    return found
+
+
+def _file(request: Request, here: Context, asking: Caller, job_id: str, name: str) -> Response:
+    _found(here, asking, job_id)
+    file, blobs = here.engine.reconstructions.file(job_id, name), here.engine.store.blobs
+    if blobs.condition(file.blob) == "sound":
+        with suppress(FileNotFoundError):
+            return send_file(
+                request, blobs.path(file.blob), file.media_type, file.blob, f"{job_id[:12]}-{name}"
+            )
+    here.engine.reconstructions.file(job_id, name)  # UnknownJob where it was deleted meanwhile
+    raise DamagedBlob(f"{name} of reconstruction {job_id} is damaged. Reconstruct it again.")
+
+
+async def _wanted(request: Request) -> NewReconstruction:
+    """What the body asks for; without a body, the defaults."""
+    if request.headers.get("content-length", "0") == "0" and (
+        "transfer-encoding" not in request.headers
+    ):
+        return NewReconstruction()
+    if media_type(request) != "application/json":
+        raise UnsupportedType(
+            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
+            "application/json, or no body."
+        )
+    given = await read_json(request)
+    if not isinstance(given, dict):
+        raise InvalidRequest("The body is no JSON object.", (("", "not an object"),))
+    try:
+        return NewReconstruction.model_validate(given)
+    except ValidationError as error:
+        raise invalid(error, "The reconstruction") from error

@@ -1,0 +1,232 @@
+"""Asking over HTTP: the same options in JSON, in a form and beside a bare frame; and refusals."""
+
+from __future__ import annotations
+
+import json
+import random
+from typing import Any
+
+import pytest
+
+OPTIONS: dict[str, Any] = {
+    "k": 2, "seed": 5, "candidates": 3, "diversity": {"sigma": 0.5},
+    "validation": {"weak": 0.0, "mode": "full"}, "explain": True, "exact": True,
+    "filter": {"robot": "r1"}, "keep": False, "stages": "retrieve,diversify,validate",
+}  # fmt: skip
+JUNK: list[Any] = [
+    None, True, -1, 0, 1, 2**70, 1.5, 1e308, "", "x", "*", ",", "\x00", "a" * 300, "{}", "[1]",
+    [], ["x"], [None], {}, {"x": 1}, {"map": "ask-a"}, {"map": "ask-a", "frame_id": "x"},
+    {"sigma": -1}, {"mode": "none"}, "true", "1e3", ["retrieve"], [["retrieve"]], "é",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def maps(served, make_map, shots) -> dict[str, list[str]]:
+    """`ask-a` has two views of each of two rooms, `ask-b` one of each."""
+    found = {}
+    for name, views in (("ask-a", (0, 1, 3, 4)), ("ask-b", (0, 3))):
+        path, found[name] = make_map(served, name), []
+        for i in views:
+            meta = {"session": f"room {i // 3}", "robot": "r1", "pose": {"matrix": shots[i].pose}}
+            sent = served.client.post(
+                f"{path}/frames", **shots[i].form(**meta), headers={"Prefer": "wait=60"}
+            )
+            assert sent.json()["state"] == "indexed"
+            found[name].append(sent.json()["frame_id"])
+    return found
+
+
+def told(answer, status: int = 200) -> dict[str, Any]:
+    assert answer.status_code == status, answer.text
+    found: dict[str, Any] = answer.json()
+    return {k: v for k, v in found.items() if k not in ("query_id", "milliseconds")}
+
+
+def as_text(options: dict[str, Any]) -> dict[str, str]:
+    return {n: one if isinstance(one, str) else json.dumps(one) for n, one in options.items()}
+
+
+def sent(served, path: str, shot, options: dict[str, Any], *, bare: bool) -> Any:
+    """A frame with options: in a form, or as the body."""
+    if bare:
+        query = {**as_text(options), **{k: str(v) for k, v in shot.camera.items()}}
+        return served.client.post(
+            path, params=query, content=shot.png, headers={"Content-Type": "image/png"}
+        )
+    form = shot.form()
+    form["data"] |= as_text(options)
+    return served.client.post(path, **form)
+
+
+def test_options_are_the_same_however_they_come(served, maps, shots):
+    for path, more in (
+        ("/v1/maps/ask-a/queries", {}),
+        ("/v1/maps/ask-a/localize", {}),
+        ("/v1/queries", {"maps": "ask-b,ask-a"}),
+    ):
+        one, two = (
+            told(sent(served, path, shots[1], OPTIONS | more, bare=bare)) for bare in (False, True)
+        )
+        assert one == two
+    assert one["maps"] == ["ask-b", "ask-a"]
+    assert [len(one["explanations"]), one["counts"]["selected"], one["counts"]["map"]] == [6, 3, 6]
+    assert one["matches"][0]["validation"]["strength"] == "weak"
+    own = maps["ask-a"][1]
+    by_text, by_json = (
+        told(served.client.post("/v1/maps/ask-a/queries", json={"frame_id": own, **given}))
+        for given in (as_text(OPTIONS), OPTIONS)
+    )
+    assert by_text == by_json
+    assert by_json["frame"] == {"map": "ask-a", "frame_id": own}
+
+
+def test_a_robot_is_localized(served, maps, shots):
+    answer = told(served.client.post("/v1/maps/ask-a/queries", **shots[0].form()))
+    there = told(served.client.post("/v1/maps/ask-a/localize", **shots[0].form()))
+    assert (there["status"], there["map"]) == ("found", "ask-a")
+    assert there["pose"] == answer["location"]["pose"]
+    assert there["best"] == answer["matches"][0]
+    assert there["best"]["frame_id"] == maps["ask-a"][0] == there["matches"][0]
+    lost = told(served.client.post("/v1/maps/ask-a/localize", **shots[2].form()))
+    assert (lost["status"], lost["pose"], lost["best"]) == ("not_found", None, None)
+    stored = served.client.post("/v1/maps/ask-a/localize", json={"frame_id": maps["ask-a"][0]})
+    assert told(stored)["pose"] is None or told(stored)["best"]["frame_id"] == maps["ask-a"][1]
+
+
+def test_maps_are_asked_together(served, maps, shots):
+    body = {"frame": {"map": "ask-b", "frame_id": maps["ask-b"][0]}, "maps": ["ask-a", "ask-b"]}
+    answer = told(served.client.post("/v1/queries", json=body))
+    best = answer["matches"][0]
+    assert (best["map"], best["frame_id"], best["distance"]) == ("ask-a", maps["ask-a"][0], 0)
+    assert answer["location"]["map"] == "ask-a"
+    assert {n: one["counts"]["map"] for n, one in answer["per_map"].items()} == {
+        "ask-a": 4, "ask-b": 1,
+    }  # fmt: skip
+    alone = told(served.client.post("/v1/queries", json={**body, "maps": "ask-b"}))
+    assert (alone["per_map"], alone["maps"]) == (None, ["ask-b"])
+
+
+def test_two_frames_are_compared(served, maps, shots):
+    names = [{"map": "ask-a", "frame_id": one} for one in maps["ask-a"]]
+    pair = {"frame_a": names[0], "frame_b": names[1], "seed": 2}
+    stored = told(served.client.post("/v1/similarity", json=pair))
+    form = {"a": ("a.png", shots[0].png), "b": ("b.png", shots[1].png)}
+    meta = {f"meta_{name}": json.dumps({"intrinsics": shots[0].camera}) for name in "ab"}
+    both = served.client.post(
+        "/v1/similarity", files=form, data=meta | {"model": "compact", "seed": "2"}
+    )
+    mixed = served.client.post(
+        "/v1/similarity",
+        files={"b": form["b"]},
+        data={"meta_b": meta["meta_b"], "frame_a": json.dumps(names[0]), "seed": "2"},
+    )
+    found = [stored, told(both), told(mixed)]
+    for field in ("distance", "similarity", "validation", "model", "seed"):
+        assert found[0][field] == found[1][field] == found[2][field]
+    assert [one["a"] for one in found] == [names[0], None, names[0]]
+    frames = [one["transform"] and one["transform"]["child_frame"] for one in found]
+    assert frames in ([None] * 3, [f"{maps['ask-a'][1]}.optical", "b.optical", "b.optical"])
+    itself = told(served.client.post("/v1/similarity", json={**pair, "frame_b": names[0]}))
+    assert (itself["distance"], itself["similarity"]) == (0, 1.0)
+    bare = told(served.client.post("/v1/similarity", json={**pair, "validate": False}))
+    assert (bare["validation"], bare["transform"]) == (None, None)
+
+
+def test_what_cannot_be_asked_is_refused(served, maps, shots, refused, make_map):
+    make_map(served, "ask-paper", "paper")
+    named = {"map": "ask-a", "frame_id": maps["ask-a"][0]}
+
+    def refuse(path: str, body: Any, status: int, kind: str, text: str) -> None:
+        refused(served.client.post(path, json=body), status, kind, text)
+
+    bad = (422, "invalid-request")
+    query, several = "/v1/maps/ask-a/queries", "/v1/queries"
+    for field, value in (
+        ("candidates", 0), ("candidates", 201), ("deadline_ms", 0), ("diversity", {"sigma": 0}),
+        ("diversity", "{"), ("validation", {"mode": "fast"}), ("validation", {"residual_m": -1}),
+        ("validation", {"stiffness": 1}), ("explain_frame", ""), ("keep", "perhaps"),
+    ):  # fmt: skip
+        refuse(query, {"frame_id": maps["ask-a"][0], field: value}, *bad, field)
+    refuse(query, {"k": 3}, *bad, "`frame_id`")
+    refuse("/v1/maps/ask-a/localize", {"frame_id": "x", "stages": ["retrieve"]}, *bad, "validated")
+    explained = {"frame_id": maps["ask-a"][0], "explain_frame": maps["ask-b"][0]}
+    refuse(query, explained, 404, "unknown-frame", "in map 'ask-a'")
+    refuse(several, {"maps": ["ask-a"]}, *bad, "`frame`")
+    refuse(several, {"frame": named}, *bad, "maps")
+    refuse(several, {"frame": named, "maps": []}, *bad, "maps")
+    refuse(several, {"frame": named, "maps": ["m"] * 65}, *bad, "64")
+    refuse(several, {"frame": named, "maps": ["ask-a", "ask-paper"]}, *bad, "ask-paper has paper-")
+    refuse(several, {"frame": named, "maps": ["ask-a", "no"]}, 404, "unknown-map", "'no'")
+    away = {"map": "no", "frame_id": "x"}
+    refuse(several, {"frame": away, "maps": ["ask-a"]}, 404, "unknown-map", "'no'")
+    same = "/v1/similarity"
+    refuse(same, {"frame_a": named}, *bad, "'frame_b' is neither")
+    refuse(same, {"frame_a": named, "frame_b": away}, 404, "unknown-map", "'no'")
+    refuse(same, {"frame_a": named, "frame_b": named, "model": "paper"}, *bad, "Leave `model` out")
+    file = ("a.png", shots[0].png)
+    for files, data, text in (
+        ({"a": file}, {}, "frame_b"),
+        ({"a": file, "b": file}, {}, "meta_a"),
+        ({"a": file}, {"frame_a": json.dumps(named), "meta_a": "{}"}, "as well"),
+        ({"a": file}, {"frame_b": json.dumps(named), "b": "text"}, "a text where a file"),
+        ({"b": file}, {"frame_a": json.dumps(named), "meta_a": "{}"}, "of no file"),
+        ({"a": file, "b": file}, {"meta_a": "{}", "meta_b": "{}"}, "intrinsics"),
+        ({"a": file}, {"frame_b": json.dumps(named), "speed": "1"}, "speed"),
+    ):
+        refused(served.client.post(same, files=files, data=data), 422, "invalid-request", text)
+    form = {"frame_b": json.dumps(named), "meta_a": "{"}
+    answer = served.client.post(same, files={"a": file}, data=form)
+    refused(answer, 400, "malformed-body", "`meta_a` is not JSON")
+    refused(served.client.post(same, content=b"[]", headers={"Content-Type": "application/json"}),
+            400, "malformed-body")  # fmt: skip
+    refused(served.client.post(same, content=b"x", headers={"Content-Type": "text/plain"}),
+            415, "unsupported-type")  # fmt: skip
+
+
+def test_what_a_key_may_not_read_is_not_there(wall, shots):
+    held = wall({"robot": {"ask-a": "read"}, "boss": {"*": "admin"}}, "--workers", "0")
+    for name in ("ask-a", "secret"):
+        made = held.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
+        assert made.status_code == 201
+    there = []
+    for hidden in ("secret", "nowhere"):
+        frame = {"map": hidden, "frame_id": "x"}
+        mine = {"map": "ask-a", "frame_id": "x"}
+        asked = [
+            ("/v1/queries", {"maps": ["ask-a", hidden], "frame": mine}),
+            ("/v1/queries", {"maps": ["ask-a"], "frame": frame}),
+            (f"/v1/maps/{hidden}/localize", {"frame_id": "x"}),
+            ("/v1/similarity", {"frame_a": frame, "frame_b": mine}),
+        ]
+        answers = [held.ask("robot", "POST", path, json=body) for path, body in asked]
+        assert {one.status_code for one in answers} == {404}
+        there.append([one.json()["detail"].replace(hidden, "MAP") for one in answers])
+    assert there[0] == there[1]
+    form = shots[0].form()
+    form["data"] |= {"maps": "*", "stages": "retrieve"}
+    every = held.ask("robot", "POST", "/v1/queries", **form)
+    assert (every.status_code, every.json()["maps"]) == (200, ["ask-a"])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_body_breaks_a_route(served, maps, seed):
+    """Every answer is one that the document declares: `promised` looks."""
+    rng, statuses = random.Random(seed), set()
+    named = {"map": "ask-a", "frame_id": maps["ask-a"][0]}
+    fields = [*OPTIONS, "deadline_ms", "explain_frame", "frame", "maps", "frame_id", "frame_a",
+              "frame_b", "validate", "model"]  # fmt: skip
+    whole: dict[str, dict[str, Any]] = {
+        "/v1/maps/ask-a/queries": {"frame_id": maps["ask-a"][0]},
+        "/v1/maps/ask-a/localize": {"frame_id": maps["ask-a"][0]},
+        "/v1/queries": {"maps": ["ask-a", "ask-b"], "frame": named},
+        "/v1/similarity": {"frame_a": named, "frame_b": named, "validate": False},
+    }
+    for _ in range(50):
+        path = rng.choice([*whole])
+        body = {**whole[path], "stages": ["retrieve"]} if "queries" in path else {**whole[path]}
+        for field in rng.sample(fields, rng.randint(1, 3)):
+            body[field] = rng.choice([*JUNK, OPTIONS.get(field)])
+        answer = served.client.post(path, json=body)
+        statuses.add(answer.status_code)
+        assert answer.status_code in (200, 404, 422), (path, body, answer.text)
+    assert statuses >= {422}

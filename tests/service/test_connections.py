@@ -1,0 +1,275 @@
+"""Connections and bodies of callers that keep us waiting: uvicorn with our limits, and a small app.
+
+The limits are made short; nothing is timed: each test waits until the other side has acted.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+import uvicorn
+from starlette.requests import Request
+from starlette.responses import Response
+
+from sceneprint.settings import Settings
+from service import connections, slowness
+from service.connections import Connection
+from service.cors import Origins
+from service.metrics import Metrics
+from service.middleware import Around
+
+LARGE = 8 << 20
+PATIENCE_S = 30
+
+
+async def app(scope: Any, receive: Any, send: Any) -> None:
+    """Answers with the length of the body; otherwise where the path says so."""
+    body = b"" if scope["path"] == "/unread" else await Request(scope, receive).body()
+    if scope["path"] == "/wait":
+        await asyncio.sleep(1.0)
+    content = b"a" * LARGE if scope["path"] == "/large" else str(len(body)).encode()
+    await Response(content)(scope, receive, send)
+
+
+@contextmanager
+def running(application: Any) -> Iterator[tuple[str, int]]:
+    config = uvicorn.Config(
+        application, http=Connection, lifespan="off", log_config=None, access_log=False
+    )
+    server = uvicorn.Server(config)
+    listening = socket.create_server(("127.0.0.1", 0))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
+    thread.start()
+    try:
+        yield listening.getsockname()
+    finally:
+        server.should_exit = True
+        thread.join()
+        listening.close()
+
+
+@pytest.fixture
+def opened(monkeypatch) -> Iterator[Callable[..., socket.socket]]:
+    """Connections to a service that is soon tired of waiting."""
+    monkeypatch.setattr(connections, "HEAD_S", 0.8)
+    monkeypatch.setattr(connections, "READING_S", 1.0)
+    monkeypatch.setattr(slowness, "IDLE_S", 0.8)
+    settings = Settings(body_s=1, upload_bytes=1 << 20, cors_origins=())
+    made: list[socket.socket] = []
+    with running(Around(app, settings, Origins(()), Metrics())) as address:
+
+        def connect(said: bytes = b"") -> socket.socket:
+            made.append(socket.create_connection(address, timeout=PATIENCE_S))
+            made[-1].sendall(said)
+            return made[-1]
+
+        try:
+            yield connect
+        finally:
+            for one in made:
+                one.close()
+
+
+def rest(wire: socket.socket) -> bytes:
+    """All that comes until the other side closes."""
+    data = b""
+    try:
+        while more := wire.recv(1 << 16):
+            data += more
+    except ConnectionError:
+        pass
+    return data
+
+
+def ask(path: str, *headers: str, method: str = "GET") -> bytes:
+    lines = (f"{method} {path} HTTP/1.1", "Host: localhost", *headers, "", "")
+    return "\r\n".join(lines).encode()
+
+
+CLOSE = "Connection: close"
+
+
+def test_a_silent_connection_is_closed_without_a_word(opened):
+    assert rest(opened()) == b""
+
+
+@contextmanager
+def dripping(wire: socket.socket, drop: bytes) -> Iterator[None]:
+    """Meanwhile something comes again and again."""
+    ended = threading.Event()
+
+    def drip() -> None:
+        while not ended.wait(0.05):
+            try:
+                wire.sendall(drop)
+            except OSError:
+                return
+
+    thread = threading.Thread(target=drip)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def test_a_head_that_drips_is_not_waited_for(opened):
+    wire = opened(b"GET / HTTP/1.1\r\nHost: localhost\r\n")
+    with dripping(wire, b"X-A: b\r\n"):
+        assert rest(wire) == b""  # closed, though it was never silent
+
+
+def test_an_answer_that_takes_long_is_not_cut_short(opened):
+    """1 s at work, and a head may take 0.8: only the caller's own slowness counts."""
+    assert rest(opened(ask("/wait", CLOSE))).endswith(b"\r\n\r\n0")
+
+
+def test_a_connection_may_be_used_again(opened):
+    wire = opened(ask("/"))
+    for path in ("/wait", "/"):
+        data = b""
+        while not data.endswith(b"\r\n\r\n0"):
+            data += wire.recv(1 << 16)
+        wire.sendall(ask(path, CLOSE if path == "/" else "Accept: */*"))
+    assert rest(wire).endswith(b"\r\n\r\n0")
+
+
+def test_the_rest_of_a_body_that_was_refused_is_not_read_for_ever(opened):
+    wire = opened(ask("/unread", "Content-Length: 99999", method="POST"))
+    with dripping(wire, b"a"):
+        assert rest(wire).endswith(b"\r\n\r\n0")
+
+
+def test_an_answer_nobody_reads_is_given_up(opened, monkeypatch):
+    lost: set[Any] = set()
+    ended = threading.Event()
+    before = Connection.connection_lost
+
+    def noted(self: Connection, exc: Exception | None) -> None:
+        before(self, exc)
+        lost.add(self.client)
+        ended.set()
+
+    monkeypatch.setattr(Connection, "connection_lost", noted)
+    with socket.socket() as wire:
+        wire.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        wire.connect(opened().getpeername())
+        wire.sendall(ask("/large"))
+        while wire.getsockname() not in lost:  # the other one is silent, and closed as well
+            assert ended.wait(PATIENCE_S)
+            ended.clear()
+
+
+def test_an_answer_that_is_read_slowly_is_given_whole(opened):
+    wire = opened(ask("/large", CLOSE))
+    data, seen = b"", threading.Event()
+    while more := wire.recv(1 << 18):
+        data += more
+        seen.wait(0.05)  # 32 pauses, longer together than the limit
+    assert len(data) > LARGE
+
+
+def test_who_was_silent_for_longest_makes_room(opened, monkeypatch):
+    monkeypatch.setattr(connections, "HEAD_S", 60)
+    monkeypatch.setattr(connections, "room", lambda: 3)
+    first, second = opened(), opened()
+    working = opened(ask("/wait", CLOSE))
+    fourth = opened(ask("/", CLOSE))
+    assert rest(fourth).endswith(b"0")
+    assert rest(first) == b""  # closed; a request at work is not
+    assert rest(working).endswith(b"0")
+    second.sendall(ask("/", CLOSE))
+    assert rest(second).endswith(b"0")
+
+
+def test_of_a_crowd_that_comes_at_once_no_more_stay_than_there_is_room_for(opened, monkeypatch):
+    """Each newcomer sends another away, not all of them the same."""
+    monkeypatch.setattr(connections, "HEAD_S", 60)
+    monkeypatch.setattr(connections, "room", lambda: 5)
+    crowd = [opened() for _ in range(40)]
+    for wire in crowd[:34]:
+        assert rest(wire) == b""
+    for wire in crowd[36:]:
+        wire.sendall(ask("/", CLOSE))
+        assert rest(wire).endswith(b"0")
+
+
+def refusal(said: bytes) -> tuple[int, dict[str, Any]]:
+    head, _, body = said.partition(b"\r\n\r\n")
+    assert b"application/problem+json" in head
+    assert b"connection: close" in head.lower()
+    return int(head.split()[1]), json.loads(body)
+
+
+@pytest.mark.parametrize("sent", [b"", b"abc"])
+def test_a_body_that_stops_is_refused(opened, sent):
+    wire = opened(ask("/", "Content-Length: 9", method="POST") + sent)
+    status, problem = refusal(rest(wire))
+    assert (status, problem["type"]) == (408, "/problems/slow-body")
+    assert f"nothing came, after {len(sent)} bytes" in problem["detail"]
+
+
+def test_a_body_that_drips_is_refused_in_the_end(opened):
+    wire = opened(ask("/", "Transfer-Encoding: chunked", method="POST"))
+    with dripping(wire, b"1\r\na\r\n"):
+        status, problem = refusal(rest(wire))
+    assert (status, problem["type"]) == (408, "/problems/slow-body")
+    assert "it took too long" in problem["detail"]
+
+
+def test_each_mebibyte_that_came_gives_more_time(monkeypatch):
+    """By hand: 2 s, and 4 s for each MiB; each part took 3 s of waiting."""
+    now = [0.0]
+    monkeypatch.setattr(slowness.time, "monotonic", lambda: now[0])
+    left = []
+
+    class Timeout:
+        def __init__(self, seconds: float) -> None:
+            left.append(seconds)
+
+        async def __aenter__(self) -> None: ...
+
+        async def __aexit__(self, *_: object) -> None: ...
+
+    monkeypatch.setattr(slowness.asyncio, "timeout", Timeout)
+
+    async def receive() -> dict[str, Any]:
+        now[0] += 3
+        return {"type": "http.request", "body": bytes(1 << 20), "more_body": True}
+
+    async def read() -> None:
+        body = slowness.Incoming(receive, 1 << 30, 2.0)
+        for _ in range(4):
+            await body.next()
+
+    asyncio.run(read())
+    assert left == [2.0, 3.0, 4.0, 5.0]
+
+
+def test_what_is_no_http_is_refused_as_all_else(opened):
+    status, problem = refusal(rest(opened(b"HELLO\r\n\r\n")))
+    assert (status, problem["type"], problem["status"]) == (400, "/problems/bad-request", 400)
+    long = b"GET / HTTP/1.1\r\nHost: localhost\r\nX-A: " + b"a" * 70_000
+    status, problem = refusal(rest(opened(long)))
+    assert (status, "16 KiB" in problem["detail"]) == (400, True)
+
+
+def test_room_is_what_the_machine_allows(monkeypatch):
+    monkeypatch.setattr(connections.resource, "getrlimit", lambda _: (1024, 4096))
+    assert connections.room() == 1024 - connections.OTHER_FILES
+    monkeypatch.setattr(connections.resource, "getrlimit", lambda _: (4096, 4096))
+    assert connections.room() == connections.MOST_CONNECTIONS
+    set_to = []
+    monkeypatch.setattr(connections.resource, "setrlimit", lambda _, both: set_to.append(both))
+    connections.make_room()
+    monkeypatch.setattr(connections.resource, "getrlimit", lambda _: (256, 1100))
+    connections.make_room()
+    assert set_to == [(1100, 1100)]

@@ -1,0 +1,217 @@
+"""Events over HTTP: as a stream that goes on where it broke, and as pages; who sees which."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import httpx
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.settings import Settings
+
+STREAM = {"Accept": "text/event-stream"}
+
+
+@pytest.fixture(scope="module")
+def guarded(begin):
+    """A server that asks for keys and keeps two streams."""
+    server = begin("--host", "0.0.0.0", "--workers", "0", event_streams=2)
+    server.client.base_url = server.url.replace("0.0.0.0", "127.0.0.1")
+    return server
+
+
+@pytest.fixture(scope="module")
+def keys(guarded) -> dict[str, dict[str, str]]:
+    """Headers that show a key, by what it may."""
+    grants: dict[str, Any] = {
+        "admin": {"*": "admin"}, "every": {"*": "read"}, "mine": {"mine": "write"}
+    }  # fmt: skip
+    with Engine(Settings(data_dir=guarded.folder)) as engine:
+        made = {name: engine.create_key(name, granted).secret for name, granted in grants.items()}
+    headers = {name: {"Authorization": f"Bearer {secret}"} for name, secret in made.items()}
+    for name in ("mine", "theirs"):
+        path, body = "/v1/maps", {"name": name, "model": "compact"}
+        assert guarded.client.post(path, json=body, headers=headers["admin"]).status_code == 201
+    return headers
+
+
+def parts(response: httpx.Response) -> Iterator[list[str]]:
+    """The messages of a stream, as lines."""
+    lines: list[str] = []
+    for line in response.iter_lines():
+        if line:
+            lines.append(line)
+        else:
+            yield lines
+            lines = []
+
+
+def event(lines: list[str]) -> dict[str, Any]:
+    number, data = lines
+    assert data.startswith("data: ")
+    found: dict[str, Any] = json.loads(data.removeprefix("data: "))
+    assert number == f"id: {found['id']}"
+    return found
+
+
+def test_a_stream_tells_what_happens_and_goes_on_where_it_broke(served, make_map, small_shots):
+    client = served.client
+    with client.stream("GET", "/v1/events", headers=STREAM) as stream:
+        assert stream.headers["content-type"] == "text/event-stream; charset=utf-8"
+        assert stream.headers["cache-control"] == "no-store"
+        came = parts(stream)
+        assert next(came) == ["retry: 1000"]
+        comment, place = next(came)
+        assert comment == ": alive"
+        path = make_map(served, "told")
+        first = event(next(came))
+        assert (first["kind"], first["map"], first["frame_id"]) == ("map.created", "told", None)
+        assert first["id"] == int(place.removeprefix("id: ")) + 1
+        sent = client.post(f"{path}/frames", **small_shots[0].form()).json()
+        found = [event(next(came)) for _ in range(2)]
+    assert [(one["kind"], one["frame_id"], one["job_id"]) for one in found] == [
+        ("frame.received", sent["frame_id"], sent["job_id"]),
+        ("frame.indexed", sent["frame_id"], sent["job_id"]),
+    ]
+    client.delete(f"{path}/frames/{sent['frame_id']}")  # while nobody listens
+    again = STREAM | {"Last-Event-ID": str(found[0]["id"])}
+    with client.stream("GET", "/v1/events?map=told&after=0", headers=again) as stream:
+        came = parts(stream)
+        assert next(came) == ["retry: 1000"]
+        assert next(came)[0] == ": alive"
+        assert [event(next(came))["kind"] for _ in range(2)] == ["frame.indexed", "frame.deleted"]
+    asked = {"map": "told", "kind": ["map.", "frame.i"], "order": "oldest"}
+    page = client.get("/v1/events", params=asked).json()
+    assert [one["kind"] for one in page["items"]] == ["map.created", "frame.indexed"]
+    assert page["items"] == [first, found[1]]
+
+
+def test_pages_have_all_in_either_order(served, make_map):
+    client = served.client
+    for i in range(5):
+        make_map(served, f"page-{i}")
+    after = client.get("/v1/events", params={"map": "page-0"}).json()["items"][0]["id"] - 1
+    for order in ("oldest", "newest"):
+        found, cursor, pages = [], None, 0
+        while True:
+            asked = {"order": order, "after": after, "limit": 2, "kind": "map.created"}
+            page = client.get("/v1/events", params=asked | ({"cursor": cursor} if cursor else {}))
+            items = page.json()["items"]
+            found += [one["map"] for one in items]
+            cursor, pages = page.json()["next_cursor"], pages + 1
+            assert len(items) <= 2
+            if cursor is None:
+                break
+        wanted = [f"page-{i}" for i in range(5)]
+        assert found == (wanted if order == "oldest" else wanted[::-1])
+        assert pages == 3
+    assert client.get("/v1/events").json()["items"][0]["map"] == "page-4"  # the newest first
+    newest = client.get("/v1/events").json()["newest"]
+    nothing = client.get("/v1/events", params={"after": newest}).json()
+    assert nothing == {"items": [], "next_cursor": None, "newest": newest}
+
+
+@pytest.mark.parametrize(
+    ("asked", "headers"),
+    [
+        ({"kind": "frame%"}, {}),
+        ({"kind": "x" * 33}, {}),
+        ({"kind": ["a"] * 21}, {}),
+        ({"after": -1}, {}),
+        ({"after": 2**70}, {}),
+        ({"cursor": "x"}, {}),
+        ({"limit": 1001}, {}),
+        ({"order": "random"}, {}),
+        ({}, {"Last-Event-ID": "1e3"}),
+        ({}, {"Last-Event-ID": "-1"}),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_before_a_stream_begins(served, refused, asked, headers):
+    for accept in ({}, STREAM):
+        answer = served.client.get("/v1/events", params=asked, headers=headers | accept)
+        refused(answer, 422, "invalid-request")
+
+
+def test_a_map_that_is_not_there_has_no_events(served, refused):
+    for accept in ({}, STREAM):
+        answer = served.client.get("/v1/events?map=nowhere", headers=accept)
+        refused(answer, 404, "unknown-map", "There is no map 'nowhere'.")
+
+
+def test_a_key_is_told_of_its_maps_alone(guarded, keys, refused):
+    def kinds(who: str, **asked: object) -> set[tuple[str, str | None]]:
+        answer = guarded.client.get("/v1/events", params=asked, headers=keys[who])
+        return {(one["kind"], one["map"]) for one in answer.json()["items"]}
+
+    assert kinds("admin") >= {
+        ("key.created", None), ("map.created", "mine"), ("map.created", "theirs")
+    }  # fmt: skip
+    assert kinds("every") == {("map.created", "mine"), ("map.created", "theirs")}
+    assert kinds("mine") == {("map.created", "mine")} == kinds("mine", map="mine")
+    hidden = guarded.client.get("/v1/events?map=theirs", headers=keys["mine"])
+    absent = guarded.client.get("/v1/events?map=absent", headers=keys["mine"])
+    refused(hidden, 404, "unknown-map")
+    assert hidden.json()["detail"].replace("theirs", "absent") == absent.json()["detail"]
+    refused(guarded.client.get("/v1/events", headers=STREAM), 401, "key-required")
+    headers = keys["mine"] | STREAM | {"Last-Event-ID": "0"}
+    with guarded.client.stream("GET", "/v1/events", headers=headers) as stream:
+        came = parts(stream)
+        assert next(came) == ["retry: 1000"]
+        assert next(came)[0] == ": alive"
+        assert event(next(came))["map"] == "mine"
+        body = {"name": "theirs-too", "model": "compact"}
+        guarded.client.post("/v1/maps", json=body, headers=keys["admin"])
+        guarded.client.post("/v1/maps/mine/reencoding", json={"model": "paper"}, **asks(keys))
+        assert event(next(came))["kind"] == "map.reencoding"
+
+
+def asks(keys: dict[str, dict[str, str]]) -> dict[str, Any]:
+    return {"headers": keys["admin"]}
+
+
+def test_places_are_given_back_and_the_end_comes_at_once(guarded, keys, refused, until):
+    """Last in this file: it stops the server."""
+    headers = keys["admin"] | STREAM
+
+    def streams() -> float:
+        text = guarded.client.get("/metrics", headers=keys["admin"]).text
+        (line,) = [one for one in text.splitlines() if one.startswith("sceneprint_event_streams ")]
+        return float(line.split()[1])
+
+    until(lambda: streams() == 0)  # of the tests before
+    with ExitStack() as open_streams:
+        for _ in range(2):
+            open_streams.enter_context(guarded.client.stream("GET", "/v1/events", headers=headers))
+        assert streams() == 2
+        answer = guarded.client.get("/v1/events", headers=headers)
+        refused(answer, 503, "busy", "2 streams of events are open")
+        assert answer.headers["retry-after"] == "1"
+        page = guarded.client.get("/v1/events", headers=keys["admin"])
+        assert page.status_code == 200
+    until(lambda: streams() == 0)  # who hangs up frees the place
+    ended: list[float] = []
+
+    def listen() -> None:
+        with guarded.client.stream("GET", "/v1/events", headers=headers) as stream:
+            begun.set()
+            for _ in stream.iter_lines():
+                pass
+        ended.append(time.monotonic())
+
+    begun = threading.Event()
+    listener = threading.Thread(target=listen)
+    listener.start()
+    assert begun.wait(30)
+    guarded.tell(signal.SIGTERM)
+    listener.join(30)
+    assert guarded.end() == 0
+    assert len(ended) == 1  # by a whole answer: a broken one would have raised
+    log = [line for line in guarded.log("request") if line["path"] == "/v1/events"]
+    assert log[-1]["status"] == 200

@@ -1,0 +1,200 @@
+"""Figures over HTTP: of several processes together; and the ids of requests in all that is said."""
+
+from __future__ import annotations
+
+import json
+import logging
+import resource
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sceneprint import descriptors
+from sceneprint.engine import Engine
+from sceneprint.logs import JsonFormatter, name_request, of_request, request_id
+from sceneprint.schemas import Answer
+from sceneprint.settings import Settings
+from sceneprint.store import database
+from sceneprint.store.samples import samples_since
+from service.sampling import Sampler
+
+
+def test_what_was_done_is_told(served, make_map, shots, until):
+    path, client = make_map(served, "figures"), served.client
+    sent = client.post(f"{path}/frames", **shots[0].form(), headers={"Prefer": "wait=60"}).json()
+    asked = client.post(f"{path}/queries", json={"frame_id": sent["frame_id"], "k": 1})
+    assert asked.status_code == 200
+    own = client.get("/v1/stats", params={"map": "figures", "minutes": 5}).json()
+    assert (own["total"]["received"], own["total"]["indexed"], own["frames"]) == (
+        1, 1, {"indexed": 1}
+    )  # fmt: skip
+    assert sum(one["indexed"] for one in own["minutes"]) == 1
+    every = client.get("/v1/stats").json()
+    assert len(every["minutes"]) == 60
+    assert every["total"]["indexed"] >= 1
+    (worker,) = every["workers"]
+    assert int(worker["name"].rpartition(":")[2]) in served.workers
+
+    def counted() -> dict[str, Any] | None:  # within ten seconds, as it says
+        total: dict[str, Any] = client.get("/v1/stats").json()["total"]
+        status = asked.json()["status"]
+        return total if total["queries"].get(status, 0) >= 1 else None
+
+    total = until(counted)
+    assert total["requests"] >= 3
+    assert 0 < total["latency"]["p50"] <= total["latency"]["p95"] <= total["latency"]["p99"] < 90
+
+
+@pytest.mark.parametrize("asked", [{"minutes": 0}, {"minutes": 61}, {"minutes": "x"}])
+def test_history_has_an_hour(served, refused, asked):
+    refused(served.client.get("/v1/stats", params=asked), 422, "invalid-request")
+
+
+def test_all_figures_are_there(served, make_map):
+    make_map(served, "plain")
+    text = served.client.get("/metrics").text
+    values = {line.rpartition(" ")[0]: float(line.split()[-1]) for line in text.splitlines()
+              if not line.startswith("#")}  # fmt: skip
+    assert values['sceneprint_index_tail_frames{map="plain"}'] == 0
+    assert values["sceneprint_maps"] >= 1
+    assert values["sceneprint_disk_free_bytes"] > 0
+    assert values['sceneprint_disk_bytes{part="database"}'] > 0
+    assert values['sceneprint_workers{state="idle"}'] + values[
+        'sceneprint_workers{state="busy"}'
+    ] == len(served.workers)
+    assert values["sceneprint_workers_began"] >= 1
+    received = 'sceneprint_received_bytes_total{route="/v1/maps"}'
+    assert values[received] >= len(json.dumps({"name": "plain", "model": "compact"}))
+    assert values["sceneprint_newest_event"] == served.client.get("/v1/events").json()["newest"]
+    streams = [name for name in values if name.startswith("sceneprint_request_seconds")]
+    assert streams
+    assert not any("/v1/events" in name for name in streams)
+
+
+def test_models_and_reencoding_over_http(served, make_map, refused):
+    path, client = make_map(served, "again"), served.client
+    listed = client.get("/v1/models").json()["items"]
+    compact = next(one for one in listed if one["name"] == "compact")
+    assert "again" in compact["maps"]
+    place = f"{path}/reencoding"
+    for body in ({"model": "huge"}, {}, [], {"model": "paper", "x": 1}):
+        refused(client.post(place, json=body), 422, "invalid-request")
+    refused(client.post(place, content=b"{", headers={"Content-Type": "application/json"}), 400,
+            "malformed-body")  # fmt: skip
+    refused(client.post(place, content=b"model=paper"), 415, "unsupported-type")
+    refused(client.post("/v1/maps/nowhere/reencoding", json={"model": "paper"}), 404, "unknown-map")
+    refused(client.post(place, json={"model": compact["model_id"]}), 409, "conflict")
+    refused(client.delete(place), 409, "conflict")
+    begun = client.post(place, json={"model": "paper"})
+    assert begun.status_code == 202
+    assert begun.json()["name"] == "again"
+
+
+def answered(status: str, seconds: float) -> Answer:
+    return Answer.model_construct(status=status, milliseconds={"total": 1e3 * seconds})
+
+
+def test_a_sample_is_written_where_something_was_counted(tmp_path: Path):
+    sampler = Sampler()
+    with Engine(Settings(data_dir=tmp_path)) as engine:
+        store = engine.store.database
+        assert not sampler.flush(store)  # nothing happened: nothing is written
+        for status in (200, 200, 404):
+            sampler.request(status)
+        sampler.answer(answered("found", 0.1))
+        assert sampler.flush(store)
+        assert not sampler.flush(store)
+        with store.read() as connection:
+            (kept,) = samples_since(connection, "service", 0.0)
+        assert kept.data["statuses"] == {"200": 2, "404": 1}
+        assert kept.data["queries"] == {"found": 1}
+        assert sum(kept.data["latencies"].values()) == 1
+
+
+def test_a_sample_waits_for_nobody_for_long(tmp_path, monkeypatch):
+    monkeypatch.setattr(database, "BUSY_S", 0.05)
+    sampler = Sampler()
+    with Engine(Settings(data_dir=tmp_path)) as engine:
+        with closing(sqlite3.connect(tmp_path / "sceneprint.db", isolation_level=None)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            sampler.request(200)
+            assert not sampler.flush(engine.store.database)
+            other.execute("COMMIT")
+        sampler.request(404)
+        assert sampler.flush(engine.store.database)
+        with engine.store.database.read() as connection:
+            (kept,) = samples_since(connection, "service", 0.0)
+        assert kept.data["statuses"] == {"404": 1}
+
+
+def test_an_id_goes_with_its_request_to_the_worker(served, make_map, until):
+    path, asked = make_map(served, "named"), {"X-Request-Id": "robot-7.42"}
+    wrong = served.client.post("/v1/maps/nowhere/frames", headers=asked)
+    assert wrong.json()["instance"] == "/requests/robot-7.42"
+    wall = {"files": {"frame": ("w.npy", flat(), "application/octet-stream")}}
+    meta = {"intrinsics": {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 32, "cy": 24}}
+    sent = served.client.post(
+        f"{path}/frames", **wall, data={"meta": json.dumps(meta)}, headers=asked
+    )
+    assert sent.status_code == 202, sent.text
+    url = f"{path}/frames/{sent.json()['frame_id']}"
+    until(lambda: served.client.get(url).json()["state"] in ("rejected", "indexed"))
+    until(lambda: [line for line in served.log() if line.get("request_id") == "robot-7.42"
+                   and line["logger"].startswith("sceneprint.engine")])  # fmt: skip
+
+
+def flat() -> bytes:
+    import io
+
+    import numpy as np
+
+    out = io.BytesIO()
+    depth = np.zeros((48, 64), np.float32)
+    depth[10:13, 10:14] = 2.0
+    np.save(out, depth)
+    return out.getvalue()
+
+
+def test_lines_name_the_request_that_is_worked_on():
+    def line() -> dict[str, Any]:
+        record = logging.LogRecord("a", logging.INFO, "", 0, "text", None, None)
+        found: dict[str, Any] = json.loads(JsonFormatter().format(record))
+        return found
+
+    assert "request_id" not in line()
+    with of_request("one"):
+        assert line()["request_id"] == "one"
+        with of_request(None):
+            assert "request_id" not in line()
+        assert request_id() == "one"
+    assert request_id() is None
+    with of_request("two"):
+        name_request("three")
+        assert line()["request_id"] == "three"
+    assert request_id() is None
+
+
+CHILD = """
+import resource
+from sceneprint import descriptors
+resource.setrlimit(resource.RLIMIT_NOFILE, (64, 256))
+told = descriptors.raise_descriptors()
+files = [open("/dev/null") for _ in range(200)]
+print(told, resource.getrlimit(resource.RLIMIT_NOFILE))
+"""
+
+
+def test_as_many_files_may_be_open_as_the_system_lets(served):
+    done = subprocess.run([sys.executable, "-c", CHILD], capture_output=True, text=True, check=True)
+    assert done.stdout == "256 (256, 256)\n"
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    wanted = descriptors.MOST if hard == resource.RLIM_INFINITY else min(hard, descriptors.MOST)
+    for pid in (served.process.pid, *served.workers):
+        text = Path(f"/proc/{pid}/limits").read_text()
+        (line,) = [one for one in text.splitlines() if one.startswith("Max open files")]
+        assert int(line.split()[3]) >= wanted

@@ -1,0 +1,389 @@
+"""A key for one map learns nothing of another: every operation of the document, one by one.
+
+What is not the key's is answered, to the byte, as what is not there: the id of the request and the
+name that was asked for apart. A route that is in no list here fails the test.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+from dataclasses import dataclass, field
+from typing import Any
+
+import httpx
+import pytest
+
+#: The key's own map, one that it may not see, and one that is not there: names of one length.
+OWN, THEIRS, NONE = "alpha", "bravo", "zulus"
+NO_ID = "0123456789abcdef0123456789abcdef"
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is asked of an operation.
+
+    Parameters
+    ----------
+    scope : that the map's key needs
+    query, body : more of the request; {map}, {frame}, {job} ... stand for what is asked about
+    """
+
+    scope: str = "read"
+    query: dict[str, str] = field(default_factory=dict)
+    body: Any = None
+
+
+FRAME = {"map": "{map}", "frame_id": "{frame}"}
+OF_A_MAP = {
+    "GET /v1/maps/{map_name}": Case(),
+    "PATCH /v1/maps/{map_name}": Case("admin", body={"title": "x"}),
+    "DELETE /v1/maps/{map_name}": Case("admin"),
+    "POST /v1/maps": Case("admin", body={"name": "{map}"}),
+    "GET /v1/maps/{map_name}/frames": Case(),
+    "POST /v1/maps/{map_name}/frames": Case("write"),
+    "PUT /v1/maps/{map_name}/frames/{frame_id}": Case("write"),
+    "POST /v1/maps/{map_name}/frames/batch": Case("write"),
+    "POST /v1/maps/{map_name}/imports": Case("write"),
+    "GET /v1/maps/{map_name}/imports/{job_id}": Case(),
+    "GET /v1/maps/{map_name}/imports/{job_id}/items": Case(),
+    "GET /v1/maps/{map_name}/frames/{frame_id}": Case(),
+    "PATCH /v1/maps/{map_name}/frames/{frame_id}": Case("write", body={"tags": ["x"]}),
+    "DELETE /v1/maps/{map_name}/frames/{frame_id}": Case("write"),
+    "GET /v1/maps/{map_name}/frames/{frame_id}/cloud.ply": Case(),
+    "GET /v1/maps/{map_name}/frames/{frame_id}/preview.png": Case(),
+    "GET /v1/maps/{map_name}/frames/{frame_id}/patches": Case(),
+    "GET /v1/maps/{map_name}/frames/{frame_id}/signature": Case(),
+    "GET /v1/maps/{map_name}/frames/{frame_id}/upload": Case(),
+    "GET /v1/maps/{map_name}/sessions": Case(),
+    "GET /v1/maps/{map_name}/trajectory": Case(query={"session": "{session}"}),
+    "POST /v1/maps/{map_name}/queries": Case(body={"frame_id": "{frame}"}),
+    "POST /v1/maps/{map_name}/localize": Case(body={"frame_id": "{frame}"}),
+    "POST /v1/queries": Case(body={"maps": [OWN, "{map}"], "frame": FRAME}),
+    "POST /v1/similarity": Case(body={"frame_a": FRAME, "frame_b": FRAME}),
+    "GET /v1/queries/{query_id}": Case(),
+    "GET /v1/queries/{query_id}/cloud.ply": Case(),
+    "GET /v1/queries/{query_id}/similarities": Case(),
+    "GET /v1/queries/{query_id}/matches/{frame_id}": Case(),
+    "GET /v1/queries/{query_id}/matches/{frame_id}/overlay.ply": Case(),
+    "POST /v1/queries/{query_id}/reconstruction": Case("write", body={}),
+    "GET /v1/reconstructions/{job_id}": Case(),
+    "DELETE /v1/reconstructions/{job_id}": Case("write"),
+    "GET /v1/reconstructions/{job_id}/mesh.ply": Case(),
+    "GET /v1/reconstructions/{job_id}/picture.png": Case(),
+    "POST /v1/maps/{map_name}/associations": Case("write", body={"sessions": ["{session}"]}),
+    "GET /v1/maps/{map_name}/associations": Case(),
+    "GET /v1/maps/{map_name}/associations/{job_id}": Case(),
+    "DELETE /v1/maps/{map_name}/associations/{job_id}": Case("write"),
+    "GET /v1/maps/{map_name}/associations/{job_id}/edges": Case(),
+    "GET /v1/maps/{map_name}/associations/{job_id}/graph": Case(),
+    "GET /v1/jobs": Case(query={"map": "{map}"}),
+    "GET /v1/jobs/{job_id}": Case(),
+    "POST /v1/jobs/{job_id}/cancel": Case("write"),
+    "POST /v1/jobs/{job_id}/retry": Case("write"),
+    "GET /v1/events": Case(query={"map": "{map}"}),
+    "GET /v1/stats": Case(query={"map": "{map}"}),
+    "POST /v1/maps/{map_name}/reencoding": Case("admin", body={"model": "compact"}),
+    "DELETE /v1/maps/{map_name}/reencoding": Case("admin"),
+}
+#: In the key's own map, an id or session may be named as another map has it: it says nothing.
+MADE_OF_ANYTHING = (
+    "PUT /v1/maps/{map_name}/frames/{frame_id}", "POST /v1/maps/{map_name}/associations",
+)  # fmt: skip
+#: The operator's: 403 for who has a map, whatever is asked for.
+OF_ALL = (
+    "GET /v1/keys", "POST /v1/keys", "DELETE /v1/keys/{key_name}", "GET /v1/audit", "GET /metrics",
+    "POST /v1/snapshots", "GET /v1/snapshots", "GET /v1/snapshots/{snapshot_id}",
+    "DELETE /v1/snapshots/{snapshot_id}",
+)  # fmt: skip
+#: Answered to anybody with a key, and by what the key may read.
+BY_KEY = ("GET /v1/maps", "GET /v1/models", "GET /v1/keys/me", "GET /v1/jobs", "GET /v1/events")
+#: Answered without a key.
+OF_NOBODY = ("GET /healthz", "GET /readyz")
+
+
+@dataclass(frozen=True)
+class There:
+    """What there is of a map; where there is no such map, ids that nothing has."""
+
+    map: str
+    frame: str
+    query: str
+    job: str
+    association: str
+    reconstruction: str
+    session: str
+
+    def of(self, operation: str, what: str) -> str:
+        """The id that a part of a path stands for."""
+        kinds = {"associations": self.association, "reconstructions": self.reconstruction}
+        jobs = [one for kind, one in kinds.items() if f"/{kind}" in operation]
+        return {
+            "map_name": self.map, "frame_id": self.frame, "query_id": self.query,
+            "job_id": (jobs or [self.job])[0], "key_name": "keeper", "snapshot_id": self.job,
+        }[what]  # fmt: skip
+
+    def fill(self, text: str) -> str:
+        return (
+            text.replace("{map}", self.map).replace("{frame}", self.frame)
+            .replace("{session}", self.session)
+        )  # fmt: skip
+
+    @property
+    def ids(self) -> list[str]:
+        return [self.map, self.frame, self.query, self.job, self.association, self.reconstruction]
+
+
+@pytest.fixture(scope="module")
+def there(walled, small_shots) -> dict[str, There]:
+    """Two maps with two frames each, an answer, an association and a reconstruction of each."""
+    found = {}
+    for name, pair in ((OWN, small_shots[:2]), (THEIRS, small_shots[1:3])):
+        made = walled.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
+        assert made.status_code == 201
+        session = f"run-of-{name}"
+        sent = [
+            walled.ask(
+                "boss", "POST", f"/v1/maps/{name}/frames", headers={"Prefer": "wait=60"},
+                **shot.form(session=session, captured_at=f"2026-11-16T09:30:0{number}Z"),
+            ).json()
+            for number, shot in enumerate(pair)
+        ]  # fmt: skip
+        assert [one["state"] for one in sent] == ["indexed", "indexed"]
+        frame = sent[0]["frame_id"]
+        asked = walled.ask("boss", "POST", f"/v1/maps/{name}/queries", json={"frame_id": frame})
+        query = asked.json()["query_id"]
+        body = {"sessions": [session], "apart": 1}
+        begun = walled.ask("boss", "POST", f"/v1/maps/{name}/associations", json=body)
+        assert begun.status_code == 202, begun.text
+        fused = walled.ask("boss", "POST", f"/v1/queries/{query}/reconstruction", json={})
+        assert fused.status_code == 202, fused.text
+        jobs = [one.headers["location"].rpartition("/")[2] for one in (begun, fused)]
+        found[name] = There(name, frame, query, sent[0]["job_id"], *jobs, session)
+    found[NONE] = There(NONE, *[NO_ID] * 5, f"run-of-{NONE}")
+    return found
+
+
+@pytest.fixture(scope="module")
+def operations(walled) -> dict[str, Any]:
+    """Each operation of the document by its method and path."""
+    document = walled.server.client.get("/openapi.json").json()
+    return {
+        f"{method.upper()} {path}": operation
+        for path, methods in document["paths"].items()
+        for method, operation in methods.items()
+    }
+
+
+def request_of(operation: str, case: Case, path: There, rest: There) -> dict[str, Any]:
+    """Arguments of a request: the map of the path is of one, all other ids of another."""
+
+    def part(found: re.Match[str]) -> str:
+        return (path if found[1] == "map_name" else rest).of(operation, found[1])
+
+    method, pattern = operation.split()
+    made: dict[str, Any] = {"method": method, "path": re.sub(r"\{(\w+)\}", part, pattern)}
+    if case.query:
+        made["params"] = {name: rest.fill(value) for name, value in case.query.items()}
+    if case.body is not None:
+        made["content"] = rest.fill(json.dumps(case.body))
+        made["headers"] = {"Content-Type": "application/json"}
+    return made
+
+
+def told(answer: httpx.Response, about: There) -> tuple[int, dict[str, str], str]:
+    """All that an answer tells, but for what was asked for and the request's own id."""
+
+    def blank(text: str) -> str:
+        text = text.replace(answer.headers["x-request-id"], "<request>")
+        for one in (*about.ids, about.session):
+            text = text.replace(one, "<asked>")
+        return text
+
+    own = ("date", "x-request-id")
+    headers = {name: blank(text) for name, text in answer.headers.items() if name not in own}
+    return answer.status_code, headers, blank(answer.text)
+
+
+def test_every_operation_is_in_a_list(operations):
+    known = {*OF_A_MAP, *OF_ALL, *BY_KEY, *OF_NOBODY}
+    assert set(operations) - known == set()  # say in this file what a key may learn by it
+    assert known - set(operations) == set()
+
+
+@pytest.mark.parametrize("key", ["admin", "reader"])
+@pytest.mark.parametrize("operation", OF_A_MAP)
+def test_what_is_anothers_is_answered_as_what_is_not_there(walled, there, operation, key):
+    case, asked = OF_A_MAP[operation], 0
+    for path in ([THEIRS, NONE], [OWN, OWN]):
+        if path[0] == OWN and not re.search(r"\{(?!map_name)\w+\}", operation + str(case.body)):
+            continue  # nothing but the map is named
+        if path[0] == OWN and "{map_name}" not in operation:
+            continue
+        answers = []
+        for of_path, rest in zip(path, (THEIRS, NONE), strict=True):
+            given = request_of(operation, case, there[of_path], there[rest])
+            answers.append((walled.ask(key, **given), there[rest]))
+        (theirs, about), (none, nothing) = answers
+        assert told(theirs, about) == told(none, nothing), operation
+        asked += 1
+        if path[0] == OWN and key == "admin" and operation in MADE_OF_ANYTHING:
+            continue
+        assert theirs.status_code in (403, 404), (operation, theirs.text)
+        if operation != "POST /v1/maps" and (key == "admin" or path[0] == THEIRS):
+            assert theirs.status_code == 404, (operation, theirs.text)
+    assert asked
+
+
+def test_its_own_is_there_all_the_same(walled, there):
+    """Else the test above would prove nothing."""
+    own = there[OWN]
+    for operation in (one for one in OF_A_MAP if one.startswith("GET") and "imports" not in one):
+        answer = walled.ask("reader", **request_of(operation, OF_A_MAP[operation], own, own))
+        expected = (200, 409) if "job_id" in operation or "matches" in operation else (200,)
+        if "/matches/" in operation:
+            expected = (200, 404)  # a frame does not find itself
+        assert answer.status_code in expected, (operation, answer.text)
+
+
+def test_lists_have_nothing_of_another_map(walled, there, operations):
+    listed = ["/v1/maps", "/v1/models", "/v1/keys/me", "/v1/jobs?limit=1000",
+              "/v1/events?limit=1000",
+              f"/v1/stats?map={OWN}", f"/v1/jobs?map={OWN}", f"/v1/events?map={OWN}",
+              "/v1/jobs?kind=associate", "/v1/jobs?kind=reconstruct", "/readyz", "/openapi.json",
+              f"/v1/maps/{OWN}/associations", f"/v1/maps/{OWN}/sessions"]  # fmt: skip
+    for path in listed:
+        for key in ("admin", "reader"):
+            answer = walled.ask(key, "GET", path)
+            assert answer.status_code == 200, answer.text
+            text = answer.text + str(answer.headers)
+            assert [
+                one for one in (*there[THEIRS].ids, "keeper", "boss", "watcher") if one in text
+            ] == [], path
+    mine = walled.ask("reader", "GET", "/v1/maps").json()["items"]
+    assert [one["name"] for one in mine] == [OWN]
+    jobs = walled.ask("reader", "GET", "/v1/jobs?limit=1000").json()["items"]
+    assert {job["map"] for job in jobs} == {OWN}
+    assert len(jobs) == 4  # two frames, an association, a reconstruction
+    events = walled.ask("reader", "GET", "/v1/events?limit=1000").json()["items"]
+    assert {event["map"] for event in events} == {OWN}
+
+
+def test_asking_all_maps_asks_those_that_the_key_may_read(walled, there):
+    body = {"maps": "*", "frame": {"map": OWN, "frame_id": there[OWN].frame}}
+    answer = walled.ask("reader", "POST", "/v1/queries", json=body).json()
+    assert {match["map"] for match in answer["matches"]} == {OWN}
+    assert THEIRS not in json.dumps(answer)
+
+
+def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
+    """And so is what is made of it."""
+    frame = {"map": OWN, "frame_id": there[OWN].frame}
+    asked = walled.ask("boss", "POST", "/v1/queries", json={"maps": [OWN, THEIRS], "frame": frame})
+    assert asked.status_code == 200, asked.text
+    mixed = asked.json()["query_id"]
+    assert {match["map"] for match in asked.json()["matches"]} == {OWN, THEIRS}
+    for end in ("", "/cloud.ply", "/similarities", f"/matches/{there[OWN].frame}"):
+        unseen(walled, "GET", "/v1/queries/{}" + end, mixed)
+    unseen(walled, "POST", "/v1/queries/{}/reconstruction", mixed)
+    fused = walled.ask("boss", "POST", f"/v1/queries/{mixed}/reconstruction", json={})
+    assert fused.status_code == 202, fused.text
+    job = fused.json()["job_id"]
+    for path in ("/v1/jobs/{}", "/v1/reconstructions/{}", "/v1/reconstructions/{}/mesh.ply"):
+        unseen(walled, "GET", path, job)
+    for path in ("/v1/jobs/{}/cancel", "/v1/jobs/{}/retry"):
+        unseen(walled, "POST", path, job)
+    unseen(walled, "DELETE", "/v1/reconstructions/{}", job)
+    for path in ("/v1/jobs?limit=1000", f"/v1/jobs?map={OWN}", "/v1/events?limit=1000"):
+        assert job not in walled.ask("admin", "GET", path).text, path
+
+
+def unseen(walled: Any, method: str, path: str, id_: str) -> None:
+    """See that an id is to the key as one that nothing has."""
+    answers = [
+        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"----"))
+        for one in (id_, NO_ID)
+    ]
+    assert told(*answers[0]) == told(*answers[1])
+    assert answers[0][0].status_code == 404, (path, answers[0][0].text)
+
+
+def test_what_is_anothers_beside_what_is_the_keys_own(walled, there):
+    """Frames of two maps in one request: the one that is not the key's is not there."""
+    own = {"map": OWN, "frame_id": there[OWN].frame}
+    fused = f"/v1/queries/{there[OWN].query}/reconstruction"
+    for path, body in (
+        ("/v1/queries", {"maps": [OWN], "frame": FRAME}),
+        ("/v1/queries", {"maps": "*", "frame": FRAME}),
+        ("/v1/similarity", {"frame_a": own, "frame_b": FRAME}),
+        ("/v1/similarity", {"frame_a": FRAME, "frame_b": own}),
+        (f"/v1/maps/{OWN}/queries", {"frame_id": own["frame_id"], "explain_frame": "{frame}",
+                                     "stages": "retrieve"}),
+        (fused, {"frames": ["{frame}"]}),
+    ):  # fmt: skip
+        answers = []
+        for one in (there[THEIRS], there[NONE]):
+            content = one.fill(json.dumps(body))
+            given = {"content": content, "headers": {"Content-Type": "application/json"}}
+            answers.append(told(walled.ask("admin", "POST", path, **given), one))
+        if answers[0][0] == 200:  # an answer of its own map, with what becomes of the other frame
+            texts = [json.loads(text) for _, _, text in answers]
+            assert texts[0]["explanation"] == texts[1]["explanation"]
+        else:
+            assert answers[0] == answers[1], path
+
+
+@pytest.mark.parametrize("operation", OF_ALL)
+def test_what_is_the_operators_is_nobody_elses(walled, there, refused, operation):
+    for key in ("admin", "reader"):
+        given = request_of(operation, Case(), there[THEIRS], there[THEIRS])
+        refused(walled.ask(key, **given), 403, "forbidden", "for all maps")
+
+
+def test_a_key_may_not_more_than_its_scope(walled, there, refused):
+    less = {"write": ["reader"], "admin": ["reader", "writer"]}
+    own = there[OWN]
+    for operation, case in OF_A_MAP.items():
+        for key in less.get(case.scope, []):
+            given = request_of(operation, case, own, own)
+            if operation == "POST /v1/maps":
+                given["content"] = json.dumps({"name": OWN})
+            answer = walled.ask(key, **given)
+            if "imports" in operation and answer.status_code == 404:
+                continue
+            refused(answer, 403, "forbidden", f"{case.scope!r}")
+    assert walled.ask("reader", "GET", f"/v1/maps/{OWN}").json()["title"] is None
+
+
+def test_without_a_key_no_body_is_waited_for(walled, there, operations):
+    """Each operation below /v1 is refused as soon as its head has come."""
+    url = httpx.URL(walled.server.url)
+    for operation in operations:
+        if operation in OF_NOBODY:
+            continue
+        given = request_of(operation, Case(), there[OWN], there[OWN])
+        head = f"{given['method']} {given['path']} HTTP/1.1\r\nHost: localhost\r\n"
+        if "requestBody" in operations[operation]:
+            head += "Content-Type: application/json\r\nContent-Length: 99\r\n"
+        with socket.create_connection((url.host, url.port), timeout=60) as wire:
+            wire.sendall(f"{head}\r\n".encode())
+            assert wire.recv(12) == b"HTTP/1.1 401", operation
+
+
+def test_what_is_not_noted_is_said(operations):
+    """Every change is in the audit log but those that are named."""
+    from service.audit import UNNOTED
+
+    names = {
+        operation["operationId"].partition("_v1_")[0]
+        for place, operation in operations.items()
+        if not place.startswith("GET")
+    }
+    assert names >= UNNOTED
+    assert names - UNNOTED == {
+        "create_key", "revoke_key", "create_map", "patch_map", "delete_map", "patch_frame",
+        "delete_frame", "cancel_job", "retry_job", "reencode", "cancel_reencoding",
+        "begin_association", "delete_association", "reconstruct", "delete_reconstruction",
+        "add_import", "take_snapshot", "delete_snapshot",
+    }  # fmt: skip

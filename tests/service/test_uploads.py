@@ -1,0 +1,237 @@
+"""Uploads under an id, as bodies, under a key, in batches."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+BASE = {"translation": {"x": 0.1, "y": 0.0, "z": 0.4}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+
+
+@pytest.fixture(scope="module")
+def hall(served, make_map) -> str:
+    return make_map(served, "put-hall")
+
+
+def query(shot, **more: object) -> dict[str, Any]:
+    """The same shot as the body, and what is known of it as parameters."""
+    camera = {name: shot.camera[name] for name in ("fx", "fy", "cx", "cy")}
+    return {
+        "content": shot.png,
+        "params": {**camera, **more},
+        "headers": {"Content-Type": "image/png"},
+    }
+
+
+def test_a_frame_has_the_id_it_was_put_under(served, hall, small_shots, refused) -> None:
+    http, shot = served.client, small_shots[0]
+    path = f"{hall}/frames/Robot-1_0.png"
+    first = http.put(path, **shot.form(session="a"), headers={"Prefer": "wait=60"})
+    assert (first.status_code, first.json()["frame_id"]) == (201, "Robot-1_0.png")
+    again = http.put(path, **shot.form(session="a"))
+    assert (again.status_code, again.json()) == (200, first.json())
+    found = http.get(path).json()
+    assert (found["frame_id"], found["session"]) == ("Robot-1_0.png", "a")
+    problem = refused(http.put(path, **shot.form(session="b")), 409, "frame-conflict")
+    assert "other session." in problem["detail"]
+    other = refused(http.put(path, **small_shots[1].form(session="a")), 409, "frame-conflict")
+    assert "other content" in other["detail"]
+    # the same content under another id is a frame of its own, and shares the blob
+    twin = http.put(f"{hall}/frames/twin", **shot.form(session="b"))
+    assert (twin.status_code, twin.json()["frame_id"]) == (202, "twin")
+    blob = hashlib.sha256(shot.png).hexdigest()
+    kept = served.folder / "blobs" / blob[:2] / blob
+    assert kept.read_bytes() == shot.png
+    # and POST goes on to know the content, by its metadata
+    assert http.post(f"{hall}/frames", **shot.form(session="a")).json()["frame_id"] == (
+        "Robot-1_0.png"
+    )
+    assert http.post(f"{hall}/frames", **shot.form(session="b")).json()["frame_id"] == "twin"
+    refused(http.post(f"{hall}/frames", **shot.form(session="c")), 409, "frame-conflict")
+    # who is deleted gives the id up, and the other keeps the blob
+    assert http.delete(path).status_code == 204
+    assert http.put(path, **small_shots[1].form()).status_code == 202
+    assert kept.exists()
+    assert http.delete(f"{hall}/frames/twin").status_code == 204
+    assert not kept.exists()
+
+
+@pytest.mark.parametrize("name", [".hidden", "-x", "_x", "a b", "ä", "x" * 65, "a%0ab"])
+def test_an_id_that_is_none_is_refused(served, hall, small_shots, refused, name) -> None:
+    answer = served.client.put(f"{hall}/frames/{name}", **small_shots[0].form())
+    refused(answer, 422, "invalid-request", "frame id")
+
+
+def test_a_body_that_is_the_frame_is_taken_as_the_form_is(served, hall, small_shots) -> None:
+    http, shot = served.client, small_shots[2]
+    said = {"session": "raw", "robot": "r2", "tags": "a,b", "captured_at": "2026-01-02T03:04:05Z"}
+    pose, base = "1,2,3,0,0,0,1", "0.1,0,0.4,0,0,0,1"
+    raw = http.put(
+        f"{hall}/frames/raw", **query(shot, **said, pose=pose, base=base, parent_frame="hall")
+    )
+    assert raw.status_code == 202
+    form = shot.form(
+        session="raw", robot="r2", tags=["a", "b"], captured_at="2026-01-02T03:04:05Z",
+        pose={"translation": {"x": 1, "y": 2, "z": 3}, "rotation": BASE["rotation"],
+              "parent_frame": "hall"}, T_base_sensor=BASE,
+    )  # fmt: skip
+    again = http.put(f"{hall}/frames/raw", **form)
+    assert (again.status_code, again.json()["frame_id"]) == (200, "raw")
+    told = http.get(f"{hall}/frames/raw").json()
+    assert (told["base_frame"], told["T_base_sensor"]["translation"]["z"]) == ("base_link", 0.4)
+    assert told["T_base_sensor"]["child_frame"] == "raw.optical"
+    assert told["pose"]["matrix"][0][3] == 1
+    meta = {"params": {"meta": json.dumps({"intrinsics": shot.camera})}, "content": shot.png}
+    octets = http.put(
+        f"{hall}/frames/octets", **meta, headers={"Content-Type": "application/octet-stream"}
+    )
+    assert octets.status_code == 202
+    depth = io.BytesIO()
+    np.save(depth, np.full((30, 40), 2.0, np.float32))
+    npy = http.put(
+        f"{hall}/frames/npy", content=depth.getvalue(),
+        params={"fx": 40, "fy": 40, "cx": 20, "cy": 15},
+        headers={"Content-Type": "application/x-npy"},
+    )  # fmt: skip
+    assert npy.status_code == 202
+    camera = http.get(f"{hall}/frames/npy").json()["intrinsics"]
+    assert (camera["width"], camera["height"]) == (40, 30)
+
+
+def test_a_query_may_be_a_body_too(served, hall, small_shots) -> None:
+    http, shot = served.client, small_shots[3]
+    sent = http.put(f"{hall}/frames/asked", **shot.form(), headers={"Prefer": "wait=60"})
+    assert sent.status_code == 201
+    asked = query(shot, k=1, stages="retrieve")
+    by_body = http.post(f"{hall}/queries", **asked).json()
+    form = shot.form()
+    form["data"] |= {"k": "1", "stages": "retrieve"}
+    by_form = http.post(f"{hall}/queries", **form).json()
+    assert by_body["matches"][0]["frame_id"] == "asked"
+    assert by_body["matches"][0]["distance"] == by_form["matches"][0]["distance"] == 0
+
+
+@pytest.mark.parametrize(
+    ("params", "reason"),
+    [
+        ({"fxx": "1"}, "fxx"),
+        ({"fx": "wide", "fy": "1", "cx": "1", "cy": "1"}, "fx"),
+        ({"fx": "1", "fy": "1", "cx": "1"}, "cy"),
+        ({"meta": "{}", "fx": "1"}, "Say all in `meta`"),
+        ({"fx": "40", "fy": "40", "cx": "1", "cy": "1", "pose": "1,2,3"}, "has 3 numbers"),
+        ({"fx": "40", "fy": "40", "cx": "1", "cy": "1", "base_frame": "b"}, "Send both"),
+        ({"fx": "40", "fy": "40", "cx": "1", "cy": "1", "base": "0,0,0,0,0,0,9"}, "T_base_sensor"),
+        ({"fx": "40", "fy": "40", "cx": "1", "cy": "1", "priority": "high"}, "priority"),
+    ],
+)
+def test_what_is_wrong_in_the_query_string_is_said(
+    served, hall, small_shots, params, reason
+) -> None:
+    answer = served.client.post(
+        f"{hall}/frames", content=small_shots[0].png, params=params,
+        headers={"Content-Type": "image/png"},
+    )  # fmt: skip
+    assert answer.status_code == 422, answer.text
+    assert reason in answer.text
+
+
+def test_other_types_and_no_json_are_refused(served, hall, small_shots, refused) -> None:
+    http = served.client
+    jpeg = http.post(f"{hall}/frames", content=b"x", headers={"Content-Type": "image/jpeg"})
+    refused(jpeg, 415, "unsupported-type", "image/png")
+    twice = http.post(
+        f"{hall}/frames", content=small_shots[0].png, params=[("fx", "1"), ("fx", "2")],
+        headers={"Content-Type": "image/png"},
+    )  # fmt: skip
+    refused(twice, 422, "invalid-request", "twice")
+    no_json = http.post(
+        f"{hall}/frames", content=b"", params={"meta": "{"}, headers={"Content-Type": "image/png"}
+    )
+    refused(no_json, 400, "malformed-body", "not JSON")
+
+
+def test_a_key_makes_an_upload_take_effect_once(served, hall, small_shots, refused) -> None:
+    http, shot, key = served.client, small_shots[5], {"Idempotency-Key": "upload 1"}
+    first = http.post(f"{hall}/frames", **shot.form(session="k"), headers=key)
+    assert "idempotent-replayed" not in first.headers
+    again = http.post(
+        f"{hall}/frames", **shot.form(session="k"), headers={**key, "Prefer": "wait=60"}
+    )
+    assert again.headers["idempotent-replayed"] == "true"
+    assert again.json() == {**first.json(), "state": "indexed"}
+    other = http.post(f"{hall}/frames", **shot.form(session="l"), headers=key)
+    refused(other, 422, "idempotency-conflict", "another request")
+    # deleted meanwhile: still the same, as it is now, where without the key it would be made anew
+    http.delete(f"{hall}/frames/{first.json()['frame_id']}")
+    gone = http.post(f"{hall}/frames", **shot.form(session="k"), headers=key).json()
+    assert (gone["frame_id"], gone["state"]) == (first.json()["frame_id"], "deleted")
+    # what was there already is remembered, too
+    there = {"Idempotency-Key": "upload 2"}
+    assert http.put(f"{hall}/frames/there", **shot.form(session="k")).status_code == 202
+    for expected in (None, "true"):
+        answer = http.post(f"{hall}/frames", **shot.form(session="k"), headers=there)
+        assert answer.status_code == 200
+        assert answer.headers.get("idempotent-replayed") == expected
+    bad = http.post(f"{hall}/frames", **shot.form(), headers={"Idempotency-Key": "x" * 256})
+    refused(bad, 422, "invalid-request", "Idempotency-Key")
+
+
+def batch(shots: list[Any], metas: object, **fields: str) -> dict[str, Any]:
+    files = [("frame", ("f.png", one if isinstance(one, bytes) else one.png)) for one in shots]
+    return {"files": files, "data": {"metas": json.dumps(metas), **fields}}
+
+
+def test_one_bad_frame_of_a_batch_costs_no_other(served, hall, small_shots) -> None:
+    http, shots = served.client, small_shots[6:10]
+    metas: list[dict[str, Any]] = [{"intrinsics": one.camera, "session": "b"} for one in shots]
+    assert http.post(f"{hall}/frames", **shots[1].form(session="b")).status_code == 202
+    conflict = http.post(f"{hall}/frames", **shots[2].form(session="other"))
+    assert conflict.status_code == 202
+    sent = [*shots, b"no image", shots[0], shots[3]]
+    said = [*metas, metas[0], metas[0], {**metas[3], "robott": "x"}]
+    key = {"Idempotency-Key": "batch"}
+    answer = http.post(f"{hall}/frames/batch", **batch(sent, said), headers=key)
+    assert answer.status_code == 200, answer.text
+    items = answer.json()["items"]
+    assert [one["status"] for one in items] == [202, 200, 409, 202, 422, 200, 422]
+    assert [one["problem"] and one["problem"]["type"] for one in items] == [
+        None, None, "/problems/frame-conflict", None, "/problems/unreadable-frame", None,
+        "/problems/invalid-request",
+    ]  # fmt: skip
+    assert items[5]["frame"]["frame_id"] == items[0]["frame"]["frame_id"]
+    assert items[6]["problem"]["errors"] == [
+        {"field": "robott", "reason": "Extra inputs are not permitted"}
+    ]
+    again = http.post(f"{hall}/frames/batch", **batch(sent, said), headers=key)
+    assert again.headers["idempotent-replayed"] == "true"
+    assert [one["status"] for one in again.json()["items"]] == [202, 200, 409, 202, 422, 200, 422]
+    assert [one["problem"] for one in again.json()["items"]] == [one["problem"] for one in items]
+    for one in (0, 3):
+        assert http.get(f"{hall}/frames/{items[one]['frame']['frame_id']}").status_code == 200
+
+
+def test_a_batch_that_is_none_is_refused_whole(
+    served, hall, small_shots, refused: Callable[..., Any]
+) -> None:
+    http, shot, meta = served.client, small_shots[12], {"intrinsics": small_shots[12].camera}
+
+    def post(**sent: Any) -> httpx.Response:
+        return http.post(f"{hall}/frames/batch", **sent)
+
+    refused(post(**batch([shot], [meta, meta])), 422, "invalid-request", "a list of 2")
+    refused(post(**batch([shot], 5)), 422, "invalid-request", "neither object nor list")
+    refused(post(**batch([shot], meta, robot="r")), 422, "invalid-request", "'robot'")
+    refused(post(**shot.form()), 422, "invalid-request", "'meta'")
+    refused(post(data={"metas": "{}"}, files={"x": b""}), 422, "invalid-request", "'x'")
+    refused(post(**batch([shot] * 65, meta)), 400, "malformed-body")
+    refused(post(content=b"{}", headers={"Content-Type": "application/json"}), 415,
+            "unsupported-type")  # fmt: skip
+    frames = http.get(f"{hall}/frames", params={"limit": 1000}).json()["items"]
+    assert not any(one["bytes"] == len(shot.png) for one in frames)
