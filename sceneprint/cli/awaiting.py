@@ -53,4 +53,4 @@ def _is_redundant(client: Client, map_name: str, job: Job) -> bool:
 
     if job.state is not JobState.SUCCEEDED:
         return False
-    return client.frame(map_name, job.frame_id).state is FrameState.REDUNDANT
+    return client.frame(map_name, str(job.frame_id)).state is FrameState.REDUNDANT

@@ -145,7 +145,8 @@ def _open3d() -> Finding:
         except OSError:
             missing.append(package)
     if missing:
-        text = f"only benchmarks need them: apt-get install {' '.join(missing)}"
+        packages = " ".join(missing)
+        text = f"only reconstructions and benchmarks need them: apt-get install {packages}"
         return Finding("note", "open3d libraries", text)
     return Finding("ok", "open3d libraries", "all there")
 

@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from sceneprint.cli.choosing import Choice, Chosen
 from sceneprint.client import Client, meta_of
-from sceneprint.engine.answers import CANDIDATES
+from sceneprint.engine.validating import CANDIDATES
 from sceneprint.errors import DatasetError, FrameConflict, FrameError, ServiceError
 from sceneprint.schemas import Added, Answer, JobState
 

@@ -71,14 +71,18 @@ def _service(options: argparse.Namespace) -> Iterator[Finding]:
 
 
 def _version(url: str, status: Status) -> Finding:
-    n_frames = sum(status.frames.values())
-    text = f"{url} answers, version {status.version}, {n_frames} frames"
+    text = f"{url} answers, version {status.version}"
+    if status.frames is not None:
+        text += f", {sum(status.frames.values())} frames"
     if status.version == __version__:
         return Finding("ok", "service", text)
     return Finding("note", "service", f"{text}; this is version {__version__}")
 
 
 def _workers(client: Client, status: Status) -> Finding:
+    if status.jobs is None:
+        text = "the service tells of them only to a key for all maps; give one with --key"
+        return Finding("note", "workers", text)
     queued, running = status.jobs.get("queued", 0), status.jobs.get("running", 0)
     text = f"{queued} jobs wait, {running} are being done"
     oldest = _oldest_s(client) if queued else 0.0

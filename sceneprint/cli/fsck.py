@@ -59,6 +59,7 @@ def add_to(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Check, tell, and repair if asked to; returns 1 where something is left."""
+    from sceneprint.engine import Engine
     from sceneprint.maintenance.fsck import GRACE_S, fsck
     from sceneprint.writing import check_writable, write_whole
 
@@ -73,6 +74,10 @@ def run(options: argparse.Namespace) -> int:
         ):  # fmt: skip
             outcomes.append(outcome)
             tqdm.write(_line(outcome))
+    repaired = sum(each.done is not None for each in outcomes)
+    if repaired:
+        with Engine(settings_of(options)) as engine:
+            engine.audit.command("fsck --repair", map_name=options.map, repaired=repaired)
     if options.json is not None:
         record = {"checked": dict(counts), "findings": [_record(each) for each in outcomes]}
         write_whole(options.json, (json.dumps(record, indent=1) + "\n").encode())

@@ -67,7 +67,8 @@ def _retry_dead(client: Client, *, as_json: bool) -> int:
     """
     again, refused = 0, 0
     for job in list(client.jobs(JobState.DEAD)):  # all before the first: pages would shift
-        if job.kind == "sign" and client.frame(job.map, job.frame_id).job_id != job.job_id:
+        of_frame = job.map is not None and job.frame_id is not None and job.kind == "sign"
+        if of_frame and client.frame(str(job.map), str(job.frame_id)).job_id != job.job_id:
             continue
         try:
             retried = client.retry_job(job.job_id)

@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sceneprint.cli.asking import add_asking_options, explained_lines, options_of
 from sceneprint.cli.connection import add_service_options, one_line, open_client
-from sceneprint.cli.filters import add_filter_options, filter_of
-from sceneprint.cli.numbers import positive, whole
+from sceneprint.cli.overlaying import add_overlay_options, check_overlay, save_overlay
 from sceneprint.datasets import FrameReference, find_sequences
 from sceneprint.errors import DatasetError, FrameError
 
@@ -34,49 +34,58 @@ def add_to(commands: Any) -> None:
         "--frame", metavar="N|FILE", help="of a folder, only this one: its place from 0, or name"
     )
     command.add_argument(
-        "--k", type=positive, default=5, metavar="K", help="accepted matches wanted (default: 5)"
+        "--map",
+        action="append",
+        default=[],
+        metavar="NAME",
+        dest="also",
+        help="ask this map too, as one with MAP; several: all of them (MAP may be '*' for every "
+        "map that you may read)",
     )
     command.add_argument(
         "--stages",
         default="retrieve,diversify,validate",
         help="comma separated, from `retrieve` (default: retrieve,diversify,validate)",
     )
-    command.add_argument("--exact", action="store_true", help="compare every frame of the map")
-    command.add_argument(
-        "--seed", type=whole, default=0, metavar="S", help="of the random choices (default: 0)"
-    )
     command.add_argument("--json", action="store_true", help="print each answer as a line of JSON")
-    add_filter_options(command)
+    add_asking_options(command)
+    add_overlay_options(command)
     add_service_options(command)
     command.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Ask; returns 2 where a frame could not be looked up."""
-    references = _chosen(options.path, options.frame)
-    stages: Any = tuple(stage.strip() for stage in options.stages.split(","))
-    wanted = filter_of(options)
+    references = chosen(options.path, options.frame)
+    how: dict[str, Any] = {**options_of(options), "stages": options.stages}
+    several = options.map == "*" or options.also
+    if several:
+        how["maps"] = "*" if options.map == "*" else [options.map, *options.also]
+    check_overlay(options, len(references))
     failed = 0
     with open_client(options) as client:
         for reference in references:
             try:
-                answer = client.query(
-                    options.map, reference, k=options.k, stages=stages, exact=options.exact,
-                    seed=options.seed, filter=wanted,
-                )  # fmt: skip
+                answer = client.query(None if several else options.map, reference, **how)
             except FrameError as error:  # says nothing of the next frame
                 failed += 1
                 print(f"{one_line(reference.name)}: {one_line(str(error))}", file=sys.stderr)
                 continue
             if options.json:
-                told = {"frame": reference.name, **answer.model_dump(mode="json")}
+                told = {
+                    "frame": reference.name,
+                    **answer.model_dump(mode="json", exclude={"frame"}),
+                }
                 print(json.dumps(told), flush=True)
             else:
-                print("\n".join(lines_of(reference.name, answer)), flush=True)
+                lines = [*lines_of(reference.name, answer), *explained_lines(answer)]
+                print("\n".join(lines), flush=True)
+            if options.overlay is not None:
+                print(save_overlay(client, answer, options), file=sys.stderr)
     return 2 if failed else 0
 
 
-def _chosen(path: Path, wanted: str | None) -> list[FrameReference]:
+def chosen(path: Path, wanted: str | None) -> list[FrameReference]:
     """The frames to look up.
 
     Raises
@@ -120,7 +129,8 @@ def lines_of(name: str, answer: Answer) -> list[str]:
         f"{of} frames, {answer.milliseconds.get('total', 0.0):.0f} ms)"
     ]
     if answer.matches:
-        width = max(len(_label(match)) for match in answer.matches)
+        several = len(answer.maps) > 1
+        width = max(len(_label(match, several)) for match in answer.matches)
         lines.append(
             f"  {'match':{width}}  rank  similarity  {'validation':15}  overlap  "
             f"{'to the match, m':>20}  {'deg':>5}  {'in the map, m':>20}  reason"
@@ -130,27 +140,29 @@ def lines_of(name: str, answer: Answer) -> list[str]:
         status = f"{v.status} {v.strength}" if v.strength else v.status
         overlap = "" if v.overlap is None else f"{v.overlap:.2f}"
         lines.append(
-            f"  {_label(match):{width}}  {match.rank:4}  {match.similarity:10.2f}  {status:15}  "
-            f"{overlap:>7}  {_metres(match.transform):>20}  {_degrees(match.transform):>5}  "
-            f"{_metres(match.pose_in_map):>20}  {one_line(v.reason)}".rstrip()
+            f"  {_label(match, several):{width}}  {match.rank:4}  {match.similarity:10.2f}  "
+            f"{status:15}  {overlap:>7}  {metres(match.transform):>20}  "
+            f"{_degrees(match.transform):>5}  {metres(match.pose_in_map):>20}  "
+            f"{one_line(v.reason)}".rstrip()
         )
     if answer.location is not None:
         there, r = answer.location, answer.location.pose.rotation
         lines.append(
-            f"  at {_metres(there.pose)} m in {one_line(there.pose.parent_frame)}, rotation "
+            f"  at {metres(there.pose)} m in {one_line(there.pose.parent_frame)}, rotation "
             f"{r.x:.4f} {r.y:.4f} {r.z:.4f} {r.w:.4f} (x y z w); {there.support} of {there.votes} "
             f"matches agree, spread {100 * there.spread_m:.1f} cm, {there.spread_deg:.1f} deg"
         )
     return lines
 
 
-def _label(match: Match) -> str:
-    """Who saw it, and the frame's id to ask for the rest."""
+def _label(match: Match, several: bool) -> str:
+    """Who saw it, in which of several maps, and the frame's id to ask for the rest."""
     seen = "/".join(one_line(who) for who in (match.robot, match.session) if who)
-    return f"{seen}  {match.frame_id}" if seen else match.frame_id
+    return "  ".join(part for part in (match.map if several else "", seen, match.frame_id) if part)
 
 
-def _metres(transform: Transform | None) -> str:
+def metres(transform: Transform | None) -> str:
+    """Its translation; nothing where there is none."""
     if transform is None:
         return ""
     t = transform.translation

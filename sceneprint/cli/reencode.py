@@ -53,8 +53,10 @@ def run(options: argparse.Namespace) -> int:
     with Engine(settings) as engine:
         if options.model is not None:
             told = engine.reencode(options.map, options.model)
+            engine.audit.command("reencode --model", map_name=options.map, model=str(options.model))
         elif options.cancel:
             told = engine.cancel_reencode(options.map)
+            engine.audit.command("reencode --cancel", map_name=options.map)
         else:
             told = engine.get_map(options.map)
         if options.wait and told.reencoding is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from sceneprint.cli.connection import one_line
+from sceneprint.cli.connection import one_line, open_client
 from sceneprint.cli.serve import add_data_option, settings_of
 from sceneprint.cli.signals import ended_by_signals
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 #: Damaged blobs that are named one by one.
 _SHOWN = 10
+#: Longest wait for a service to take one, seconds.
+_PATIENCE_S = 6 * 3600.0
 
 
 def add_to(commands: Any) -> None:
@@ -41,6 +44,16 @@ def add_to(commands: Any) -> None:
         metavar="FILE",
         help="archive to write, or its folder (default: sceneprint-TIME.tar here)",
     )
+    command.add_argument(
+        "--url",
+        metavar="URL",
+        help="let the service there take it, and fetch it, rather than read a folder here",
+    )
+    command.add_argument(
+        "--key",
+        default=os.environ.get("SCENEPRINT_KEY") or None,
+        help="where that service asks for one (default: SCENEPRINT_KEY)",
+    )
     command.set_defaults(run=run)
 
 
@@ -53,10 +66,37 @@ def run(options: argparse.Namespace) -> int:
     if path.is_dir():
         path = path / name
     start = time.perf_counter()
+    if options.url is not None:
+        return _fetched(options, path)
     with ended_by_signals(), shown_progress("snapshot") as progress:
         taken = take_snapshot(settings_of(options), path, progress)
     print(f"{one_line(str(path))}: {contents(taken)} in {time.perf_counter() - start:.1f} s")
     return 1 if name_damaged(taken, "Run `sceneprint fsck` to see what can be done.") else 0
+
+
+def _fetched(options: argparse.Namespace, path: Path) -> int:
+    """Have a service take a snapshot, and download it; returns 1 where blobs were lost."""
+    from sceneprint.errors import InvalidRequest, SnapshotError
+    from sceneprint.schemas.snapshots import SnapshotFile
+
+    if options.data is not None:
+        raise InvalidRequest("--url names a service and --data a folder here. Give one of them.")
+    start = time.perf_counter()
+    with open_client(options) as client:
+        job = client.take_snapshot(wait_s=_PATIENCE_S)
+        if job.result is None:
+            why = job.error or "no worker has done it; see `sceneprint jobs`"
+            raise SnapshotError(f"The service took no snapshot: job {job.job_id}: {why}")
+        taken = SnapshotFile.model_validate(job.result)
+        client.download_snapshot(taken.snapshot_id, path)
+    print(
+        f"{one_line(str(path))}: {taken.maps} maps, {taken.frames} frames, {taken.blobs} blobs, "
+        f"{taken.bytes / 1e6:,.1f} MB in {time.perf_counter() - start:.1f} s"
+    )
+    if taken.damaged:
+        print(f"{taken.damaged} blobs were lost, and are not in it; damaged.jsonl in it names "
+              "them.", file=sys.stderr)  # fmt: skip
+    return 1 if taken.damaged else 0
 
 
 @contextmanager

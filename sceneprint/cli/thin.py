@@ -84,6 +84,8 @@ def run(options: argparse.Namespace) -> int:
             return 0
         with _Bar("delete") as bar:
             deleted = carry_out(engine, proposal, bar.tell)
+        if deleted:
+            engine.audit.command("thin", map_name=options.map, deleted=deleted)
     left = len(proposal.losses) - deleted
     why = f", {left} not: they are gone already, or what stood for them is" if left else ""
     print(f"{deleted} frames are deleted{why}")

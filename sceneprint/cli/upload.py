@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from sceneprint.cli.archive import import_all, is_archive_file
 from sceneprint.cli.awaiting import STALL_S, wait_for_all
 from sceneprint.cli.connection import add_service_options, open_client
 from sceneprint.cli.numbers import positive
+from sceneprint.cli.saying import base_of, priority_of, share_of
 from sceneprint.cli.tally import Tally
 from sceneprint.datasets import FrameReference, Sequence, find_sequences
 from sceneprint.errors import (
@@ -26,8 +28,7 @@ from sceneprint.errors import (
     Refused,
     UnknownMap,
 )
-from sceneprint.schemas.frames import MOST_PRIORITY
-from sceneprint.schemas.novelty import NOVEL, novelty_of
+from sceneprint.schemas.novelty import NOVEL
 
 if TYPE_CHECKING:
     from sceneprint.client import Client
@@ -44,7 +45,8 @@ def add_to(commands: Any) -> None:
         help="upload depth frames to a map of a service",
         description="Upload every frame of the given files and folders (7-Scenes, TUM RGB-D or "
         "plain depth images, with an intrinsics.json beside them or above), and wait until they "
-        "are signed. A frame that is in the map already is not stored twice.",
+        "are signed. A zip or tar of them is sent whole, and unpacked by the service. A frame that "
+        "is in the map already is not stored twice.",
     )
     command.add_argument("map", metavar="MAP", help="made where missing")
     command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
@@ -65,6 +67,15 @@ def add_to(commands: Any) -> None:
     )
     command.add_argument("--no-pose", action="store_true", help="leave known poses out")
     command.add_argument(
+        "--base",
+        type=base_of,
+        metavar="TX,TY,TZ,QX,QY,QZ,QW",
+        help="where the camera sits on the robot: metres and a unit quaternion, camera to base",
+    )
+    command.add_argument(
+        "--base-frame", metavar="NAME", help="what the robot calls its base (default: base_link)"
+    )
+    command.add_argument(
         "--create",
         action=argparse.BooleanOptionalAction,
         default=True,
@@ -78,7 +89,7 @@ def add_to(commands: Any) -> None:
     )
     command.add_argument(
         "--priority",
-        type=_priority,
+        type=priority_of,
         default=0,
         metavar="N",
         help="from -10 to 10: frames of a greater one are signed first (default: 0)",
@@ -86,7 +97,7 @@ def add_to(commands: Any) -> None:
     command.add_argument(
         "--if-novel",
         nargs="?",
-        type=_novelty,
+        type=share_of,
         const=True,
         metavar="D",
         help="keep a frame only if the map lacks its place: if the nearest frame is farther than D "
@@ -102,17 +113,23 @@ def add_to(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Upload; returns 2 where a frame was not indexed."""
-    found = list(_found(options.paths, options.every, one_frame=options.parent_frame is not None))
+    archives = [path for path in options.paths if is_archive_file(path)]
+    paths = [path for path in options.paths if path not in archives]
+    found = list(_found(paths, options.every, one_frame=options.parent_frame is not None))
+    if options.base is not None and options.base_frame is not None:
+        options.base = options.base.model_copy(update={"base_frame": options.base_frame})
     tally, start, stalled = Tally(), time.perf_counter(), False
     with open_client(options) as client:
         _see_to_map(client, options)
         try:
             _send_all(client, options, found, tally)
-            if not options.no_wait:
+            stalled = not import_all(client, options, archives, tally)
+            if not options.no_wait and not stalled:
                 novel = options.if_novel is not None
                 stalled = not wait_for_all(client, options.map, tally, may_be_redundant=novel)
         finally:  # what was received stays, however the run ended
-            tally.report(len(found), time.perf_counter() - start)
+            counted = tally.new + tally.there + tally.refused
+            tally.report(max(len(found), counted), time.perf_counter() - start)
             if stalled:
                 print(
                     f"{len(tally.waiting)} frames are safe and wait, but none was signed for "
@@ -150,24 +167,6 @@ def _found(
                 )
             for reference in sequence.frames[::every]:
                 yield sequence, reference
-
-
-def _priority(text: str) -> int:
-    """A whole number from -10 to 10."""
-    if text.removeprefix("-") not in {str(number) for number in range(MOST_PRIORITY + 1)}:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from -10 to 10")
-    return int(text)
-
-
-def _novelty(text: str) -> float:
-    """A share of the distance of unrelated frames."""
-    try:
-        share = novelty_of(text)
-    except InvalidRequest:
-        share = None
-    if share is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0, up to 1")
-    return share
 
 
 def _see_to_map(client: Client, options: argparse.Namespace) -> None:
@@ -213,31 +212,17 @@ def _send_all(
 def _send(
     client: Client, options: argparse.Namespace, sequence: Sequence, reference: FrameReference
 ) -> tuple[Added, bool]:
-    from sceneprint.client import meta_of
+    from sceneprint.datasets.metas import meta_of, parent_frame_of, session_of
 
     meta = meta_of(
         reference,
         robot=options.robot,
-        session=options.session or _session(sequence),
+        session=options.session or session_of(sequence),
         tags=options.tag,
         with_pose=not options.no_pose,
-        parent_frame=_parent_frame(options, sequence),
+        base=options.base,
+        parent_frame=options.parent_frame or parent_frame_of(sequence, options.robot),
     )
     return client.add(
         options.map, reference, meta, priority=options.priority, if_novel=options.if_novel
     )
-
-
-def _parent_frame(options: argparse.Namespace, sequence: Sequence) -> str:
-    """What poses lead to: folders of two robots may share a name, and their poses no frame."""
-    if options.parent_frame is not None:
-        return str(options.parent_frame)
-    own = sequence.parent_frame
-    return own if options.robot is None else f"{options.robot}/{own}"
-
-
-def _session(sequence: Sequence) -> str:
-    """Name of a sequence, the same whether its own folder was named or the scene's."""
-    if sequence.parent_frame == sequence.name:
-        return sequence.name
-    return f"{sequence.parent_frame}/{sequence.folder.name}"

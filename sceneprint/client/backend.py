@@ -6,18 +6,24 @@ from typing import Protocol
 
 from pydantic import Field
 
+from sceneprint.client.asking import AskingBackend
+from sceneprint.client.associations import AssociationsBackend
+from sceneprint.client.ingest import IngestBackend
+from sceneprint.client.kept import KeptBackend
+from sceneprint.client.keys import KeysBackend
+from sceneprint.client.operations import OperationsBackend
+from sceneprint.client.outputs import OutputsBackend
+from sceneprint.client.reconstructions import ReconstructionsBackend
+from sceneprint.client.snapshots import SnapshotsBackend
 from sceneprint.schemas import (
     Added,
-    Answer,
     Frame,
     FrameMeta,
-    FrameState,
     Job,
     JobState,
     Map,
     NewMap,
     Page,
-    Query,
 )
 from sceneprint.schemas.base import Told
 
@@ -26,11 +32,27 @@ class Status(Told):
     """How a service is."""
 
     version: str
-    frames: dict[str, int] = Field(description="How many frames of all maps are in each state.")
-    jobs: dict[str, int] = Field(description="How many jobs are in each state that has any.")
+    frames: dict[str, int] | None = Field(
+        description="How many frames of all maps are in each state; None where the key may not "
+        "read all maps."
+    )
+    jobs: dict[str, int] | None = Field(
+        description="How many jobs are in each state that has any; None as `frames`."
+    )
 
 
-class Backend(Protocol):
+class Backend(
+    IngestBackend,
+    AskingBackend,
+    KeptBackend,
+    OutputsBackend,
+    AssociationsBackend,
+    ReconstructionsBackend,
+    SnapshotsBackend,
+    KeysBackend,
+    OperationsBackend,
+    Protocol,
+):
     """Does what a `Client` asks for; every method may be called from any thread.
 
     Each raises what the engine raises for it, `Unreachable` and `Refused` besides where a
@@ -55,11 +77,6 @@ class Backend(Protocol):
     ) -> tuple[Added, bool]:  # fmt: skip
         """Take a frame into a map, waiting for its job at most so long; whether it is new."""
 
-    def list_frames(
-        self, map_name: str, cursor: str | None, state: FrameState | None
-    ) -> Page[Frame]:
-        """A page of the frames of a map."""
-
     def get_frame(self, map_name: str, frame_id: str) -> Frame:
         """A frame."""
 
@@ -77,12 +94,6 @@ class Backend(Protocol):
 
     def retry_job(self, job_id: str) -> Job:
         """Try again what was given up."""
-
-    def query_upload(self, map_name: str, data: bytes, meta: FrameMeta, query: Query) -> Answer:
-        """Look a frame up that is not kept."""
-
-    def query_frame(self, map_name: str, frame_id: str, query: Query) -> Answer:
-        """Look a frame of the map up among the others."""
 
     def meanwhile(self, pause_s: float) -> None:
         """Let jobs come nearer to their end: do one, or wait for others to."""

@@ -3,38 +3,49 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
+from sceneprint.client.asking import Asking
+from sceneprint.client.associations import Associations
 from sceneprint.client.backend import Backend, Status
 from sceneprint.client.frames import checked, sendable
+from sceneprint.client.ingest import Ingest
 from sceneprint.client.jobs import Jobs
+from sceneprint.client.kept import Kept
+from sceneprint.client.keys import Keys
+from sceneprint.client.operations import Operations
+from sceneprint.client.outputs import Outputs
+from sceneprint.client.reconstructions import Reconstructions
+from sceneprint.client.snapshots import Snapshots
 from sceneprint.client.waiting import settle
 from sceneprint.datasets import FrameReference
 from sceneprint.errors import InvalidRequest
 from sceneprint.schemas import (
     Added,
-    Answer,
-    Filter,
     Frame,
     FrameMeta,
-    FrameState,
     Map,
     NewMap,
-    Page,
-    Query,
-    Stage,
 )
 from sceneprint.schemas.frames import MOST_PRIORITY
 from sceneprint.schemas.novelty import novelty_of
-from sceneprint.schemas.queries import STAGES
 
 DEFAULT_URL = "http://127.0.0.1:8008"
 
 
-class Client(Jobs):
+class Client(
+    Jobs,
+    Ingest,
+    Asking,
+    Kept,
+    Outputs,
+    Associations,
+    Reconstructions,
+    Snapshots,
+    Keys,
+    Operations,
+):
     """Maps, frames and queries of a service; safe to share between threads.
 
     Brief faults of the network and of a busy service are waited out; uploading twice is safe,
@@ -175,15 +186,6 @@ class Client(Jobs):
         data, known = sendable(frame, meta, with_pose=True)
         return self._backend.add_frame(map_name, data, known, wait_s or 0.0, priority, novelty)
 
-    def frames(self, map_name: str, state: FrameState | None = None) -> Iterator[Frame]:
-        """Frames of a map in the order they came; deleted ones only where asked for.
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        """
-        return self._rest(map_name, state, self._backend.list_frames(map_name, None, state))
-
     def frame(self, map_name: str, frame_id: str) -> Frame:
         """A frame; UnknownMap or UnknownFrame where there is none."""
         return self._backend.get_frame(map_name, frame_id)
@@ -191,41 +193,6 @@ class Client(Jobs):
     def delete_frame(self, map_name: str, frame_id: str) -> None:
         """Take a frame out of its map; UnknownMap or UnknownFrame where there is none."""
         self._backend.delete_frame(map_name, frame_id)
-
-    # queries
-
-    def query(
-        self, map_name: str, frame: bytes | Path | FrameReference | None = None,
-        meta: FrameMeta | None = None, *, frame_id: str | None = None, k: int = 5,
-        stages: Iterable[Stage] = STAGES, exact: bool = False, seed: int = 0,
-        filter: Filter | dict[str, Any] | None = None,  # noqa: A002  (as in JSON)
-    ) -> Answer:  # fmt: skip
-        """Where was this frame taken? The frame is not kept.
-
-        Parameters
-        ----------
-        map_name : of the map
-        frame, meta : as for `upload`
-        frame_id : of a frame of the map, in place of `frame`; it does not find itself
-        k, stages, exact, seed : see Query
-        filter : see Filter, or its fields as a dictionary; only frames that pass it are searched
-
-        Raises
-        ------
-        UnknownMap, UnknownFrame : there is none.
-        FrameError, DatasetError : the frame cannot be read, or nothing in it can be signed.
-        InvalidRequest : an option is out of its range, or the frame of the map is not indexed.
-        TypeError : not one of `frame` and `frame_id`.
-        """
-        query = checked(
-            Query, "The query", k=k, stages=tuple(stages), exact=exact, seed=seed, filter=filter
-        )
-        if frame_id is not None and frame is None:
-            return self._backend.query_frame(map_name, frame_id, query)
-        if frame is None or frame_id is not None:
-            raise TypeError("give either `frame` or `frame_id`")
-        data, known = sendable(frame, meta, with_pose=False)
-        return self._backend.query_upload(map_name, data, known, query)
 
     # the service
 
@@ -236,9 +203,3 @@ class Client(Jobs):
     def healthy(self) -> bool:
         """Whether it answers; asked once, without patience."""
         return self._backend.healthy()
-
-    def _rest(self, map_name: str, state: FrameState | None, page: Page[Frame]) -> Iterator[Frame]:
-        yield from page.items
-        while page.next_cursor is not None:
-            page = self._backend.list_frames(map_name, page.next_cursor, state)
-            yield from page.items

@@ -8,21 +8,28 @@ import time
 from pathlib import Path
 
 from sceneprint import __version__
+from sceneprint.client.asking import EmbeddedAsking
+from sceneprint.client.associations import EmbeddedAssociations
 from sceneprint.client.backend import Status
+from sceneprint.client.ingest import EmbeddedIngest
+from sceneprint.client.kept import EmbeddedKept
+from sceneprint.client.keys import EmbeddedKeys
+from sceneprint.client.operations import EmbeddedOperations
+from sceneprint.client.outputs import EmbeddedOutputs
+from sceneprint.client.reconstructions import EmbeddedReconstructions
+from sceneprint.client.snapshots import EmbeddedSnapshots
 from sceneprint.engine import Engine
 from sceneprint.errors import SceneprintError
+from sceneprint.maintenance.shelf import LONGEST_S, SNAPSHOT, snapshot_handler
 from sceneprint.schemas import (
     Added,
-    Answer,
     Frame,
     FrameMeta,
-    FrameState,
     Job,
     JobState,
     Map,
     NewMap,
     Page,
-    Query,
 )
 from sceneprint.settings import Settings
 
@@ -30,7 +37,17 @@ from sceneprint.settings import Settings
 _UPKEEP = 256
 
 
-class Embedded:
+class Embedded(
+    EmbeddedIngest,
+    EmbeddedAsking,
+    EmbeddedKept,
+    EmbeddedOutputs,
+    EmbeddedAssociations,
+    EmbeddedReconstructions,
+    EmbeddedSnapshots,
+    EmbeddedKeys,
+    EmbeddedOperations,
+):
     """The engine on a data folder.
 
     Parameters
@@ -46,6 +63,7 @@ class Embedded:
         # a folder was named, so nothing goes elsewhere, whatever the environment says
         settings = Settings(data_dir=path.absolute(), database_url=None, index_dir=None)
         self._engine = Engine(settings)
+        self._engine.tasks.register(SNAPSHOT, snapshot_handler(settings), LONGEST_S)
         self._name = f"embedded-{os.getpid()}"
         self._done = itertools.count(1)
 
@@ -73,12 +91,6 @@ class Embedded:
         del wait_s
         return self._engine.add_frame(map_name, data, meta, priority, if_novel)
 
-    def list_frames(
-        self, map_name: str, cursor: str | None, state: FrameState | None
-    ) -> Page[Frame]:
-        """A page of the frames of a map."""
-        return self._engine.list_frames(map_name, cursor, state=state)
-
     def get_frame(self, map_name: str, frame_id: str) -> Frame:
         """A frame."""
         return self._engine.get_frame(map_name, frame_id)
@@ -102,14 +114,6 @@ class Embedded:
     def retry_job(self, job_id: str) -> Job:
         """Try again what was given up."""
         return self._engine.retry_job(job_id)[0]
-
-    def query_upload(self, map_name: str, data: bytes, meta: FrameMeta, query: Query) -> Answer:
-        """Look a frame up that is not kept."""
-        return self._engine.query_upload(map_name, data, meta, query)
-
-    def query_frame(self, map_name: str, frame_id: str, query: Query) -> Answer:
-        """Look a frame of the map up among the others."""
-        return self._engine.query_frame(map_name, frame_id, query)
 
     def meanwhile(self, pause_s: float) -> None:
         """Do a job, or wait where there is none to do."""

@@ -10,7 +10,14 @@ import httpx
 from pydantic import BaseModel, ValidationError
 
 from sceneprint.client.problems import not_ours
-from sceneprint.errors import SceneprintError, UnknownFrame, UnknownJob, UnknownMap
+from sceneprint.errors import (
+    SceneprintError,
+    UnknownFrame,
+    UnknownJob,
+    UnknownMap,
+    UnknownQuery,
+    UnknownSnapshot,
+)
 from sceneprint.schemas import FrameMeta
 
 Record = TypeVar("Record", bound=BaseModel)
@@ -50,6 +57,26 @@ def map_path(name: str) -> str:
     return f"/v1/maps/{_part(name, 'map', UnknownMap)}"
 
 
+def query_path(query_id: str) -> str:
+    """Path of a kept answer; UnknownQuery where no answer can have that id."""
+    return f"/v1/queries/{_part(query_id, 'query', UnknownQuery)}"
+
+
+def reconstruction_path(job_id: str) -> str:
+    """Path of a reconstruction; UnknownJob where none can have that id."""
+    return f"/v1/reconstructions/{_part(job_id, 'reconstruction', UnknownJob)}"
+
+
+def snapshot_path(snapshot_id: str) -> str:
+    """Path of a snapshot; UnknownSnapshot where none can have that id."""
+    return f"/v1/snapshots/{_part(snapshot_id, 'snapshot', UnknownSnapshot)}"
+
+
+def match_path(query_id: str, frame_id: str) -> str:
+    """Path of a match of a kept answer; UnknownQuery or UnknownFrame as `query_path`."""
+    return f"{query_path(query_id)}/matches/{_part(frame_id, 'frame', UnknownFrame)}"
+
+
 def frame_path(map_name: str, frame_id: str) -> str:
     """Path of a frame; UnknownMap or UnknownFrame as `map_path`."""
     return f"{map_path(map_name)}/frames/{_part(frame_id, 'frame', UnknownFrame)}"
@@ -60,8 +87,13 @@ def job_path(job_id: str) -> str:
     return f"/v1/jobs/{_part(job_id, 'job', UnknownJob)}"
 
 
+def association_path(map_name: str, association_id: str) -> str:
+    """Path of an association; UnknownMap or UnknownJob as `map_path`."""
+    return f"{map_path(map_name)}/associations/{_part(association_id, 'association', UnknownJob)}"
+
+
 def _part(name: str, what: str, error: type[SceneprintError]) -> str:
     """A name that stays one part of a path: `..` would lead to another resource."""
-    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name):
         raise error(f"There is no {what} {name!r:.80}. Check the name.")
     return name

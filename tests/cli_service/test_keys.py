@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
+from sceneprint.store.audit import Change
 
 Run = Callable[..., Any]
 
@@ -24,16 +26,17 @@ def test_keys_are_made_listed_and_revoked(sceneprint: Run, tmp_path: Path) -> No
     before = datetime.now(UTC).replace(microsecond=0)
     secrets = [keys("--create", name).stdout.strip() for name in ("robot 1", "robot 2")]
     lines = keys("--list").stdout.splitlines()
-    assert [line[20:] for line in lines] == ["  robot 1", "  robot 2"]
+    assert [line[20:] for line in lines] == ["  robot 1  admin of all", "  robot 2  admin of all"]
     for line in lines:
         assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", line[:20])
         assert before <= datetime.fromisoformat(line[:20]) <= datetime.now(UTC)
     assert keys("--revoke", "robot 1").stdout == "key robot 1 is revoked\n"
-    assert [line[22:] for line in keys("--list").stdout.splitlines()] == ["robot 2"]
+    assert [line[22:] for line in keys("--list").stdout.splitlines()] == ["robot 2  admin of all"]
     again = keys("--revoke", "robot 1", expect=2)
     assert again.stderr.startswith("sceneprint keys: There is no key named 'robot 1'")
     with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
-        assert [engine.key_name(secret) for secret in secrets] == [None, "robot 2"]
+        found = [engine.find_key(secret) for secret in secrets]
+    assert [one and (one.name, one.grants) for one in found] == [None, ("robot 2", {"*": "admin"})]
 
 
 @pytest.mark.parametrize(
@@ -42,3 +45,58 @@ def test_keys_are_made_listed_and_revoked(sceneprint: Run, tmp_path: Path) -> No
 def test_one_thing_at_a_time(sceneprint: Run, arguments: tuple[str, ...]) -> None:
     with pytest.raises(SystemExit):
         sceneprint("keys", *arguments)
+
+
+def test_a_key_may_do_what_it_was_made_for(sceneprint: Run, tmp_path: Path) -> None:
+    given = ("--scope", "write", "--map", "hall", "--map", "yard", "--expires", "30d")
+    sceneprint("keys", "--create", "robot", *given, "--data", tmp_path)
+    sceneprint("keys", "--create", "screen", "--scope", "read", "--data", tmp_path)
+    before = datetime.now(UTC)
+    robot, screen = sceneprint("keys", "--list", "--data", tmp_path).stdout.splitlines()
+    assert screen[22:] == "screen  read of all"
+    told, until = robot[22:].split(", until ")
+    assert told == "robot  write of hall, write of yard"
+    left = datetime.fromisoformat(until) - before
+    assert timedelta(days=30) - timedelta(seconds=60) < left <= timedelta(days=30)
+    with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
+        engine.create_key("late", expires_at=before - timedelta(days=1))
+    (late,) = [
+        line for line in sceneprint("keys", "--list", "--data", tmp_path).stdout.splitlines()
+        if "late" in line
+    ]  # fmt: skip
+    assert ", expired " in late
+
+
+@pytest.mark.parametrize("time", ["30", "d", "0d", "-1d", "1y", "999999w", "1 d"])
+def test_a_time_is_written_as_it_is_read(sceneprint: Run, time: str) -> None:
+    with pytest.raises(SystemExit):
+        sceneprint("keys", "--create", "x", "--expires", time)
+
+
+def test_what_a_key_may_is_said_when_it_is_made(sceneprint: Run, tmp_path: Path) -> None:
+    done = sceneprint("keys", "--list", "--scope", "read", "--data", tmp_path, expect=2)
+    assert "Give it with --create" in done.stderr
+    done = sceneprint("keys", "--create", "x", "--map", "No Map", "--data", tmp_path, expect=2)
+    assert "'No Map' is no name of a map" in done.stderr
+    done = sceneprint("keys", "--create", "command", "--data", tmp_path, expect=2)
+    assert "is no name for a key" in done.stderr
+
+
+def test_who_changed_what_is_printed(sceneprint: Run, tmp_path: Path) -> None:
+    for arguments in (("--create", "robot"), ("--create", "screen"), ("--revoke", "robot")):
+        sceneprint("keys", *arguments, "--data", tmp_path)
+    with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
+        engine.audit.note(Change("delete_map", "screen", "192.0.2.7", "hall", request_id="r1"))
+    lines = sceneprint("audit", "--data", tmp_path).stdout.splitlines()
+    assert [line[22:] for line in lines] == [
+        "screen from 192.0.2.7  delete_map hall",
+        "command  keys --revoke robot",
+        "command  keys --create screen",
+        "command  keys --create robot",
+    ]
+    lines = sceneprint("audit", "--limit", "1", "--data", tmp_path).stdout.splitlines()
+    assert [line[22:] for line in lines] == ["screen from 192.0.2.7  delete_map hall"]
+    done = sceneprint("audit", "--actor", "screen", "--json", "--data", tmp_path)
+    (one,) = [json.loads(line) for line in done.stdout.splitlines()]
+    assert (one["map"], one["address"], one["request_id"]) == ("hall", "192.0.2.7", "r1")
+    assert sceneprint("audit", "--map", "yard", "--data", tmp_path).stdout == ""

@@ -245,3 +245,26 @@ def test_a_service_that_is_not_there(sceneprint: Run, monkeypatch: pytest.Monkey
         assert done.stderr.startswith("sceneprint maps: ")
         assert message in done.stderr
         assert len(done.stderr.splitlines()) == 1
+
+
+def test_an_archive_is_uploaded_as_its_folder_is(
+    sceneprint: Run, house: str, service_url: str, rooms: Path, tmp_path: Path
+) -> None:
+    made = shutil.make_archive(str(tmp_path / "rooms"), "gztar", rooms.parent, rooms.name)
+    done = sceneprint("upload", house, made, "--robot", "r1")
+    assert done.stdout.startswith("6 frames: 0 received, 6 already there; 6 indexed, ")
+    base = ("--base", "0,0,0.5,0,0,0,1", "--base-frame", "base")
+    done = sceneprint("upload", "shed", made, "--model", "compact", "--every", 3, *base)
+    assert done.stdout.splitlines()[1].startswith(
+        "2 frames: 2 received, 0 already there; 2 indexed"
+    )
+    with Client(service_url) as client:
+        frames = list(client.frames("shed"))
+        client.delete_map("shed")
+    assert {(one.session, one.base_frame) for one in frames} == {
+        ("room-0/seq-01", "base"), ("room-1/seq-01", "base"),
+    }  # fmt: skip
+    bad = tmp_path / "bad.zip"
+    bad.write_bytes(b"PK\x03\x04" + bytes(600))
+    done = sceneprint("upload", house, bad, expect=2)
+    assert "has no directory" in done.stderr

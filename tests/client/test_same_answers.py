@@ -8,7 +8,8 @@ import pytest
 
 from sceneprint.client import Client
 from sceneprint.datasets import FrameReference
-from sceneprint.schemas import Answer
+from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
+from sceneprint.schemas import Answer, Localization, NamedFrame, Similarity, ValidationOptions
 
 STAGES: tuple[Any, ...] = (
     ("retrieve",),
@@ -97,3 +98,81 @@ def test_maps_and_frames_are_equal(
     assert told[0][0]["frames"]["indexed"] == 6
     assert [one["frame_id"] for one in told[0][1:]] == [f"frame {i}" for i in range(6)]
     remote.delete_map(map_name)
+
+
+def test_all_ways_of_asking_are_equal(
+    remote: Client,
+    embedded: Client,
+    map_name: str,
+    references: tuple[FrameReference, ...],
+    filled: tuple[dict[str, int], dict[str, int]],
+) -> None:
+    """One after the other: options, maps as one, a pose, and two frames compared."""
+    other = f"{map_name}-b"
+    told, frames = [], []
+    for client, numbers in zip((remote, embedded), filled, strict=True):
+        client.create_map(other)
+        added = client.upload(other, references[2], wait_s=30)
+        ids = {number: frame_id for frame_id, number in numbers.items()}
+        numbers[added.frame_id] = 99
+        options: dict[str, Any] = {
+            "k": 2, "seed": 3, "candidates": 4, "diversity": {"omega": 8.0},
+            "validation": ValidationOptions(strong=1.0), "explain": True, "keep": False,
+            "filter": {"exclude_frames": [ids[4]]}, "stages": "retrieve,diversify,validate",
+        }  # fmt: skip
+        answers = [
+            client.query(map_name, references[1], **options),
+            client.query(map_name, frame_id=ids[0], explain_frame=ids[4], deadline_ms=600_000),
+            client.query(maps=[map_name, other], frame=references[1], **options),
+            client.query(map_name, frame_id=ids[2], maps=f"{other},{map_name}"),
+            client.localize(map_name, references[0], seed=2),
+            client.localize(map_name, frame_id=ids[3]),
+            client.similarity((map_name, ids[0]), (other, added.frame_id), seed=1),
+            client.similarity(NamedFrame(map=other, frame_id=added.frame_id), references[0]),
+            client.similarity(references[0], references[1], validate=False, model="compact"),
+        ]
+        told.append([comparable(one.model_dump(mode="json"), numbers) for one in answers])
+        frames.append(answers)
+    for over_http, in_process in zip(*told, strict=True):
+        assert over_http == in_process
+    answers = frames[0]
+    assert [type(one) for one in answers] == [Answer] * 4 + [Localization] * 2 + [Similarity] * 3
+    assert len(answers[0].explanations) == 5
+    assert answers[1].explained_frame.frame_id in filled[0]
+    assert answers[2].maps == [map_name, other]
+    assert (answers[3].matches[0].map, answers[3].matches[0].distance) == (other, 0)
+    assert answers[4].pose.parent_frame == "room-0/seq-01"
+    assert answers[8].validation is None
+    remote.delete_map(other)
+
+
+@pytest.mark.parametrize("which", ["remote", "embedded"])
+def test_what_cannot_be_asked_is_refused_alike(
+    request: pytest.FixtureRequest, which: str, map_name: str,
+    references: tuple[FrameReference, ...],
+) -> None:  # fmt: skip
+    client: Client = request.getfixturevalue(which)
+    client.create_map(map_name)
+    for name in ("x", "y"):
+        client.create_map(f"{map_name}-{name}", model="compact")
+    frame = references[0]
+    with pytest.raises(InvalidRequest, match="maps"):
+        client.query(maps=[], frame=frame)
+    with pytest.raises(InvalidRequest, match=r"has paper-.* has compact-"):
+        client.query(maps=[map_name, f"{map_name}-x"], frame=frame)
+    with pytest.raises(UnknownMap, match="'nowhere'"):
+        client.query(maps=[map_name, "nowhere"], frame=frame)
+    with pytest.raises(InvalidRequest, match="rests on validated matches"):
+        client.localize(map_name, frame, stages=("retrieve",))
+    with pytest.raises(UnknownFrame):
+        client.similarity(frame, (map_name, "nobody"))
+    with pytest.raises(UnknownFrame):
+        client.query(map_name, frame, explain_frame="nobody")
+    for wrong in (
+        {"frame": frame}, {"maps": "*"}, {"maps": "*", "map_name": map_name, "frame": frame},
+        {"maps": "*", "frame_id": "x"}, {"map_name": map_name, "frame": frame, "speed": 1},
+    ):  # fmt: skip
+        with pytest.raises(TypeError):
+            client.query(**wrong)
+    for name in (map_name, f"{map_name}-x", f"{map_name}-y"):
+        client.delete_map(name)

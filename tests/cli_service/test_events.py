@@ -1,0 +1,56 @@
+"""`sceneprint events` against a real service."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+
+from sceneprint.client import Client
+
+Run = Callable[..., tuple[str, str]]
+
+
+def test_events_are_listed(sceneprint: Run, service_url: str) -> None:
+    with Client(service_url) as client:
+        for name in ("events-a", "events-b"):
+            client.create_map(name, model="compact")
+        client.delete_map("events-b")
+        made, gone = [
+            client.event_page(kinds=[kind], limit=1).items[0] for kind in ("map.cr", "map.del")
+        ]
+    (said, _) = sceneprint("events", "--kind", "map.", "--limit", 2)
+    assert [line.split() for line in said.splitlines()] == [
+        [str(one.id), f"{one.at:%Y-%m-%d}", f"{one.at:%H:%M:%S}", kind, "events-b"]
+        for one, kind in ((made, "map.created"), (gone, "map.deleted"))
+    ]
+    (said, _) = sceneprint("events", "--map", "events-a", "--json")
+    (line,) = said.splitlines()
+    assert json.loads(line)["kind"] == "map.created"
+    (said, _) = sceneprint("events", "--after", made.id, "--kind", "map.")
+    assert [line.split()[0] for line in said.splitlines()] == [str(gone.id)]
+    (said, told) = sceneprint("events", "--map", "events-b", expect=2)
+    assert (said, "There is no map 'events-b'." in told) == ("", True)
+
+
+def test_events_are_followed_line_by_line(service_url: str) -> None:
+    with Client(service_url) as client:
+        newest = client.event_page(limit=1).newest
+        command = [sys.executable, "-m", "sceneprint", "events", "--follow", "--url", service_url]
+        process = subprocess.Popen(
+            [*command, "--after", str(newest), "--kind", "map.", "--json"],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert process.stdout is not None
+        assert process.stderr is not None
+        try:
+            for name in ("followed-1", "followed-2"):
+                client.create_map(name, model="compact")
+                assert json.loads(process.stdout.readline())["map"] == name
+        finally:
+            process.send_signal(2)
+            process.wait(30)
+        assert (process.returncode, process.stderr.read()) == (130, "sceneprint events: stopped\n")
+        process.stdout.close()
+        process.stderr.close()

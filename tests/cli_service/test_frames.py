@@ -1,0 +1,80 @@
+"""`sceneprint frames` against a service."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from sceneprint.datasets import read_trajectory
+
+
+@pytest.fixture(scope="module")
+def name() -> str:
+    return "frames-command"
+
+
+def test_lists_files_and_edits(
+    sceneprint: Callable[..., object], rooms: Path, name: str, tmp_path: Path
+) -> None:
+    sceneprint("upload", name, rooms / "room-0", "--model", "compact", "--robot", "r1")
+    frames = [json.loads(line) for line in sceneprint("frames", name, "--json").stdout.splitlines()]
+    ids = [one["frame_id"] for one in frames]
+    assert len(ids) == 3
+    table = sceneprint("frames", name, "--newest", "--limit", "2").stdout.splitlines()
+    assert [line.split()[0] for line in table] == ["frame", ids[2], ids[1]]
+    assert sceneprint("frames", name, "--tag", "nowhere").stdout == "no such frames\n"
+
+    png, ply, lists = tmp_path / "a.png", tmp_path / "a.ply", tmp_path / "a.json"
+    said = sceneprint(
+        "frames", name, ids[0], "--preview", png, "--view", "normals", "--width", "100",
+        "--cloud", ply, "--within", "parent", "--patches", lists, "--upload", tmp_path / "u",
+        "--signature", tmp_path / "s",
+    )  # fmt: skip
+    assert said.stdout.splitlines() == [
+        f"wrote {one}" for one in (ply, png, lists, tmp_path / "s", tmp_path / "u")
+    ]
+    with Image.open(png) as image:
+        assert image.size[0] == 100
+    assert b"comment frame r1/room-0\n" in ply.read_bytes()
+    assert json.loads(lists.read_text())["frame_id"] == ids[0]
+    assert (tmp_path / "u").read_bytes()[:4] == b"\x89PNG"
+    assert json.loads((tmp_path / "s").read_text())["dtype"] == "uint8"
+
+    for i, one in enumerate(ids[:2]):
+        change = {"captured_at": f"2026-11-16T09:30:0{i}Z", "tags": ["door"], "session": "s"}
+        edited = sceneprint("frames", name, one, "--edit", json.dumps(change), "--json").stdout
+        assert json.loads(edited)["tags"] == ["door"]
+    tagged = sceneprint(
+        "frames", name, "--tag", "door", "--after", "2026-11-16T09:30:01Z", "--json"
+    )
+    assert [json.loads(line)["frame_id"] for line in tagged.stdout.splitlines()] == ids[1:2]
+    tum = tmp_path / "a.tum"
+    said = sceneprint("frames", name, "--session", "s", "--trajectory", tum)
+    assert said.stdout == f"wrote {tum}: 2 poses\n"
+    assert len(read_trajectory(tum).stamps) == 2
+    sessions = sceneprint("frames", name, "--sessions").stdout.splitlines()
+    assert [line.split()[-1] for line in sessions[1:]] == ["r1/room-0/seq-01", "r1/s"]
+    told = sceneprint("frames", name, "--sessions", "--json").stdout.splitlines()
+    assert [json.loads(line)["frames"] for line in told] == [{"indexed": 1}, {"indexed": 2}]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("--cloud", "a.ply"), "--cloud is of one frame"),
+        (("--edit", "{}"), "--edit is of one frame"),
+        (("--trajectory", "a.tum"), "--trajectory is of one session"),
+        (("--session", "s", "--robot", "a", "--robot", "b", "--trajectory", "a"), "of one robot"),
+        (("nobody", "--cloud", "a.ply"), "There is no"),
+    ],
+)
+def test_what_cannot_be_is_one_line(
+    sceneprint: Callable[..., object], name: str, arguments: tuple[str, ...], text: str
+) -> None:
+    said = sceneprint("frames", name, *arguments, expect=2)
+    assert text in said.stderr
+    assert said.stderr.count("\n") == 1

@@ -1,0 +1,211 @@
+"""Associations by client, raw HTTP and command: the same answers, whoever does the work."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from sceneprint.cli import main
+from sceneprint.client import Client
+from sceneprint.datasets import write_depth_png
+from sceneprint.errors import InvalidRequest, UnknownJob, UnknownMap
+from sceneprint.schemas import FrameMeta, JobState
+from sceneprint.synth import synthesise_room
+
+MAP = "associated"
+
+
+@dataclass(frozen=True)
+class Sent:
+    """One frame of either run, and its meta."""
+
+    data: bytes
+    meta: FrameMeta
+
+
+@pytest.fixture(scope="module")
+def sent(tmp_path_factory: pytest.TempPathFactory) -> list[Sent]:
+    """Six frames along a path, one to each of two runs in turn."""
+    path, found = tmp_path_factory.mktemp("sent") / "depth.png", []
+    for i, frame in enumerate(synthesise_room(21, 0, 6, along_path=True).frames):
+        write_depth_png(path, frame.depth, 1000.0)
+        k = frame.intrinsics
+        assert frame.pose is not None
+        fields = {
+            "intrinsics": {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy,
+                           "cx": k.cx, "cy": k.cy},
+            "session": "ab"[i % 2], "robot": "ann", "pose": {"matrix": frame.pose.tolist()},
+            "captured_at": datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=i),
+        }  # fmt: skip
+        found.append(Sent(path.read_bytes(), FrameMeta.model_validate(fields)))
+    return found
+
+
+@dataclass(frozen=True)
+class Filled:
+    """A client of a map with both runs."""
+
+    client: Client
+    numbers: dict[str, int]
+
+
+def filled(client: Client, sent: list[Sent]) -> Filled:
+    client.create_map(MAP, model="compact")
+    ids = [client.upload(MAP, one.data, one.meta, wait_s=60).frame_id for one in sent]
+    assert {frame.state for frame in client.frames(MAP)} == {"indexed"}
+    return Filled(client, {frame_id: i for i, frame_id in enumerate(ids)})
+
+
+@pytest.fixture(scope="module")
+def both(
+    service_url: str, sent: list[Sent], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Filled, Filled]]:
+    folder = tmp_path_factory.mktemp("both")
+    with Client(service_url) as remote, Client.embedded(folder) as embedded:
+        yield filled(remote, sent), filled(embedded, sent)
+
+
+def plain(told: Any, numbers: dict[str, int]) -> Any:
+    """What is told, with frames by number, and without ids and times of the job."""
+    drop = {"association_id", "created_at", "finished_at"}
+    if isinstance(told, dict):
+        return {key: plain(value, numbers) for key, value in told.items() if key not in drop}
+    if isinstance(told, list):
+        return [plain(value, numbers) for value in told]
+    if isinstance(told, str):
+        for frame_id, number in numbers.items():
+            told = told.replace(frame_id, f"frame {number}")
+    return told
+
+
+def test_a_service_and_the_engine_in_process_agree(both: tuple[Filled, Filled]) -> None:
+    told, steps = [], []
+    for one in both:
+        found = one.client.associate(
+            MAP, "a", "b", k=2, seed=3, progress=lambda *step: steps.append(step)
+        )
+        assert found.state is JobState.SUCCEEDED
+        assert one.client.association(MAP, found.association_id) == found
+        name = found.association_id
+        edges = [edge.model_dump(mode="json") for edge in one.client.edges(MAP, name)]
+        middle = sorted(edge["overlap"] for edge in edges)[len(edges) // 2]
+        told.append(
+            plain(
+                {
+                    "association": found.model_dump(mode="json"),
+                    "edges": edges,
+                    "g2o": one.client.graph(MAP, name, odometry=True),
+                    "tum": one.client.graph(MAP, name, "tum"),
+                    "json": json.loads(one.client.graph(MAP, name, "json", min_overlap=middle)),
+                },
+                one.numbers,
+            )
+        )
+    assert told[0] == told[1]
+    result = told[0]["association"]["result"]
+    assert result["edges"] == len(told[0]["edges"]) > 4
+    assert result["joins"][0]["transform"] is not None
+    assert steps[-1] == (3, 3)
+    assert len(told[0]["json"]["edges"]) == len(edges) - len(edges) // 2
+
+
+@pytest.mark.parametrize("place", [0, 1], ids=["remote", "embedded"])
+def test_list_remove_and_refusals(both: tuple[Filled, Filled], place: int) -> None:
+    client = both[place].client
+    before = [one.association_id for one in client.associations(MAP)]
+    begun = client.associate(MAP, "a", apart=2, timeout_s=0)
+    assert [one.association_id for one in client.associations(MAP)] == [
+        begun.association_id, *before,
+    ]  # fmt: skip
+    done = client.wait_for_association(begun, timeout_s=60)
+    assert done.result is not None
+    assert done.result.frames == 3
+    client.delete_association(MAP, begun.association_id)
+    assert [one.association_id for one in client.associations(MAP)] == before
+    for name in (begun.association_id, "../jobs"):
+        with pytest.raises(UnknownJob):
+            client.association(MAP, name)
+    with pytest.raises(UnknownMap):
+        client.associate("nowhere", "a")
+    with pytest.raises(InvalidRequest, match="no indexed frame"):
+        client.associate(MAP, "a", "nobody")
+    with pytest.raises(InvalidRequest, match="name it once"):
+        client.associate(MAP, "a", "a")
+
+
+def test_over_http(both: tuple[Filled, Filled], service_url: str) -> None:
+    client = both[0].client
+    root = f"/v1/maps/{MAP}/associations"
+    with httpx.Client(base_url=service_url, trust_env=False, timeout=60) as http:
+        answer = http.post(root, json={"sessions": ["a", "b"]})
+        assert answer.status_code == 202
+        begun = client.wait_for_association(
+            client.association(MAP, answer.json()["association_id"]), timeout_s=60
+        )
+        place = answer.headers["Location"]
+        assert place == f"{root}/{begun.association_id}"
+        assert http.get(place).json()["state"] == "succeeded"
+        assert http.get(f"/v1/jobs/{begun.association_id}").json()["kind"] == "associate"
+        for kind, media in (
+            ("g2o", "text/x-g2o"), ("tum", "text/plain; charset=utf-8"),
+            ("json", "application/json"),
+        ):  # fmt: skip
+            by_name = http.get(f"{place}/graph", params={"format": kind})
+            by_type = http.get(f"{place}/graph", headers={"Accept": media.partition(";")[0]})
+            assert by_name.headers["Content-Type"].partition(";")[0] == media.partition(";")[0]
+            assert by_name.content == by_type.content
+            assert by_name.text == client.graph(MAP, begun.association_id, kind)  # type: ignore[arg-type]
+        page = http.get(f"{place}/edges", params={"limit": 3, "consistent": "true"}).json()
+        assert [edge["number"] for edge in page["items"]] == [0, 1, 2]
+        rest = http.get(f"{place}/edges", params={"cursor": page["next_cursor"]}).json()
+        assert rest["items"][0]["number"] == 3
+        for status, method, path, more in (
+            (404, "GET", f"{root}/{'0' * 32}", {}),
+            (404, "GET", f"/v1/maps/nowhere/associations/{begun.association_id}", {}),
+            (404, "DELETE", f"{root}/nothing", {}),
+            (422, "GET", f"{place}/edges", {"params": {"min_overlap": 2}}),
+            (422, "GET", f"{place}/graph", {"params": {"format": "gtsam"}}),
+            (422, "POST", root, {"json": {"sessions": ["a", "b", "c"]}}),
+            (422, "POST", root, {"json": []}),
+            (422, "POST", root, {"json": {"sessions": ["nobody"]}}),
+            (415, "POST", root, {"content": b"sessions=a"}),
+            (400, "POST", root, {"content": b"{", "headers": {"Content-Type": "application/json"}}),
+        ):
+            refused = http.request(method, path, **more)
+            assert refused.status_code == status, (method, path)
+            assert refused.headers["Content-Type"] == "application/problem+json"
+        assert http.delete(place).status_code == 204
+        assert http.get(f"{place}/edges").status_code == 404
+
+
+def test_the_command(
+    both: tuple[Filled, Filled], service_url: str, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    client, out = both[0].client, tmp_path / "graph.g2o"
+    of = ["associate", MAP, "--url", service_url, "--session", "a"]
+    assert main([*of, "--session", "b", "--out", str(out), "--odometry"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    newest = next(iter(client.associations(MAP)))
+    assert newest.result is not None
+    assert lines[0].startswith(f"association {newest.association_id}: {newest.result.edges} edges")
+    assert lines[2].startswith("joined surely, ann/a onto ann/b: ") or lines[2].startswith(
+        "joined weakly"
+    )
+    assert lines[-1] == f"written: {out}"
+    assert out.read_text() == client.graph(MAP, newest.association_id, odometry=True)
+    assert main([*of, "--apart", "2", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["asked"]["apart"] == 2
+    assert told["result"]["joins"] == []
+    assert main([*of, "--out", str(tmp_path / "graph.gtsam")]) == 2
+    assert "does not say what it is" in capsys.readouterr().err
+    assert main([*of, "--session", "nobody"]) == 2
+    assert "no indexed frame" in capsys.readouterr().err

@@ -1,0 +1,186 @@
+"""Events, figures, models and reencoding: the same through HTTP and in process."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+
+from sceneprint.client import Client, streams
+from sceneprint.datasets import FrameReference
+from sceneprint.errors import Conflict, InvalidRequest, UnknownMap, Unreachable
+from sceneprint.models import PRESETS, read_model
+from sceneprint.schemas.events import Event
+
+
+def test_events_that_are_kept(
+    client: Client, map_name: str, references: tuple[FrameReference, ...]
+) -> None:
+    client.create_map(map_name, model="compact")
+    added = client.upload(map_name, references[0], wait_s=60)
+    client.delete_frame(map_name, added.frame_id)
+    found = list(client.events(map_name, follow=False))
+    assert [(one.kind, one.frame_id) for one in found] == [
+        ("map.created", None),
+        ("frame.received", added.frame_id),
+        ("frame.indexed", added.frame_id),
+        ("frame.deleted", added.frame_id),
+    ]
+    assert [one.id for one in found] == sorted(one.id for one in found)
+    assert {one.map for one in found} == {map_name}
+    page = client.event_page(map_name, kinds=["frame."], limit=2)
+    assert page.items == found[:1:-1]
+    rest = client.event_page(map_name, kinds=["frame."], limit=2, cursor=page.next_cursor)
+    assert (rest.items, rest.next_cursor) == (found[1:2], None)
+    assert page.newest >= found[-1].id
+    assert list(client.events(map_name, after=found[2].id, follow=False)) == found[3:]
+    for wrong in (["%"], ["x" * 40], ["a"] * 21):
+        with pytest.raises(InvalidRequest):
+            client.event_page(kinds=wrong)
+    with pytest.raises(InvalidRequest):
+        client.event_page(cursor="none")
+    for follow in (False, True):
+        with pytest.raises(UnknownMap):
+            next(client.events("nowhere", follow=follow))
+
+
+def test_events_as_they_happen(client: Client, map_name: str) -> None:
+    client.create_map(map_name, model="compact")
+    (made,) = client.events(map_name, follow=False)
+    names = [f"{map_name[:18]}{i}" for i in range(3)]
+
+    def write() -> None:
+        for name in names:
+            client.create_map(name, model="compact")
+
+    stream = client.events(kinds=["map.created"], after=made.id - 1)
+    assert next(stream) == made
+    writer = threading.Thread(target=write)
+    writer.start()
+    found = list(itertools.islice((one for one in stream if one.map in names), 3))
+    writer.join()
+    assert [one.map for one in found] == names
+    stream.close()  # type: ignore[attr-defined]
+
+
+def test_figures(client: Client, map_name: str, references: tuple[FrameReference, ...]) -> None:
+    client.create_map(map_name, model="compact")
+    client.upload(map_name, references[0], wait_s=60)
+    own = client.stats(map_name, minutes=2)
+    assert (own.map, own.maps, own.frames, own.jobs) == (
+        map_name, 1, {"indexed": 1}, {"succeeded": 1}
+    )  # fmt: skip
+    assert (own.total.received, own.total.indexed, own.waiting) == (1, 1, 0)
+    assert own.oldest_waiting_s is None
+    assert len(own.minutes) == 2
+    every = client.stats(minutes=1)
+    assert every.maps == len(client.maps())
+    assert every.frames["indexed"] >= 1
+    assert every.bytes is not None
+    assert every.bytes.blobs > 0
+    for minutes in (0, 61):
+        with pytest.raises(InvalidRequest):
+            client.stats(minutes=minutes)
+    with pytest.raises(UnknownMap):
+        client.stats("nowhere")
+
+
+def test_models_and_reencoding(client: Client, map_name: str) -> None:
+    client.create_map(map_name, model="compact")
+    listed = client.models()
+    assert [one.name for one in listed][:2] == list(PRESETS)
+    compact = next(one for one in listed if one.name == "compact")
+    assert compact.model_id == read_model("compact").id
+    assert map_name in compact.maps
+    told = client.reencode(map_name, "paper")
+    if told.reencoding is not None:  # no frame waits: a worker may have switched it already
+        assert told.reencoding.model_id == read_model("paper").id
+        with pytest.raises(Conflict):
+            client.reencode(map_name, compact.model_id)
+    for wrong in ("small", "/etc/passwd"):
+        with pytest.raises(InvalidRequest, match="There is no model"):
+            client.reencode(map_name, wrong)
+    with pytest.raises(UnknownMap):
+        client.reencode("nowhere", "paper")
+    with pytest.raises(UnknownMap):
+        client.cancel_reencoding("nowhere")
+
+
+def test_reencoding_is_given_up(embedded: Client, map_name: str) -> None:
+    """Where nobody works, so that it is surely under way."""
+    made = embedded.create_map(map_name, model="compact")
+    embedded.reencode(map_name, read_model("paper").label)
+    assert embedded.cancel_reencoding(map_name) == made
+    with pytest.raises(Conflict, match="nothing is to be given up"):
+        embedded.cancel_reencoding(map_name)
+
+
+def test_both_tell_the_same_events(remote: Client, embedded: Client, map_name: str) -> None:
+    told = []
+    for client in (remote, embedded):
+        client.create_map(map_name, model="compact")
+        client.delete_map(map_name)
+        kept = client.event_page(kinds=["map."], limit=50)
+        told.append([(one.kind, one.data) for one in kept.items if one.map == map_name])
+    assert told[0] == told[1] == [("map.deleted", {}), ("map.created", {})]
+
+
+EVENT = Event(
+    id=7, at=datetime(2026, 11, 21, 20, tzinfo=UTC), kind="map.created", map="hall",
+    frame_id=None, job_id=None, data={"a": "b"},
+)  # fmt: skip
+
+
+def test_a_stream_is_read_as_the_standard_says() -> None:
+    data = EVENT.model_dump_json()
+    half = data.index(",") + 1
+    lines = [
+        "retry: 20", "", ": a comment", "id: 3", "", "event: message", "id:7",
+        f"data: {data[:half]}", f"data:{data[half:]}", "", "id: 9", "data: {",
+    ]  # fmt: skip
+    place = streams.Place(None)
+    found = [(one, place.last) for one in streams.messages(lines, place)]
+    assert found == [(EVENT, "7")]
+    assert place == streams.Place("7", 0.02)  # what was cut off is asked for again
+
+
+class Answered:
+    """A stream that has come to its end."""
+
+    def __init__(self, body: str) -> None:
+        self._body = body
+
+    def iter_lines(self) -> list[str]:
+        return self._body.split("\n")
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_broken_stream_is_taken_up_where_it_broke() -> None:
+    told = [EVENT.model_copy(update={"id": number}) for number in (5, 6, 9)]
+    said: list[str | Unreachable] = [
+        f"retry: 10\n\nid: 4\n\nid: 5\ndata: {told[0].model_dump_json()}\n\nid: 6\ndata: {{",
+        Unreachable("it starts anew"),
+        f"id: 6\ndata: {told[1].model_dump_json()}\n\n: alive\nid: 8\n\n",
+        f"id: 9\ndata: {told[2].model_dump_json()}\n\n",
+    ]
+    asked: list[str | None] = []
+
+    def opened(last: str | None) -> Any:
+        asked.append(last)
+        answer = said[len(asked) - 1]
+        if isinstance(answer, Unreachable):
+            raise answer
+        return Answered(answer)
+
+    assert list(itertools.islice(streams.followed(opened, None), 3)) == told
+    assert asked == [None, "5", "5", "8"]
+
+
+def test_where_no_service_is_that_is_said_at_once() -> None:
+    with Client("http://127.0.0.1:9") as client, pytest.raises(Unreachable):
+        next(client.events())

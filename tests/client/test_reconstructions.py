@@ -1,0 +1,238 @@
+"""Reconstructions over HTTP and in process: the same files, the same figures."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from sceneprint.client import Client
+from sceneprint.datasets import (
+    Camera,
+    FrameReference,
+    find_sequences,
+    write_depth_png,
+    write_intrinsics,
+    write_pose,
+)
+from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownQuery
+from sceneprint.schemas import Answer, JobState
+from sceneprint.synth import synthesise_room
+
+NAME = "rebuilt"
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory: pytest.TempPathFactory) -> list[FrameReference]:
+    """Eight neighbouring views of one room: most can be validated against each other."""
+    folder = tmp_path_factory.mktemp("walk") / "room" / "seq-01"
+    folder.mkdir(parents=True)
+    for number, frame in enumerate(synthesise_room(33, 1, 8).frames):
+        write_intrinsics(folder, Camera(frame.intrinsics))
+        write_depth_png(folder / f"frame-{number:06d}.depth.png", frame.depth, 1000.0)
+        assert frame.pose is not None
+        write_pose(folder / f"frame-{number:06d}.pose.txt", frame.pose)
+    return list(find_sequences(folder)[0].frames)
+
+
+@pytest.fixture(scope="module")
+def both(
+    service_url: str,
+    views: list[FrameReference],
+    with_open3d: None,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[list[tuple[Client, Answer]]]:
+    """A service and a folder that hold the same frames, each with the answer to the same query."""
+    clients = [Client(service_url), Client.embedded(tmp_path_factory.mktemp("rebuilt"))]
+    found = []
+    for client in clients:
+        client.create_map(NAME, model="compact")
+        for view in views[1:]:
+            assert client.upload(NAME, view, wait_s=60).state == "indexed"
+        answer = client.query(NAME, views[0], k=4)
+        assert answer.status == "found"
+        found.append((client, answer))
+    yield found
+    for client in clients:
+        client.close()
+
+
+def files(folder: Path) -> set[Path]:
+    """Blobs of a data folder."""
+    return {path for path in (folder / "blobs").rglob("*") if path.is_file()}
+
+
+def ply(data: bytes) -> tuple[int, int, str]:
+    """Points, triangles and comment of a PLY file, whose size must fit its header."""
+    head, _, body = data.partition(b"end_header\n")
+    lines = head.decode().splitlines()
+    counts = {line.split()[1]: int(line.split()[2]) for line in lines if "element" in line}
+    points, faces = counts["vertex"], counts.get("face", 0)
+    assert len(body) == points * (6 * 4 + 3) + faces * (1 + 3 * 4)
+    return points, faces, next(line for line in lines if line.startswith("comment"))
+
+
+def test_both_ways_give_the_same_surface(both: list[tuple[Client, Answer]]) -> None:
+    meshes, coverages = [], []
+    for client, answer in both:
+        made = client.reconstruct(answer, voxel_m=0.04)
+        assert made.state == JobState.QUEUED
+        assert (made.query_id, made.maps, made.coverage) == (answer.query_id, [NAME], None)
+        [job] = client.wait([made.job_id], timeout_s=120)
+        assert (job.state, job.kind, job.map) == ("succeeded", "reconstruct", NAME), job.error
+        done = client.reconstruction(made.job_id)
+        assert done.coverage is not None
+        mesh = client.reconstruction_mesh(made.job_id)
+        picture = client.reconstruction_picture(made.job_id)
+        assert [(one.name, one.bytes) for one in done.files] == [
+            ("mesh.ply", len(mesh)),
+            ("picture.png", len(picture)),
+        ]
+        points, triangles, comment = ply(mesh)
+        assert (points, triangles) == (done.coverage.points, done.coverage.triangles)
+        assert comment == "comment frame query.optical: x right, y down, z ahead, metres"
+        width, height = struct.unpack(">II", picture[16:24])
+        assert (width, height) == (1440, 920)
+        meshes.append(mesh.partition(b"end_header\n")[2])
+        coverages.append(done.coverage)
+    assert meshes[0] == meshes[1]
+    here, there = coverages
+    assert (here.area_m2, here.query_explained) == (there.area_m2, there.query_explained)
+    accepted = [m for m in both[0][1].matches if m.validation.status == "accepted"]
+    views = here.views
+    assert [one.frame_id for one in views[1:]] == [
+        match.frame_id for match in sorted(accepted, key=lambda match: match.rank)
+    ]
+    assert (views[0].frame_id, views[0].source) == (None, "geometry")
+    assert all(one.source == "upload" for one in views[1:])
+    assert sum(one.added_m2 for one in views) == pytest.approx(here.area_m2)
+    assert 0.5 < here.query_explained <= 1.0
+    assert here.left_out == []
+
+
+def test_what_is_wanted_is_what_is_fused(both: list[tuple[Client, Answer]]) -> None:
+    client, answer = both[1]
+    first = next(match for match in answer.matches if match.validation.status == "accepted")
+    made = client.reconstruct(
+        answer.query_id, frames=[first.frame_id], include_query=False, voxel_m=0.05,
+        output="cloud", wait_s=60,
+    )  # fmt: skip
+    assert made.coverage is not None, made.error
+    assert [one.frame_id for one in made.coverage.views] == [first.frame_id]
+    assert (made.coverage.triangles, made.coverage.voxel_m) == (0, 0.05)
+    assert made.coverage.area_m2 > 1.0  # also of a cloud: it is that of the surface
+    points, triangles, _ = ply(client.reconstruction_mesh(made.job_id))
+    assert (points, triangles) == (made.coverage.points, 0)
+
+
+def test_the_surface_lies_where_the_query_saw_it(
+    both: list[tuple[Client, Answer]], views: list[FrameReference]
+) -> None:
+    """Matches alone, in the query's camera: their points project onto the query's depth."""
+    client, answer = both[1]
+    made = client.reconstruct(answer, include_query=False, strength="strong", wait_s=60)
+    data = client.reconstruction_mesh(made.job_id).partition(b"end_header\n")[2]
+    assert made.coverage is not None
+    rows = np.frombuffer(data[: 27 * made.coverage.points], np.uint8).reshape(-1, 27)
+    points = rows[:, :12].copy().view("<f4").astype(float)
+    query = views[0].read()
+    k = query.intrinsics
+    points = points[points[:, 2] > 0.3]
+    x = np.rint(points[:, 0] / points[:, 2] * k.fx + k.cx).astype(int)
+    y = np.rint(points[:, 1] / points[:, 2] * k.fy + k.cy).astype(int)
+    seen = (x >= 0) & (x < k.width) & (y >= 0) & (y < k.height)
+    depth = query.depth[y[seen], x[seen]]
+    behind = points[seen, 2] - depth
+    visible = (depth > 0) & (behind < 0.3)  # what is farther behind is hidden from the query
+    assert visible.sum() > 5000
+    assert np.median(np.abs(behind[visible])) < 0.02
+
+
+def test_refusals(both: list[tuple[Client, Answer]]) -> None:
+    for client, answer in both:
+        with pytest.raises(UnknownQuery, match="no answer"):
+            client.reconstruct("0" * 32)
+        with pytest.raises(InvalidRequest, match="'nobody' is no accepted match"):
+            client.reconstruct(answer, frames=["nobody"])
+        with pytest.raises(InvalidRequest, match="voxel_m"):
+            client.reconstruct(answer, voxel_m=0.0001)
+        with pytest.raises(UnknownJob, match="no job"):
+            client.reconstruction("nothing")
+        made = client.reconstruct(answer, voxel_m=0.002)  # finer than memory allows for a room
+        [job] = client.wait([made.job_id], timeout_s=60)
+        assert (job.state, job.attempts) == ("failed", 1)
+        assert "Ask for" in str(job.error)
+        with pytest.raises(NotIndexed, match=r"is failed, and mesh\.ply is made at its end"):
+            client.reconstruction_mesh(made.job_id)
+        client.delete_reconstruction(made.job_id)
+        with pytest.raises(UnknownJob):
+            client.job(made.job_id)
+        with pytest.raises(UnknownJob):
+            client.delete_reconstruction(made.job_id)
+        unvalidated = client.query(NAME, frame_id=answer.matches[0].frame_id, stages=["retrieve"])
+        with pytest.raises(InvalidRequest, match="no accepted match, so"):
+            client.reconstruct(unvalidated)
+
+
+def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
+    views: list[FrameReference], tmp_path: Path
+) -> None:
+    with Client.embedded(tmp_path) as client:
+        client.create_map(NAME, model="compact")
+        client.wait([client.upload(NAME, view).job_id for view in views[1:]])
+        answer = client.query(NAME, views[0], k=4)
+        accepted = sorted(
+            (m for m in answer.matches if m.validation.status == "accepted"), key=lambda m: m.rank
+        )
+        assert len(accepted) >= 2
+        made = client.reconstruct(answer, voxel_m=0.05)
+        lost, deleted = accepted[0].frame_id, accepted[1].frame_id
+        size = client.frame(NAME, lost).bytes
+        next(path for path in files(tmp_path) if path.stat().st_size == size).unlink()
+        client.delete_frame(NAME, deleted)
+        [job] = client.wait([made.job_id], timeout_s=60)
+        assert job.state == "succeeded", job.error
+        coverage = client.reconstruction(made.job_id).coverage
+        assert coverage is not None
+        sources = {one.frame_id: one.source for one in coverage.views}
+        assert sources[lost] == "geometry"
+        assert [one.frame_id for one in coverage.left_out] == [deleted]
+        # what the query saw is not kept beyond the job, and all goes with it
+        before = files(tmp_path)
+        client.delete_reconstruction(made.job_id)
+        assert len(before - files(tmp_path)) == 2
+
+
+def test_files_are_sent_in_ranges(both: list[tuple[Client, Answer]], service_url: str) -> None:
+    client, answer = both[0]
+    made = client.reconstruct(answer, voxel_m=0.05, wait_s=60)
+    whole = client.reconstruction_picture(made.job_id)
+    url = f"{service_url}/v1/reconstructions/{made.job_id}/picture.png"
+    answered = httpx.get(url)
+    tag = answered.headers["ETag"]
+    assert (answered.content, answered.headers["Content-Type"]) == (whole, "image/png")
+    for asked, first, last in (("0-99", 0, 99), ("100-", 100, len(whole) - 1), ("-7", -7, None)):
+        part = httpx.get(url, headers={"Range": f"bytes={asked}", "If-Range": tag})
+        assert part.status_code == 206
+        stop = None if last is None else last + 1
+        assert part.content == whole[first:stop]
+        assert part.headers["Content-Range"].endswith(f"/{len(whole)}")
+    for asked in ("1-2,5-6", "x", "9-3", ""):  # not understood, or more than is done: all of it
+        assert httpx.get(url, headers={"Range": f"bytes={asked}"}).content == whole
+    assert httpx.get(url, headers={"Range": "bytes=0-9", "If-Range": '"old"'}).content == whole
+    refused = httpx.get(url, headers={"Range": f"bytes={len(whole)}-"})
+    assert (refused.status_code, refused.json()["type"]) == (416, "/problems/range-not-satisfiable")
+    assert refused.headers["Content-Range"] == f"bytes */{len(whole)}"
+    assert httpx.get(url, headers={"If-None-Match": tag}).status_code == 304
+    # a body is not needed, and what is not JSON is told of
+    post = f"{service_url}/v1/queries/{answer.query_id}/reconstruction"
+    begun = httpx.post(post)
+    assert begun.status_code == 202
+    assert begun.headers["Location"] == f"/v1/reconstructions/{begun.json()['job_id']}"
+    assert httpx.post(post, content=b"x", headers={"Content-Type": "text/plain"}).status_code == 415
+    assert httpx.post(post, json=[1]).status_code == 422
+    assert httpx.post(post, json={"voxels": 1}).status_code == 422
