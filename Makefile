@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint format bench soak models lock clean
+.PHONY: help demo test lint format bench soak siege models lock clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
@@ -16,6 +16,7 @@ help:
 	@echo "make lint    lint, types and import contracts only"
 	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
 	@echo "make soak    200 kills, and a crowd of writers and readers; rewrites its part of docs/reliability.md"
+	@echo "make siege   broken uploads, every operation fuzzed, ten times too many requests; likewise"
 	@echo "make models  train the presets that ship with the package (minutes)"
 	@echo "make lock    resolve the dependencies anew into requirements.txt"
 
@@ -49,6 +50,9 @@ bench: $(STAMP)
 
 soak: $(STAMP)
 	$(BIN)/python -m benchmarks.soak --page docs/reliability.md
+
+siege: $(STAMP)
+	$(BIN)/python -m benchmarks.siege --page docs/reliability.md
 
 models: $(STAMP)
 	$(BIN)/sceneprint train --preset paper --out sceneprint/presets/paper.safetensors

@@ -134,7 +134,7 @@ def _sign(data: Path, frames: list[FrameReference], n: int) -> float:
 
 def _until(client: Client, signed: int) -> tuple[int, float]:
     """How many frames are signed when so many are, and when; asked for rarely, as it costs."""
-    while (found := client.status().jobs.get("succeeded", 0)) < signed:
+    while (found := (client.status().jobs or {}).get("succeeded", 0)) < signed:
         time.sleep(0.05)
     return found, time.perf_counter()
 

@@ -49,7 +49,7 @@ def crowd(
     stable = {one.frame_id: number for number, one in enumerate(added)}
     port = free_port()
     url = f"http://127.0.0.1:{port}"
-    parts = [service(data, port), workers(data, 2)]
+    parts = [service(data, port, waiting=512), workers(data, 2)]
     spawn = multiprocessing.get_context("spawn")
     jobs: list[tuple[Callable[..., None], tuple[Any, ...]]] = []
     for i in range(n_writers):

@@ -87,7 +87,7 @@ def kill(folder: Path, shots: list[Shot], n_kills: int, seed: int) -> KillFigure
         client.create_map(MAP, model=MODEL)
     port = free_port()
     url = f"http://127.0.0.1:{port}"
-    parts = [service(data, port), workers(data, 2)]
+    parts = [service(data, port, waiting=512), workers(data, 2)]
     plan = Plan(range(len(shots)))
     remote = [RemoteWriter(url, shots, plan) for _ in range(2)]
     embedded = [EmbeddedWriter(data, folder / "shots.json", plan) for _ in range(2)]
@@ -201,7 +201,7 @@ def _until(what: Callable[[], bool], said: str) -> None:
 
 def _idle(client: Client) -> bool:
     try:
-        jobs = client.status().jobs
+        jobs = client.status().jobs or {}
     except SceneprintError:
         return False
     return not jobs.get("queued", 0) and not jobs.get("running", 0)

@@ -144,11 +144,11 @@ class Part:
             self._process = None
 
 
-def service(data: Path, port: int, workers: int = 0) -> Part:
-    """`sceneprint serve` on a data folder."""
+def service(data: Path, port: int, workers: int = 0, **settings: object) -> Part:
+    """`sceneprint serve` on a data folder; `settings`: as for Settings."""
     given = ["--port", str(port), "--data", str(data), "--workers", str(workers)]
     log = data.with_suffix(".service.log")
-    return Part("service", ["sceneprint", "serve", *given], log, waiting=512)
+    return Part("service", ["sceneprint", "serve", *given], log, **settings)
 
 
 def workers(data: Path, n: int) -> Part:

@@ -1,0 +1,1 @@
+"""What strangers may send, and more than the service can do: it answers all, and loses nothing."""

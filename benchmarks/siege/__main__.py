@@ -1,0 +1,194 @@
+"""`make siege`: broken uploads, every operation fuzzed, and ten times too many requests.
+
+`python -m benchmarks.siege --page docs/reliability.md` puts the figures into the page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+from benchmarks.machine import describe_machine
+from benchmarks.siege.contract import ContractFigures, try_contract
+from benchmarks.siege.mutations import MutationFigures, besiege
+from benchmarks.siege.overload import OverloadFigures, overload
+from benchmarks.soak.load import MODEL, Part, Shot, free_port, service, shots
+from sceneprint.client import Client
+from sceneprint.engine import Engine
+from sceneprint.settings import Settings
+
+#: Seconds in which a service has to begin, on a machine that others use too.
+_BEGIN_S = 90.0
+BEGIN, END = "<!-- siege:begin -->", "<!-- siege:end -->"
+
+
+@contextmanager
+def besieged(data: Path, indexed: list[Shot], **settings: object) -> Iterator[tuple[str, Part]]:
+    """A service with one worker and a map `siege` that holds some frames.
+
+    Parameters
+    ----------
+    data : its data folder
+    indexed : frames that are in the map before
+    settings : as for Settings
+    """
+    port = free_port()
+    part = service(data, port, workers=1, **settings)
+    part.begin()
+    url = f"http://127.0.0.1:{port}"
+    try:
+        await_service(url)
+        with Client(url) as client:
+            client.create_map("siege", model=MODEL)
+            for one in indexed:
+                client.upload("siege", one.png, one.meta, wait_s=60)
+        yield url, part
+    finally:
+        part.end()
+
+
+def await_service(url: str) -> None:
+    """Wait until a service answers; TimeoutError where it does not begin."""
+    until = time.monotonic() + _BEGIN_S
+    with Client(url) as client:
+        while not client.healthy():
+            if time.monotonic() > until:
+                raise TimeoutError(f"{url} did not begin within {_BEGIN_S:g} s; look into its log")
+            time.sleep(0.1)
+
+
+def known_of(url: str) -> dict[str, str]:
+    """Names of what is there, for parameters of the paths."""
+    with Client(url) as client:
+        frame = next(iter(client.frames("siege")))
+        query = client.query("siege", frame_id=frame.frame_id)
+    return {
+        "path.map_name": "siege", "path.frame_id": frame.frame_id, "path.job_id": frame.job_id,
+        "path.query_id": query.query_id,
+    }  # fmt: skip
+
+
+def contracts(folder: Path, frames: list[Shot], examples: int, seed: int) -> list[ContractFigures]:
+    """Every operation: of an open service, of what is there, and of one that asks for keys."""
+    found = []
+    with besieged(folder / "open", frames) as (url, _):
+        found.append(try_contract(url, folder, examples=examples, seed=seed))
+    with besieged(folder / "known", frames) as (url, _):
+        known = known_of(url)
+        found.append(try_contract(url, folder, known=known, examples=examples, seed=seed))
+    keyed, port = folder / "keyed", free_port()
+    keyed.mkdir()
+    with Engine(Settings(data_dir=keyed, database_url=None)) as engine:
+        key = engine.create_key("fuzzer", {"siege": "write"}).secret
+    part = service(keyed, port, workers=1, host="0.0.0.0", requests_per_s=0)
+    part.begin()
+    try:
+        url = f"http://127.0.0.1:{port}"
+        await_service(url)
+        found.append(try_contract(url, folder, key=key, examples=examples, seed=seed))
+        found.append(try_contract(url, folder, examples=max(examples // 5, 1), seed=seed))
+    finally:
+        part.end()
+    return found
+
+
+def table(
+    mutations: MutationFigures, contracts: list[ContractFigures], overloaded: OverloadFigures
+) -> list[str]:
+    """The figures as lines of Markdown."""
+    kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(mutations.sent.items()))
+    answers = ", ".join(f"{n} of {status}" for status, n in mutations.statuses.items())
+    asked = [f"{one.passed} of {one.requests}" for one in contracts]
+    loaded = ", ".join(f"{n} of {status}" for status, n in overloaded.statuses.items())
+    return [
+        f"### {sum(mutations.sent.values())} broken uploads within {mutations.seconds:.0f} s",
+        "",
+        "| | |",
+        "|---|--:|",
+        f"| files | {kinds} |",
+        f"| answers | {answers} |",
+        f"| **5xx, or no answer** | **{len(mutations.failed)}** |",
+        f"| **processes that ended** | **{mutations.crashed}** |",
+        f"| most memory of a process | {mutations.peak_bytes / 2**20:.0f} MiB |",
+        "",
+        f"### Every operation of the OpenAPI document ({contracts[0].operations})",
+        "",
+        "| asked of | answered as declared, none with 5xx |",
+        "|---|--:|",
+        *(
+            f"| {of} | {count} |"
+            for of, count in zip(
+                ("an open service", "what is there", "a key for one map", "no key"),
+                asked,
+                strict=True,
+            )
+        ),
+        "",
+        f"### {overloaded.offered:.0f} requests a second where {overloaded.sustainable:.0f} can "
+        f"be done, for {overloaded.seconds:.0f} s",
+        "",
+        "| | |",
+        "|---|--:|",
+        f"| answers | {loaded} |",
+        f"| sent away without `Retry-After` | {overloaded.without_word} |",
+        f"| latency of the accepted, median and p99 | {overloaded.accepted_ms[0]:.0f} ms, "
+        f"{overloaded.accepted_ms[1]:.0f} ms |",
+        f"| latency of those sent away | {overloaded.away_ms[0]:.0f} ms, "
+        f"{overloaded.away_ms[1]:.0f} ms |",
+        f"| frames acknowledged, **lost** | {overloaded.acknowledged}, **{overloaded.lost}** |",
+        f"| queries as fast as before, after | {overloaded.recovery_s:.1f} s |",
+        "",
+    ]
+
+
+def write_page(page: Path, lines: list[str]) -> None:
+    """Put the figures between the marks of a page."""
+    text = page.read_text()
+    head, rest = text.split(BEGIN)
+    tail = rest.split(END)[1]
+    page.write_text("\n".join([head + BEGIN, *lines, END]) + tail)
+
+
+def main() -> int:
+    """Run all of it; exit code 1 where anything failed, was lost, or was not as declared."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--uploads", type=int, default=20_000, help="that are broken")
+    parser.add_argument("--examples", type=int, default=50, help="requests of each operation")
+    parser.add_argument("--seconds", type=float, default=120, help="of too many requests")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--page", type=Path, help="whose figures to replace")
+    options = parser.parse_args()
+    every = shots(160)
+    with tempfile.TemporaryDirectory(prefix="sceneprint-siege-") as name:
+        folder = Path(name)
+        with besieged(folder / "overload", every[:40]) as (url, _):
+            overloaded = overload(url, every[40:], options.seconds)
+        print(overloaded)
+        with besieged(folder / "mutations", every[:4]) as (url, part):
+            mutations = besiege(url, [part], every, options.uploads, options.seed)
+        print(mutations)
+        tried = contracts(folder, every[:4], options.examples, options.seed)
+    for line in (*mutations.failed[:20], *(one.report for one in tried if not one.sound)):
+        print(line, file=sys.stderr)
+    machine = describe_machine()
+    when = (
+        f"Measured {datetime.now(UTC):%Y-%m-%d} on {machine.processor}, "
+        f"{machine.cores} processors; `make siege`."
+    )
+    lines = ["", when, "", *table(mutations, tried, overloaded)]
+    print("\n".join(lines))
+    if options.page is not None:
+        write_page(options.page, lines)
+    unanswered = overloaded.statuses.get(0, 0) + overloaded.lost
+    wrong = len(mutations.failed) + mutations.crashed + unanswered
+    return int(bool(wrong) or not all(one.sound for one in tried))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""`make siege` at reduced size, with real processes; and that it would see what goes wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benchmarks.siege.__main__ import BEGIN, END, besieged, known_of, table, write_page
+from benchmarks.siege.contract import ContractFigures, try_contract
+from benchmarks.siege.mutations import MutationFigures, besiege, mutated
+from benchmarks.siege.overload import OverloadFigures, overload
+from benchmarks.soak.load import Shot, shots
+
+
+@pytest.fixture(scope="module")
+def every() -> list[Shot]:
+    return shots(24)
+
+
+def test_broken_uploads_and_every_operation_are_answered(every: list[Shot], tmp_path: Path) -> None:
+    with besieged(tmp_path / "data", every[:2]) as (url, part):
+        found = besiege(url, [part], every, n=300, seed=5)
+        assert (found.failed, found.crashed) == ([], 0)
+        assert sum(found.statuses.values()) == 300
+        assert set(found.sent) == {"png", "npy", "json", "zip", "tar"}
+        assert {200, 202, 422} <= set(found.statuses)  # some are sound after all
+        assert found.peak_bytes < 1 << 30
+        known = known_of(url)
+        tried = try_contract(url, tmp_path, known=known, examples=2, phases="fuzzing")
+        assert tried.sound, tried.report[-4000:]
+        assert tried.operations >= 40
+        assert tried.requests > tried.operations
+
+
+def test_too_many_requests_are_sent_away_and_nothing_is_lost(
+    every: list[Shot], tmp_path: Path
+) -> None:
+    with besieged(tmp_path / "data", every[:4], waiting=8) as (url, _):
+        found = overload(url, every, seconds=4, factor=10, measure_s=1.5)
+    assert set(found.statuses) <= {200, 202, 429, 503}
+    assert found.statuses[503] + found.statuses.get(429, 0) > 0
+    assert (found.without_word, found.lost) == (0, 0)
+    assert found.acknowledged >= 10
+    assert found.recovery_s < 60
+
+
+def test_mutations_are_the_same_each_time_and_break_things(every: list[Shot]) -> None:
+    first = [mutated(every, 3, number) for number in range(50)]
+    assert first == [mutated(every, 3, number) for number in range(50)]
+    assert first != [mutated(every, 4, number) for number in range(50)]
+    sound = {(one.png, one.meta.model_dump_json()) for one in every}
+    assert sum((one.data, one.meta) not in sound for one in first) >= 48
+
+
+def test_the_page_tells_what_was_measured(tmp_path: Path) -> None:
+    mutations = MutationFigures({"png": 3, "tar": 1}, {202: 1, 422: 3}, ["x"], 2, 3 << 20, 7.0)
+    contract = ContractFigures(41, 10, 9, "")
+    overloaded = OverloadFigures(
+        50.0, 500.0, 4.0, {200: 3, 503: 9}, 1, (10.0, 20.0), (1.0, 2.0), 5, 1, 0.5
+    )
+    lines = table(mutations, [contract] * 4, overloaded)
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    write_page(page, lines)
+    text = page.read_text()
+    assert text.startswith("before")
+    assert text.endswith("after\n")
+    assert "old" not in text
+    for part in (
+        "4 broken uploads within 7 s", "3 png, 1 tar", "1 of 202, 3 of 422", "| **1** |",
+        "| **2** |", "3 MiB", "(41)", "| no key | 9 of 10 |", "500 requests a second where 50",
+        "5, **1**", "0.5 s",
+    ):  # fmt: skip
+        assert part in text, part
+
+
+@pytest.mark.parametrize(
+    ("changed", "sound"),
+    [({}, True), ({"passed": 9}, False), ({"requests": 0, "passed": 0}, False)],
+)
+def test_a_contract_that_was_not_tried_is_not_kept(changed: dict[str, int], sound: bool) -> None:
+    assert replace(ContractFigures(3, 10, 10, ""), **changed).sound is sound
