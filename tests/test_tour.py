@@ -15,24 +15,38 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 TOUR = (ROOT / "docs/api.md").read_text()
+#: Seconds in which the tour has to come to its end: it waits for jobs.
+PATIENCE_S = 600.0
 
 
 def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", TOUR, re.DOTALL)
 
 
+def named_blocks() -> list[tuple[str, str]]:
+    """Blocks of commands, each with the heading it stands under."""
+    found, heading = [], ""
+    for part in re.findall(r"^##+ [^\n]*$|^```sh\n.*?^```", TOUR, re.DOTALL | re.MULTILINE):
+        if part.startswith("#"):
+            heading = part.lstrip("# ")
+        else:
+            found.append((heading, part.removeprefix("```sh\n").removesuffix("```")))
+    return found
+
+
 @pytest.fixture(scope="module")
-def outputs(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """What each block of commands printed; a command that fails fails the tour."""
+def outputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+    """What the blocks under each heading printed; a command that fails fails the tour."""
     folder = tmp_path_factory.mktemp("tour")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     url = f"http://127.0.0.1:{port}"
     mark = "=== next block ==="
+    named = named_blocks()
     # `kill %1` must reach the service, so it stays a job of this shell
     script = f"set -eo pipefail\ntrap 'kill %1; wait' EXIT\n\necho '{mark}'\n".join(
-        ["", *blocks("sh")]
+        ["", *(commands for _, commands in named)]
     ).replace("http://127.0.0.1:8008", url)
     environment = {
         **os.environ,
@@ -43,10 +57,15 @@ def outputs(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
         "SCENEPRINT_WORKERS": "1",
     }
     done = subprocess.run(
-        ["bash", "-c", script], cwd=folder, env=environment, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout.split(f"{mark}\n")[1:]
+        ["bash", "-c", script], cwd=folder, env=environment, capture_output=True, text=True,
+        timeout=PATIENCE_S,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-1500:]
+    said: dict[str, list[str]] = {}
+    texts = done.stdout.split(f"{mark}\n")[1:]
+    for (heading, _), text in zip(named, texts, strict=True):
+        said.setdefault(heading, []).append(text)
+    return said
 
 
 def documents(output: str) -> list[dict[str, Any]]:
@@ -60,32 +79,52 @@ def documents(output: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_the_tour_runs_and_says_what_the_page_promises(outputs: list[str]) -> None:
-    (
-        _,
-        health,
-        made,
-        one,
-        five,
-        recording,
-        around,
-        asked,
-        of_map,
-        listed,
-        filtered,
-        newest,
-        removed,
-        refused,
-        operations,
-    ) = outputs
-    assert documents(health)[0]["status"] == "ok"
-    assert [m["title"] for m in documents(made)] == ["Two rooms"] * 2
-    assert documents(one)[0]["state"] == "received"
+def one(outputs: dict[str, list[str]], heading: str, place: int = 0) -> list[dict[str, Any]]:
+    return documents(outputs[heading][place].partition("# HELP")[0])
+
+
+def test_frames_go_into_a_map(outputs: dict[str, list[str]]) -> None:
+    assert one(outputs, "Start", 1)[0]["status"] == "ok"
+    assert [m["title"] for m in one(outputs, "A map")] == ["Two rooms"] * 2
+    first, five, recording = outputs["A frame into the map"]
+    assert documents(first)[0]["state"] == "received"
     assert [added["state"] for added in documents(five)] == ["indexed"] * 5
     assert recording.startswith("8 frames: 8 received, 0 already there; 8 indexed, 0 rejected")
-    page, job = documents(around)
+
+
+def test_there_are_other_ways_in(outputs: dict[str, list[str]]) -> None:
+    raw, put, once, batch, archive = outputs["Other ways to upload"]
+    assert documents(raw)[1]["state"] == "received"
+    added, frame = documents(put)
+    assert added["frame_id"] == frame["frame_id"] == "r3-000007"
+    assert frame["T_base_sensor"]["translation"] == {"x": 0.1, "y": 0.0, "z": 0.4}
+    assert [a["frame_id"] for a in documents(once)] == [documents(once)[0]["frame_id"]] * 2
+    assert once.lower().count("idempotent-replayed: true") == 1
+    assert [i["status"] for i in documents(batch)[0]["items"]] == [202, 202, 422]
+    assert len(documents(archive)[1]["items"]) == 3
+    # every second of sixteen, sent once more by command
+    assert "8 frames: 0 received, 8 already there" in archive
+
+
+def test_frames_can_be_looked_at_and_edited(outputs: dict[str, list[str]]) -> None:
+    page, job = one(outputs, "Look around")
     assert len(page["items"]) == 2
     assert job["state"] == "succeeded"
+    monday, posed = [documents(text)[0] for text in outputs["Frames by their metadata"][0:1]] + [
+        one(outputs, "Frames by their metadata")[1]
+    ]
+    assert [f["session"] for f in monday["items"]] == ["monday"]
+    assert [f["session"] for f in posed["items"]] == ["monday"]
+    trajectory = outputs["Sessions and trajectories"][0]
+    assert "1794821400.0 0.0 0.0 1.2 0.0 0.0 0.0 1.0" in trajectory
+    edited, refused, titled = one(outputs, "Edit")
+    assert edited["tags"] == ["door", "north"]
+    assert refused["type"] == "/problems/precondition-failed"
+    assert titled["title"] == "Two rooms, and a door"
+
+
+def test_queries_answer_as_the_page_says(outputs: dict[str, list[str]]) -> None:
+    asked, of_map, listed = outputs["Where was this taken?"]
     answer = documents(asked)[0]
     assert answer["status"] == "found"
     assert answer["matches"][0]["validation"]["status"] == "accepted"
@@ -94,27 +133,73 @@ def test_the_tour_runs_and_says_what_the_page_promises(outputs: list[str]) -> No
     assert (again["status"], again["seed"]) == ("found", 7)
     unvalidated = documents(listed)[0]
     assert (unvalidated["status"], unvalidated["counts"]["selected"]) == ("unvalidated", 5)
-    assert [answer["counts"]["passed"] for answer in documents(filtered)] == [8, 13]
-    jobs = documents(newest)[0]
+    explained = one(outputs, "Why not that one?")[0]
+    assert [each["rank"] for each in explained["explanations"]] == list(range(1, 15))
+    assert explained["explained_frame"]["rank"] >= 1
+    filtered = one(outputs, "Among which frames")
+    assert [each["counts"]["passed"] for each in filtered] == [8, 13]
+    sure = one(outputs, "How sure is it?")[0]
+    assert len(sure["location"]["uncertainty"]["covariance"]) == 36
+    assert sure["location"]["base"]["child_frame"] == "base_link"
+    kept = one(outputs, "Look at it again")
+    assert kept[0] == answer
+    where = one(outputs, "Where am I?")[0]
+    assert (where["status"], where["pose"]["parent_frame"]) == ("found", "room-001")
+    several = one(outputs, "In which of several maps?")[2:]
+    assert several[0]["maps"] == ["building", "annex"]
+    same, different = one(outputs, "Are these two of one place?")
+    assert (same["similarity"], different["validation"]["status"]) == (1.0, "accepted")
+
+
+def test_places_are_rebuilt(outputs: dict[str, list[str]], with_open3d: None) -> None:
+    rebuilt = one(outputs, "What does the place look like?")[-1]
+    assert rebuilt["state"] == "succeeded"
+    assert {f["name"] for f in rebuilt["files"]} == {"mesh.ply", "picture.png"}
+
+
+def test_robots_maps_are_joined(outputs: dict[str, list[str]]) -> None:
+    joined = one(outputs, "Join two robots' maps", 1)
+    (join,) = joined[-2]["result"]["joins"]
+    assert (join["from_session"], join["to_session"]) == ("ann", "bob")
+    assert join["transform"] is not None
+    assert all(edge["consistent"] for edge in joined[-1]["items"])
+
+
+def test_operators_see_what_goes_on(outputs: dict[str, list[str]]) -> None:
+    jobs = one(outputs, "Jobs")[0]
     assert [job["state"] for job in jobs["items"]] == ["succeeded"] * 3
     assert jobs["next_cursor"] is not None
-    assert removed.strip() == ""
-    assert documents(refused)[0]["type"] == "/problems/unknown-map"
-    assert documents(operations.splitlines()[0])[0]["status"] == "ready"
-    assert 'sceneprint_answers_total{status="found"} 2.0' in operations
+    happened = outputs["What happens, as it happens"][0]
+    assert len(documents(happened)[0]["items"]) == 3
+    assert "retry: 1000" in happened
+    operations = outputs["Operations"][0]
+    assert documents(operations[: operations.index("# HELP")])[0]["status"] == "ready"
+    assert 'sceneprint_answers_total{status="found"}' in operations
+    coming, standing = one(outputs, "Operations", 1)[:2]
+    assert coming["reencoding"]["model"].startswith("compact")
+    assert standing["name"] == "building"
+    assert one(outputs, "Snapshots")[-1]["items"]
+    made, listed, me = one(outputs, "Keys")
+    assert made["secret"].startswith("sp_")
+    assert [key["name"] for key in listed["items"]] == ["robot-7"]
+    assert (me["name"], me["grants"]) == (None, {"*": "admin"})
+    proxied, refused, audit = one(outputs, "Keys", 1)
+    assert (proxied["name"], refused["type"]) == ("robot-7", "/problems/key-required")
+    assert len(audit["items"]) == 3
+    assert outputs["Take out"][0].strip() == ""
+    assert one(outputs, "When something is wrong")[0]["type"] == "/problems/unknown-map"
 
 
-def test_the_page_shows_the_fields_that_there_are(outputs: list[str]) -> None:
+def test_the_page_shows_the_fields_that_there_are(outputs: dict[str, list[str]]) -> None:
     """The examples are JSON, and have the keys of the records they stand for."""
     from sceneprint.schemas import Answer, Match, Validation
 
-    (example,) = [block for block in blocks("json") if "matches" in block]
+    (example,) = [block for block in blocks("json") if '"milliseconds"' in block]
     shown = json.loads(example)
     assert set(shown) == set(Answer.model_fields)
     assert set(shown["matches"][0]) == set(Match.model_fields)
     assert set(shown["matches"][0]["validation"]) == set(Validation.model_fields)
-    given = documents(outputs[7])[0]
-    assert set(given) == set(shown)
+    assert set(one(outputs, "Where was this taken?")[0]) == set(shown)
 
 
 def test_every_kind_of_problem_has_its_row() -> None:

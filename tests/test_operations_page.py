@@ -1,0 +1,160 @@
+"""docs/operations.md and the dashboard are held to settings, states, events, metrics, commands."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+from sceneprint.cli import parser
+from sceneprint.schemas import AnswerStatus, FrameState, JobState
+from sceneprint.schemas.events import KINDS, MISSED
+from sceneprint.settings import Settings
+from service.metrics import Metrics
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGE = (DOCS / "operations.md").read_text()
+DASHBOARD = json.loads((DOCS / "grafana.json").read_text())
+
+
+def section(title: str) -> str:
+    """A section of the page, without those after it."""
+    (found,) = re.findall(rf"^## {title}\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL)
+    return str(found)
+
+
+def rows(text: str) -> dict[str, list[str]]:
+    """Rows of its tables by the first cell's code, with the other cells."""
+    found = re.findall(r"^\| `([^`]+)` \|(.*)\|$", text, re.MULTILINE)
+    return {name: [cell.strip() for cell in rest.split("|")] for name, rest in found}
+
+
+def families() -> dict[str, set[str]]:
+    """Names of all that is told to Prometheus, with their labels."""
+    found: dict[str, set[str]] = {}
+    for collector in Metrics().registry._collector_to_names:  # also those without data
+        labels = set(getattr(collector, "_labelnames", ()))
+        for family in collector.describe():
+            name = family.name + ("_total" if family.type == "counter" else "")
+            found[name] = labels
+    return found
+
+
+def queried(expression: str) -> list[tuple[str, set[str]]]:
+    """Names of metrics in an expression of Prometheus, with the labels that they are picked by."""
+    return [
+        (name, set(re.findall(r"(\w+)\s*(?:=~|!=|!~|=)", picked)))
+        for name, picked in re.findall(r"(sceneprint_\w+)(\{[^}]*\})?", expression)
+    ]
+
+
+def check(expression: str) -> None:
+    known = families()
+    found = queried(expression)
+    by = set(re.findall(r"\w+", " ".join(re.findall(r"\bby \(([^)]*)\)", expression))))
+    labels = set()
+    for name, picked in found:
+        family = re.sub(r"_(bucket|sum|count)$", "", name)
+        assert family in known, expression
+        if family != name:
+            assert name not in known
+            labels.add("le")
+        assert picked - {"job"} <= known[family], expression
+        labels |= known[family]
+    assert by <= labels, expression
+
+
+def test_every_setting_is_told_with_its_default():
+    told = rows(section("Settings"))
+    assert set(told) == {name.upper() for name in Settings.model_fields}
+    for name, field in Settings.model_fields.items():
+        default, *_ = told[name.upper()]
+        if isinstance(field.default, str | int | float | tuple):
+            assert default.split("`")[1] == f"{field.default}"
+    assert all(len(cells) == 3 and all(cells) for cells in told.values())
+
+
+def test_every_state_is_told():
+    told = rows(section("States"))
+    wanted: dict[str, str] = {str(one): one.sentence for one in FrameState}
+    by_frames = rows(section("States").split("A job:")[0])
+    by_jobs = rows(section("States").split("A job:")[1].split("An answer:")[0])
+    answers = rows(section("States").split("An answer:")[1].split("Kinds of events")[0])
+    kinds = rows(section("States").split("Kinds of events")[1])
+    assert by_frames == {name: [sentence] for name, sentence in wanted.items()}
+    assert by_jobs == {str(one): [one.sentence] for one in JobState}
+    assert set(answers) == set(get_args(AnswerStatus))
+    assert {kind: [text] for kind, text in KINDS.items()} == {
+        kind: cells for kind, cells in kinds.items() if kind != MISSED
+    }
+    assert MISSED in told
+
+
+def test_every_metric_is_told_and_no_other():
+    text = section("What to watch")
+    table = text.split("| metric |")[1].split("\n\n")[0]
+    assert set(re.findall(r"`(sceneprint_\w+)`", table)) == set(families())
+    alerts = re.findall(r"^\| `([^`]*sceneprint_[^`]*)` \|", text.split("| condition |")[1], re.M)
+    assert len(alerts) >= 9
+    for alert in alerts:
+        check(alert)
+
+
+def test_the_dashboard_asks_for_what_there_is():
+    panels: list[dict[str, Any]] = DASHBOARD["panels"]
+    asked = [target["expr"] for panel in panels for target in panel["targets"]]
+    for expression in asked:
+        assert queried(expression), expression
+        check(expression)
+    named = {re.sub(r"_(bucket|sum|count)$", "", name) for one in asked for name, _ in queried(one)}
+    assert named == set(families())  # all is shown somewhere
+    assert len({panel["id"] for panel in panels}) == len(panels) >= 15
+    (variable,) = DASHBOARD["templating"]["list"]
+    assert queried(variable["query"]["query"]) == [("sceneprint_build_info", set())]
+
+
+def test_the_dashboard_can_be_imported():
+    """As Grafana wants it: an input for the data source, and every use of it by that name."""
+    (source,) = DASHBOARD["__inputs"]
+    assert (source["type"], source["pluginId"]) == ("datasource", "prometheus")
+    wanted = {"type": "prometheus", "uid": f"${{{source['name']}}}"}
+    taken = set()
+    for panel in DASHBOARD["panels"]:
+        assert panel["datasource"] == wanted
+        assert all(target["datasource"] == wanted for target in panel["targets"])
+        assert panel["type"] in {one["id"] for one in DASHBOARD["__requires"]}
+        place = panel["gridPos"]
+        cells = {
+            (x, y)
+            for x in range(place["x"], place["x"] + place["w"])
+            for y in range(place["y"], place["y"] + place["h"])
+        }
+        assert not cells & taken
+        assert max(x for x, _ in cells) < 24
+        taken |= cells
+    assert DASHBOARD["schemaVersion"] >= 30
+    assert "id" not in DASHBOARD  # of another Grafana: an import would overwrite
+
+
+@pytest.mark.parametrize("target", sorted(set(re.findall(r"\]\(([^)]+)\)", PAGE))))
+def test_links_lead_somewhere(target):
+    name, _, heading = target.partition("#")
+    path = DOCS / name
+    assert path.is_file()
+    if heading:
+        titles = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
+        assert heading in {re.sub(r"[^\w -]", "", one).lower().replace(" ", "-") for one in titles}
+
+
+def test_every_command_and_option_is_there():
+    (choices,) = [one.choices for one in parser()._actions if one.dest == "command"]
+    assert choices is not None
+    named = re.findall(r"`sceneprint (\w+)([^`]*)`", PAGE)
+    assert len(named) >= 8
+    for name, rest in named:
+        assert name in choices
+        for option in re.findall(r"--[\w-]+", rest):
+            assert option in choices[name].format_help()  # type: ignore[call-overload]
