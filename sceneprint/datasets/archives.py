@@ -9,6 +9,7 @@ disk. An image is read out of the archive when its turn comes.
 
 from __future__ import annotations
 
+import errno
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,6 +32,9 @@ _LISTS = ("depth.txt", "groundtruth.txt")
 _TEXTS = (FILE_NAME, "TrainSplit.txt", "TestSplit.txt")
 _MAXIMUM_LIST, _MAXIMUM_TEXT, _MAXIMUM_TEXTS = 1 << 26, 1 << 16, 1 << 27  #: bytes; of all of them
 _PARENTS = ("0", "1", "2", "3", "4")  #: a camera is looked for above the frames: not beyond these
+
+#: What a file system says where a file and a folder have one name, or a name is none for it.
+_CLASHES = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EINVAL)
 
 Wanted = Literal["image", "text"]
 
@@ -111,7 +115,9 @@ class Archive:
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.touch(exist_ok=False)
-            except OSError:  # FileExistsError, NotADirectoryError: a file and a folder
+            except OSError as error:
+                if error.errno not in _CLASHES:  # a full disk is no fault of the archive's
+                    raise
                 self._refuse(member, "another member has the name of its folder, or its own")
                 continue
             self._members[path] = member

@@ -15,7 +15,15 @@ import numpy as np
 from sceneprint.artifacts import read_geometry
 from sceneprint.clouds import write_ply
 from sceneprint.engine.frames import read_stored
-from sceneprint.errors import DamagedBlob, FrameError, NotFound, UnreadableGeometry, UselessFrame
+from sceneprint.engine.indexed import living
+from sceneprint.errors import (
+    DamagedBlob,
+    FrameError,
+    NotFound,
+    UnknownFrame,
+    UnreadableGeometry,
+    UselessFrame,
+)
 from sceneprint.fusion import BAND, FusionParameters, fuse, open3d, within
 from sceneprint.geometry.coverage import (
     added_areas,
@@ -72,7 +80,7 @@ class Fused:
 
 def fused(
     store: Store, views: Sequence[View], query: Geometry | None, own: View | None,
-    wanted: NewReconstruction, model_id: str, parent_frame: str,
+    wanted: NewReconstruction, model_id: str, parent_frame: str, asked_at: float,
 ) -> Fused:  # fmt: skip
     """Fuse the matches of an answer, and what the query saw.
 
@@ -85,6 +93,7 @@ def fused(
     wanted : see NewReconstruction
     model_id : whose artifacts stand in for uploads that are lost
     parent_frame : what the query's camera frame is called
+    asked_at : when the answer was given, seconds since 1970
 
     Raises
     ------
@@ -96,12 +105,12 @@ def fused(
     p = FusionParameters(voxel_m=wanted.voxel_m)
     frames, told, left_out = list[Frame](), list[FusedView](), list[LeftOut]()
     if query is not None and wanted.include_query:
-        frame, source = _own(store, query, own, model_id)
+        frame, source = _own(store, query, own, model_id, asked_at)
         frames.append(within(frame, p))
         told.append(_told(None, frames[-1], source))
     for view in views:
         try:
-            frame, source = _read(store, view, model_id)
+            frame, source = _read(store, view, model_id, asked_at)
         except (NotFound, FrameError, DamagedBlob, UnreadableGeometry) as error:
             left_out.append(LeftOut(frame_id=view.frame_id, map=view.map, reason=str(error)))
             continue
@@ -140,27 +149,33 @@ def fused(
     return Fused(coverage, ply, reconstruction_picture(mesh, first, frames, added, title))
 
 
-def _own(store: Store, query: Geometry, own: View | None, model_id: str) -> tuple[Frame, Source]:
+def _own(
+    store: Store, query: Geometry, own: View | None, model_id: str, asked_at: float
+) -> tuple[Frame, Source]:
     """What the query saw, as fine as it is kept."""
     if own is not None:
         with suppress(NotFound, FrameError, DamagedBlob, UnreadableGeometry):
-            frame, source = _read(store, own, model_id)
+            frame, source = _read(store, own, model_id, asked_at)
             return replace(frame, name="query"), source
     return doubled(_frame(query, "query", np.eye(4))), "geometry"
 
 
-def _read(store: Store, view: View, model_id: str) -> tuple[Frame, Source]:
+def _read(store: Store, view: View, model_id: str, asked_at: float) -> tuple[Frame, Source]:
     """A match's depth as it was sent; where that is lost, as validation compares it.
 
     Raises
     ------
-    NotFound : its map or it is gone.
+    NotFound : its map or it is gone, whether or not another has its name.
     DamagedBlob, UnreadableGeometry : both are lost.
     FrameError : there is nothing in it.
     """
     with store.database.read() as connection:
         row = find_map(connection, view.map)
-        frame = find_frame(connection, row, view.frame_id)
+        frame = living(row, find_frame(connection, row, view.frame_id))
+        if frame.received_at > asked_at:
+            raise UnknownFrame(
+                f"Frame {frame.id} of map {row.name!r} was deleted, and another has its id since."
+            )
         blob = geometry_blobs(connection, [frame.number], model_id).get(frame.number)
     T = np.array(view.transform)
     try:

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sqlalchemy import Connection
+
 from sceneprint.datasets import FrameReference
 from sceneprint.datasets.archives import Archive, open_archive
 from sceneprint.datasets.inflating import Inflater
@@ -24,20 +26,23 @@ from sceneprint.engine.cursors import row_of
 from sceneprint.engine.jobs import get_job
 from sceneprint.engine.replaying import Outcome as Taken
 from sceneprint.engine.replaying import item_of
-from sceneprint.engine.tasks import Outcome, Task, Tasks
+from sceneprint.engine.tasks import Outcome, Swept, Task, Tasks
 from sceneprint.engine.uploads import Upload, Uploads, sweep_deleted
-from sceneprint.errors import SceneprintError, StoreError, UnreadableArchive
+from sceneprint.errors import SceneprintError, StoreError, UnreadableArchive, UnusableStore
 from sceneprint.schemas import Job, Page
 from sceneprint.schemas.ingest import ImportItem, ImportOptions
-from sceneprint.store import Store
+from sceneprint.store import Store, queue
 from sceneprint.store.blobs import IncomingBlob
 from sceneprint.store.faults import unusable
 from sceneprint.store.idempotency import Once
 from sceneprint.store.listing import find_job, unknown_job
 from sceneprint.store.maps import find_map
-from sceneprint.store.parts import JobFile, files_of, items_of, remove_parts
+from sceneprint.store.parts import JobFile, files_of, given_up, items_of, remove_parts
 
 KIND, FILE = "import", "archive"
+#: Seconds for which the archive of an import that was given up is kept for another try, and
+#: between two looks for those.
+KEPT_S, TIDY_S = 86_400.0, 60.0
 #: Frames that are taken in one commit.
 _AT_ONCE = 16
 #: How much more a compressed tar may hold than the largest archive that is taken.
@@ -96,6 +101,7 @@ class Imports:
     def __init__(self, store: Store, tasks: Tasks, uploads: Uploads, most_bytes: int) -> None:
         self._store, self._tasks, self._uploads = store, tasks, uploads
         self._most = most_bytes
+        self._tidied = time.monotonic()
         tasks.register(KIND, self.handle)
 
     @contextmanager
@@ -126,12 +132,15 @@ class Imports:
         Raises
         ------
         UnknownMap, IdempotencyConflict : see `Tasks.begin_once`; the archive is removed.
+        UnusableStore : an import of the same archive has just ended, and removed it.
         """
         data = options.model_dump(mode="json")
         try:
             job, again = self._tasks.begin_once(
                 KIND, map_name, data, options.priority, [archive], once
             )
+        except Swept as error:
+            raise UnusableStore(f"{error} Send the archive once more.") from error
         except SceneprintError:
             sweep_deleted(self._store, [archive.blob])
             raise
@@ -174,7 +183,10 @@ class Imports:
         with self._store.database.read() as connection:
             file = files_of(connection, task.claim.job.number).get(FILE)
         if file is None:
-            raise UnreadableArchive("The archive was removed when its import failed. Send it anew.")
+            raise UnreadableArchive(
+                "The archive was removed, as its import failed, or was given up long ago. Send it "
+                "anew."
+            )
         try:
             with self._opened(file, options.name) as archive:
                 return self._slice(task, archive, options, until)
@@ -185,19 +197,42 @@ class Imports:
             sweep_deleted(self._store, gone)
             raise
 
+    def tidy(self) -> int:
+        """Remove archives of imports that were given up long ago, if it is time; returns how many.
+
+        Raises
+        ------
+        UnusableStore : it cannot be written; it is tried again the next time.
+        """
+        if time.monotonic() - self._tidied < TIDY_S:
+            return 0
+        self._tidied = time.monotonic()
+        long_ago = time.time() - KEPT_S
+        with self._store.database.read() as connection:  # most often there is none: no lock
+            if not given_up(connection, KIND, FILE, long_ago):
+                return 0
+        with self._store.database.write() as connection:
+            gone = [
+                blob
+                for number in given_up(connection, KIND, FILE, long_ago)
+                for blob in remove_parts(connection, number, items=False, files=[FILE])
+            ]
+        sweep_deleted(self._store, gone)
+        return len(gone)
+
     @contextmanager
     def _opened(self, file: JobFile, name: str) -> Iterator[Archive]:
-        path = self._store.blobs.path(file.blob)
         try:
-            with (
-                path.open("rb") as opened,
-                open_archive(opened, Path(tempfile.gettempdir()), name) as archive,
-            ):
-                yield archive
+            opened = self._store.blobs.path(file.blob).open("rb")
         except FileNotFoundError as error:
             raise UnreadableArchive(
                 "The archive is gone from the store. Send it once more."
             ) from error
+        except OSError as error:
+            raise unusable("The archive cannot be read", error) from error
+        try:
+            with opened, open_archive(opened, Path(tempfile.gettempdir()), name) as archive:
+                yield archive
         except OSError as error:
             raise unusable("The archive cannot be unpacked", error) from error
 
@@ -208,7 +243,7 @@ class Imports:
         items: list[dict[str, Any]] = []
         while progress["done"] < len(steps) and (not items or time.monotonic() < until):
             some = steps[progress["done"] :][:_AT_ONCE]
-            for item in self._taken(task.of_map.name, archive, some, options):
+            for item in self._taken(task, archive, some, options):
                 items.append(item.model_dump(mode="json"))
                 what = {202: "received", 200: "there"}.get(item.status, "refused")
                 progress[what] += 1
@@ -222,9 +257,13 @@ class Imports:
         )  # fmt: skip
 
     def _taken(
-        self, map_name: str, archive: Archive, steps: Sequence[_Step], options: ImportOptions
+        self, task: Task, archive: Archive, steps: Sequence[_Step], options: ImportOptions
     ) -> list[ImportItem]:
-        """Take some frames in one commit."""
+        """Take some frames in one commit, as long as the job is this worker's."""
+
+        def fence(connection: Connection) -> None:  # cancelled, or of a map that was made anew
+            queue.check_held(connection, task.claim)
+
         outcomes: list[Taken | None] = []
         uploads = []
         for step in steps:
@@ -235,7 +274,8 @@ class Imports:
                 raise
             except SceneprintError as error:
                 outcomes.append(Taken(None, error=type(error)(archive.told(error))))
-        rest = iter(self._uploads.add_all(map_name, uploads)[0] if uploads else [])
+        name = task.of_map.name
+        rest = iter(self._uploads.add_all(name, uploads, fence=fence)[0] if uploads else [])
         return [
             _item(step.name, outcome or next(rest))
             for step, outcome in zip(steps, outcomes, strict=True)

@@ -16,7 +16,7 @@ from sqlalchemy import Connection
 from sceneprint.artifacts import read_geometry
 from sceneprint.engine.fusing import View, fused
 from sceneprint.engine.kept import Kept
-from sceneprint.engine.tasks import Outcome, Task, Tasks
+from sceneprint.engine.tasks import Outcome, Swept, Task, Tasks
 from sceneprint.engine.uploads import sweep_deleted
 from sceneprint.engine.wire import when
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnreadableGeometry
@@ -77,26 +77,27 @@ class Reconstructions:
             "maps": maps,
             "parent_frame": chosen[0].transform.child_frame if chosen[0].transform else "",
             "model_id": kept.model_id,
+            "asked_at": kept.at,
             "request": wanted.model_dump(mode="json"),
             "views": [asdict(view) for view in views],
             "own": None if own is None else asdict(View(own.map, own.frame_id, None, None, _STILL)),
         }
-        files = []
-        if kept.geometry is not None:
-            self._store.database.require_writable()
-            blob = self._store.blobs.put(kept.geometry)
-            files = [JobFile(QUERY, blob, len(kept.geometry), "application/octet-stream")]
         # of several maps: the job's own page would tell who may read one of them of the others
         of = maps[0] if len(maps) == 1 else None
-        try:
-            job = self._tasks.begin(KIND, of, data, files=files)
-        except BaseException:
-            sweep_deleted(self._store, [one.blob for one in files])
-            raise
-        for one in files:
-            if not self._store.blobs.holds(one.blob):  # a deletion of the same bytes removed it
-                self._store.blobs.put(kept.geometry or b"")
-        return self.find(job.job_id)
+        self._store.database.require_writable()
+        while True:
+            files = []
+            if kept.geometry is not None:
+                blob = self._store.blobs.put(kept.geometry)
+                files = [JobFile(QUERY, blob, len(kept.geometry), "application/octet-stream")]
+            try:
+                job = self._tasks.begin(KIND, of, data, files=files)
+            except Swept:
+                continue
+            except BaseException:
+                sweep_deleted(self._store, [one.blob for one in files])
+                raise
+            return self.find(job.job_id)
 
     def find(self, job_id: str) -> Reconstruction:
         """A reconstruction; UnknownJob where there is none."""
@@ -137,7 +138,7 @@ class Reconstructions:
         own = None if data["own"] is None else View(**data["own"])
         result = fused(
             self._store, views, self._query_of(task), own, wanted, data["model_id"],
-            data["parent_frame"],
+            data["parent_frame"], data["asked_at"],
         )  # fmt: skip
         files = [
             JobFile(name, self._store.blobs.put(content), len(content), MEDIA_TYPES[name])

@@ -38,7 +38,7 @@ from sceneprint.store.events import tell
 from sceneprint.store.idempotency import Once
 from sceneprint.store.listing import find_job
 from sceneprint.store.maps import find_map, map_of
-from sceneprint.store.parts import JobFile, add_files, append_items, remove_parts
+from sceneprint.store.parts import JobFile, add_files, append_items, files_of, remove_parts
 from sceneprint.store.records import MapRow
 
 log = logging.getLogger(__name__)
@@ -49,6 +49,11 @@ SLICE_S = 15.0
 LEFT_S = 5.0
 #: Errors that trying again cannot help: what was asked for cannot be done.
 HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, SnapshotError)
+
+
+class Swept(UnusableStore):
+    """A deletion removed a file between its making and the commit that would have referred to it;
+    nothing was stored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +161,7 @@ class Tasks:
         Raises
         ------
         UnknownMap : no such map.
+        Swept : a file is gone; put it once more.
         """
         return self.begin_once(kind, map_name, data, priority, files)[0]
 
@@ -176,6 +182,7 @@ class Tasks:
                 with suppress(UnknownJob):  # its map may have been deleted and made anew
                     there = find_job(connection, before["job_id"])
                     return tell_job(there, None, map_name), True
+            self._check(files)
             number = None if row is None else row.number
             job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
             add_files(connection, job.number, files)
@@ -206,6 +213,9 @@ class Tasks:
             return None
         except HOPELESS as error:
             state = self._fail(task, str(error))
+        except Swept:
+            self.put_back(task)
+            state = JobState.QUEUED
         except UnusableStore:  # a full disk is no fault of the job's, and costs it no try
             self.put_back(task, LEFT_S)
             raise
@@ -223,11 +233,20 @@ class Tasks:
             queue.give_back(connection, task.claim, after_s)
 
     def _keep(self, task: Task, outcome: Outcome) -> JobState:
+        try:
+            gone = self._stored(task, outcome)
+        except Exception:  # nothing came to refer to them
+            sweep_deleted(self._store, [one.blob for one in outcome.files])
+            raise
+        sweep_deleted(self._store, gone)
+        if not outcome.over:
+            self._bell.ring()
+        return JobState.SUCCEEDED if outcome.over else JobState.QUEUED
+
+    def _stored(self, task: Task, outcome: Outcome) -> list[str]:
+        """What a slice came to, in one commit; returns blobs that may be of no use any more."""
         job = task.claim.job
         with self._store.database.write() as connection:
-            append_items(connection, job.number, outcome.items)
-            add_files(connection, job.number, outcome.files)
-            gone = remove_parts(connection, job.number, items=False, files=outcome.drop)
             if outcome.over:
                 queue.finish(
                     connection, task.claim, JobState.SUCCEEDED, progress=outcome.progress,
@@ -238,10 +257,21 @@ class Tasks:
                     tell(connection, outcome.event, name, None, job.id, **(outcome.result or {}))
             else:
                 queue.go_on(connection, task.claim, outcome.progress)
-        sweep_deleted(self._store, gone)
-        if not outcome.over:
-            self._bell.ring()
-        return JobState.SUCCEEDED if outcome.over else JobState.QUEUED
+            self._check(outcome.files)
+            # after the job: it may be gone, and nothing can be of one that is
+            append_items(connection, job.number, outcome.items)
+            before = files_of(connection, job.number)
+            add_files(connection, job.number, outcome.files)
+            gone = remove_parts(connection, job.number, items=False, files=outcome.drop)
+            return gone + [before[one.name].blob for one in outcome.files if one.name in before]
+
+    def _check(self, files: Collection[JobFile]) -> None:
+        """See that files are there, in the transaction that comes to refer to them."""
+        for one in files:
+            if not self._store.blobs.holds(one.blob):
+                raise Swept(
+                    f"A deletion elsewhere swept the same {one.name} before its job was stored."
+                )
 
     def _fail(self, task: Task, reason: str) -> JobState | None:
         try:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -115,9 +115,16 @@ class Uploads:
         return outcome, again
 
     def add_all(
-        self, map_name: str, uploads: Sequence[Upload], once: Once | None = None
-    ) -> tuple[list[Outcome], bool]:
+        self, map_name: str, uploads: Sequence[Upload], once: Once | None = None,
+        fence: Callable[[Connection], None] | None = None,
+    ) -> tuple[list[Outcome], bool]:  # fmt: skip
         """Take frames into a map in one commit; see `add`, but what is wrong with one is told.
+
+        Parameters
+        ----------
+        map_name, uploads, once : see `add`
+        fence : called in that commit before anything is written; whatever it raises of
+            `SceneprintError` is raised, and none was taken
 
         Raises
         ------
@@ -145,7 +152,7 @@ class Uploads:
                     del ready[i]
         again = False
         if ready:
-            outcomes, again = self._write(map_name, ready, outcomes, once)
+            outcomes, again = self._write(map_name, ready, outcomes, once, fence)
         if any(one is not None and one.new for one in outcomes) and not again:
             self._bell.ring()
         return [one for one in outcomes if one is not None], again
@@ -178,7 +185,7 @@ class Uploads:
 
     def _write(
         self, map_name: str, ready: dict[int, _Prepared], known: list[Outcome | None],
-        once: Once | None,
+        once: Once | None, fence: Callable[[Connection], None] | None,
     ) -> tuple[list[Outcome | None], bool]:  # fmt: skip
         """Store those uploads of which it is not known yet what comes of them.
 
@@ -193,6 +200,8 @@ class Uploads:
         left = list[str]()  # blobs that may be of no use
 
         def do(connection: Connection) -> tuple[list[Outcome | None], bool] | None:
+            if fence is not None:
+                fence(connection)
             row = find_map(connection, map_name)
             before = _before(connection, row, once)
             if before is not None:

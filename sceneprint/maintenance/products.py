@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-from sqlalchemy import select
+from sqlalchemy import Connection, select
 
 from sceneprint.maintenance.findings import Finding, Folder
 from sceneprint.maintenance.repairs import GONE, quarantine_blob
@@ -30,8 +30,11 @@ def check_products(folder: Folder) -> Iterator[Finding]:
         folder.progress("files of jobs", done, len(found))
         folder.counts["blobs"] += 1
         condition = folder.store.blobs.condition(one.blob, quick=folder.quick)
-        if condition == "sound" or not _is_there(folder, one.job_number, one.name, one.blob):
+        if condition == "sound":
             continue
+        with folder.store.database.read() as connection:
+            if not _is_there(connection, one.job_number, one.name, one.blob):
+                continue
         move = "move it to the quarantine, and " if condition == "damaged" else ""
         yield Finding(
             f"{condition}-job-file", f"{one.name} of job {one.id} ({one.kind})", "damage",
@@ -41,22 +44,22 @@ def check_products(folder: Folder) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _is_there(folder: Folder, job_number: int, name: str, blob: str) -> bool:
+def _is_there(connection: Connection, job_number: int, name: str, blob: str) -> bool:
     """Whether the job still has the file: it may have been removed since."""
     own = (
         (job_files.c.job_number == job_number)
         & (job_files.c.name == name)
         & (job_files.c.blob == blob)
     )
-    with folder.store.database.read() as connection:
-        return connection.execute(select(job_files.c.name).where(own)).first() is not None
+    return connection.execute(select(job_files.c.name).where(own)).first() is not None
 
 
 def _repair(folder: Folder, job_number: int, name: str, blob: str) -> str:
-    condition = folder.store.blobs.condition(blob)
-    if condition == "sound" or not _is_there(folder, job_number, name, blob):
-        return GONE
-    moved = quarantine_blob(folder, blob) if condition == "damaged" else ""
+    # in one transaction: an upload of the same bytes may come, and what it put must stay
     with folder.store.database.write() as connection:
+        condition = folder.store.blobs.condition(blob)
+        if condition == "sound" or not _is_there(connection, job_number, name, blob):
+            return GONE
+        moved = quarantine_blob(folder, blob) if condition == "damaged" else ""
         remove_parts(connection, job_number, items=False, files=[name])
     return f"{moved}the job has it no more"

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextvars import copy_context
 from typing import Any, TypeVar, cast
 
 from sqlalchemy import Connection
 
-from sceneprint.errors import SceneprintError, StoreError
+from sceneprint.errors import SceneprintError, UnusableStore
 from sceneprint.store.database import Database
 
 T = TypeVar("T")
@@ -26,7 +27,8 @@ class _Waiting:
     """A piece of work, and what came of it."""
 
     def __init__(self, do: Callable[[Connection], Any]) -> None:
-        self.do = do
+        own = copy_context()  # another thread may do it: what it says of a request is of this one
+        self.do: Callable[[Connection], Any] = lambda connection: own.run(do, connection)
         self.done = False
         self.result: Any = None
         self.error: Exception | None = None
@@ -51,8 +53,8 @@ class Grouping:
 
         Parameters
         ----------
-        do : whatever it raises of `SceneprintError`, beside those of the store, it raises before
-            it writes: others of the transaction go on. It may be called more than once
+        do : whatever it raises of `SceneprintError`, beside `UnusableStore`, it raises before it
+            writes: others of the transaction go on. It may be called more than once
 
         Raises
         ------
@@ -78,25 +80,31 @@ class Grouping:
         """Write what waits, from the first on."""
         taken: list[_Waiting] = []
         try:
+            self._write_together(taken)
+        except BaseException:  # Ctrl-C is the caller's alone: the others write themselves
+            with self._list:
+                self._waiting = [one for one in taken if not one.done] + self._waiting
+            raise
+
+    def _write_together(self, taken: list[_Waiting]) -> None:
+        """Write what waits in one transaction, or each alone; `taken` is filled with it."""
+        try:
             with self._database.write() as connection:
                 with self._list:  # not before it is our turn: more have come since
-                    taken, self._waiting = self._waiting[:MOST], self._waiting[MOST:]
+                    taken[:], self._waiting = self._waiting[:MOST], self._waiting[MOST:]
                 for one in taken:
                     _do(one, connection)
         except Exception as error:
             if not taken:  # it was never our turn: who waits has waited as long
                 with self._list:
-                    taken, self._waiting = self._waiting, []
-            if len(taken) == 1 or isinstance(error, StoreError):
+                    taken[:], self._waiting = self._waiting, []
+            if len(taken) == 1 or isinstance(error, UnusableStore):
                 for one in taken:
                     one.result, one.error = None, error
             else:
                 for one in taken:  # one of them broke the transaction of all
                     self._write_alone(one)
-        except BaseException:  # Ctrl-C is the caller's alone: the others write themselves
-            with self._list:
-                self._waiting = taken + self._waiting
-            raise
+                    one.done = True
         for one in taken:
             one.done = True
 
@@ -113,7 +121,7 @@ def _do(one: _Waiting, connection: Connection) -> None:
     one.result = one.error = None
     try:
         one.result = one.do(connection)
-    except StoreError:
+    except UnusableStore:
         raise
     except SceneprintError as error:
         one.error = error

@@ -8,7 +8,8 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, func, insert, select
 
-from sceneprint.store.tables import job_files, job_items
+from sceneprint.schemas import JobState
+from sceneprint.store.tables import job_files, job_items, jobs
 
 #: Rows that are inserted at once.
 _BLOCK = 500
@@ -81,6 +82,21 @@ def files_of(connection: Connection, job_number: int) -> dict[str, JobFile]:
         row["name"]: JobFile(row["name"], row["blob"], row["bytes"], row["media_type"])
         for row in connection.execute(asked).mappings()
     }
+
+
+def given_up(connection: Connection, kind: str, name: str, before: float) -> list[int]:
+    """Numbers of the jobs of a kind that were over by a time, and still have a file of a name."""
+    asked = (
+        select(jobs.c.number)
+        .join(job_files, job_files.c.job_number == jobs.c.number)
+        .where(
+            job_files.c.name == name,
+            jobs.c.kind == kind,
+            jobs.c.state.in_([state for state in JobState if state.over]),
+            jobs.c.finished_at < before,
+        )
+    )
+    return list(connection.execute(asked).scalars())
 
 
 def remove_parts(

@@ -168,6 +168,17 @@ def renew(connection: Connection, held: Claim, lease_s: float) -> None:
     _hold(connection, held, leased_until=time.time() + lease_s)
 
 
+def check_held(connection: Connection, held: Claim) -> None:
+    """See that a claim is still the latest, in the transaction that stores a part of its work.
+
+    Raises
+    ------
+    LostLease : as `renew`.
+    """
+    if connection.execute(select(jobs.c.number).where(*_own(held))).first() is None:
+        raise _lost(held)
+
+
 def finish(
     connection: Connection, held: Claim, state: JobState, error: str | None = None,
     traceback: str | None = None, **values: object,
@@ -185,14 +196,18 @@ def finish(
 
 
 def go_on(connection: Connection, held: Claim, progress: dict[str, Any]) -> None:
-    """Queue a long job again after a part of it, behind those that wait: no try is used up.
+    """Queue a long job again after a part of it, behind those that wait.
+
+    However many tries it took, they count no more: it came further.
 
     Raises
     ------
     LostLease : as `renew`.
     """
+    # one try, and not none: its number is less than that of all that came since, and it would
+    # go before them with every part
     _hold(
-        connection, held, state=JobState.QUEUED, attempts=held.job.attempts - 1, failures=0,
+        connection, held, state=JobState.QUEUED, attempts=1, failures=0,
         leased_until=None, worker=None, run_after=time.time(), progress=progress,
     )  # fmt: skip
 
@@ -289,17 +304,22 @@ def _due(now: float) -> ColumnElement[bool]:
 
 def _hold(connection: Connection, held: Claim, **values: object) -> None:
     """Change a job while its claim is the latest."""
-    changed = connection.execute(
-        update(jobs)
-        .where(
-            jobs.c.number == held.job.number,
-            jobs.c.token == held.token,
-            jobs.c.state == JobState.RUNNING,
-        )
-        .values(**values)
-    )
+    changed = connection.execute(update(jobs).where(*_own(held)).values(**values))
     if changed.rowcount != 1:
-        raise LostLease(
-            f"Job {held.job.id} is no longer held by this worker: its lease ran out, or it was "
-            "cancelled. Nothing was stored."
-        )
+        raise _lost(held)
+
+
+def _own(held: Claim) -> tuple[ColumnElement[bool], ...]:
+    """What holds of a job while a claim on it does."""
+    return (
+        jobs.c.number == held.job.number,
+        jobs.c.token == held.token,
+        jobs.c.state == JobState.RUNNING,
+    )
+
+
+def _lost(held: Claim) -> LostLease:
+    return LostLease(
+        f"Job {held.job.id} is no longer held by this worker: its lease ran out, or it was "
+        "cancelled. Nothing was stored."
+    )

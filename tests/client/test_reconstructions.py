@@ -194,6 +194,7 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
         size = client.frame(NAME, lost).bytes
         next(path for path in files(tmp_path) if path.stat().st_size == size).unlink()
         client.delete_frame(NAME, deleted)
+        client.put_frame(NAME, deleted, views[0])  # another frame, which nobody has matched
         [job] = client.wait([made.job_id], timeout_s=60)
         assert job.state == "succeeded", job.error
         coverage = client.reconstruction(made.job_id).coverage
@@ -201,6 +202,7 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
         sources = {one.frame_id: one.source for one in coverage.views}
         assert sources[lost] == "geometry"
         assert [one.frame_id for one in coverage.left_out] == [deleted]
+        assert "another has its id" in coverage.left_out[0].reason
         # what the query saw is not kept beyond the job, and all goes with it
         before = files(tmp_path)
         client.delete_reconstruction(made.job_id)

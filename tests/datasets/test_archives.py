@@ -10,6 +10,8 @@ import os
 import random
 import shutil
 import struct
+import subprocess
+import sys
 import tarfile
 import zipfile
 import zlib
@@ -41,6 +43,22 @@ DEPTH = np.arange(12, dtype=np.float32).reshape(3, 4) / 8
 PACKERS: dict[str, Callable[[bytes], bytes]] = {
     "gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress,
 }  # fmt: skip
+
+
+FULL = """
+import subprocess, sys
+from pathlib import Path
+from sceneprint.datasets.archives import open_archive
+
+archive, folder = map(Path, sys.argv[1:])
+subprocess.run(["mount", "-t", "tmpfs", "-o", "nr_inodes=12", "none", folder], check=True)
+try:
+    with archive.open("rb") as file, open_archive(file, folder) as opened:
+        print(opened.refused)
+except OSError as error:
+    print(error.strerror)
+print(list(folder.iterdir()))
+"""
 
 
 def pose_at(x: float) -> np.ndarray:
@@ -224,6 +242,19 @@ def test_names_that_lead_elsewhere_are_refused_and_the_rest_is_taken(
     assert "another member of this name" in reasons["s/good.png"]
     assert "name of its folder" in reasons["s/good.png/below.png"]
     assert {p.name for p in tmp_path.iterdir()} == set()
+
+
+def test_a_full_disk_is_no_fault_of_the_members(kitchen: Path, tmp_path: Path) -> None:
+    if subprocess.run(["unshare", "-rm", "true"], capture_output=True).returncode != 0:
+        pytest.skip("this machine lets nobody mount anything")
+    (tmp_path / "kitchen.zip").write_bytes(zipped(kitchen))
+    (tmp_path / "full").mkdir()
+    said = subprocess.run(
+        ["unshare", "-rm", sys.executable, "-c", FULL, str(tmp_path / "kitchen.zip"),
+         str(tmp_path / "full")],
+        capture_output=True, text=True, check=True,
+    ).stdout.splitlines()  # fmt: skip
+    assert said == ["No space left on device", "[]"]
 
 
 def test_a_damaged_member_costs_itself_alone(kitchen: Path, tmp_path: Path) -> None:

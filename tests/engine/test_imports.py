@@ -6,16 +6,20 @@ import io
 import json
 import tarfile
 import time
+from collections.abc import Callable
 from typing import Any
 
 import pytest
+from sqlalchemy import update
 
 from sceneprint.engine import Engine, imports
 from sceneprint.engine.tasks import Task
-from sceneprint.errors import UnknownMap
-from sceneprint.schemas import Job, JobState
+from sceneprint.engine.uploads import sweep
+from sceneprint.errors import LostLease, UnknownMap, UnusableStore
+from sceneprint.schemas import Job, JobState, NewMap
 from sceneprint.schemas.ingest import ImportOptions
 from sceneprint.store.parts import files_of
+from sceneprint.store.tables import jobs
 
 
 def packed(uploads: Any) -> bytes:
@@ -101,3 +105,79 @@ def test_nothing_is_left_of_an_archive_that_was_refused(empty: Engine, uploads: 
         raise ConnectionError("gone")
     assert sorted(empty.store.blobs.digests()) == before
     assert list(empty.settings.blob_dir.glob(".*")) == []
+
+
+class Between:
+    """An end of a slice that is not reached, and what happens when it is asked for."""
+
+    def __init__(self, do: Callable[[], object]) -> None:
+        self._do = do
+
+    def __gt__(self, now: float) -> bool:
+        self._do()
+        return True
+
+
+def test_a_cancelled_import_takes_no_frame_more(
+    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(imports, "_AT_ONCE", 2)
+    job = begun(empty, packed(uploads[:4]))
+    until: Any = Between(lambda: empty.cancel_job(job.job_id))
+    with pytest.raises(LostLease):
+        empty.imports.handle(claimed(empty), until)
+    assert len(empty.list_frames("hall").items) == 2
+    assert len(list(empty.store.blobs.digests())) == 3  # theirs, and the archive
+
+
+def test_a_map_that_is_made_anew_takes_nothing_of_an_import_into_the_one_before(
+    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(imports, "_AT_ONCE", 2)
+    begun(empty, packed(uploads[:4]))
+
+    def make_anew() -> None:
+        empty.delete_map("hall")
+        empty.create_map(NewMap(name="hall", model="compact"))
+
+    until: Any = Between(make_anew)
+    with pytest.raises(LostLease):
+        empty.imports.handle(claimed(empty), until)
+    assert list(empty.list_frames("hall").items) == []
+    assert list(empty.store.blobs.digests()) == []
+
+
+def test_the_archive_of_an_import_that_was_given_up_is_kept_for_a_day(
+    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(imports, "TIDY_S", 0.0)
+    job = begun(empty, packed(uploads[:1]))
+    waiting = begun(empty, packed(uploads[:2]))
+    empty.cancel_job(job.job_id)
+    empty.publish_due()
+    assert len(list(empty.store.blobs.digests())) == 2
+    with empty.store.database.write() as connection:
+        long_ago = time.time() - imports.KEPT_S - 1
+        connection.execute(update(jobs).values(created_at=long_ago))
+        connection.execute(
+            update(jobs).where(jobs.c.finished_at.is_not(None)).values(finished_at=long_ago)
+        )
+    empty.publish_due()
+    assert len(list(empty.store.blobs.digests())) == 1
+    empty.retry_job(job.job_id)
+    assert empty.run(claimed(empty)) == JobState.FAILED
+    assert "given up long ago" in str(empty.get_job(job.job_id).error)
+    assert empty.run(claimed(empty)) == JobState.SUCCEEDED
+    assert empty.get_job(waiting.job_id).state == JobState.SUCCEEDED
+
+
+def test_an_archive_that_was_swept_before_its_job_was_there_is_not_acknowledged(
+    empty: Engine, uploads: Any
+) -> None:
+    with empty.imports.receive("hall") as receiver:
+        receiver.write(packed(uploads[:1]))
+        archive = receiver.end()
+    sweep(empty.store, [archive.blob])  # an import of the same archive ends at this moment
+    with pytest.raises(UnusableStore, match="Send the archive once more"):
+        empty.imports.begin("hall", archive, ImportOptions())
+    assert list(empty.list_jobs().items) == []

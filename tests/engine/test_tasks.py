@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from sqlalchemy import select, update
 
 from sceneprint.engine import Engine
 from sceneprint.engine.tasks import Outcome, Task
+from sceneprint.engine.uploads import sweep
 from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
 from sceneprint.schemas import Job, JobState, NewMap
+from sceneprint.store.associations import remove_job
 from sceneprint.store.listing import find_job
 from sceneprint.store.parts import JobFile, files_of, items_of
 from sceneprint.store.tables import events, jobs
@@ -56,7 +60,7 @@ def test_each_slice_is_kept_and_the_last_one_ends_the_job(engine, work_off):
     assert (claimed.data, claimed.of_map.name) == ({"to": 3}, "hall")
     assert engine.run(claimed) == JobState.QUEUED
     between = engine.get_job(job.job_id)
-    assert (between.state, between.attempts, between.result) == (JobState.QUEUED, 0, None)
+    assert (between.state, between.attempts, between.result) == (JobState.QUEUED, 1, None)
     assert between.progress is not None
     assert (between.progress.done, between.progress.total) == (1, 3)
     assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
@@ -147,3 +151,80 @@ def test_a_map_takes_its_long_jobs_and_their_files_along(engine, work_off):
     assert engine.get_job(other.job_id).state == JobState.SUCCEEDED
     assert [one.job_id for one in engine.list_jobs(map_names=["hall"]).items] == []
     assert [one.job_id for one in engine.list_jobs(kind="count").items] == [other.job_id]
+
+
+def test_frames_that_wait_are_signed_between_two_slices(
+    engine: Engine, uploads: Any, work_off: Callable[[Engine], list[JobState]]
+) -> None:
+    engine.tasks.register("count", count_to(engine, 3))
+    engine.tasks.begin("count", "hall", {})
+    first = engine.claim("w")
+    assert isinstance(first, Task)
+    assert engine.run(first) == JobState.QUEUED
+    time.sleep(0.01)  # so that the next slice is due for sure
+    engine.add_frame("hall", uploads[0].data, uploads[0].meta)
+    frame = engine.claim("w")
+    assert frame is not None
+    assert not isinstance(frame, Task)
+    engine.put_back(frame)
+    assert work_off(engine) == [JobState.SUCCEEDED, JobState.QUEUED, JobState.SUCCEEDED]
+
+
+def test_tries_before_a_slice_that_came_through_count_no_more(engine: Engine) -> None:
+    engine.tasks.register("count", count_to(engine, 30))
+    job = engine.tasks.begin("count", "hall", {})
+    for _ in range(12):  # a machine that is restarted within every other slice
+        assert isinstance(engine.claim("killed"), Task)
+        with engine.store.database.write() as connection:
+            connection.execute(update(jobs).values(leased_until=1.0))
+        again = engine.claim("w")
+        assert isinstance(again, Task)
+        assert engine.run(again) == JobState.QUEUED
+    assert items(engine, job) == list(range(12))
+
+
+def test_a_job_that_is_removed_while_a_slice_runs_is_no_fault_of_its_worker(
+    engine: Engine,
+) -> None:
+    def handle(task: Task, until: float) -> Outcome:
+        with engine.store.database.write() as connection:
+            remove_job(connection, find_job(connection, task.claim.job.id))
+        return count_to(engine, 2)(task, until)
+
+    engine.tasks.register("count", handle)
+    engine.tasks.begin("count", "hall", {})
+    broke: list[bool] = []
+    claimed = engine.claim("w")
+    assert claimed is not None
+    assert engine.run(claimed, lambda: broke.append(True)) is None
+    assert broke == []  # its worker goes on
+    assert list(engine.store.blobs.digests()) == []  # nor is anything left
+
+
+def test_a_file_that_a_deletion_swept_is_made_again(
+    engine: Engine, work_off: Callable[[Engine], list[JobState]]
+) -> None:
+    swept: list[str] = []
+
+    def handle(task: Task, until: float) -> Outcome:
+        outcome = count_to(engine, 1)(task, until)
+        if not swept:  # another job that had made the same is removed at this moment
+            swept.append(outcome.files[0].blob)
+            sweep(engine.store, swept)
+        return outcome
+
+    engine.tasks.register("count", handle)
+    job = engine.tasks.begin("count", "hall", {})
+    assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
+    assert engine.get_job(job.job_id).attempts == 1
+    assert engine.store.blobs.get(swept[0]) == b"part 0"
+
+
+def test_a_file_that_another_takes_the_place_of_is_removed(
+    engine: Engine, work_off: Callable[[Engine], list[JobState]]
+) -> None:
+    engine.tasks.register("count", count_to(engine, 3))
+    engine.tasks.begin("count", "hall", {})
+    work_off(engine)
+    [blob] = engine.store.blobs.digests()
+    assert engine.store.blobs.get(blob) == b"part 2"

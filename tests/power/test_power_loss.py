@@ -76,17 +76,29 @@ def lost_blobs(
     recorded: Recorded, after_crash: AfterCrash, tmp_path: Path
 ) -> Callable[[str], set[str]]:
     """Put blobs on a disk, and say which promises a loss of power breaks."""
-    first, second = b"depth" * 300, b"another frame" * 100
+    first, second, large = b"depth" * 300, b"another frame" * 100, b"an archive" * 200
+    folder = hashlib.sha256(first).hexdigest()[:2]
+    beside = next(
+        data
+        for data in (f"of the same folder {i}".encode() * 50 for i in range(10_000))
+        if hashlib.sha256(data).hexdigest().startswith(folder)
+    )
 
     def run(deaf: str) -> set[str]:
         root = tmp_path / f"disk-{deaf}"
         root.mkdir()
-        contents = {hashlib.sha256(one).hexdigest(): one for one in (first, second)}
+        contents = {hashlib.sha256(one).hexdigest(): one for one in (first, second, beside, large)}
         with recorded(root, deaf) as disk:
             promised: list[tuple[int, set[str]]] = [(0, set())]
             blobs = Blobs(root / "data" / "blobs")
-            for data in (first, second, first):
-                digest = blobs.put(data)
+            for data in (large, first, second, beside, first):
+                if data is large:
+                    with blobs.incoming() as part:
+                        part.write(data[:700])
+                        part.write(data[700:])
+                        digest = part.keep()
+                else:
+                    digest = blobs.put(data)
                 disk.mark("put")
                 promised.append((len(disk.states) - 1, promised[-1][1] | {digest}))
             disk.mark("removing")  # its rows are gone: from here on nothing is promised

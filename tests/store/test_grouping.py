@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, event, func, select
 
-from sceneprint.errors import FrameConflict, StoreFull
+from sceneprint.errors import FrameConflict, LostLease, StoreFull
+from sceneprint.logs import of_request, request_id
 from sceneprint.store import Database, open_database
 from sceneprint.store.events import tell
-from sceneprint.store.grouping import MOST, Grouping
+from sceneprint.store.grouping import MOST, Grouping, _Waiting
 from sceneprint.store.tables import events
 
 
@@ -66,9 +67,28 @@ def test_who_waits_together_is_committed_together(database: Database) -> None:
     assert commits == 2  # at most MOST in one
 
 
-def test_a_refusal_costs_no_other(database: Database) -> None:
+def test_each_is_of_its_own_request_whoever_writes_it(database: Database) -> None:
+    group, seen = Grouping(database), dict[int, str | None]()
+
+    def run(i: int) -> None:
+        with of_request(f"request {i}"):
+            seen[i] = group.run(lambda _: request_id())
+
+    threads = [threading.Thread(target=run, args=(i,)) for i in range(4)]
+    with database.write():
+        for one in threads:
+            one.start()
+        while len(group._waiting) < len(threads):
+            pass
+    for one in threads:
+        one.join()
+    assert seen == {i: f"request {i}" for i in range(4)}
+
+
+@pytest.mark.parametrize("kind", [FrameConflict, LostLease])
+def test_a_refusal_costs_no_other(database: Database, kind: type[Exception]) -> None:
     def refuse(_: Connection) -> None:
-        raise FrameConflict("no")
+        raise kind("no")
 
     found, commits = together(database, [noting("a", 0), refuse, noting("a", 2)])
     assert (found[0], found[2], str(found[1])) == (0, 2, "no")
@@ -109,3 +129,21 @@ def test_ctrl_c_ends_its_own_writer_alone(database: Database) -> None:
         group.run(stop)
     assert group.run(noting("a", 1)) == 1
     assert (tries, count(database, "a")) == ([1], 1)
+
+
+def test_ctrl_c_in_a_second_try_forgets_nobody(database: Database) -> None:
+    group, errors = Grouping(database), [ValueError, KeyboardInterrupt]
+
+    def stop(_: Connection) -> None:
+        if errors:
+            raise errors.pop(0)
+
+    before, broken, after = (_Waiting(do) for do in (noting("a", 1), stop, noting("a", 2)))
+    group._waiting += [before, broken, after]
+    with pytest.raises(KeyboardInterrupt):
+        group.run(noting("a", 3))
+    assert (before.done, before.result) == (True, 1)
+    assert group._waiting == [broken, after]
+    assert group.run(noting("a", 4)) == 4
+    assert (broken.done, after.done, after.result) == (True, True, 2)
+    assert count(database, "a") == 3
