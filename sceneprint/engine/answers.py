@@ -18,6 +18,7 @@ from sceneprint.engine.searching import Place, Searched, search_maps
 from sceneprint.engine.telling import Found, tell_location, tell_matches
 from sceneprint.engine.validating import Validated, validated, wanted_of
 from sceneprint.engine.why import Asking, why
+from sceneprint.engine.wire import query_camera
 from sceneprint.geometry.diversity import DiversityParameters, diversify
 from sceneprint.geometry.retrieval import pairwise_distances
 from sceneprint.matches import Match
@@ -79,8 +80,9 @@ def answer(
         rows = frames_of(connection, ranking.indices[list(shown)].tolist())
     matches = [one for one in tried.matches if one.index in rows]  # the rest was deleted meanwhile
     names = {place.row.number: place.row.name for place in places}
+    optical = query_camera(_name(asked), list(names.values()))
     found = Found(
-        names, ranking, selection, rows, tried.unreadable, tried.untried, asked.frame, asked.base
+        names, ranking, selection, rows, tried.unreadable, tried.untried, optical, asked.base
     )
     explanations = explained = None
     if query.explain:
@@ -98,7 +100,7 @@ def answer(
     }
     told = Answer(
         query_id=uuid.uuid4().hex,
-        status=_status(matches, query, deadline),
+        status=_status(matches, query, tried),
         matches=tell_matches(found, chosen, matches),
         location=tell_location(found, matches),
         seed=query.seed,
@@ -110,7 +112,7 @@ def answer(
         maps=[place.row.name for place in places],
         frame=_name(asked),
         per_map=per_map if len(places) > 1 else None,
-        deadline_reached=deadline.reached,
+        deadline_reached=tried.late,
         explanations=explanations,
         explained_frame=explained,
     )
@@ -154,7 +156,7 @@ def _name(asked: Asked) -> FrameName | None:
     return FrameName(map=asked.home.name, frame_id=asked.frame[1])
 
 
-def _status(matches: Sequence[Match], query: Query, deadline: Deadline) -> AnswerStatus:
+def _status(matches: Sequence[Match], query: Query, tried: Validated) -> AnswerStatus:
     statuses = [match.validation.status for match in matches]
     if "accepted" in statuses:
         return "found"
@@ -162,4 +164,4 @@ def _status(matches: Sequence[Match], query: Query, deadline: Deadline) -> Answe
         return "unvalidated"
     if "ambiguous" in statuses:
         return "ambiguous"
-    return "unvalidated" if deadline.reached else "not_found"
+    return "unvalidated" if tried.late else "not_found"

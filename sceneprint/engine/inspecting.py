@@ -17,7 +17,7 @@ from sceneprint.engine.signers import Signers
 from sceneprint.engine.telling import tell_uncertainty, tell_validation
 from sceneprint.engine.transforms import transform
 from sceneprint.engine.validating import thresholds
-from sceneprint.engine.wire import camera_frame
+from sceneprint.engine.wire import camera_frame, query_camera
 from sceneprint.errors import (
     DamagedBlob,
     InvalidRequest,
@@ -210,8 +210,7 @@ class Inspection:
 
 
 def _optical(kept: Kept) -> str:
-    frame = kept.answer.frame
-    return camera_frame("query" if frame is None else frame.frame_id)
+    return query_camera(kept.answer.frame, kept.answer.maps)
 
 
 def _geometry(kept: Kept) -> Geometry:

@@ -38,7 +38,7 @@ class Found:
     rows : frames of the candidates by number; those deleted in the meantime are not among them
     unreadable : numbers of frames whose artifact cannot be read, and why
     untried : why the other candidates were not tried
-    own : number and id of the query, if it is a frame of the map
+    query_frame : what the query's camera frame is called
     base : what the robot's base is called, and T_base_query (4, 4); None where it is not known
     """
 
@@ -48,13 +48,8 @@ class Found:
     rows: dict[int, FrameRow]
     unreadable: dict[int, str]
     untried: str
-    own: tuple[int, str] | None
+    query_frame: str
     base: tuple[str, Floats] | None = None
-
-    @property
-    def query_frame(self) -> str:
-        """What the query's camera frame is called."""
-        return camera_frame("query" if self.own is None else self.own[1])
 
     def base_of(self, T_parent_query: Floats | None, parent: str) -> Transform | None:
         """Where the robot's base is, by where its camera is."""

@@ -38,12 +38,14 @@ class Validated:
     matches : those that were tried, of `associate`
     unreadable : numbers of frames whose artifact cannot be read, and why
     untried : why the others were not tried
+    late : whether the deadline came before the last of them; None without a deadline
     """
 
     chosen: Sequence[int]
     matches: list[Match]
     unreadable: dict[int, str]
     untried: str
+    late: bool | None
 
 
 def wanted_of(query: Query) -> int:
@@ -77,7 +79,7 @@ def validated(
     query, deadline : see there
     """
     if geometry is None:
-        return Validated(chosen, [], {}, NOT_ASKED)
+        return Validated(chosen, [], {}, NOT_ASKED, deadline.reached)
     ranking, model_id = searched.ranking, searched.parts[0].place.row.model_id
     with store.database.read() as connection:
         blobs = geometry_blobs(connection, ranking.indices[list(chosen)].tolist(), model_id)
@@ -100,5 +102,6 @@ def validated(
     for i, part in enumerate(searched.parts):
         bad = sorted(number for number in unreadable if owner[number] == i)
         sign_again(store, part.place.row, bad, model_id)
-    late = "the deadline came before it" if deadline.reached else "enough were accepted before it"
-    return Validated(chosen, matches, unreadable, late)
+    late = deadline.reached
+    untried = "the deadline came before it" if late else "enough were accepted before it"
+    return Validated(chosen, matches, unreadable, untried, late)

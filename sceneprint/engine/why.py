@@ -107,16 +107,25 @@ def why(asking: Asking, frame_id: str) -> ExplainedFrame:
 
 
 def _found(asking: Asking, frame_id: str) -> tuple[Part, FrameRow]:
-    """The frame, and what is searched of its map: the first one that has such an id."""
-    parts = asking.searched.parts
+    """The frame, and what is searched of its map: the first that has one which can be found."""
+    parts, own = asking.searched.parts, asking.asked.frame
+    held, missing = [], None
     with asking.store.database.read() as connection:
-        for i, part in enumerate(parts):
+        for part in parts:
             try:
-                return part, find_frame(connection, part.place.row, frame_id)
-            except UnknownFrame:
-                if i == len(parts) - 1:
-                    raise
-    raise AssertionError("no map was asked")
+                held.append((part, find_frame(connection, part.place.row, frame_id)))
+            except UnknownFrame as error:
+                missing = error
+    if missing is not None and not held:
+        raise missing
+    # another map may have had one of that id, or have the query itself under it
+    return min(
+        held,
+        key=lambda one: (
+            one[1].state != FrameState.INDEXED,
+            own is not None and one[1].number == own[0],
+        ),
+    )
 
 
 def _absent(asking: Asking, part: Part, row: FrameRow) -> tuple[Lost, str] | None:
@@ -165,7 +174,7 @@ def _lost(
         return None, f"it is a match, of rank {rank}; validation was not asked for"
     if row.number in tried.unreadable:
         return "validation", tried.unreadable[row.number]
-    return "deadline" if asking.deadline.reached else "turn", tried.untried
+    return "deadline" if tried.late else "turn", tried.untried
 
 
 def _aligned(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
@@ -11,7 +12,15 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.tags import frame_tag, map_tag
 from sceneprint.engine.transforms import transform
-from sceneprint.schemas import CameraIntrinsics, Frame, Job, Map, Progress, Reencoding
+from sceneprint.schemas import (
+    CameraIntrinsics,
+    Frame,
+    FrameName,
+    Job,
+    Map,
+    Progress,
+    Reencoding,
+)
 from sceneprint.store.listing import jobs_of
 from sceneprint.store.maps import count_frames, model_names
 from sceneprint.store.records import FrameRow, JobRow, MapRow
@@ -31,6 +40,21 @@ def model_label(name: str, model_id: str) -> str:
 def camera_frame(frame_id: str) -> str:
     """What the optical frame of a frame's camera is called in transforms."""
     return f"{frame_id}.optical"
+
+
+def query_camera(frame: FrameName | None, maps: Sequence[str]) -> str:
+    """What a query's optical frame is called.
+
+    By its id where it is a stored frame, asked of its own map alone: another map may have a frame
+    of the same id, and a transform leads from one frame to another.
+
+    Parameters
+    ----------
+    frame : that was asked for; None for an upload
+    maps : that were asked
+    """
+    alone = frame is not None and list(maps) == [frame.map]
+    return camera_frame(frame.frame_id if frame is not None and alone else "query")
 
 
 def tell_map(connection: Connection, row: MapRow) -> Map:

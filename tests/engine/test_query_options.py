@@ -136,6 +136,36 @@ def test_a_deadline_stops_validation_and_says_so(
         assert one.validation == full_told[one.frame_id].validation
 
 
+def test_a_frame_that_there_is_no_time_to_explain_changes_no_answer(
+    full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names, strict = ids(full), {"evidence": 1.0}
+    ranked = ask(full, names[0], k=50, stages=["retrieve"]).matches
+    how: dict[str, Any] = {"candidates": 3, "stages": VR, "deadline_ms": 600_000}
+    allows, asked = Deadline.allows, list[bool]()
+
+    def so_often(self: Deadline) -> bool:
+        asked.append(allows(self))
+        self.reached = len(asked) > most
+        return not self.reached
+
+    monkeypatch.setattr(Deadline, "allows", so_often)
+    most = 3
+    answer = ask(full, names[0], **how, validation=strict, explain_frame=ranked[-1].frame_id)
+    assert len(asked) == 4
+    assert answer.explained_frame.validation.reason == "the deadline came before it"
+    assert answer.explained_frame.lost_at == "selection"
+    assert (answer.counts.validated, answer.counts.accepted) == (3, 0)
+    assert (answer.status, answer.deadline_reached) == ("not_found", False)  # all were tried
+    most = 1
+    asked.clear()
+    answer = ask(full, names[0], **how, k=1, explain_frame=ranked[2].frame_id)
+    assert (len(asked), answer.status, answer.deadline_reached) == (2, "found", False)
+    assert (answer.explained_frame.lost_at, answer.matches[2].validation.reason) == (
+        "turn", "enough were accepted before it",
+    )  # fmt: skip
+
+
 def test_no_candidate_is_begun_that_would_likely_end_too_late(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from sceneprint.engine import Engine
+from sceneprint.engine.uploads import Upload
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
 from sceneprint.schemas import Answer, NamedFrame, NewMap, Query, SeveralQuery
 
@@ -92,6 +93,47 @@ def test_a_stored_frame_does_not_find_itself_and_finds_others(two: Engine, ids: 
     assert told.explained_frame.of == 15
     with pytest.raises(UnknownFrame):
         two.queries.stored(["lab"], NamedFrame(map="lab", frame_id=own), query)
+
+
+def test_two_maps_may_call_their_frames_alike(full: Engine, uploads: Any, work_off: Any) -> None:
+    maps = ["attic", "cellar"]
+    for name, places in zip(maps, ((0, 1), (1, 2)), strict=True):
+        full.create_map(NewMap(name=name, model="compact"))
+        for frame_id, i in zip(("a", "b"), places, strict=True):
+            upload = Upload(uploads[i].data, uploads[i].meta, frame_id=frame_id)
+            full.uploads.add(name, upload)
+    work_off(full)
+
+    def asked(of: list[str], **how: Any) -> Answer:
+        return full.queries.stored(of, NamedFrame(map="attic", frame_id="b"), Query(**how))
+
+    several = asked(maps)
+    assert [(one.map, one.frame_id, one.distance) for one in several.matches[:1]] == [
+        ("cellar", "a", 0)
+    ]
+    # attic's b is asked for, and cellar's is among the matches
+    assert {(one.map, one.frame_id) for one in several.matches} > {("cellar", "b")}
+    for match in several.matches:
+        ends = match.transform.parent_frame, match.transform.child_frame
+        assert ends == (f"{match.frame_id}.optical", "query.optical")
+    details = full.inspection.match(several.query_id, "b", "cellar")
+    same = next(one for one in several.matches if (one.map, one.frame_id) == ("cellar", "b"))
+    assert details.transform == same.transform
+    assert b"comment frame query.optical" in full.inspection.cloud(several.query_id)
+    assert asked(["cellar"]).location.pose.child_frame == "query.optical"
+    assert asked(["attic"]).location.pose.child_frame == "b.optical"
+
+    def explained(frame_id: str) -> Any:
+        return asked(maps, explain_frame=frame_id, keep=False).explained_frame
+
+    told = explained("b")  # not the query itself: there is another
+    assert (told.map, told.lost_at, told.rank) == ("cellar", None, same.rank)
+    assert told.transform == same.transform
+    assert explained("a").map == "attic"
+    full.delete_frame("attic", "a")
+    assert (explained("a").map, explained("a").lost_at) == ("cellar", None)
+    full.delete_frame("cellar", "a")
+    assert (explained("a").map, explained("a").lost_at) == ("attic", "state")
 
 
 def test_maps_of_two_models_are_not_asked_as_one(two: Engine, uploads: Any, ids: Ids) -> None:
