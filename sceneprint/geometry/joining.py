@@ -38,6 +38,7 @@ class JoiningParameters:
     strong_votes: int = 10
     strong_frames: int = 5
     strong_share: float = 0.5  #: of all votes
+    strong_extent_m: float = 1.0  #: that they reach over: at one place all may be wrong alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +169,9 @@ def _belief(
         return None, f"{told}, and {int(rivals.sum())} on another transform"
     if frames < p.strong_frames or support < max(p.strong_votes, p.strong_share * n):
         return "weak", told
+    extent = float(np.linalg.norm(np.ptp(votes.places[agree], axis=0)))
+    if extent < p.strong_extent_m:
+        return "weak", f"{told}, all within {extent:.2f} m"
     return "strong", told
 
 

@@ -124,7 +124,10 @@ class Join(Told):
         description="x_to = matrix @ x_from, between the parent frames; null where the edges do "
         "not agree on one."
     )
-    strength: Literal["strong", "weak"] | None
+    strength: Literal["strong", "weak"] | None = Field(
+        description="`strong` where many edges of several frames agree that reach over a metre; "
+        "null without a transform."
+    )
     support: int = Field(description="Edges that agree with it.")
     votes: int = Field(description="Edges between the two parent frames that were not outvoted.")
     rival: int = Field(description="Edges that agree on the best other transform.")

@@ -144,6 +144,21 @@ def test_too_few_votes_or_too_few_frames_are_none() -> None:
         join(votes_of(T[:0], b[:0], a[:0], n[:0], n[:0], np.ones(0)))
 
 
+def test_many_frames_of_one_place_are_weak() -> None:
+    """A robot that stands still takes one view many times, and all are mistaken alike."""
+    rng = np.random.default_rng(6)
+    true, n = rigid(rng, 3.0), np.arange(30)
+    still = np.array([rigid(rng, 5.0)] * 30)
+    moving = np.array([rigid(rng, 0.0, 0.0) @ still[0] for _ in range(30)])
+    moving[:, 0, 3] += np.linspace(0.0, 1.1, 30)
+    for b, strength in ((still, "weak"), (moving, "strong")):
+        T = np.array([rigid(rng, 0.01, 0.4) for _ in range(30)])
+        found = join(votes_of(T, b, true @ b, n, n, np.ones(30)))
+        assert (found.support, found.strength) == (30, strength)
+        assert ("all within 0.00 m" in found.reason) is (strength == "weak")
+        assert found.T is not None
+
+
 def test_a_frame_that_was_found_often_counts_once() -> None:
     rng = np.random.default_rng(4)
     true, wrong = rigid(rng, 3.0), rigid(rng, 3.0)
