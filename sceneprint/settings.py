@@ -54,6 +54,8 @@ class Settings(BaseSettings):
     concurrency: int = Field(default_factory=lambda: max(os.cpu_count() or 1, 2), ge=1, le=256)
     #: Uploads and queries that may wait; more are asked to come back (503).
     waiting: int = Field(default=64, ge=0, le=10_000)
+    #: Seconds that an upload or a query may wait for its turn; then it is asked to come back (503).
+    wait_s: float = Field(default=5.0, gt=0, le=3600)
     #: Largest body of a request, bytes.
     upload_bytes: int = Field(default=72 << 20, ge=1024)
     #: Largest archive that is imported, bytes; inflated it may have four times as many.

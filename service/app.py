@@ -73,9 +73,9 @@ def create_app(settings: Settings) -> FastAPI:
         engine = await to_thread.run_sync(Engine, settings)
         try:
             await to_thread.run_sync(engine.warm)
-            gate = Gate(settings.concurrency, settings.waiting)
+            gate = Gate(settings.concurrency, settings.waiting, settings.wait_s)
             # they mostly wait for the disk: the engine sees to how many are decoded at once
-            uploads = Gate(max(UPLOADS, settings.concurrency), settings.waiting)
+            uploads = Gate(max(UPLOADS, settings.concurrency), settings.waiting, settings.wait_s)
             feed = Feed(engine.store.database, settings.event_streams, settings.events_kept)
             limits = Limits(settings.requests_per_s, settings.failed_keys_per_minute)
             app.state.context = Context(
@@ -87,9 +87,12 @@ def create_app(settings: Settings) -> FastAPI:
         finally:
             await to_thread.run_sync(engine.close)
 
+    # a path with a slash too many is not there: a redirection has no problem document, and would
+    # lead whoever follows it, with a key, to where Host says, and behind a proxy away from TLS
     app = FastAPI(
-        title="sceneprint", version=__version__, description=DESCRIPTION, lifespan=lifespan
-    )
+        title="sceneprint", version=__version__, description=DESCRIPTION, lifespan=lifespan,
+        redirect_slashes=False,
+    )  # fmt: skip
     v1 = APIRouter(prefix="/v1", dependencies=[Depends(caller)])
     for part in ROUTES:
         v1.include_router(part.router)

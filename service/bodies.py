@@ -101,6 +101,8 @@ async def form_of(request: Request, most_files: int) -> AsyncIterator[FormData]:
         )
     try:
         form = await request.form(max_files=most_files, max_fields=16, max_part_size=FIELD_BYTES)
+        for name, value in form.multi_items():  # some charsets have halves of surrogate pairs
+            f"{name}{value if isinstance(value, str) else ''}".encode()
     except (HTTPException, MultiPartException, UnicodeError) as error:  # of a strange charset
         raise MalformedBody(
             f"The form cannot be parsed ({getattr(error, 'detail', error)}). Send a file part "

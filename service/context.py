@@ -27,10 +27,12 @@ class Gate:
     ----------
     running : at once
     waiting : at most, be it for their bodies or for their turn
+    longest_s : seconds to wait for a turn: an answer that comes later helps no robot
     """
 
-    def __init__(self, running: int, waiting: int) -> None:
-        self._limiter = anyio.CapacityLimiter(running)
+    def __init__(self, running: int, waiting: int, longest_s: float) -> None:
+        self._turns, self._threads = (anyio.CapacityLimiter(running) for _ in range(2))
+        self._longest_s = longest_s
         self._places = running + waiting
         self._taken = 0
 
@@ -53,9 +55,31 @@ class Gate:
         finally:
             self._taken -= 1
 
-    async def run(self, do: Callable[[], T]) -> T:
-        """Do it in a thread, off the event loop, when it is its turn; for who has a place."""
-        return await to_thread.run_sync(do, limiter=self._limiter)
+    async def run(self, do: Callable[[], T], *, patient: bool = False) -> T:
+        """Do it in a thread, off the event loop, when it is its turn; for who has a place.
+
+        Parameters
+        ----------
+        do : the work
+        patient : wait for as long as it takes: much would have to be sent again
+
+        Raises
+        ------
+        Busy : its turn did not come in time; nothing was begun.
+        """
+        turn = object()
+        try:
+            with anyio.fail_after(None if patient else self._longest_s):
+                await self._turns.acquire_on_behalf_of(turn)
+        except TimeoutError:
+            raise Busy(
+                f"More uploads and queries came than can be done in {self._longest_s:g} s. "
+                "Nothing was begun: come back in a second."
+            ) from None
+        try:
+            return await to_thread.run_sync(do, limiter=self._threads)
+        finally:
+            self._turns.release_on_behalf_of(turn)
 
 
 @dataclass(frozen=True, eq=False)

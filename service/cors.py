@@ -11,8 +11,8 @@ Headers = list[tuple[bytes, bytes]]
 
 #: What a page may read of an answer beside its body.
 _EXPOSED = (
-    "Accept-Ranges, Content-Disposition, Content-Range, ETag, Location, Preference-Applied, "
-    "RateLimit, RateLimit-Policy, Retry-After, X-Request-Id"
+    "Accept-Ranges, Content-Disposition, Content-Range, ETag, Idempotent-Replayed, Location, "
+    "Preference-Applied, RateLimit, RateLimit-Policy, Retry-After, X-Request-Id"
 )
 _METHODS = "GET, POST, PUT, PATCH, DELETE"
 _SENT = (

@@ -12,6 +12,7 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import AsyncGenerator, Callable
+from contextlib import suppress
 from itertools import islice
 
 from anyio import to_thread
@@ -90,13 +91,14 @@ class Feed:
     ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
         """Events as they come, with the number up to which all have been told.
 
-        At first, and after ALIVE_S without any, the list may be empty.
+        At first, and once in ALIVE_S whatever else there is, the list is empty: others' events are
+        no silence to the poller, and are to who waits for his own.
 
         Parameters
         ----------
         wanted : the others are passed over
         after : number from which to go on; None: from now on
-        may_go_on : asked each time all was silent, in a thread; False ends the stream
+        may_go_on : asked once in ALIVE_S, in a thread; False ends the stream
         """
         try:
             async for batch in self._batches(wanted, after, may_go_on):
@@ -111,7 +113,14 @@ class Feed:
             self._poller = asyncio.create_task(self._poll())
         place, first = await to_thread.run_sync(begin, self._database, self._kept, after)
         yield first, place  # also where it is empty: the reader learns its place
+        clock = asyncio.get_running_loop().time
+        due = clock() + ALIVE_S
         while not self._closed:
+            if clock() >= due:
+                if not await to_thread.run_sync(may_go_on):
+                    return
+                yield [], place
+                due = clock() + ALIVE_S
             news = self._news
             if self._since is None or place < self._since:
                 found, place = await to_thread.run_sync(
@@ -128,12 +137,8 @@ class Feed:
                 if found:
                     yield found, place
                 continue
-            try:
-                await asyncio.wait_for(news.wait(), ALIVE_S)
-            except TimeoutError:
-                if not await to_thread.run_sync(may_go_on):
-                    return
-                yield [], place
+            with suppress(TimeoutError):
+                await asyncio.wait_for(news.wait(), max(due - clock(), 0.0))
 
     def _after(self, place: int) -> tuple[list[EventRow], int]:
         """The next of the events held, and the number up to which these are all."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,15 +19,17 @@ _CHUNK = 1 << 18
 _RANGE = re.compile(r"\s*bytes\s*=\s*(\d{0,18})\s*-\s*(\d{0,18})\s*", re.IGNORECASE | re.ASCII)
 
 
-def files(media_type: str, description: str, *statuses: int) -> dict[int | str, dict[str, Any]]:
+def files(
+    media_types: Sequence[str], description: str, *statuses: int
+) -> dict[int | str, dict[str, Any]]:
     """Responses of a route that sends such a file, for the OpenAPI document.
 
     Parameters
     ----------
-    media_type, description : of the file
+    media_types, description : of the file: one of these types
     statuses : of refusals beside 416
     """
-    binary = {media_type: {"schema": {"type": "string", "format": "binary"}}}
+    binary = {one: {"schema": {"type": "string", "format": "binary"}} for one in media_types}
     tag = {"description": "Stands for these bytes.", "schema": {"type": "string"}}
     headers = {"ETag": tag, "Accept-Ranges": {"schema": {"type": "string"}}}
     return {

@@ -6,12 +6,13 @@ import logging
 import re
 import time
 import uuid
+from collections import Counter
 
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from sceneprint.errors import Busy, SceneprintError
+from sceneprint.errors import Busy, RateLimited, SceneprintError
 from sceneprint.logs import name_request
 from sceneprint.settings import Settings
 from service.audit import note
@@ -55,6 +56,9 @@ class Around:
         self._most_of_import = settings.import_bytes
         self._alone = not settings.asks_for_keys
         self._at_once = 0
+        # a caller that holds its bodies back must not take every place in the gates
+        self._most_of_key = max(3 * (settings.concurrency + settings.waiting) // 4, 1)
+        self._of_key: Counter[bytes] = Counter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One request."""
@@ -88,7 +92,9 @@ class Around:
                 await note(scope, status, said)
             await send(message)
 
+        key = b"" if self._alone else _key_of(headers)
         self._at_once += 1
+        self._of_key[key] += 1
         try:
             early = self._early(scope, headers)
             if isinstance(early, SceneprintError):
@@ -106,6 +112,9 @@ class Around:
             raise
         finally:
             self._at_once -= 1
+            self._of_key[key] -= 1
+            if not self._of_key[key]:
+                del self._of_key[key]  # who makes keys up must not fill the memory
         if body.fault is not None and status == 0:
             fault, body.fault = body.fault, None
             await _refusal(request_id, fault)(scope, receive, answered)
@@ -126,6 +135,12 @@ class Around:
         if self._at_once > _MOST_AT_ONCE:
             return Busy(
                 "The service is answering as many requests as it can hold. Come back in a second."
+            )
+        key = b"" if self._alone else _key_of(headers)
+        if key and self._of_key[key] > self._most_of_key:
+            return RateLimited(
+                f"{self._most_of_key} requests with this key are in hand, the most at once. Wait "
+                "for their answers."
             )
         most = self._limit(scope)
         if length.isdigit() and (len(length) > 18 or int(length) > most):
@@ -175,6 +190,11 @@ class Around:
                 "status": status,
             },
         )
+
+
+def _key_of(headers: dict[bytes, bytes]) -> bytes:
+    """The key that is shown, be it one or not; however its scheme is written."""
+    return headers.get(b"authorization", b"").partition(b" ")[2].strip()
 
 
 def _refusal(request_id: str, error: SceneprintError) -> Response:

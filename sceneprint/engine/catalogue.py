@@ -55,8 +55,14 @@ class Catalogue:
             for model in [*shipped, *rest]
         ]
 
-    def find(self, name: str) -> Model:
+    def find(self, name: str, may_read: Callable[[str], bool] | None = None) -> Model:
         """A model by the name of a preset, or by id or label.
+
+        Parameters
+        ----------
+        name : see above
+        may_read : whether a map may be named: a model that only others have is not there; default:
+            all are
 
         Raises
         ------
@@ -65,7 +71,12 @@ class Catalogue:
         if name in PRESETS:
             return _preset(name)
         with self._database.read() as connection:
+            rows = list_maps(connection)
             known = [*(_preset(one) for one in PRESETS), *self._stored(connection)]
+        if may_read is not None:
+            of = [(row.model_id, row.next_model_id) for row in rows if may_read(row.name)]
+            seen = {model_id for pair in of for model_id in pair}
+            known = [one for i, one in enumerate(known) if i < len(PRESETS) or one.id in seen]
         for model in known:
             if name in (model.id, model.label):
                 return model

@@ -32,7 +32,7 @@ def create_key(
     Raises
     ------
     InvalidRequest : the name is empty, too long, not printable or taken by us; or a name of a map
-        that none can have.
+        that none can have; or `expires_at` is beyond what a date can say.
     Conflict : there is a key of that name.
     """
     if not (0 < len(name) <= 128 and name.isprintable()) or name == COMMAND:
@@ -49,7 +49,7 @@ def create_key(
                 "or * for all.",
                 (("grants", "no name of a map"),),
             )
-    until = None if expires_at is None else expires_at.timestamp()
+    until = None if expires_at is None else _until(expires_at)
     with store.database.write() as connection:
         secret = stored.create_key(connection, name, granted, until)
         row = stored.find_key(connection, secret)
@@ -69,6 +69,20 @@ def list_keys(store: Store, cursor: str | None = None, limit: int = 100) -> Page
         found = stored.list_keys(connection, after, limit + 1)
     more = _cursor_of(found[limit - 1].name) if len(found) > limit else None
     return Page[Key](items=[_told(row) for row in found[:limit]], next_cursor=more)
+
+
+def _until(expires_at: datetime) -> float:
+    """Seconds since 1970, that are a date again when the key is told of."""
+    seconds = expires_at.timestamp()
+    try:
+        datetime.fromtimestamp(seconds, UTC)
+    except (ValueError, OverflowError) as error:  # of another zone, or rounded up
+        raise InvalidRequest(
+            f"{expires_at.isoformat()} is not within the years 1 to 9999 of UTC. Leave expires_at "
+            "out for a key that does not expire.",
+            (("expires_at", "not within the years 1 to 9999 of UTC"),),
+        ) from error
+    return seconds
 
 
 def _told(row: stored.KeyRow) -> Key:

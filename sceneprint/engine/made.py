@@ -32,10 +32,12 @@ class Output(Generic[T]):
     ----------
     tag : the same as long as what is made is the same, and another otherwise
     make : makes it; takes some 100 ms at most
+    blob : that it is, where it is not made but lies in the store
     """
 
     tag: str
     make: Callable[[], T]
+    blob: str | None = None
 
 
 def upload_type(data: bytes) -> str:

@@ -183,7 +183,8 @@ class Outputs:
                 f"Frame {frame.id} is redundant, and its upload was not kept. "
                 f"{frame.reason or ''} Upload it without `if_novel` to keep it."
             )
-        return Output(tag_of("upload", frame.blob), lambda: self._store.blobs.get(frame.blob))
+        blob = frame.blob
+        return Output(tag_of("upload", blob), lambda: self._store.blobs.get(blob), blob)
 
     def _hierarchy(self, found: IndexedFrame) -> Hierarchy:
         """As it was signed: of the upload, as the artifact's points are rounded."""

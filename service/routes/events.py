@@ -28,7 +28,7 @@ router = APIRouter(prefix="/events", tags=["operations"])
 _STREAM = {
     "description": "A page of events; or, where `Accept` names text/event-stream, a stream that "
     "goes on: each message has the event's number as `id` and the event as JSON in `data`. "
-    "A comment comes after 15 s of silence.",
+    "A comment comes every 15 s.",
     "model": EventPage,
     "content": {MEDIA_TYPE: {"schema": {"type": "string"}}},
 }

@@ -7,6 +7,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, Field
 
 from sceneprint import __version__
+from sceneprint.store.events import newest_number
 from service.access import Guest, reads_every
 from service.context import Here
 from service.problems import declared
@@ -31,23 +32,29 @@ class Readiness(Health):
     jobs: dict[str, int] | None = Field(description="As `frames`.")
 
 
+@router.head("/healthz", include_in_schema=False)  # as balancers ask
 @router.get("/healthz", responses=declared())
 async def healthz() -> Health:
     """Answers while the process lives, whatever else it does."""
     return Health(status="ok", version=__version__)
 
 
+@router.head("/readyz", include_in_schema=False)
 @router.get("/readyz", responses=declared())
 def readyz(here: Here, asking: Guest) -> Readiness:
     """Answers while the database does; 503 while it does not. No key is asked for."""
-    frames, jobs = here.engine.counts()
-    told = asking is not None and asking.reads_every
+    frames = jobs = None
+    if asking is not None and asking.reads_every:
+        frames, jobs = here.engine.counts()
+    else:  # whoever shows no key has nothing counted: that takes the longer the more there is
+        with here.engine.store.database.read() as connection:
+            newest_number(connection)
     return Readiness(
         status="ready",
         version=__version__,
         read_only=here.engine.store.database.read_only,
-        frames=frames if told else None,
-        jobs=jobs if told else None,
+        frames=frames,
+        jobs=jobs,
     )
 
 

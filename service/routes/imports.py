@@ -90,7 +90,7 @@ async def add_import(
         archive = await _received(map_name, request, here)
         once = guarded(asking, key, "import", map_name, archive.blob, options)
         job, replayed = await here.uploads.run(
-            lambda: here.engine.imports.begin(map_name, archive, options, once)
+            lambda: here.engine.imports.begin(map_name, archive, options, once), patient=True
         )
     tell_replayed(response, replayed=replayed)
     response.headers["Location"] = f"/v1/maps/{map_name}/imports/{job.job_id}"
@@ -129,11 +129,11 @@ async def _received(map_name: str, request: Request, here: Context) -> JobFile:
             receiver.write(bytes(waiting))
             return receiver.end()
 
-        return await here.uploads.run(end)
+        return await here.uploads.run(end, patient=True)
 
 
 async def _written(here: Context, receiver: Receiver, data: bytes) -> None:
-    await here.uploads.run(lambda: receiver.write(data))
+    await here.uploads.run(lambda: receiver.write(data), patient=True)
 
 
 def _options(request: Request) -> ImportOptions:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Any
 
 from anyio import to_thread
@@ -58,7 +59,7 @@ def models(here: Here, asking: Asking) -> Page[ModelInfo]:
     openapi_extra={"requestBody": BODY},
     dependencies=[Depends(may_admin)],
 )
-async def reencode(map_name: str, request: Request, here: Here) -> Map:
+async def reencode(map_name: str, request: Request, here: Here, asking: Asking) -> Map:
     """Have every frame of a map signed with another model; the map switches when all are.
 
     Queries go on with the model that the map has until then. `reencoding` of the map tells how
@@ -70,8 +71,10 @@ async def reencode(map_name: str, request: Request, here: Here) -> Map:
             "application/json."
         )
     wanted = _wanted(await read_json(request))
+    may_read = None if asking.reads_every else partial(asking.may, "read")
+    find = here.engine.operations.catalogue.find
     return await to_thread.run_sync(
-        lambda: here.engine.reencode(map_name, here.engine.operations.catalogue.find(wanted.model))
+        lambda: here.engine.reencode(map_name, find(wanted.model, may_read))
     )
 
 

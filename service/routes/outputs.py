@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Annotated, Any, TypeVar
 
 from anyio import to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response
 
+from sceneprint.datasets.sizes import HEAD
 from sceneprint.engine.made import BYTES, JSON, NPY, PLY, PNG, Output, upload_type
+from sceneprint.errors import DamagedBlob
 from sceneprint.schemas.outputs import (
     WIDTH,
     WIDTHS,
@@ -20,6 +23,7 @@ from sceneprint.schemas.outputs import (
 from service.access import may_read
 from service.conditions import chosen, is_known
 from service.context import Context, Here
+from service.files import files, send_file
 from service.problems import declared
 
 T = TypeVar("T")
@@ -145,31 +149,49 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
 @router.get(
     "/upload",
     response_class=Response,
-    responses=_files(PNG, NPY, description="Byte for byte as it came."),
+    responses=files((PNG, NPY), "Byte for byte as it came.", 409),
 )
 async def get_upload(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """The frame's upload: what you sent in is yours to take out."""
     found = await _found(lambda: here.engine.outputs.upload(map_name, frame_id))
-    return await _sent(request, here, found, None, name=frame_id)
+    if is_known(request, found.tag):
+        return Response(None, 304, _tagged(found))
+    async with here.gate.place():
+        return await here.gate.run(lambda: _upload(request, here, found, frame_id))
 
 
 async def _found(find: Callable[[], Output[T]]) -> Output[T]:
     return await to_thread.run_sync(find)
 
 
+def _upload(request: Request, here: Context, found: Output[bytes], frame_id: str) -> Response:
+    """An upload out of its file: of 70 MiB in memory each, a few slow readers would be too much."""
+    blobs, blob = here.engine.store.blobs, found.blob or ""
+    if blobs.condition(blob) == "sound":
+        with suppress(FileNotFoundError):
+            path = blobs.path(blob)
+            with path.open("rb") as file:
+                kind = upload_type(file.read(HEAD))
+            name = _safe(f"{frame_id}.{'png' if kind == PNG else 'npy'}")
+            return send_file(request, path, kind, found.tag, name)
+    found.make()  # says what is wrong with it
+    raise DamagedBlob(f"The upload of frame {frame_id} was put back just now. Ask again.")
+
+
+def _tagged(output: Output[Any]) -> dict[str, str]:
+    return {"ETag": f'"{output.tag}"', "Cache-Control": "private, no-cache"}
+
+
 async def _sent(
-    request: Request, here: Context, output: Output[bytes], kind: str | None,
+    request: Request, here: Context, output: Output[bytes], kind: str,
     name: str | None = None, **headers: str,
 ) -> Response:  # fmt: skip
     """An output; made only where the caller does not have it yet, and when it is its turn."""
-    headers |= {"ETag": f'"{output.tag}"', "Cache-Control": "private, no-cache"}
+    headers |= _tagged(output)
     if is_known(request, output.tag):
         return Response(None, 304, headers)
     async with here.gate.place():
         data = await here.gate.run(output.make)
-    if kind is None:
-        kind = upload_type(data)
-        name = f"{name}.{'png' if kind == PNG else 'npy'}"
     if name is not None:
         headers["Content-Disposition"] = f'inline; filename="{_safe(name)}"'
     return Response(data, 200, headers, kind)

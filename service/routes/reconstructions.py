@@ -16,6 +16,7 @@ from sceneprint.schemas.reconstructions import NewReconstruction, Reconstruction
 from sceneprint.store.listing import unknown_job
 from service.access import Asking, Caller
 from service.bodies import media_type, read_json
+from service.conditions import is_known
 from service.context import Context, Here
 from service.files import files, send_file
 from service.problems import declared, invalid
@@ -63,27 +64,27 @@ def get_reconstruction(job_id: str, here: Here, asking: Asking) -> Reconstructio
     "/reconstructions/{job_id}/mesh.ply",
     response_class=Response,
     responses=files(
-        MEDIA_TYPES[MESH],
+        [MEDIA_TYPES[MESH]],
         "Points with normals, coloured by the first view that saw them, and triangles unless a "
         "cloud was asked for; binary little-endian. A comment names the frame of coordinates.",
         409,
     ),
 )
-def get_mesh(job_id: str, request: Request, here: Here, asking: Asking) -> Response:
+async def get_mesh(job_id: str, request: Request, here: Here, asking: Asking) -> Response:
     """The surface, in the query's camera frame; 409 until the job has succeeded."""
-    return _file(request, here, asking, job_id, MESH)
+    return await _sent(request, here, asking, job_id, MESH)
 
 
 @router.get(
     "/reconstructions/{job_id}/picture.png",
     response_class=Response,
     responses=files(
-        MEDIA_TYPES[PICTURE], "The surface from above, coloured by view, with the cameras.", 409
+        [MEDIA_TYPES[PICTURE]], "The surface from above, coloured by view, with the cameras.", 409
     ),
 )
-def get_picture(job_id: str, request: Request, here: Here, asking: Asking) -> Response:
+async def get_picture(job_id: str, request: Request, here: Here, asking: Asking) -> Response:
     """A picture of the surface, and what each view adds to it; 409 until it is made."""
-    return _file(request, here, asking, job_id, PICTURE)
+    return await _sent(request, here, asking, job_id, PICTURE)
 
 
 @router.delete("/reconstructions/{job_id}", status_code=204, responses=declared(404))
@@ -114,10 +115,18 @@ def _found(here: Context, asking: Caller, job_id: str) -> Reconstruction:
     return found
 
 
-def _file(request: Request, here: Context, asking: Caller, job_id: str, name: str) -> Response:
-    _found(here, asking, job_id)
+async def _sent(
+    request: Request, here: Context, asking: Caller, job_id: str, name: str
+) -> Response:
+    """A file of a reconstruction, which is read whole before: when it is its turn."""
+    await to_thread.run_sync(_found, here, asking, job_id)
+    async with here.gate.place():
+        return await here.gate.run(lambda: _file(request, here, job_id, name))
+
+
+def _file(request: Request, here: Context, job_id: str, name: str) -> Response:
     file, blobs = here.engine.reconstructions.file(job_id, name), here.engine.store.blobs
-    if blobs.condition(file.blob) == "sound":
+    if is_known(request, file.blob) or blobs.condition(file.blob) == "sound":
         with suppress(FileNotFoundError):
             return send_file(
                 request, blobs.path(file.blob), file.media_type, file.blob, f"{job_id[:12]}-{name}"

@@ -37,7 +37,7 @@ def list_snapshots(here: Here) -> Page[SnapshotFile]:
 @router.get(
     "/{snapshot_id}",
     response_class=Response,
-    responses=files("application/x-tar", "The archive, for `sceneprint restore`."),
+    responses=files(["application/x-tar"], "The archive, for `sceneprint restore`."),
 )
 def get_snapshot(snapshot_id: str, request: Request, here: Here) -> Response:
     """The archive. It holds all frames and the hashes of keys: keep it as you keep the folder.

@@ -136,6 +136,37 @@ def test_silence_is_broken_and_a_key_that_opens_nothing_ends_it(database, monkey
     assert len(asked) == 3
 
 
+def test_events_of_others_are_no_reason_to_go_on(database, monkeypatch):
+    """Neither to keep silent, nor to keep a stream whose key opens nothing any more."""
+    monkeypatch.setattr(feeds, "ALIVE_S", 0.2)
+    asked: list[int] = []
+
+    def twice() -> bool:
+        asked.append(1)
+        return len(asked) < 3
+
+    async def run(wanted: Wanted) -> list[Batch]:
+        feed, found = Feed(database, most=1, kept=1000), []
+        asked.clear()
+
+        async def busy() -> None:
+            while True:
+                write(database, "hall")
+                await asyncio.sleep(0.02)
+
+        others = asyncio.create_task(busy())
+        async with asyncio.timeout(30):
+            found = [batch async for batch in feed.batches(wanted, None, twice)]
+        others.cancel()
+        return found
+
+    silent = asyncio.run(run(Wanted(frozenset(("shop",)))))
+    assert [events for events, _ in silent] == [[], [], []]
+    assert silent[0][1] < silent[1][1] < silent[2][1]  # the place up to which there was nothing
+    told = [one for batch in asyncio.run(run(Wanted())) for one in ids(batch)]
+    assert told == list(range(told[0], told[-1] + 1))
+
+
 def test_there_are_so_many_places_and_all_end_together(database):
     async def run() -> None:
         feed = Feed(database, most=2, kept=9)

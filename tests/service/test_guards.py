@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import socket
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 
 import httpx
@@ -46,6 +48,13 @@ def test_every_answer_is_guarded(served):
         guarded(answer)
 
 
+@pytest.mark.parametrize("path", ["/healthz", "/readyz"])
+def test_a_balancer_may_ask_for_the_head_alone(served, path):
+    answer = served.client.head(path)
+    assert (answer.status_code, answer.content) == (200, b"")
+    assert int(answer.headers["content-length"]) > 0
+
+
 def test_only_the_pages_of_the_documentation_may_load_anything(served):
     for path in ("/docs", "/redoc"):
         answer = served.client.get(path)
@@ -67,7 +76,7 @@ def test_a_page_of_an_allowed_origin_may_ask_and_read(served, path):
     assert answer.headers["access-control-allow-origin"] == FLEET
     assert answer.headers["vary"] == "Origin"
     exposed = {one.strip() for one in answer.headers["access-control-expose-headers"].split(",")}
-    assert {"ETag", "Location", "Retry-After", "X-Request-Id"} <= exposed
+    assert {"ETag", "Idempotent-Replayed", "Location", "Retry-After", "X-Request-Id"} <= exposed
     assert "access-control-allow-credentials" not in answer.headers
 
 
@@ -180,6 +189,28 @@ def test_no_body_is_waited_for_of_who_asks_too_often(held):
     raise AssertionError("it was let in twice")
 
 
+def test_one_key_does_not_take_every_place(walled, refused, until):
+    """It holds back the bodies of as many queries as it may have in hand."""
+    defaults = Settings(concurrency=max(os.cpu_count() or 1, 2))
+    most = 3 * (defaults.concurrency + defaults.waiting) // 4
+    url = httpx.URL(walled.server.url)
+    head = (
+        "POST /v1/maps/alpha/queries HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n"
+        "Content-Type: multipart/form-data; boundary=x\r\n"
+        f"Authorization: Bearer {walled.secrets['reader']}\r\n\r\n"
+    ).encode()
+    with ExitStack() as held:
+        for _ in range(most):
+            wire = held.enter_context(socket.create_connection((url.host, url.port), timeout=60))
+            wire.sendall(head)
+        until(lambda: walled.ask("reader", "GET", "/v1/keys/me").status_code == 429)
+        answer = walled.ask("reader", "GET", "/v1/keys/me", headers={"X-Request-Id": "late"})
+        refused(answer, 429, "rate-limited", f"{most} requests with this key are in hand")
+        other = walled.ask("keeper", "POST", "/v1/maps/bravo/queries", json={"frame_id": "none"})
+        assert other.status_code == 404
+    until(lambda: walled.ask("reader", "GET", "/v1/keys/me").status_code == 200)
+
+
 def test_wrong_keys_are_counted_and_right_ones_are_not_kept_out_by_them(held, refused):
     def try_key(secret: str) -> httpx.Response:
         return held.server.client.get("/v1/maps", headers={"Authorization": f"Bearer {secret}"})
@@ -238,12 +269,22 @@ def test_a_key_that_has_expired_says_so(walled, refused):
         ({"name": "", "grants": {"*": "read"}}, "name"),
         ({"name": "command", "grants": {"*": "read"}}, "name"),
         ({"name": "a", "grants": {"*": "read"}, "expires_at": "2030-01-01T00:00:00"}, "expires_at"),
+        # as a date of UTC it would be of the year 10000, and no list of keys could tell it
+        (
+            {"name": "a", "grants": {"*": "read"}, "expires_at": "9999-12-31T23:59:59.999999Z"},
+            "expires_at",
+        ),
+        (
+            {"name": "a", "grants": {"*": "read"}, "expires_at": "0001-01-01T00:00:00+12:00"},
+            "expires_at",
+        ),
         ({"name": "a", "grants": {"*": "read"}, "secret": "sp_mine"}, "secret"),
     ],
 )
 def test_a_key_that_cannot_be_made_names_the_field(walled, refused, new, field):
     problem = refused(walled.ask("boss", "POST", "/v1/keys", json=new), 422, "invalid-request")
     assert [one["field"] for one in problem["errors"]] == [field] or field in str(problem["errors"])
+    assert "a" not in [key["name"] for key in walled.ask("boss", "GET", "/v1/keys").json()["items"]]
 
 
 def test_only_admins_of_all_have_to_do_with_keys(walled, refused):

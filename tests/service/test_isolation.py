@@ -15,6 +15,10 @@ from typing import Any
 import httpx
 import pytest
 
+from sceneprint.engine import Engine
+from sceneprint.schemas import NewMap
+from sceneprint.settings import Settings
+
 #: The key's own map, one that it may not see, and one that is not there: names of one length.
 OWN, THEIRS, NONE = "alpha", "bravo", "zulus"
 NO_ID = "0123456789abcdef0123456789abcdef"
@@ -268,6 +272,25 @@ def test_lists_have_nothing_of_another_map(walled, there, operations):
     assert len(jobs) == 4  # two frames, an association, a reconstruction
     events = walled.ask("reader", "GET", "/v1/events?limit=1000").json()["items"]
     assert {event["map"] for event in events} == {OWN}
+
+
+def test_a_model_that_only_another_map_has_is_not_there(walled, there, small_model):
+    with Engine(Settings(data_dir=walled.server.folder, database_url=None)) as engine:
+        engine.create_map(NewMap(name="yard", model="compact"))
+        engine.reencode("yard", small_model)
+    answers = [
+        walled.ask("admin", "POST", f"/v1/maps/{OWN}/reencoding", json={"model": name})
+        for name in (small_model.id, "0" * 64)
+    ]
+    assert {answer.status_code for answer in answers} == {422}
+    told = [
+        answer.json()["detail"].replace(name, "")
+        for answer, name in zip(answers, (small_model.id, "0" * 64), strict=True)
+    ]
+    assert told[0] == told[1]
+    found = walled.ask("boss", "POST", "/v1/maps/yard/reencoding", json={"model": small_model.id})
+    assert found.status_code in (202, 409), found.text  # it is there for who may read the map
+    assert walled.ask("boss", "DELETE", "/v1/maps/yard").status_code == 204
 
 
 def test_asking_all_maps_asks_those_that_the_key_may_read(walled, there):

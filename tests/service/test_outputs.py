@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import base64
 import io
+import re
+import socket
 from datetime import datetime
+from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 from PIL import Image
@@ -96,6 +100,40 @@ def test_pictures_and_uploads_are_files(served, shown, small_shots):
     upload = served.client.get(f"{path}/frames/{ids[0]}/upload")
     assert upload.content == small_shots[0].png
     assert upload.headers["content-disposition"] == f'inline; filename="{ids[0]}.png"'
+    assert upload.headers["content-type"] == "image/png"
+    rest = {"Range": "bytes=100-", "If-Range": upload.headers["etag"]}
+    part = served.client.get(f"{path}/frames/{ids[0]}/upload", headers=rest)
+    assert (part.status_code, part.content) == (206, small_shots[0].png[100:])
+
+
+def test_who_does_not_read_an_upload_costs_no_memory(served, make_map):
+    path = make_map(served, "unread")
+    rows, columns = np.mgrid[:1400, :1600]
+    out = io.BytesIO()
+    np.save(out, 2 + np.sin(rows / 900) / 3 + np.cos(columns / 700) / 5)
+    sent = served.client.post(
+        f"{path}/frames?fx=2000&fy=2000&cx=800&cy=700", content=out.getvalue(),
+        headers={"Content-Type": "application/x-npy"},
+    )  # fmt: skip
+    assert sent.status_code == 202, sent.text
+
+    def resident() -> int:
+        status = Path(f"/proc/{served.process.pid}/status").read_text()
+        return int(re.findall(r"VmRSS:\s+(\d+) kB", status)[0]) << 10
+
+    url, before, wires = httpx.URL(served.url), resident(), []
+    head = f"GET {path}/frames/{sent.json()['frame_id']}/upload HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    try:
+        for _ in range(12):
+            wires.append(wire := socket.create_connection((url.host, url.port), timeout=60))
+            wire.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            wire.sendall(head.encode())
+            assert wire.recv(12) == b"HTTP/1.1 200"
+        assert resident() - before < 4 * len(out.getvalue())
+    finally:
+        for wire in wires:
+            wire.close()
+    assert served.client.delete(path).status_code == 204
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,69 @@
+"""The gate: a few at once, some wait, not for ever, and the rest is sent away."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+
+import pytest
+
+from sceneprint.errors import Busy
+from service.context import Gate
+
+
+def test_who_waits_too_long_is_sent_away_and_nothing_of_it_is_begun():
+    done = threading.Event()
+    begun: list[str] = []
+
+    def work(name: str) -> str:
+        begun.append(name)
+        assert done.wait(30)
+        return name
+
+    async def test() -> None:
+        gate = Gate(1, 5, longest_s=0.2)
+        first = asyncio.create_task(gate.run(lambda: work("first")))
+        while not begun:
+            await asyncio.sleep(0.01)
+        waiting = [asyncio.create_task(gate.run(lambda: work("late"))) for _ in range(2)]
+        for one in waiting:
+            with pytest.raises(Busy, match=r"in 0\.2 s\. Nothing was begun"):
+                await one
+        done.set()
+        assert await first == "first"
+        assert await gate.run(lambda: work("next")) == "next"  # its turn is free again
+
+    asyncio.run(test())
+    assert begun == ["first", "next"]
+
+
+def test_who_hangs_up_while_it_waits_leaves_no_turn_behind():
+    done = threading.Event()
+
+    async def test() -> None:
+        gate = Gate(1, 5, longest_s=30)
+        first = asyncio.create_task(gate.run(lambda: done.wait(30)))
+        await asyncio.sleep(0.05)
+        second = asyncio.create_task(gate.run(lambda: True))
+        await asyncio.sleep(0.05)
+        second.cancel()
+        done.set()
+        assert await first is True
+        assert await asyncio.wait_for(gate.run(lambda: "third"), 30) == "third"
+        with pytest.raises(asyncio.CancelledError):
+            await second
+
+    asyncio.run(test())
+
+
+def test_as_many_have_a_place_as_may():
+    async def test() -> None:
+        gate = Gate(1, 1, longest_s=1)
+        async with gate.place(), gate.place():
+            with pytest.raises(Busy, match="as it lets wait"):
+                async with gate.place():
+                    pass
+        async with gate.place():
+            pass
+
+    asyncio.run(test())
