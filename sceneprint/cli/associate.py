@@ -12,7 +12,7 @@ from sceneprint.cli.connection import add_service_options, one_line, open_client
 from sceneprint.cli.numbers import positive, whole
 from sceneprint.errors import InvalidRequest
 from sceneprint.schemas import JobState
-from sceneprint.writing import write_whole
+from sceneprint.writing import check_writable, write_whole
 
 if TYPE_CHECKING:
     from sceneprint.schemas.associations import Association, GraphFormat, Join
@@ -92,6 +92,8 @@ def run(options: argparse.Namespace) -> int:
             f"{options.out.name!a:.80} does not say what it is. Let --out end in "
             f"{', '.join(_FORMATS)}."
         )
+    if options.out is not None:  # it may take an hour
+        check_writable(options.out)
     times = {"captured_after": options.after, "captured_before": options.before}
     wanted = {name: value for name, value in times.items() if value is not None}
     with (

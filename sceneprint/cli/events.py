@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.cli.connection import add_service_options, one_line, open_client
@@ -37,8 +38,8 @@ def add_to(commands: Any) -> None:
         "--after", type=whole, metavar="N", help="begin behind the event of this number"
     )
     command.add_argument(
-        "--limit", type=whole, default=LISTED, metavar="N",
-        help=f"list at most so many (default: {LISTED})",
+        "--limit", type=whole, metavar="N",
+        help=f"at most so many (default: {LISTED}; with --after or --follow all)",
     )  # fmt: skip
     command.add_argument("--json", action="store_true", help="print JSON, one event a line")
     add_service_options(command)
@@ -56,18 +57,18 @@ def run(options: argparse.Namespace) -> int:
             )
         else:
             found = iter(_latest(client, options))
-        _print(found, as_json=options.json)
+        _print(islice(found, options.limit), as_json=options.json)
     return 0
 
 
 def _latest(client: Client, options: argparse.Namespace) -> list[Event]:
     """The newest events, the oldest of them first."""
     found: list[Event] = []
-    cursor = None
-    while len(found) < options.limit:
+    cursor, most = None, LISTED if options.limit is None else options.limit
+    while len(found) < most:
         page = client.event_page(
             options.map, kinds=options.kind, cursor=cursor,
-            limit=min(options.limit - len(found), 500),
+            limit=min(most - len(found), 500),
         )  # fmt: skip
         found += page.items
         cursor = page.next_cursor

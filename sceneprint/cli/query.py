@@ -72,10 +72,7 @@ def run(options: argparse.Namespace) -> int:
                 print(f"{one_line(reference.name)}: {one_line(str(error))}", file=sys.stderr)
                 continue
             if options.json:
-                told = {
-                    "frame": reference.name,
-                    **answer.model_dump(mode="json", exclude={"frame"}),
-                }
+                told = {"name": reference.name, **answer.model_dump(mode="json")}
                 print(json.dumps(told), flush=True)
             else:
                 lines = [*lines_of(reference.name, answer), *explained_lines(answer)]

@@ -14,7 +14,7 @@ from sceneprint.cli.filters import add_filter_options, filter_of
 from sceneprint.cli.numbers import positive, whole
 from sceneprint.datasets import FrameReference, find_sequences
 from sceneprint.errors import DatasetError
-from sceneprint.writing import write_whole
+from sceneprint.writing import check_writable, write_whole
 
 if TYPE_CHECKING:
     from sceneprint.client import Client
@@ -63,6 +63,9 @@ def run(options: argparse.Namespace) -> int:
     out = options.out
     if out is None and options.picture is None:
         out = Path("mesh.ply")
+    for path in (out, options.picture):
+        if path is not None:
+            check_writable(path)
     with open_client(options) as client:
         answer = _asked(client, options)
         name = one_line(options.frame)

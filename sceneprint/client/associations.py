@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, get_args
 
 from sceneprint.client.frames import checked
 from sceneprint.client.messages import association_path, map_path
 from sceneprint.client.sending import PAGE, Sender, given
+from sceneprint.errors import InvalidRequest
 from sceneprint.schemas import Filter, Page, ValidationOptions
 from sceneprint.schemas.associations import (
     Association,
@@ -241,7 +242,9 @@ class Associations:
         Raises
         ------
         UnknownMap, UnknownJob : there is none.
+        InvalidRequest : an overlap out of its range.
         """
+        _check_overlap(min_overlap)
         asked = (min_overlap, consistent)
         page = self._backend.list_edges(map_name, association_id, None, *asked)
         yield from page.items
@@ -267,7 +270,23 @@ class Associations:
         ------
         UnknownMap, UnknownJob : there is none.
         NotIndexed : it is not over, or did not succeed.
+        InvalidRequest : there is no such file, or an overlap out of its range.
         """
+        known = get_args(GraphFormat)
+        if kind not in known:
+            raise InvalidRequest(
+                f"A graph does not come as {kind!r:.80}. Give one of {', '.join(known)}.",
+                (("format", f"give one of {', '.join(known)}"),),
+            )
+        _check_overlap(min_overlap)
         return self._backend.graph(
             map_name, association_id, kind, min_overlap, odometry, consistent
+        )
+
+
+def _check_overlap(least: float) -> None:
+    if not 0.0 <= least <= 1.0:
+        raise InvalidRequest(
+            f"The least overlap is {least}. Give one from 0 to 1.",
+            (("min_overlap", "out of its range"),),
         )

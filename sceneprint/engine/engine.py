@@ -186,6 +186,7 @@ class Engine(Administration):
         self._reencoding.run()
         published = self._upkeep.run()
         self.operations.tidy()
+        self.imports.tidy()
         return published
 
     def rebuild_index(self, map_name: str) -> int:

@@ -28,7 +28,7 @@ def parsed(given: object) -> object:
     try:
         return from_json(given)
     except ValueError as error:
-        raise ValueError(f"not JSON ({error}); a form has a filter as JSON text") from error
+        raise ValueError(f"not JSON ({error}); a form has an object as JSON text") from error
 
 
 _Several = Annotated[list[Label], Field(min_length=1, max_length=100)]

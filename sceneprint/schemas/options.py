@@ -6,11 +6,11 @@ import math
 from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, StringConstraints
-from pydantic_core import from_json
 
 from sceneprint.geometry.acceptance import AcceptanceParameters, Mode
 from sceneprint.geometry.diversity import DiversityParameters
 from sceneprint.schemas.base import Given, Told
+from sceneprint.schemas.filters import parsed
 
 Stage = Literal["retrieve", "diversify", "validate"]
 STAGES: tuple[Stage, ...] = ("retrieve", "diversify", "validate")
@@ -24,17 +24,8 @@ _A, _D = AcceptanceParameters(), DiversityParameters()
 Named = Annotated[str, StringConstraints(min_length=1, max_length=128)]
 
 
-def _parsed(given: object) -> object:
-    if not isinstance(given, str):
-        return given
-    try:
-        return from_json(given)
-    except ValueError as error:
-        raise ValueError(f"not JSON ({error}); a form has an object as JSON text") from error
-
-
 #: An object in JSON; a form and a query string give it as text.
-JsonText = BeforeValidator(_parsed)
+JsonText = BeforeValidator(parsed)
 
 
 class NamedFrame(Given):

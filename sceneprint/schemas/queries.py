@@ -71,7 +71,7 @@ class Query(Given):
     explain_frame: Named | None = Field(
         default=None,
         description="A frame of the map: say where it was lost. It is compared and validated for "
-        "this even where the query did not.",
+        "this even where the query did not. Of several maps, the first that has one of this id.",
     )
     keep: bool = Field(
         default=True,
@@ -164,11 +164,13 @@ class Answer(Told):
     counts: Counts
     milliseconds: dict[str, float] = Field(
         description="`prepare` (signature and geometry of the query), `retrieve`, `diversify`, "
-        "`validate`, `total`."
+        "`validate`, `explain` where it was asked for, `total`."
     )
     maps: list[str] = Field(default=[], description="The maps that were asked.")
     frame: FrameName | None = Field(
-        default=None, description="The stored frame that was asked for; null for an upload."
+        default=None,
+        description="The stored frame that was asked for; null for an upload. Transforms call its "
+        "camera by its id where its own map alone was asked, and `query.optical` else.",
     )
     per_map: dict[str, OfMap] | None = Field(
         default=None, description="What each of several maps had; null where one was asked."

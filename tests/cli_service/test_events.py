@@ -30,6 +30,8 @@ def test_events_are_listed(sceneprint: Run, service_url: str) -> None:
     assert json.loads(line)["kind"] == "map.created"
     (said, _) = sceneprint("events", "--after", made.id, "--kind", "map.")
     assert [line.split()[0] for line in said.splitlines()] == [str(gone.id)]
+    (said, _) = sceneprint("events", "--after", made.id - 1, "--kind", "map.", "--limit", 1)
+    assert [line.split()[0] for line in said.splitlines()] == [str(made.id)]
     (said, told) = sceneprint("events", "--map", "events-b", expect=2)
     assert (said, "There is no map 'events-b'." in told) == ("", True)
 

@@ -181,7 +181,7 @@ def test_a_query_is_told_in_a_table(sceneprint: Run, house: str, rooms: Path) ->
 def test_queries_as_json(sceneprint: Run, house: str, rooms: Path) -> None:
     done = sceneprint("query", house, rooms / "room-1", "--json", "--seed", 3, "--exact")
     lines = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [line["frame"] for line in lines] == [f"seq-01/frame-00000{i}" for i in range(3)]
+    assert [line["name"] for line in lines] == [f"seq-01/frame-00000{i}" for i in range(3)]
     for line in lines:
         answer = Answer.model_validate(line)
         assert (answer.counts.map, answer.seed, answer.exact) == (6, 3, True)
@@ -191,7 +191,7 @@ def test_queries_as_json(sceneprint: Run, house: str, rooms: Path) -> None:
     answer = Answer.model_validate_json(done.stdout)
     assert (answer.status, len(answer.matches)) == ("unvalidated", 2)
     by_name = sceneprint("query", house, rooms, "--frame", file, "--json", "--stages", "retrieve")
-    assert json.loads(by_name.stdout)["frame"] == "room-1/seq-01/frame-000002"
+    assert json.loads(by_name.stdout)["name"] == "room-1/seq-01/frame-000002"
 
 
 def test_queries_that_cannot_be_asked(

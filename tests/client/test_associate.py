@@ -127,6 +127,15 @@ def test_list_remove_and_refusals(both: tuple[Filled, Filled], place: int) -> No
     done = client.wait_for_association(begun, timeout_s=60)
     assert done.result is not None
     assert done.result.frames == 3
+    of = MAP, begun.association_id
+    for ask, field in (
+        (lambda: client.graph(*of, "gtsam"), "format"),  # type: ignore[arg-type]
+        (lambda: client.graph(*of, min_overlap=2.0), "min_overlap"),
+        (lambda: list(client.edges(*of, min_overlap=-0.1)), "min_overlap"),
+    ):
+        with pytest.raises(InvalidRequest) as caught:
+            ask()
+        assert [name for name, _ in caught.value.fields] == [field]
     client.delete_association(MAP, begun.association_id)
     assert [one.association_id for one in client.associations(MAP)] == before
     for name in (begun.association_id, "../jobs"):
@@ -207,5 +216,9 @@ def test_the_command(
     assert told["result"]["joins"] == []
     assert main([*of, "--out", str(tmp_path / "graph.gtsam")]) == 2
     assert "does not say what it is" in capsys.readouterr().err
+    begun = len(list(client.associations(MAP)))
+    assert main([*of, "--out", str(tmp_path / "no" / "graph.g2o")]) == 2  # before it is begun
+    assert "No such file or directory" in capsys.readouterr().err
+    assert len(list(client.associations(MAP))) == begun
     assert main([*of, "--session", "nobody"]) == 2
     assert "no indexed frame" in capsys.readouterr().err

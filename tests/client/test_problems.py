@@ -44,7 +44,7 @@ def test_no_proxy_stands_before_this_machine(
         asked.append(given)
         return is_loopback(given)
 
-    monkeypatch.setattr("sceneprint.client.remote.is_loopback", noted)
+    monkeypatch.setattr("sceneprint.client.sending.is_loopback", noted)
     with Client(f"http://{host}:8008") as client:
         mounts = client._backend._http._mounts  # type: ignore[attr-defined]
     assert (len(mounts) > 0, asked) == (proxied, [host.strip("[]").lower()])
