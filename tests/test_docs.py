@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAPER = (ROOT / "docs/paper.md").read_text()
 README = (ROOT / "README.md").read_text()
 MODEL = (ROOT / "docs/model.md").read_text()
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 GEOMETRY = sorted((ROOT / "sceneprint/geometry").glob("*.py"))
 ROWS = re.findall(r"^\| ((?:Eq\.|Sec\.)[^|]+) \| `([^`:]+):(\w+)`", PAPER, re.MULTILINE)
 
@@ -92,8 +93,21 @@ def test_docs_name_the_shipped_models_as_they_are() -> None:
 
 
 def test_no_blank_is_left_to_fill_in() -> None:
-    pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")]
-    assert [page.name for page in pages if "@@" in page.read_text()] == []
+    assert [page.name for page in PAGES if "@@" in page.read_text()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if target.startswith("https://"):
+            continue
+        name, _, heading = target.partition("#")
+        path = page.parent / name if name else page
+        assert path.exists(), target
+        if heading:
+            titles = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
+            marks = {re.sub(r"[^\w -]", "", one).lower().replace(" ", "-") for one in titles}
+            assert heading in marks, target
 
 
 def test_every_dependency_has_a_reason() -> None:
@@ -169,7 +183,7 @@ def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
             printed[arguments[0]] = done.stdout
     assert "6 indexed" in printed["upload"]
     assert "found" in printed["query"]
-    assert printed["localize"].startswith("found")
+    assert ": found (strong); " in printed["localize"]
     assert "EDGE_SE3:QUAT" in (tmp_path / "loops.g2o").read_text()
     assert "room-000/seq-01" in printed["frames"]
     assert "frame.indexed" in printed["events"]
