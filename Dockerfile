@@ -20,8 +20,9 @@ WORKDIR /src
 COPY pyproject.toml requirements.txt ./
 
 # The lock holds the dev extra as well: it is a constraint here, what to install says pyproject.toml.
-# Without open3d: 0.9 GB with what it brings, and it wants libGL, libX11 and libusb. Only benchmarks
-# load it (an import contract in pyproject.toml keeps that true), and they are not in the image.
+# Without open3d: 0.9 GB with what it brings, and it wants libGL, libX11 and libusb. Only benchmarks,
+# which are not in the image, and reconstructions load it (an import contract in pyproject.toml keeps
+# that true): here those fail, and name what is missing. All else works.
 # Without pip in the environment: the final stage installs nothing.
 RUN python -m venv --without-pip /opt/sceneprint && \
     python -c "import tomllib; print(*(d for d in tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies'] if not d.startswith('open3d')), sep='\n')" > runtime.txt && \

@@ -23,6 +23,7 @@ from benchmarks import curves, disk, recall
 from benchmarks.growth_page import GrowthFigures, section, table
 from benchmarks.machine import pin_to_one_processor
 from benchmarks.maps import Library, dense, grown, join, noise, read_library, thousands
+from benchmarks.pages import put_between
 from benchmarks.trajectories import laps, make, signed
 from sceneprint.datasets import find_sequences
 from sceneprint.models import PRESETS, read_model
@@ -134,11 +135,8 @@ def write_page(figures: GrowthFigures, page: Path) -> None:
     """Replace the marked section of a page, and the picture beside it."""
     from benchmarks.growth_picture import draw
 
-    text = page.read_text()
-    before, rest = text.split(BEGIN)
-    own = "\n".join([BEGIN, *section(figures, "growth.png"), END])
     draw(figures, page.with_name("growth.png"))
-    page.write_text(before + own + rest.split(END)[1])
+    put_between(page, BEGIN, END, section(figures, "growth.png"))
 
 
 if __name__ == "__main__":

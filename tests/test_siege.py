@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.siege.__main__ import BEGIN, END, besieged, known_of, table, write_page
+from benchmarks.pages import put_between
+from benchmarks.siege.__main__ import BEGIN, END, besieged, known_of, table
 from benchmarks.siege.contract import ContractFigures, try_contract
 from benchmarks.siege.mutations import MutationFigures, besiege, mutated
 from benchmarks.siege.overload import OverloadFigures, overload
@@ -63,7 +64,7 @@ def test_the_page_tells_what_was_measured(tmp_path: Path) -> None:
     lines = table(mutations, [contract] * 4, overloaded)
     page = tmp_path / "page.md"
     page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    write_page(page, lines)
+    put_between(page, BEGIN, END, lines)
     text = page.read_text()
     assert text.startswith("before")
     assert text.endswith("after\n")

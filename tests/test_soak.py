@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.pages import put_between
 from benchmarks.soak import kills
-from benchmarks.soak.__main__ import BEGIN, END, table, write_page
+from benchmarks.soak.__main__ import BEGIN, END, table
 from benchmarks.soak.answers import State
 from benchmarks.soak.checking import CrowdFigures, K, check, faults
 from benchmarks.soak.crowd import STABLE, crowd
@@ -104,7 +105,7 @@ def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
     page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
     of_kills = KillFigures({"service": 3, "a writer": 1}, 9, 1, 0, 0, 0, 2, 0, 40, 0, 5, 3, 60.0)
     lines = table(of_kills, CrowdFigures(8, 8, 120, 5, 6, 7))
-    write_page(page, lines)
+    put_between(page, BEGIN, END, lines)
     text = page.read_text()
     assert text.startswith(f"before\n{BEGIN}\n### 4 kills within 60 s\n")
     assert text.endswith(f"{END}\nafter\n")

@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from benchmarks.machine import describe_machine
+from benchmarks.pages import put_between
 from benchmarks.siege.contract import ContractFigures, try_contract
 from benchmarks.siege.mutations import MutationFigures, besiege
 from benchmarks.siege.overload import OverloadFigures, overload
@@ -147,19 +148,11 @@ def table(
     ]
 
 
-def write_page(page: Path, lines: list[str]) -> None:
-    """Put the figures between the marks of a page."""
-    text = page.read_text()
-    head, rest = text.split(BEGIN)
-    tail = rest.split(END)[1]
-    page.write_text("\n".join([head + BEGIN, *lines, END]) + tail)
-
-
 def main() -> int:
     """Run all of it; exit code 1 where anything failed, was lost, or was not as declared."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--uploads", type=int, default=20_000, help="that are broken")
-    parser.add_argument("--examples", type=int, default=50, help="requests of each operation")
+    parser.add_argument("--examples", type=int, default=20, help="requests of each operation")
     parser.add_argument("--seconds", type=float, default=120, help="of too many requests")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--page", type=Path, help="whose figures to replace")
@@ -184,7 +177,7 @@ def main() -> int:
     lines = ["", when, "", *table(mutations, tried, overloaded)]
     print("\n".join(lines))
     if options.page is not None:
-        write_page(options.page, lines)
+        put_between(options.page, BEGIN, END, lines)
     unanswered = overloaded.statuses.get(0, 0) + overloaded.lost
     wrong = len(mutations.failed) + mutations.crashed + unanswered
     return int(bool(wrong) or not all(one.sound for one in tried))

@@ -181,16 +181,14 @@ def besiege(
     statuses: Counter[int] = Counter()
     sent: Counter[str] = Counter()
     failed: list[str] = []
-    lock, own = threading.Lock(), threading.local()
+    lock = threading.Lock()
     start = time.perf_counter()
     bar = tqdm(total=n, desc="mutated uploads", disable=None, leave=False)
 
     def send(number: int) -> None:
-        if not hasattr(own, "client"):
-            own.client = httpx.Client(base_url=url, timeout=60, trust_env=False)
         upload = mutated(shots, seed, number)
         try:
-            status, text = _send(own.client, upload, number)
+            status, text = _send(client, upload, number)
         except httpx.HTTPError as error:
             status, text = 0, repr(error)
         with lock:
@@ -200,7 +198,8 @@ def besiege(
             if status == 0 or (status >= 500 and status != 503):
                 failed.append(f"upload {number} of {upload.kind}: {status} {text[:300]}")
 
-    with bar, ThreadPoolExecutor(threads) as pool:
+    client = httpx.Client(base_url=url, timeout=60, trust_env=False)  # all threads may use it
+    with bar, client, ThreadPoolExecutor(threads) as pool:
         list(pool.map(send, range(n)))
     seconds = time.perf_counter() - start
     after = {pid for part in parts for pid in [part.pid, *part.children()]}

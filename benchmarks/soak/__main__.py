@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from benchmarks.machine import describe_machine
+from benchmarks.pages import put_between
 from benchmarks.soak.checking import CrowdFigures
 from benchmarks.soak.crowd import STABLE, crowd
 from benchmarks.soak.kills import KillFigures, kill
@@ -53,14 +54,6 @@ def table(kills: KillFigures, crowded: CrowdFigures) -> list[str]:
     ]
 
 
-def write_page(page: Path, lines: list[str]) -> None:
-    """Put the figures between the marks of a page."""
-    text = page.read_text()
-    head, rest = text.split(BEGIN)
-    tail = rest.split(END)[1]
-    page.write_text("\n".join([head + BEGIN, *lines, END]) + tail)
-
-
 def main() -> int:
     """Run all of it; exit code 1 where anything was lost, doubled, locked or wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -92,7 +85,7 @@ def main() -> int:
     lines = ["", when, "", *table(of_kills, of_crowd)]
     print("\n".join(lines))
     if options.page is not None:
-        write_page(options.page, lines)
+        put_between(options.page, BEGIN, END, lines)
     lost = of_kills.lost + of_kills.doubled + of_kills.half_written
     wrong = of_kills.differing + of_kills.wrong + len(of_crowd.wrong) + len(of_crowd.errors)
     idle = 0 in (of_crowd.uploads, of_crowd.deletions, of_crowd.answers)  # nothing was tried

@@ -230,5 +230,9 @@ def test_models_are_listed_with_the_maps_that_may_be_named(make_engine, small_mo
             engine.operations.catalogue.find(name)
     for name in (small_model.id, small_model.label):
         assert engine.operations.catalogue.find(name).id == small_model.id
+        assert engine.operations.catalogue.find(name, "shop".__eq__).id == small_model.id
+        with pytest.raises(InvalidRequest, match="There is no model"):  # another's alone
+            engine.operations.catalogue.find(name, "hall".__eq__)
+    assert engine.operations.catalogue.find(compact.label, lambda _: False).id == compact.id
     with pytest.raises(Conflict, match="is being signed with"):
         engine.reencode("shop", engine.operations.catalogue.find("paper"))

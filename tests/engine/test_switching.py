@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from sceneprint.engine import Engine, readers, reencoding
-from sceneprint.engine import engine as engines
+from sceneprint.engine import Engine, querying, readers, reencoding
 from sceneprint.engine import work as working
+from sceneprint.engine.deadlines import Deadline
 from sceneprint.engine.readers import index_folder
 from sceneprint.errors import Busy, ModelMismatch, UselessFrame
 from sceneprint.geometry.retrieval import distances
@@ -141,7 +141,7 @@ def test_a_query_signed_before_the_switch_is_signed_again(
         return run
 
     for name in ("ask_upload", "ask_stored", "answer"):
-        monkeypatch.setattr(engines, name, then_switch(getattr(engines, name)))
+        monkeypatch.setattr(querying, name, then_switch(getattr(querying, name)))
     del models[1:]
     answer = full.query_upload("hall", uploads[4].data, uploads[4].meta, Query())
     assert answer.model.startswith("small-")
@@ -153,7 +153,7 @@ def test_a_query_signed_before_the_switch_is_signed_again(
     assert answer.model.startswith("compact-")
     assert found(answer) == right(names, by_model, answer.model, 4)[1:]
     monkeypatch.undo()
-    monkeypatch.setattr(engines, "answer", then_switch(engines.answer))
+    monkeypatch.setattr(querying, "answer", then_switch(querying.answer))
     models[:] = [small_file]
     answer = full.query_upload("hall", uploads[4].data, uploads[4].meta, R)
     assert answer.model.startswith("small-")
@@ -166,10 +166,11 @@ def test_signatures_of_two_models_are_not_compared_whatever_their_length(
     full: Engine, uploads: Any, small_model: Model, signer: Signer
 ) -> None:
     row = full._row("hall")
-    asked = engines.ask_upload(uploads[0].data, uploads[0].meta, signer, R)
-    assert full._answer(row, asked, R).matches[0].distance == 0
+    asked = querying.ask_upload(uploads[0].data, uploads[0].meta, signer, R)
+    given = ([row], asked, R, Deadline(None))
+    assert full.queries.answer(*given).matches[0].distance == 0
     with pytest.raises(ModelMismatch, match="two models cannot be compared"):
-        full._answer(row, replace(asked, model_id=small_model.id), R)
+        full.queries.answer([row], replace(asked, model_id=small_model.id), R, Deadline(None))
 
 
 def test_what_was_being_signed_at_the_switch_is_signed_with_the_new_model(
