@@ -22,7 +22,19 @@ from sceneprint.pipeline import Signer, open_signer
 from sceneprint.synth import synthesise_room
 from sceneprint.types import Frame
 
+#: Files that are begun first: no process is left alone with one of them in the end.
+LONG = (
+    "test_same_as_evaluate.py", "test_quality.py", "test_soak.py", "test_siege.py", "test_tour.py",
+    "test_bench_rows.py", "test_container.py", "test_kill.py", "test_docs.py", "test_survival.py",
+)  # fmt: skip
+
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put long files first."""
+    places = {name: place for place, name in enumerate(LONG)}
+    items.sort(key=lambda item: places.get(item.path.name, len(LONG)))
 
 
 @pytest.fixture(scope="session")

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, BinaryIO, Protocol, cast
 from sceneprint.client.messages import snapshot_path
 from sceneprint.client.sending import Sender
 from sceneprint.errors import DamagedSnapshot, SnapshotError, Unreachable
-from sceneprint.maintenance.shelf import SNAPSHOT, Shelf
 from sceneprint.schemas import Job, JobState, Page
 from sceneprint.schemas.snapshots import SnapshotFile
 
 if TYPE_CHECKING:
     from sceneprint.client.backend import Backend
     from sceneprint.engine import Engine
+    from sceneprint.maintenance.shelf import Shelf
 
 #: Times that a download goes on where it broke off.
 _TRIES = 5
@@ -89,23 +89,31 @@ class EmbeddedSnapshots:
 
     _engine: Engine
 
+    @property
+    def _shelf(self) -> Shelf:
+        from sceneprint.maintenance.shelf import Shelf
+
+        return Shelf(self._engine.settings)
+
     def begin_snapshot(self) -> Job:
         """Queue the taking of a snapshot."""
+        from sceneprint.maintenance.shelf import SNAPSHOT
+
         waiting = self._engine.list_jobs(JobState.QUEUED, limit=1, kind=SNAPSHOT).items
         return waiting[0] if waiting else self._engine.tasks.begin(SNAPSHOT, None, {})
 
     def list_snapshots(self) -> list[SnapshotFile]:
         """Snapshots that are kept."""
-        return list(Shelf(self._engine.settings).list())
+        return list(self._shelf.list())
 
     def fetch_snapshot(self, snapshot_id: str, file: BinaryIO) -> None:
         """Write the bytes of one to a file."""
-        with Shelf(self._engine.settings).path(snapshot_id).open("rb") as archive:
+        with self._shelf.path(snapshot_id).open("rb") as archive:
             shutil.copyfileobj(archive, file, 1 << 20)
 
     def delete_snapshot(self, snapshot_id: str) -> None:
         """Remove one."""
-        Shelf(self._engine.settings).delete(snapshot_id)
+        self._shelf.delete(snapshot_id)
 
 
 class Snapshots:

@@ -28,6 +28,7 @@ from sceneprint.errors import (
     NotFound,
     SceneprintError,
     SnapshotError,
+    StoreError,
     UnknownJob,
     UnusableStore,
 )
@@ -51,7 +52,7 @@ LEFT_S = 5.0
 HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, SnapshotError)
 
 
-class Swept(UnusableStore):
+class Swept(StoreError):
     """A deletion removed a file between its making and the commit that would have referred to it;
     nothing was stored."""
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
@@ -247,3 +249,12 @@ def test_retry_after() -> None:
     in_a_minute = datetime.now(UTC) + timedelta(seconds=60)
     assert 58.0 < retry_after_s(format_datetime(in_a_minute, usegmt=True)) <= 60.0
     assert retry_after_s("Wed, 21 Oct 2015 07:28:00 GMT") == 0.0
+
+
+def test_a_robot_loads_neither_engine_nor_store() -> None:
+    told = subprocess.run(
+        [sys.executable, "-c", "import sys, sceneprint.client; print(*sys.modules)"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    heavy = {"sqlalchemy", "faiss", "fastapi", "open3d", "sceneprint.engine", "sceneprint.store"}
+    assert heavy & set(told.stdout.split()) == set()

@@ -80,8 +80,12 @@ class Server:
     def log(self, message: str = "") -> list[dict[str, Any]]:
         """Lines of standard error, or those with a message; each must be JSON."""
         text = self.errors.read_text()
-        whole = text[: text.rfind("\n") + 1]
-        lines = [json.loads(line) for line in whole.splitlines()]
+        # by this mark alone: a name in a line may hold others, such as U+2028
+        whole = text.split("\n")[:-1]
+        try:
+            lines = [json.loads(line) for line in whole]
+        except json.JSONDecodeError as error:
+            raise AssertionError(f"not JSON in the log: {error.doc[:500]!r}") from error
         return [line for line in lines if not message or line["message"] == message]
 
     def ready(self, workers: int = 1) -> None:

@@ -1,4 +1,4 @@
-"""Service and worker killed at 20 random moments of an upload run: nothing acknowledged is lost."""
+"""Service and worker killed at nine random moments of an upload run: nothing acknowledged is lost."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 
 import httpx
 
-KILLS, FRAMES = 20, 80
+KILLS, FRAMES = 9, 36
 
 
 class Uploader(threading.Thread):
