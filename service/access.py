@@ -1,5 +1,8 @@
 """Who asks, and what they may: one path for all routes.
 
+What depends on nothing slow is asked in the event loop: a thread's turn comes late where many
+are at work.
+
 What a caller may not read is not there: the same answer, word for word, as where there is none.
 """
 
@@ -10,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from anyio import to_thread
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
@@ -108,7 +112,7 @@ def anybody() -> Caller:
     return Caller("", {EVERY: "admin"})
 
 
-def caller(
+async def caller(
     request: Request, here: Here,
     given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Caller:  # fmt: skip
@@ -124,7 +128,7 @@ def caller(
         return found
     if given is None:
         raise KeyRequired(_why(request, here))
-    key = here.engine.find_key(given.credentials)
+    key = await to_thread.run_sync(here.engine.find_key, given.credentials)
     if key is None or (key.expires_at is not None and key.expires_at <= time.time()):
         _admit(request, here.limits.failed_keys, place_of(address_of(request)))
         raise KeyRequired(_why(request, here) if key is None else _EXPIRED)
@@ -138,7 +142,7 @@ def caller(
 Asking = Annotated[Caller, Depends(caller)]
 
 
-def guest(
+async def guest(
     request: Request, here: Here,
     given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Caller | None:  # fmt: skip
@@ -148,7 +152,9 @@ def guest(
     ------
     KeyRequired : an unknown one was shown, or one that has expired.
     """
-    return None if given is None and asks_for_key(request, here) else caller(request, here, given)
+    if given is None and asks_for_key(request, here):
+        return None
+    return await caller(request, here, given)
 
 
 Guest = Annotated[Caller | None, Depends(guest)]
@@ -193,27 +199,27 @@ def _why(request: Request, here: Here) -> str:
     )
 
 
-def may_read(map_name: str, asking: Asking) -> None:
+async def may_read(map_name: str, asking: Asking) -> None:
     """For routes of a map: UnknownMap where the caller may not read it."""
     asking.require(map_name, "read")
 
 
-def may_write(map_name: str, asking: Asking) -> None:
+async def may_write(map_name: str, asking: Asking) -> None:
     """For routes that change what is in a map."""
     asking.require(map_name, "write")
 
 
-def may_admin(map_name: str, asking: Asking) -> None:
+async def may_admin(map_name: str, asking: Asking) -> None:
     """For routes that change a map itself."""
     asking.require(map_name, "admin")
 
 
-def reads_every(asking: Asking) -> None:
+async def reads_every(asking: Asking) -> None:
     """For routes that tell of all maps together."""
     asking.require_every("read")
 
 
-def administers(asking: Asking) -> None:
+async def administers(asking: Asking) -> None:
     """For routes that are the operator's."""
     asking.require_every("admin")
 

@@ -105,7 +105,7 @@ class Context:
     limits: Limits
 
 
-def _context(request: Request) -> Context:
+async def _context(request: Request) -> Context:
     return cast(Context, request.app.state.context)
 
 

@@ -18,6 +18,9 @@ from service.connections import Connection, make_room
 
 log = logging.getLogger(__name__)
 
+#: Seconds after which a thread that computes lets another go on: the event loop waits for each of
+#: a dozen in turn, and answers nobody meanwhile.
+SWITCH_S = 0.0005
 #: Seconds that requests in flight may take after the signal to stop.
 GRACE_S = 20
 
@@ -82,6 +85,7 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
         proxy_headers=False,  # uvicorn would believe X-Forwarded-For of whoever is on this machine
     )
     raise_descriptors()
+    sys.setswitchinterval(SWITCH_S)
     make_room()
     _Server(config, lambda: ready(url, read_only), lambda: app.state.context.feed.close()).run(
         sockets=[listening]
