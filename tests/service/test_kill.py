@@ -1,4 +1,4 @@
-"""Service and worker killed at nine random moments of an upload run: nothing acknowledged is lost."""
+"""Service and worker killed at nine random moments of an upload run: nothing is lost."""
 
 from __future__ import annotations
 
