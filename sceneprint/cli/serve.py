@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import signal
 import threading
 from pathlib import Path
@@ -81,8 +82,8 @@ def run(options: argparse.Namespace) -> int:
     from worker.supervisor import Supervisor
 
     settings = settings_of(options)
-    prepare_presets(settings)
-    log_as_json()
+    log_as_json()  # from the first line on
+    prepare_presets(settings, logging.getLogger(__name__).info)
     supervisor, stop = Supervisor(settings), threading.Event()
     watching = threading.Thread(target=supervisor.watch, args=(stop,), name="supervisor")
 

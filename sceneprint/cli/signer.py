@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -46,33 +47,41 @@ def open_for(options: argparse.Namespace, settings: Settings) -> Signer:
     return signer
 
 
-def prepare_presets(settings: Settings) -> None:
+def prepare_presets(settings: Settings, say: Callable[[str], None] | None = None) -> None:
     """See that code is compiled and the presets' tables are built, once an installation.
 
     So that a service's first frame does not wait for what a person can watch now.
+
+    Parameters
+    ----------
+    settings : see Settings
+    say : what tells that it takes a while (default: a line on standard error)
     """
     from sceneprint.engine.warming import warm
 
-    if _announce():
+    if _announce(say):
         warm(_opened("paper", settings))
     for preset in PRESETS:
         _opened(preset, settings)
 
 
-def _announce() -> bool:
+def _announce(say: Callable[[str], None] | None = None) -> bool:
     """Whether the code is yet to be compiled; says so."""
     folder, pattern = compiled_at()
     new = not any(Path(folder).glob(pattern))
     if new:
-        print(
-            "sceneprint: first use of this installation; compiling (once, about 10 seconds)",
-            file=sys.stderr,
-        )
+        (say or _print)("first use of this installation; compiling (once, about 10 seconds)")
     return new
 
 
+def _print(text: str) -> None:
+    print(f"sceneprint: {text}", file=sys.stderr)
+
+
 def _opened(model: str | Path, settings: Settings) -> Signer:
-    with tqdm(desc=f"pair table of {model}", unit="bin", unit_scale=True, delay=0.5) as bar:
+    name = f"pair table of {model}"
+    # no bar among the lines of a log
+    with tqdm(desc=name, unit="bin", unit_scale=True, delay=0.5, disable=None) as bar:
 
         def progress(done: int, total: int) -> None:
             bar.total = total

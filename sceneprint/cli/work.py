@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from typing import Any
 
 from sceneprint.cli.serve import add_data_option, add_workers_option, settings_of
@@ -30,7 +31,7 @@ def run(options: argparse.Namespace) -> int:
     settings = settings_of(options)
     with Engine(settings) as engine:  # what is wrong is said once, and not by every worker
         engine.store.database.require_writable()
-    prepare_presets(settings)
-    log_as_json()
+    log_as_json()  # from the first line on
+    prepare_presets(settings, logging.getLogger(__name__).info)
     work(settings)
     return 0

@@ -16,7 +16,7 @@ from sceneprint.schemas import FrameMeta, NewMap
 #: The workers as they are, but for what they do with frames of some focal lengths. Nothing but
 #: the bell, and the time of the next try, wakes those that wait.
 SCRIPT = """
-import ctypes, sys
+import ctypes, logging, sys
 import numpy as np
 import sceneprint.engine.work as work
 import sceneprint.store.queue as queue
@@ -28,7 +28,9 @@ worker.supervisor.GRACE_S = 1.0
 prepare = work.prepare
 
 def crashing(): ctypes.string_at(0)
-def hanging(): ctypes.PyDLL(None).sleep(600)  # never gives the interpreter back
+def hanging():
+    logging.getLogger("spoilt").info("hanging")
+    ctypes.PyDLL(None).sleep(600)  # never gives the interpreter back
 def hungry(): return np.ones(1 << 30, np.uint8)
 def broken(): raise ZeroDivisionError("a bug")
 
@@ -93,8 +95,9 @@ def test_a_frame_that_ends_its_worker_is_given_up_and_costs_no_other(crew, frame
 
 
 def test_a_worker_that_does_not_stop_gives_its_job_back(crew, frames):
+    before = len(crew.log("hanging"))
     job = add_marked(crew.engine, frames[20], "hanging")
-    crew.until(lambda: crew.job(job, "state") == ("running",))
+    crew.until(lambda: len(crew.log("hanging")) > before)  # claimed alone, it would be put back
     crew.process.terminate()
     assert crew.process.wait(60) == 0
     assert crew.pid(job) in [line["pid"] for line in crew.log("worker does not stop")]
