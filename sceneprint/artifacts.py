@@ -103,7 +103,8 @@ def write_geometry(geometry: Geometry) -> bytes:
     ----------
     geometry : see Geometry; its model id is 64 hexadecimal digits
     """
-    surface, patches, k = geometry.surface, geometry.patches, geometry.surface.intrinsics
+    surface, patches, k = geometry.surface, geometry.patches, geometry.surface.camera
+    assert isinstance(k, Intrinsics)
     z = surface.points[..., 2][surface.valid]
     scale = 1.0 / (float(z.min()) * 65535.0) if z.size else 1.0
     packed = np.zeros((k.height, k.width, 3), np.uint16)

@@ -1,4 +1,4 @@
-"""The records that travel between the parts: frames and their camera.
+"""The records that travel between the parts: frames, and what is made of them.
 
 Inside sceneprint lengths are metres, angles radians, times seconds; any other unit is
 in the name. Camera frames are optical: x right, y down, z forward.
@@ -6,98 +6,36 @@ in the name. Camera frames are optical: x right, y down, z forward.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.errors import InvalidIntrinsics
+from sceneprint.cameras import MAXIMUM_PIXELS, MAXIMUM_SAMPLES, Camera, Intrinsics, Sphere
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Ints32 = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
 
-#: Most samples a depth image may have (an 8-megapixel sensor); more is refused unread.
-MAXIMUM_SAMPLES = 8_388_608
-
-#: Longest focal length and farthest principal point that are believed, pixels.
-MAXIMUM_PIXELS = 1e7
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """A pinhole camera: pixel = (fx x/z + cx, fy y/z + cy), pixel centres at integers.
-
-    Parameters
-    ----------
-    width, height : size of the image, pixels
-    fx, fy : focal lengths, pixels
-    cx, cy : principal point, pixels
-    distortion : Brown-Conrady coefficients k1, k2, p1, p2[, k3] in OpenCV's order and
-        meaning; empty for an image without distortion
-
-    Raises
-    ------
-    InvalidIntrinsics : a size below 1, a focal length that is not positive and finite, a
-        principal point that is not finite, or a number of coefficients other than 0, 4, 5.
-    """
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise InvalidIntrinsics(
-                f"The image size {self.width} x {self.height} is empty. "
-                "Give the width and height of the depth image in pixels."
-            )
-        if self.width * self.height > MAXIMUM_SAMPLES:
-            raise InvalidIntrinsics(
-                f"The image size {self.width} x {self.height} exceeds the limit of "
-                f"{MAXIMUM_SAMPLES} samples. Send the image at a lower resolution."
-            )
-        for name, value in (("fx", self.fx), ("fy", self.fy)):
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidIntrinsics(
-                    f"The focal length {name} = {value} is not a positive number, so pixels "
-                    "have no direction. Give it in pixels, as the sensor's calibration states."
-                )
-            if not 1e-3 <= value <= MAXIMUM_PIXELS:
-                raise InvalidIntrinsics(
-                    f"The focal length {name} = {value:g} is that of no camera. "
-                    "Give it in pixels, as the sensor's calibration states."
-                )
-        if not (math.isfinite(self.cx) and math.isfinite(self.cy)):
-            raise InvalidIntrinsics(
-                f"The principal point ({self.cx}, {self.cy}) is not finite. "
-                "Give cx and cy in pixels, as the sensor's calibration states."
-            )
-        if max(abs(self.cx), abs(self.cy)) > MAXIMUM_PIXELS:
-            raise InvalidIntrinsics(
-                f"The principal point ({self.cx:g}, {self.cy:g}) is that of no camera. "
-                "Give cx and cy in pixels, as the sensor's calibration states."
-            )
-        if len(self.distortion) not in (0, 4, 5):
-            raise InvalidIntrinsics(
-                f"{len(self.distortion)} distortion coefficients were given. "
-                "Give k1, k2, p1, p2 and optionally k3, or none."
-            )
-        if not all(math.isfinite(k) for k in self.distortion):
-            raise InvalidIntrinsics(
-                f"The distortion coefficients {self.distortion} are not all finite. "
-                "Give k1, k2, p1, p2 and optionally k3 as the calibration states."
-            )
-
-    def without_distortion(self) -> Intrinsics:
-        """The same camera after its images have been undistorted."""
-        return replace(self, distortion=())
+__all__ = [
+    "MAXIMUM_PIXELS",
+    "MAXIMUM_SAMPLES",
+    "AnyFrame",
+    "Bytes",
+    "Camera",
+    "Cloud",
+    "Floats",
+    "Floats32",
+    "Frame",
+    "Geometry",
+    "Hierarchy",
+    "Intrinsics",
+    "Ints32",
+    "Patches",
+    "Sphere",
+    "Surface",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +57,35 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
+class Cloud:
+    """One point cloud, as the geometry reads it.
+
+    Parameters
+    ----------
+    points : (N, 3) float32, metres, in the sensor's axes, the viewpoint at the origin; all finite
+    has_viewpoint : False for points that were not seen from one place, as those fused of many
+        views: nothing is known of free space then
+    name : what to call the frame in lines and errors
+    pose : (4, 4) T_parent_sensor, or None where unknown; never read by the geometry
+    note : what was done to the points on the way, for people; empty where nothing was
+    """
+
+    points: Floats32
+    has_viewpoint: bool = True
+    name: str = ""
+    pose: Floats | None = None
+    note: str = ""
+
+
+#: A frame of either kind.
+AnyFrame = Frame | Cloud
+
+
+@dataclass(frozen=True, eq=False)
 class Surface:
     """What the sensor saw, as an ordered map of points and normals.
+
+    Points that are in no order, as those of a cloud, are a map of one row without a camera.
 
     Parameters
     ----------
@@ -128,14 +93,14 @@ class Surface:
     normals : (h, w, 3) float32, unit length, towards the sensor; 0 where not valid
     valid : (h, w) bool
     areas : (h, w) float32, square metres of surface seen by each pixel; 0 where not valid
-    intrinsics : the camera of this (reduced) map
+    camera : of this (reduced) map; None for points in no order
     """
 
     points: Floats32
     normals: Floats32
     valid: NDArray[np.bool_]
     areas: Floats32
-    intrinsics: Intrinsics
+    camera: Camera | None
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,7 +80,7 @@ def test_round_trip(geometries: list[Geometry]) -> None:
     for geometry in geometries:
         read, was = read_geometry(write_geometry(geometry)), geometry.surface
         seen, valid = read.surface, was.valid
-        assert seen.intrinsics == was.intrinsics
+        assert seen.camera == was.camera
         assert read.model_id == geometry.model_id
         np.testing.assert_array_equal(seen.valid, valid)
         assert valid.mean() > 0.4
@@ -132,7 +132,7 @@ def test_the_same_bytes_again(geometries: list[Geometry]) -> None:
 def test_size_of_a_kinect_frame(geometries: list[Geometry]) -> None:
     for geometry in geometries:
         data = write_geometry(geometry)
-        k, n = geometry.surface.intrinsics, len(geometry.patches)
+        k, n = geometry.surface.camera, len(geometry.patches)
         assert (k.width, k.height) == (160, 120)
         assert len(data) == HEAD + BODY + 6 * 160 * 120 + n * (36 + 128)
         assert len(data) <= 262_144

@@ -38,7 +38,7 @@ from sceneprint.store import Store
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import geometry_blobs
-from sceneprint.types import Floats, Frame, Geometry
+from sceneprint.types import Floats, Frame, Geometry, Intrinsics
 
 Source = Literal["upload", "geometry"]
 Strength = Literal["strong", "weak"]
@@ -191,7 +191,8 @@ def _frame(geometry: Geometry, name: str, T: Floats) -> Frame:
     """The depth that an artifact keeps, with a pose."""
     surface = geometry.surface
     depth = np.where(surface.valid, surface.points[..., 2], np.float32(0))
-    return Frame(np.ascontiguousarray(depth, np.float32), surface.intrinsics, name, T)
+    assert isinstance(surface.camera, Intrinsics)
+    return Frame(np.ascontiguousarray(depth, np.float32), surface.camera, name, T)
 
 
 def _points(geometry: Geometry) -> Floats:

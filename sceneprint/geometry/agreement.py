@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.types import Floats, Floats32, Intrinsics, Surface
+from sceneprint.types import Camera, Floats, Floats32, Intrinsics, Surface
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,9 @@ def sampled(surface: Surface, stride: int) -> Floats32:
     return np.ascontiguousarray(np.concatenate([points, normals], axis=1))
 
 
-def camera_of(k: Intrinsics) -> Floats:
+def camera_of(k: Camera | None) -> Floats:
     """fx, fy, cx, cy as kernels take them."""
+    assert isinstance(k, Intrinsics)
     return np.array([k.fx, k.fy, k.cx, k.cy])
 
 
@@ -152,7 +153,7 @@ def agreements(
     out = np.zeros((len(transforms), 2))
     w = np.ones(len(source), np.float32) if weights is None else weights
     _weigh_all(
-        source, w, target.points, target.normals, camera_of(target.intrinsics),
+        source, w, target.points, target.normals, camera_of(target.camera),
         np.ascontiguousarray(transforms), tolerances(p), out,
     )  # fmt: skip
     return out

@@ -204,7 +204,7 @@ def refine(
     """
     T, information = np.array(T_target_source, float), np.zeros((6, 6))
     used, mean_square = refine_in_place(
-        source, target.points, target.normals, camera_of(target.intrinsics), T,
+        source, target.points, target.normals, camera_of(target.camera), T,
         numbers_of(p), information,
     )  # fmt: skip
     return Refined(T, information, used, mean_square) if used else None
@@ -214,7 +214,7 @@ def refined_all(
     source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
 ) -> Floats:
     """Each of the hypotheses (n, 4, 4) refined; those that lose the surface are left out."""
-    points, camera = sampled(source, p.stride), camera_of(target.intrinsics)
+    points, camera = sampled(source, p.stride), camera_of(target.camera)
     numbers, information = numbers_of(p), np.zeros((6, 6))
     kept = []
     for hypothesis in hypotheses:

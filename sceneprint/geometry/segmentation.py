@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.types import Floats32, Ints32, Patches, Surface
+from sceneprint.types import Floats32, Intrinsics, Ints32, Patches, Surface
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,10 @@ def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
     labels : (h, w) int32, 0 to P - 1 in the order of the image; -1 for none
     """
     height, width = surface.valid.shape
+    assert isinstance(surface.camera, Intrinsics)
     spacing = max(math.sqrt(height * width / p.n_patches), 1.0)
     rows, columns = max(round(height / spacing), 1), max(round(width / spacing), 1)
-    focal_length = math.sqrt(surface.intrinsics.fx * surface.intrinsics.fy)
+    focal_length = math.sqrt(surface.camera.fx * surface.camera.fy)
     y, x = np.mgrid[:height, :width]
     cell_y = np.minimum((y / spacing).astype(np.int32), rows - 1)
     cell_x = np.minimum((x / spacing).astype(np.int32), columns - 1)

@@ -73,7 +73,7 @@ def judged(
     """What becomes of each of a source's points (N, 6): (N,) NEITHER, AGREES or VIOLATES."""
     out = np.zeros(len(source), np.uint8)
     _judge(
-        source, target.points, target.normals, camera_of(target.intrinsics),
+        source, target.points, target.normals, camera_of(target.camera),
         np.ascontiguousarray(T_target_source), tolerances(p), out,
     )  # fmt: skip
     return out

@@ -18,7 +18,7 @@ P = AgreementParameters()
 
 def oracle(source: Floats32, target: Surface, T: Floats, p: AgreementParameters) -> tuple[int, int]:
     """Inliers and violations, point after point."""
-    k, inliers, violations = target.intrinsics, 0, 0
+    k, inliers, violations = target.camera, 0, 0
     for row in source.astype(float):
         point, normal = T[:3, :3] @ row[:3] + T[:3, 3], T[:3, :3] @ row[3:]
         if point[2] <= 0.1:

@@ -36,7 +36,7 @@ def step_oracle(
 ) -> tuple[Floats, Floats, int]:
     """Information, step and points of one Gauss-Newton step, from the definition."""
     J, r, w = [], [], []
-    k = target.intrinsics
+    k = target.camera
     for row in source.astype(float):
         point, normal = T[:3, :3] @ row[:3] + T[:3, 3], T[:3, :3] @ row[3:]
         u = int(np.floor(point[0] / point[2] * k.fx + k.cx + 0.5))

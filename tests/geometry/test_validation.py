@@ -107,7 +107,7 @@ def off(v: Validation, T: Floats) -> tuple[float, float]:
 
 def flipped(g: Geometry, signs: tuple[float, float, float]) -> Geometry:
     """Everything with x or y, or both, the other way round, as another camera would see it."""
-    s, k = g.surface, g.surface.intrinsics
+    s, k = g.surface, g.surface.camera
     f = np.array(signs, np.float32)
     way = (slice(None, None, int(signs[1])), slice(None, None, int(signs[0])))
     camera = replace(
@@ -297,7 +297,7 @@ def test_what_was_not_seen_supports_nothing(
         np.zeros_like(s.normals),
         np.zeros_like(s.valid),
         np.zeros_like(s.areas),
-        s.intrinsics,
+        s.camera,
     )
     for a, b in ((query, replace(match, surface=blank)), (replace(match, surface=blank), query)):
         v = sane(validate(a, b))
