@@ -39,7 +39,7 @@ class Feed:
     ----------
     database : that is looked at while anybody listens
     most : streams at once
-    kept : newest events that are kept for sure
+    kept : newest events of each map that are kept for sure
     """
 
     def __init__(self, database: Database, most: int, kept: int) -> None:
@@ -67,8 +67,8 @@ class Feed:
         """
         if self._closed or self._streams >= self._most:
             raise Busy(
-                f"{self._streams} streams of events are open, as many as the service keeps. Close "
-                "one, ask for a page of events instead, or come back later."
+                "As many streams of events are open as the service keeps. Close one, ask for a "
+                "page of events instead, or come back later."
             )
         self._streams += 1
 
@@ -89,10 +89,11 @@ class Feed:
     async def batches(
         self, wanted: Wanted, after: int | None, may_go_on: Callable[[], bool]
     ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
-        """Events as they come, with the number up to which all have been told.
+        """Events as they come, each time with the number of the last one that the reader may know
+        and needs no more.
 
         At first, and once in ALIVE_S whatever else there is, the list is empty: others' events are
-        no silence to the poller, and are to who waits for his own.
+        no silence to the poller, and are to who waits for his own. Nor do they move the number.
 
         Parameters
         ----------
@@ -111,31 +112,34 @@ class Feed:
     ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
         if self._poller is None or self._poller.done():
             self._poller = asyncio.create_task(self._poll())
-        place, first = await to_thread.run_sync(begin, self._database, self._kept, after)
-        yield first, place  # also where it is empty: the reader learns its place
+        first, place, seen = await to_thread.run_sync(
+            begin, self._database, wanted, self._kept, after
+        )
+        yield first, seen  # also where it is empty: the reader learns its place
         clock = asyncio.get_running_loop().time
         due = clock() + ALIVE_S
         while not self._closed:
             if clock() >= due:
                 if not await to_thread.run_sync(may_go_on):
                     return
-                yield [], place
+                yield [], seen
                 due = clock() + ALIVE_S
             news = self._news
             if self._since is None or place < self._since:
-                found, place = await to_thread.run_sync(
+                found, place, seen = await to_thread.run_sync(
                     read_on, self._database, wanted, place, MOST
                 )
                 if found:
-                    yield found, place
+                    yield found, seen
                     continue
                 if self._since is not None and place < self._since:
                     continue
             if self._since is not None and place < self._newest:
                 held, place = self._after(place)
+                seen = max((event.number for event in held if wanted.sees(event)), default=seen)
                 found = [event for event in held if wanted(event)]
                 if found:
-                    yield found, place
+                    yield found, seen
                 continue
             with suppress(TimeoutError):
                 await asyncio.wait_for(news.wait(), max(due - clock(), 0.0))

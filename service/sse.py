@@ -27,8 +27,8 @@ def message(event: Event) -> bytes:
     return f"id: {event.id}\ndata: {event.model_dump_json()}\n\n".encode()
 
 
-def alive(place: int) -> bytes:
-    """A comment, and the place up to which there was nothing to be told."""
+def alive(place: str) -> bytes:
+    """A comment, and the id to come back with: there was nothing to be told."""
     return f": alive\nid: {place}\n\n".encode()
 
 

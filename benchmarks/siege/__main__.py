@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 import time
@@ -27,16 +28,26 @@ from sceneprint.settings import Settings
 #: Seconds in which a service has to begin, on a machine that others use too.
 _BEGIN_S = 90.0
 BEGIN, END = "<!-- siege:begin -->", "<!-- siege:end -->"
+#: Whom `contracts` asks, in its order.
+ASKED_OF = (
+    "an open service", "what is there", "its own map, with a key for one map",
+    "another map, with a key for one map", "no key",
+)  # fmt: skip
 
 
 @contextmanager
-def besieged(data: Path, indexed: list[Shot], **settings: object) -> Iterator[tuple[str, Part]]:
-    """A service with one worker and a map `siege` that holds some frames.
+def besieged(
+    data: Path, indexed: list[Shot], maps: tuple[str, ...] = ("siege",), key: str | None = None,
+    **settings: object,
+) -> Iterator[tuple[str, Part]]:  # fmt: skip
+    """A service with one worker and maps that hold some frames.
 
     Parameters
     ----------
     data : its data folder
-    indexed : frames that are in the map before
+    indexed : frames that are in each map before
+    maps : their names
+    key : that may make them, where one is asked for
     settings : as for Settings
     """
     port = free_port()
@@ -45,10 +56,11 @@ def besieged(data: Path, indexed: list[Shot], **settings: object) -> Iterator[tu
     url = f"http://127.0.0.1:{port}"
     try:
         await_service(url)
-        with Client(url) as client:
-            client.create_map("siege", model=MODEL)
-            for one in indexed:
-                client.upload("siege", one.png, one.meta, wait_s=60)
+        with Client(url, key) as client:
+            for name in maps:
+                client.create_map(name, model=MODEL)
+                for one in indexed:
+                    client.upload(name, one.png, one.meta, wait_s=60)
         yield url, part
     finally:
         part.end()
@@ -64,38 +76,40 @@ def await_service(url: str) -> None:
             time.sleep(0.1)
 
 
-def known_of(url: str) -> dict[str, str]:
-    """Names of what is there, for parameters of the paths."""
-    with Client(url) as client:
-        frame = next(iter(client.frames("siege")))
-        query = client.query("siege", frame_id=frame.frame_id)
+def known_of(url: str, map_name: str = "siege", key: str | None = None) -> dict[str, str]:
+    """Names of what there is of a map, for parameters of the paths."""
+    with Client(url, key) as client:
+        frame = next(iter(client.frames(map_name)))
+        query = client.query(map_name, frame_id=frame.frame_id)
     return {
-        "path.map_name": "siege", "path.frame_id": frame.frame_id, "path.job_id": frame.job_id,
+        "path.map_name": map_name, "path.frame_id": frame.frame_id, "path.job_id": frame.job_id,
         "path.query_id": query.query_id,
     }  # fmt: skip
 
 
 def contracts(folder: Path, frames: list[Shot], examples: int, seed: int) -> list[ContractFigures]:
-    """Every operation: of an open service, of what is there, and of one that asks for keys."""
+    """Every operation: of an open service, of what is there; and of one that asks for keys: of
+    the map that a key is for, of another, which it may not see, and without one.
+    """
     found = []
     with besieged(folder / "open", frames) as (url, _):
         found.append(try_contract(url, folder, examples=examples, seed=seed))
     with besieged(folder / "known", frames) as (url, _):
         known = known_of(url)
         found.append(try_contract(url, folder, known=known, examples=examples, seed=seed))
-    keyed, port = folder / "keyed", free_port()
+    keyed, maps = folder / "keyed", ("siege", "other")
     keyed.mkdir()
     with Engine(Settings(data_dir=keyed, database_url=None)) as engine:
-        key = engine.create_key("fuzzer", {"siege": "write"}).secret
-    part = service(keyed, port, workers=1, host="0.0.0.0", requests_per_s=0)
-    part.begin()
-    try:
-        url = f"http://127.0.0.1:{port}"
-        await_service(url)
-        found.append(try_contract(url, folder, key=key, examples=examples, seed=seed))
+        own = engine.create_key("fuzzer", {"siege": "write"}).secret
+        every = engine.create_key("operator").secret
+    walls = {"host": "0.0.0.0", "requests_per_s": 0}
+    with besieged(keyed, frames, maps, every, **walls) as (url, _):
+        for name in maps:
+            known = known_of(url, name, every)
+            found.append(
+                try_contract(url, folder, key=own, known=known, examples=examples, seed=seed)
+            )
         found.append(try_contract(url, folder, examples=max(examples // 5, 1), seed=seed))
-    finally:
-        part.end()
     return found
 
 
@@ -122,14 +136,7 @@ def table(
         "",
         "| asked of | answered as declared, none with 5xx |",
         "|---|--:|",
-        *(
-            f"| {of} | {count} |"
-            for of, count in zip(
-                ("an open service", "what is there", "a key for one map", "no key"),
-                asked,
-                strict=True,
-            )
-        ),
+        *(f"| {of} | {count} |" for of, count in zip(ASKED_OF, asked, strict=True)),
         "",
         f"### {overloaded.offered:.0f} requests a second where {overloaded.sustainable:.0f} can "
         f"be done, for {overloaded.seconds:.0f} s",
@@ -157,6 +164,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--page", type=Path, help="whose figures to replace")
     options = parser.parse_args()
+    load = os.getloadavg()[1]  # of what else there is to do
     every = shots(160)
     with tempfile.TemporaryDirectory(prefix="sceneprint-siege-") as name:
         folder = Path(name)
@@ -174,6 +182,11 @@ def main() -> int:
         f"Measured {datetime.now(UTC):%Y-%m-%d} on {machine.processor}, "
         f"{machine.cores} processors; `make siege`."
     )
+    if load > machine.cores / 4:
+        when += (
+            f" The machine was shared with other work: before it began, {load:.1f} processes "
+            "wanted a processor on average."
+        )
     lines = ["", when, "", *table(mutations, tried, overloaded)]
     print("\n".join(lines))
     if options.page is not None:

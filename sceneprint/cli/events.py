@@ -35,7 +35,7 @@ def add_to(commands: Any) -> None:
     )  # fmt: skip
     command.add_argument("--follow", action="store_true", help="go on with what happens")
     command.add_argument(
-        "--after", type=whole, metavar="N", help="begin behind the event of this number"
+        "--after", metavar="ID", help="begin behind the event of this id; 0: with the oldest kept"
     )
     command.add_argument(
         "--limit", type=whole, metavar="N",
@@ -84,5 +84,5 @@ def _print(found: Iterable[Event], *, as_json: bool) -> None:
         else:
             about = [event.map, event.frame_id, *(f"{k}={v}" for k, v in event.data.items())]
             told = "  ".join(one_line(one) for one in about if one is not None)
-            print(f"{event.id:8}  {event.at:%Y-%m-%d %H:%M:%S}  {event.kind:22}  {told}".rstrip())
+            print(f"{event.id}  {event.at:%Y-%m-%d %H:%M:%S}  {event.kind:22}  {told}".rstrip())
         sys.stdout.flush()  # who follows wants it now, also through a pipe

@@ -26,13 +26,13 @@ class EventsBackend(Protocol):
     """What events need of whoever does the work."""
 
     def list_events(
-        self, map_name: str | None, kinds: Sequence[str], after: int | None, cursor: str | None,
+        self, map_name: str | None, kinds: Sequence[str], after: str | None, cursor: str | None,
         limit: int, *, newest_first: bool,
     ) -> EventPage:  # fmt: skip
         """A page of the events that are kept."""
 
     def follow_events(
-        self, map_name: str | None, kinds: Sequence[str], after: int | None
+        self, map_name: str | None, kinds: Sequence[str], after: str | None
     ) -> Iterator[Event]:
         """Events as they happen, for ever."""
 
@@ -41,7 +41,7 @@ class RemoteEvents(Sender):
     """Over HTTP."""
 
     def list_events(
-        self, map_name: str | None, kinds: Sequence[str], after: int | None, cursor: str | None,
+        self, map_name: str | None, kinds: Sequence[str], after: str | None, cursor: str | None,
         limit: int, *, newest_first: bool,
     ) -> EventPage:  # fmt: skip
         """A page of the events that are kept."""
@@ -54,7 +54,7 @@ class RemoteEvents(Sender):
         )
 
     def follow_events(
-        self, map_name: str | None, kinds: Sequence[str], after: int | None
+        self, map_name: str | None, kinds: Sequence[str], after: str | None
     ) -> Iterator[Event]:
         """Events as they happen, for ever."""
         from sceneprint.client.problems import refusal
@@ -90,22 +90,22 @@ class EmbeddedEvents:
     _engine: Engine
 
     def list_events(
-        self, map_name: str | None, kinds: Sequence[str], after: int | None, cursor: str | None,
+        self, map_name: str | None, kinds: Sequence[str], after: str | None, cursor: str | None,
         limit: int, *, newest_first: bool,
     ) -> EventPage:  # fmt: skip
         """A page of the events that are kept."""
         return self._engine.operations.events(
-            self._engine.operations.wanted(map_name, kinds), after=after or 0, cursor=cursor,
+            self._engine.operations.wanted(map_name, kinds), after=after, cursor=cursor,
             limit=limit, newest_first=newest_first,
         )  # fmt: skip
 
     def follow_events(
-        self, map_name: str | None, kinds: Sequence[str], after: int | None
+        self, map_name: str | None, kinds: Sequence[str], after: str | None
     ) -> Iterator[Event]:
         """Events as they happen, for ever; the store is looked at four times a second."""
         operations = self._engine.operations
         wanted = operations.wanted(map_name, kinds)
-        place, found = operations.begin(after)
+        found, place = operations.begin(wanted, after)
         while True:
             yield from found
             if not found:
@@ -119,7 +119,7 @@ class Events:
     _backend: EventsBackend
 
     def events(
-        self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: int | None = None,
+        self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
         follow: bool = True,
     ) -> Iterator[Event]:  # fmt: skip
         """Events in the order in which they happened: those that are kept, and those to come.
@@ -132,14 +132,14 @@ class Events:
         ----------
         map_name : only of this map
         kinds : beginnings of the kinds that are wanted, such as `frame.`; default: all
-        after : number of the event to begin behind, 0 for all that are kept; default: 0, or the
+        after : id of the event to begin behind, "0" for all that are kept; default: these, or the
             newest where they are followed
         follow : go on for ever with what happens; else end with what has happened
 
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : a kind that cannot be one.
+        InvalidRequest : a kind that cannot be one, or an id of no event.
         Unreachable : there is no service, when this is asked first.
         """
         if follow:
@@ -147,7 +147,7 @@ class Events:
         return self._kept_events(map_name, kinds, after)
 
     def event_page(
-        self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: int | None = None,
+        self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
         cursor: str | None = None, limit: int = 100, newest_first: bool = True,
     ) -> EventPage:  # fmt: skip
         """Some of the events that are kept, the newest first; `cursor` is that of another page."""
@@ -156,7 +156,7 @@ class Events:
         )
 
     def _kept_events(
-        self, map_name: str | None, kinds: Sequence[str], after: int | None
+        self, map_name: str | None, kinds: Sequence[str], after: str | None
     ) -> Iterator[Event]:
         cursor = None
         while True:

@@ -1,6 +1,6 @@
 """A stream of events over HTTP, read for as long as anybody wants it.
 
-lines  --messages-->  events, each with the number to go on from  --followed-->  events for ever
+lines  --messages-->  events, each with the id to go on from  --followed-->  events for ever
 """
 
 from __future__ import annotations
@@ -56,19 +56,19 @@ def messages(lines: Iterable[str], place: Place) -> Iterator[Event]:
             place.pause_s = min(float(value[:9]) / 1e3, SILENCE_S)
 
 
-def followed(opened: Callable[[str | None], httpx.Response], after: int | None) -> Iterator[Event]:
+def followed(opened: Callable[[str | None], httpx.Response], after: str | None) -> Iterator[Event]:
     """Events of one stream after the other, as if it were one.
 
     Parameters
     ----------
     opened : asks for a stream, from an `id` on; raises where there will be none
-    after : number of the event to begin behind; None: from now on
+    after : id of the event to begin behind; None: from now on
     """
     import httpx
 
     from sceneprint.errors import Unreachable
 
-    place = Place(None if after is None else str(after))
+    place = Place(after)
     met = False
     while True:
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from sceneprint.engine.cursors import row_of
+from sceneprint.engine.cursors import opened
 from sceneprint.schemas import Page
 from sceneprint.schemas.keys import Audited
 from sceneprint.store import Store
@@ -54,10 +54,11 @@ class Audit:
         ------
         InvalidRequest : a cursor that was not given out.
         """
-        before = row_of(cursor)
+        seals = self._store.seals
+        before = opened(seals, "audit", cursor)
         with self._store.database.read() as connection:
             found = stored.list_changes(connection, before, limit + 1, actor, map_name)
-        more = str(found[limit - 1].number) if len(found) > limit else None
+        more = seals.seal("audit", found[limit - 1].number) if len(found) > limit else None
         return Page[Audited](items=[_told(one) for one in found[:limit]], next_cursor=more)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sceneprint.engine import happenings
 from sceneprint.engine.catalogue import Catalogue
-from sceneprint.engine.cursors import row_of
+from sceneprint.engine.cursors import event_of, opened
 from sceneprint.engine.lags import anchors
 from sceneprint.engine.statistics import Statistics
 from sceneprint.engine.wire import when
@@ -20,15 +20,10 @@ from sceneprint.schemas.operations import ModelInfo
 from sceneprint.settings import Settings
 from sceneprint.store import Store
 from sceneprint.store.bell import Bell
-from sceneprint.store.events import (
-    EventRow,
-    Wanted,
-    list_events,
-    newest_number,
-    remove_events,
-    spent_numbers,
-)
+from sceneprint.store.events import EventRow, Wanted, list_events, newest_seen
 from sceneprint.store.maps import find_map
+from sceneprint.store.retention import remove_events, spent_numbers
+from sceneprint.store.seals import Seals
 
 log = logging.getLogger(__name__)
 
@@ -79,49 +74,59 @@ class Operations:
             row = find_map(connection, map_name)
         return Wanted(frozenset((row.name,)), tuple(kinds))
 
-    def begin(self, after: int | None) -> tuple[int, list[Event]]:
-        """See `happenings.begin`."""
-        place, found = happenings.begin(self._store.database, self._settings.events_kept, after)
-        return place, [tell_event(one) for one in found]
+    def begin(self, wanted: Wanted, after: str | None) -> tuple[list[Event], int]:
+        """The place to read on from, behind the event of an id, and what is to be told first.
+
+        Raises
+        ------
+        InvalidRequest : no id of an event.
+        """
+        last = None if after is None else event_of(self._store.seals, after)
+        found, place, _ = happenings.begin(
+            self._store.database, wanted, self._settings.events_kept, last
+        )
+        return self._told(found), place
 
     def read_on(self, wanted: Wanted, place: int) -> tuple[list[Event], int]:
         """See `happenings.read_on`."""
-        found, place = happenings.read_on(self._store.database, wanted, place, AT_A_TIME)
-        return [tell_event(one) for one in found], place
+        found, place, _ = happenings.read_on(self._store.database, wanted, place, AT_A_TIME)
+        return self._told(found), place
 
     def events(
-        self, wanted: Wanted, *, after: int = 0, cursor: str | None = None, limit: int = 100,
-        newest_first: bool = False,
+        self, wanted: Wanted, *, after: str | None = None, cursor: str | None = None,
+        limit: int = 100, newest_first: bool = False,
     ) -> EventPage:  # fmt: skip
         """A page of events.
 
         Parameters
         ----------
         wanted : which
-        after : only those with a greater number
+        after : only those that followed the event of this id
         cursor : `next_cursor` of the page before
         limit : at most so many
         newest_first : else the oldest first
 
         Raises
         ------
-        InvalidRequest : a cursor that was not given out.
+        InvalidRequest : a cursor that was not given out, or no id of an event.
         """
-        place, before = row_of(cursor), None
+        seals, before = self._store.seals, None
+        least = 0 if after is None else event_of(seals, after)
+        place = opened(seals, "event", cursor)
         if place is not None:
-            after, before = (after, place) if newest_first else (max(after, place), None)
+            least, before = (least, place) if newest_first else (max(least, place), None)
         with self._store.database.read() as connection:
-            newest = newest_number(connection)
+            newest = newest_seen(connection, wanted)
             found = list_events(
-                connection, wanted, after=after, before=before, limit=limit + 1,
+                connection, wanted, after=least, before=before, limit=limit + 1,
                 newest_first=newest_first,
             )  # fmt: skip
-        more = len(found) > limit
-        return EventPage(
-            items=[tell_event(one) for one in found[:limit]],
-            next_cursor=str(found[limit - 1].number) if more else None,
-            newest=newest,
-        )
+        items = self._told(found[:limit])
+        more = items[-1].id if len(found) > limit else None
+        return EventPage(items=items, next_cursor=more, newest=seals.seal("event", newest))
+
+    def _told(self, found: Sequence[EventRow]) -> list[Event]:
+        return [tell_event(self._store.seals, one) for one in found]
 
     def models(self, may_read: Callable[[str], bool] = lambda _: True) -> list[ModelInfo]:
         """Models that maps can be signed with, each with the maps that may be named."""
@@ -160,10 +165,10 @@ class Operations:
         return removed
 
 
-def tell_event(row: EventRow) -> Event:
+def tell_event(seals: Seals, row: EventRow) -> Event:
     """An event as JSON tells it."""
     return Event(
-        id=row.number,
+        id=seals.seal("event", row.number),
         at=when(row.at),
         kind=row.kind,
         map=row.map,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.engine.transforms import transform
-from sceneprint.engine.wire import camera_frame
+from sceneprint.engine.wire import sensor_of
 from sceneprint.geometry.covariance import PAIR_METHOD, PLACE_METHOD, Method, free_directions
 from sceneprint.geometry.diversity import Selection
 from sceneprint.geometry.retrieval import Ranking
@@ -38,7 +38,7 @@ class Found:
     rows : frames of the candidates by number; those deleted in the meantime are not among them
     unreadable : numbers of frames whose artifact cannot be read, and why
     untried : why the other candidates were not tried
-    query_frame : what the query's camera frame is called
+    query_frame : what the coordinates of the query's sensor are called
     base : what the robot's base is called, and T_base_query (4, 4); None where it is not known
     """
 
@@ -132,7 +132,7 @@ def _match(
         selected=selected,
         diversity_gain=gain,
         validation=validation,
-        transform=None if T is None else transform(T, camera_frame(row.id), found.query_frame),
+        transform=None if T is None else transform(T, sensor_of(row), found.query_frame),
         pose_in_map=(
             None if in_map is None else transform(in_map, str(row.pose_parent), found.query_frame)
         ),

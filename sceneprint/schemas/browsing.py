@@ -96,7 +96,8 @@ class Trajectory(Told):
         description="Where the poses lead; null where no frame of the run has one."
     )
     child_frame: str = Field(
-        default="optical", description="Of each camera: x right, y down, z forward."
+        default="optical",
+        description="Of each camera: x right, y down, z forward; of a cloud, its sensor's.",
     )
     frame_ids: list[str]
     poses: list[list[float]] = Field(

@@ -37,9 +37,9 @@ MISSED = "events.missed"
 class Event(Told):
     """Something that happened."""
 
-    id: int = Field(
-        description="Grows with every event; what a stream takes as `Last-Event-ID` and a request "
-        "as `after`."
+    id: str = Field(
+        description="Of no meaning but to be given back: as `Last-Event-ID` to a stream, as "
+        "`after` to a request. Ids have no order; events are told in theirs."
     )
     at: datetime
     kind: str = Field(
@@ -56,7 +56,7 @@ class Event(Told):
 class EventPage(Page[Event]):
     """A part of the events that are kept."""
 
-    newest: int = Field(
-        description="Number of the newest event of all when this was asked, 0 where there was "
-        "none yet: what follows it is told by a stream with this as `after`."
+    newest: str = Field(
+        description="Id of the newest event of your maps, of whatever kind, when this was asked; "
+        "0 where there was none yet: what follows it is told by a stream with this as `after`."
     )

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, delete, func, insert, or_, select
+from sqlalchemy import Connection, func, insert, or_, select
 
-from sceneprint.store.tables import events, maps
+from sceneprint.store.tables import events
 
 
 def tell(
@@ -88,16 +87,34 @@ class Wanted:
 
     def __call__(self, event: EventRow) -> bool:
         """Whether an event is one of them."""
+        return self.sees(event) and (not self.kinds or event.kind.startswith(self.kinds))
+
+    def sees(self, event: EventRow) -> bool:
+        """Whether an event is one that may be told, of whatever kind."""
         if self.maps is None:
-            seen = event.map is not None or not self.of_maps
-        else:
-            seen = event.map in self.maps
-        return seen and (not self.kinds or event.kind.startswith(self.kinds))
+            return event.map is not None or not self.of_maps
+        return event.map in self.maps
 
 
 def newest_number(connection: Connection) -> int:
     """Number of the newest event, 0 where there is none."""
     return int(connection.execute(select(func.max(events.c.number))).scalar() or 0)
+
+
+def newest_seen(connection: Connection, wanted: Wanted) -> int:
+    """Number of the newest event that may be told, of whatever kind; 0 where there is none.
+
+    What is told of how far somebody has read is this, and never the number of an event that is
+    hidden: when it changes, the caller was told what happened.
+    """
+    if wanted.maps is not None:
+        newest = select(func.max(events.c.number))
+        of = [connection.execute(newest.where(events.c.map == one)) for one in wanted.maps]
+        return max((int(one.scalar() or 0) for one in of), default=0)
+    if not wanted.of_maps:
+        return newest_number(connection)
+    last = select(events.c.number).where(events.c.map.is_not(None))
+    return int(connection.execute(last.order_by(events.c.number.desc()).limit(1)).scalar() or 0)
 
 
 def list_events(
@@ -122,47 +139,6 @@ def list_events(
         fits = [events.c.kind.startswith(one, autoescape=True) for one in wanted.kinds]
         asked = asked.where(or_(*fits))
     return [EventRow(**row) for row in connection.execute(asked).mappings()]
-
-
-def spent_numbers(
-    connection: Connection, kept: int, anchors: Collection[int], limit: int
-) -> list[int]:
-    """Numbers of events that may be removed, the oldest first.
-
-    An index is believed while the event is there that was the last of its map when it was made:
-    its anchor. So of each map the last one stays of those that are old enough to go: an index
-    that is being published has no other. And so do the anchors of indexes that are there.
-
-    Parameters
-    ----------
-    connection : of the database
-    kept : newest events that stay
-    anchors : numbers that stay too
-    limit : at most so many
-    """
-    floor = newest_number(connection) - kept
-    oldest = connection.execute(select(func.min(events.c.number))).scalar()
-    if oldest is None or oldest > floor:
-        return []
-    last = [
-        connection.execute(
-            select(func.max(events.c.number)).where(events.c.map == name, events.c.number <= floor)
-        ).scalar()
-        for name in connection.execute(select(maps.c.name)).scalars()
-    ]
-    stay = {number for number in (*last, *anchors) if number is not None and number <= floor}
-    found = connection.execute(
-        select(events.c.number)
-        .where(events.c.number <= floor)
-        .order_by(events.c.number)
-        .limit(limit + len(stay))
-    ).scalars()
-    return [number for number in found if number not in stay][:limit]
-
-
-def remove_events(connection: Connection, numbers: Sequence[int]) -> None:
-    """Remove events; see `spent_numbers`."""
-    connection.execute(delete(events).where(events.c.number.in_(numbers)))
 
 
 def anchor_number(anchor: str) -> int | None:

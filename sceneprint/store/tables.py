@@ -66,7 +66,7 @@ frames = Table(
     Column("content_id", String(64)),  # null when deleted: the same frame may come again
     Column("blob", String(64), nullable=False),
     Column("bytes", Integer, nullable=False),
-    Column("intrinsics", JSON, nullable=False),
+    Column("intrinsics", JSON, nullable=False),  # JSON's null of a cloud
     Column("depth_scale", Float, nullable=False),
     Column("depth_along_ray", Boolean, nullable=False),
     Column("robot", String(128)),
@@ -84,6 +84,7 @@ frames = Table(
     Column("received_at", Float, nullable=False),
     Column("indexed_at", Float),
     Column("revision", Integer),
+    Column("cloud", JSON(none_as_null=True)),  # what its points are; null: it is a depth image
     UniqueConstraint("map_number", "id"),
     Index(None, "map_number", "content_id"),
     Index(None, "map_number", "revision"),
@@ -245,4 +246,12 @@ samples = Table(
     Column("data", JSON, nullable=False),
     Index(None, "kind", "at"),
     sqlite_autoincrement=True,
+)
+
+#: Made with the database, and never told: see `seals`.
+secrets = Table(
+    "secrets",
+    metadata,
+    Column("name", String(32), primary_key=True),
+    Column("value", LargeBinary, nullable=False),
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
@@ -12,11 +11,11 @@ from typing import Annotated, Literal
 from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
 
-from sceneprint.engine.cursors import row_of
+from sceneprint.engine.cursors import event_of, opened
 from sceneprint.engine.operations import MOST_KINDS, tell_event
-from sceneprint.errors import InvalidRequest
 from sceneprint.schemas.events import EventPage
 from sceneprint.store.events import Wanted
+from sceneprint.store.seals import Seals
 from service.access import Asking, Caller
 from service.context import Context, Here
 from service.feed import Feed
@@ -27,7 +26,7 @@ router = APIRouter(prefix="/events", tags=["operations"])
 
 _STREAM = {
     "description": "A page of events; or, where `Accept` names text/event-stream, a stream that "
-    "goes on: each message has the event's number as `id` and the event as JSON in `data`. "
+    "goes on: each message has the event's `id` and the event as JSON in `data`. "
     "A comment comes every 15 s.",
     "model": EventPage,
     "content": {MEDIA_TYPE: {"schema": {"type": "string"}}},
@@ -49,12 +48,11 @@ async def events(
         ),
     ] = [],  # noqa: B006  (FastAPI copies it)
     after: Annotated[
-        int | None,
+        str | None,
         Query(
-            ge=0,
-            lt=2**62,
-            description="Only events with a greater number. Without it a stream begins with what "
-            "happens from now on.",
+            max_length=64,
+            description="Only events that followed the one of this id; `0`: all that are kept. "
+            "Without it a stream begins with what happens from now on.",
         ),
     ] = None,
     order: Annotated[
@@ -73,23 +71,28 @@ async def events(
 
     With `Accept: text/event-stream` the events come as they happen, half a second late at most,
     each once and in order, also where several processes work on the store. Who lost the stream
-    sends the number of the last event as `Last-Event-ID`, as browsers do by themselves, and
+    sends the id of the last event as `Last-Event-ID`, as browsers do by themselves, and
     misses nothing. Where what is asked for is no longer kept, an event `events.missed` says so.
 
     With a key, events of the maps that it may read; those of no map are for admins of all.
     """
-    wanted = await to_thread.run_sync(_wanted, here, asking, map_name, kind)
-    last = after if last_event_id is None else _number(last_event_id)
-    row_of(cursor)  # a stream has no pages, and what was not given out is no cursor there either
+    seals, place = here.engine.store.seals, "after" if last_event_id is None else "Last-Event-ID"
+    last = after if last_event_id is None else last_event_id
+
+    def asked() -> tuple[Wanted, int | None]:
+        opened(seals, "event", cursor)  # a stream has no pages; what is wrong is told all the same
+        wanted = _wanted(here, asking, map_name, kind)
+        return wanted, None if last is None else event_of(seals, last, place)
+
+    wanted, number = await to_thread.run_sync(asked)
     if MEDIA_TYPE in request.headers.get("accept", ""):
         here.feed.join()
-        return EventStream(
-            _told(here.feed, wanted, last, _still(request, here, asking)), here.feed.leave
-        )
+        told = _told(here.feed, seals, wanted, number, _still(request, here, asking))
+        return EventStream(told, here.feed.leave)
     newest_first = order == "newest" or (order is None and last is None)
     return await to_thread.run_sync(
         lambda: here.engine.operations.events(
-            wanted, after=last or 0, cursor=cursor, limit=limit, newest_first=newest_first
+            wanted, after=last, cursor=cursor, limit=limit, newest_first=newest_first
         )
     )
 
@@ -103,15 +106,6 @@ def _wanted(here: Context, asking: Caller, map_name: str | None, kinds: list[str
     if asking.named is not None:
         return replace(wanted, maps=frozenset(asking.named))
     return replace(wanted, of_maps=True)
-
-
-def _number(last_event_id: str) -> int:
-    if not re.fullmatch(r"[0-9]{1,18}", last_event_id):
-        raise InvalidRequest(
-            f"The Last-Event-ID {last_event_id!r:.40} is none. Send the `id` of an event.",
-            (("Last-Event-ID", "not a number"),),
-        )
-    return int(last_event_id)
 
 
 def _still(request: Request, here: Context, asking: Caller) -> Callable[[], bool]:
@@ -129,9 +123,10 @@ def _still(request: Request, here: Context, asking: Caller) -> Callable[[], bool
 
 
 async def _told(
-    feed: Feed, wanted: Wanted, after: int | None, still: Callable[[], bool]
+    feed: Feed, seals: Seals, wanted: Wanted, after: int | None, still: Callable[[], bool]
 ) -> AsyncGenerator[bytes, None]:
     yield BEGIN
     async with aclosing(feed.batches(wanted, after, still)) as batches:
-        async for found, place in batches:
-            yield b"".join(message(tell_event(one)) for one in found) if found else alive(place)
+        async for found, seen in batches:
+            messages = [message(tell_event(seals, one)) for one in found]
+            yield b"".join(messages) if found else alive(seals.seal("event", seen))

@@ -14,24 +14,25 @@ Run = Callable[..., tuple[str, str]]
 
 def test_events_are_listed(sceneprint: Run, service_url: str) -> None:
     with Client(service_url) as client:
-        for name in ("events-a", "events-b"):
-            client.create_map(name, model="compact")
+        client.create_map("events-a", model="compact")
+        before = client.event_page(limit=1).newest
+        client.create_map("events-b", model="compact")
         client.delete_map("events-b")
         made, gone = [
             client.event_page(kinds=[kind], limit=1).items[0] for kind in ("map.cr", "map.del")
         ]
     (said, _) = sceneprint("events", "--kind", "map.", "--limit", 2)
     assert [line.split() for line in said.splitlines()] == [
-        [str(one.id), f"{one.at:%Y-%m-%d}", f"{one.at:%H:%M:%S}", kind, "events-b"]
+        [one.id, f"{one.at:%Y-%m-%d}", f"{one.at:%H:%M:%S}", kind, "events-b"]
         for one, kind in ((made, "map.created"), (gone, "map.deleted"))
     ]
     (said, _) = sceneprint("events", "--map", "events-a", "--json")
     (line,) = said.splitlines()
     assert json.loads(line)["kind"] == "map.created"
     (said, _) = sceneprint("events", "--after", made.id, "--kind", "map.")
-    assert [line.split()[0] for line in said.splitlines()] == [str(gone.id)]
-    (said, _) = sceneprint("events", "--after", made.id - 1, "--kind", "map.", "--limit", 1)
-    assert [line.split()[0] for line in said.splitlines()] == [str(made.id)]
+    assert [line.split()[0] for line in said.splitlines()] == [gone.id]
+    (said, _) = sceneprint("events", "--after", before, "--kind", "map.", "--limit", 1)
+    assert [line.split()[0] for line in said.splitlines()] == [made.id]
     (said, told) = sceneprint("events", "--map", "events-b", expect=2)
     assert (said, "There is no map 'events-b'." in told) == ("", True)
 
@@ -41,7 +42,7 @@ def test_events_are_followed_line_by_line(service_url: str) -> None:
         newest = client.event_page(limit=1).newest
         command = [sys.executable, "-m", "sceneprint", "events", "--follow", "--url", service_url]
         process = subprocess.Popen(
-            [*command, "--after", str(newest), "--kind", "map.", "--json"],
+            [*command, "--after", newest, "--kind", "map.", "--json"],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert process.stdout is not None

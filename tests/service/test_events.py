@@ -63,6 +63,7 @@ def event(lines: list[str]) -> dict[str, Any]:
 
 def test_a_stream_tells_what_happens_and_goes_on_where_it_broke(served, make_map, small_shots):
     client = served.client
+    newest = client.get("/v1/events").json()["newest"]
     with client.stream("GET", "/v1/events", headers=STREAM) as stream:
         assert stream.headers["content-type"] == "text/event-stream; charset=utf-8"
         assert stream.headers["cache-control"] == "no-store"
@@ -71,9 +72,9 @@ def test_a_stream_tells_what_happens_and_goes_on_where_it_broke(served, make_map
         comment, place = next(came)
         assert comment == ": alive"
         path = make_map(served, "told")
+        assert place == f"id: {newest}"
         first = event(next(came))
         assert (first["kind"], first["map"], first["frame_id"]) == ("map.created", "told", None)
-        assert first["id"] == int(place.removeprefix("id: ")) + 1
         sent = client.post(f"{path}/frames", **small_shots[0].form()).json()
         found = [event(next(came)) for _ in range(2)]
     assert [(one["kind"], one["frame_id"], one["job_id"]) for one in found] == [
@@ -81,7 +82,7 @@ def test_a_stream_tells_what_happens_and_goes_on_where_it_broke(served, make_map
         ("frame.indexed", sent["frame_id"], sent["job_id"]),
     ]
     client.delete(f"{path}/frames/{sent['frame_id']}")  # while nobody listens
-    again = STREAM | {"Last-Event-ID": str(found[0]["id"])}
+    again = STREAM | {"Last-Event-ID": found[0]["id"]}
     with client.stream("GET", "/v1/events?map=told&after=0", headers=again) as stream:
         came = parts(stream)
         assert next(came) == ["retry: 1000"]
@@ -95,9 +96,9 @@ def test_a_stream_tells_what_happens_and_goes_on_where_it_broke(served, make_map
 
 def test_pages_have_all_in_either_order(served, make_map):
     client = served.client
+    after = client.get("/v1/events").json()["newest"]
     for i in range(5):
         make_map(served, f"page-{i}")
-    after = client.get("/v1/events", params={"map": "page-0"}).json()["items"][0]["id"] - 1
     for order in ("oldest", "newest"):
         found, cursor, pages = [], None, 0
         while True:
@@ -124,13 +125,15 @@ def test_pages_have_all_in_either_order(served, make_map):
         ({"kind": "frame%"}, {}),
         ({"kind": "x" * 33}, {}),
         ({"kind": ["a"] * 21}, {}),
-        ({"after": -1}, {}),
-        ({"after": 2**70}, {}),
+        ({"after": "-1"}, {}),
+        ({"after": "17"}, {}),  # ids were numbers once
+        ({"after": "0" * 32}, {}),
         ({"cursor": "x"}, {}),
+        ({"cursor": "0"}, {}),
         ({"limit": 1001}, {}),
         ({"order": "random"}, {}),
         ({}, {"Last-Event-ID": "1e3"}),
-        ({}, {"Last-Event-ID": "-1"}),
+        ({}, {"Last-Event-ID": "17"}),
     ],
 )
 def test_what_cannot_be_asked_is_refused_before_a_stream_begins(served, refused, asked, headers):
@@ -191,7 +194,7 @@ def test_places_are_given_back_and_the_end_comes_at_once(guarded, keys, refused,
             open_streams.enter_context(guarded.client.stream("GET", "/v1/events", headers=headers))
         assert streams() == 2
         answer = guarded.client.get("/v1/events", headers=headers)
-        refused(answer, 503, "busy", "2 streams of events are open")
+        refused(answer, 503, "busy", "As many streams of events are open")
         assert answer.headers["retry-after"] == "1"
         page = guarded.client.get("/v1/events", headers=keys["admin"])
         assert page.status_code == 200

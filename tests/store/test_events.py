@@ -11,16 +11,7 @@ from sqlalchemy import insert, select
 
 from sceneprint.schemas.events import KINDS
 from sceneprint.store import Store, open_store
-from sceneprint.store.events import (
-    Wanted,
-    anchor_of,
-    holds_anchor,
-    list_events,
-    newest_number,
-    remove_events,
-    spent_numbers,
-    tell,
-)
+from sceneprint.store.events import Wanted, list_events, newest_seen
 from sceneprint.store.figures import count_events
 from sceneprint.store.maps import add_map, keep_model
 from sceneprint.store.tables import events
@@ -54,7 +45,7 @@ import time
 def read(store):
     seen, place, until = [], 0, time.monotonic() + 60
     while len(seen) < int(ARGS[2]) and time.monotonic() < until:
-        found, place = read_on(store.database, Wanted(), place, 5)
+        found, place, _ = read_on(store.database, Wanted(), place, 5)
         seen += [(one.number, one.frame_id) for one in found]
     return seen
 
@@ -105,34 +96,10 @@ def test_the_database_and_the_stream_pick_the_same(empty):
         for named, begun, of_maps in itertools.product(maps, kinds, (False, True)):
             wanted = Wanted(named, begun, of_maps)
             assert list_events(connection, wanted) == [one for one in every if wanted(one)]
+            seen = [one.number for one in every if wanted.sees(one)]
+            assert newest_seen(connection, wanted) == max(seen, default=0)
         newest = list_events(connection, Wanted(), before=50, limit=7, newest_first=True)
         assert [one.number for one in newest] == list(range(49, 42, -1))
-
-
-def test_what_is_not_kept_goes_and_the_anchors_stay(empty):
-    fill(empty, 60)
-    with empty.database.read() as connection:
-        anchor = anchor_of(connection, "shop")
-        assert newest_number(connection) == 62
-        assert spent_numbers(connection, 62, (), 99) == []
-        # 1 and 2 made the maps; then hall, shop, none in turn: of 1 to 40 the last ones are 39
-        # and 40, and 17 is an anchor
-        found = spent_numbers(connection, 22, (17, 55), 99)
-        assert found == [n for n in range(1, 41) if n not in (39, 40, 17)]
-        assert spent_numbers(connection, 22, (17,), 5) == [1, 2, 3, 4, 5]
-    with empty.database.write() as connection:
-        remove_events(connection, found)
-        assert spent_numbers(connection, 22, (17,), 99) == []
-        assert holds_anchor(connection, anchor)
-        assert len(list_events(connection, Wanted())) == 62 - len(found)
-        # a map in which nothing happens keeps its last event, however many follow
-        for _ in range(100):
-            tell(connection, "key.created")
-        gone = spent_numbers(connection, 1, (), 999)
-        assert {39, 40} <= set(gone)
-        remove_events(connection, gone)
-        assert holds_anchor(connection, anchor)
-        assert anchor_of(connection, "shop") == anchor
 
 
 def test_events_are_counted_by_interval(empty):

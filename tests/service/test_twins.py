@@ -1,0 +1,228 @@
+"""Two stores with the same map, in one of which much happens in others: a key for the map that
+both have is told the same by either, but for times and for what is drawn by chance.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from anyio.from_thread import BlockingPortal, start_blocking_portal
+
+from sceneprint.engine import Engine
+from sceneprint.schemas.keys import Scope
+from sceneprint.settings import Settings
+from service.app import create_app
+
+KEYS: dict[str, dict[str, Scope]] = {
+    "boss": {"*": "admin"}, "admin": {"alpha": "admin"}, "reader": {"alpha": "read"},
+}  # fmt: skip
+#: Ids and seals; times; how long something took, and in which minutes it was.
+CHANCE = re.compile(r"\b[0-9a-f]{32}\b")
+TIMES = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|\+00:00)")
+TOOK = re.compile(r'"milliseconds":{[^}]*}|"oldest_waiting_s":[\d.e-]+|"minutes":\[[^]]*\]')
+OWN_HEADERS = ("date", "x-request-id", "content-length")
+
+
+@dataclass
+class Twin:
+    """One of the two: a service without workers, whose jobs are done here.
+
+    Parameters
+    ----------
+    client, portal, engine : of the service, which runs in a thread of its own
+    secrets : of the keys
+    busy : whether much happens beside `alpha`
+    """
+
+    client: httpx.AsyncClient
+    portal: BlockingPortal
+    engine: Engine
+    secrets: dict[str, str]
+    shots: list[Any]
+    busy: bool
+    ids: dict[str, str] = field(default_factory=dict)
+    sent: int = 0
+
+    def ask(self, key: str, method: str, path: str, **request: Any) -> Any:
+        headers = {"Authorization": f"Bearer {self.secrets[key]}", **request.pop("headers", {})}
+        asked = partial(self.client.request, method, path, headers=headers, **request)
+        return self.portal.call(asked)
+
+    def work(self) -> None:
+        """Do all jobs that wait."""
+        while (work := self.engine.claim("here:1")) is not None:
+            self.engine.run(work)
+
+    def disturb(self) -> None:
+        """What would show, if anything of it did: rows of every table that others number too."""
+        if not self.busy:
+            return
+        shot = self.shots[4 + self.sent % 40]
+        self.sent += 1
+        self.ask("boss", "POST", "/v1/maps/bravo/frames", **shot.form(session="there"))
+        self.ask("boss", "POST", "/v1/maps", json={"name": f"c{self.sent}", "model": "compact"})
+        self.ask("boss", "DELETE", f"/v1/maps/c{self.sent}")
+        self.ask("boss", "POST", "/v1/keys", json={"name": f"k{self.sent}"})
+        frames = self.ask("boss", "GET", "/v1/maps/bravo/frames?limit=1").json()["items"]
+        self.ask("boss", "DELETE", f"/v1/maps/bravo/frames/{frames[0]['frame_id']}")
+
+    def told(self, key: str, method: str, path: str, **request: Any) -> str:
+        """All that an answer tells, on lines."""
+        answer = self.ask(key, method, path, **request)
+        assert answer.status_code < 500, answer.text
+        kept = {k: v for k, v in answer.headers.items() if k not in OWN_HEADERS}
+        text = answer.content.decode("latin-1").replace(answer.headers["x-request-id"], "<request>")
+        return f"{key} {method} {path}\n{answer.status_code} {json.dumps(kept)}\n{text}\n"
+
+
+@contextmanager
+def twin(folder: Path, shots: list[Any], *, busy: bool) -> Iterator[Twin]:
+    """A store with the maps alpha and bravo."""
+    settings = Settings(
+        data_dir=folder, database_url=None, require_keys=True, requests_per_s=0, events_kept=1000
+    )
+    app = create_app(settings)
+    with (
+        start_blocking_portal() as portal,
+        portal.wrap_async_context_manager(app.router.lifespan_context(app)),
+        portal.wrap_async_context_manager(
+            httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://here")
+        ) as client,
+    ):
+        engine = app.state.context.engine
+        secrets = {name: engine.create_key(name, grants).secret for name, grants in KEYS.items()}
+        made = Twin(client, portal, engine, secrets, shots, busy)
+        for name in ("bravo", "alpha"):
+            made.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
+            made.disturb()
+        yield made
+
+
+def live(one: Twin, small_model: Any) -> None:
+    """What happens in alpha, and in the busy one always something else before and after."""
+    path = "/v1/maps/alpha"
+    for number, shot in enumerate(one.shots[:4]):
+        form = shot.form(session="run", captured_at=f"2026-11-16T09:30:0{number}Z", pose={
+            "parent_frame": "hall", "translation": {"x": number, "y": 0, "z": 0},
+            "rotation": {"w": 1, "x": 0, "y": 0, "z": 0},
+        })  # fmt: skip
+        sent = one.ask("boss", "PUT", f"{path}/frames/frame-{number}", **form)
+        assert sent.status_code == 202, sent.text
+        one.ids["job_id"] = sent.json()["job_id"]
+        one.disturb()
+    one.work()
+    if one.busy:  # a model that no other map has, and jobs for it
+        one.engine.reencode("bravo", small_model)
+    asked = one.ask("boss", "POST", f"{path}/queries", json={"frame_id": "frame-0"})
+    one.ids["query_id"] = asked.json()["query_id"]
+    one.disturb()
+    body = {"sessions": ["run"], "apart": 1}
+    for _ in range(2):
+        begun = one.ask("boss", "POST", f"{path}/associations", json=body)
+        assert begun.status_code == 202, begun.text
+        one.ids["association"] = begun.json()["association_id"]
+        one.disturb()
+    one.work()
+    fused = one.ask("boss", "POST", f"/v1/queries/{one.ids['query_id']}/reconstruction", json={})
+    one.ids["reconstruction"] = fused.json()["job_id"]
+    one.disturb()
+
+
+def path_of(one: Twin, pattern: str) -> str:
+    """A path of the document, about what there is in alpha."""
+    kinds = [kind for kind in ("association", "reconstruction") if f"/{kind}s/" in pattern]
+    names = {
+        "map_name": "alpha", "frame_id": "frame-1", "query_id": one.ids["query_id"],
+        "job_id": one.ids[kinds[0] if kinds else "job_id"], "key_name": "k2", "snapshot_id": "x",
+    }  # fmt: skip
+    return re.sub(r"\{(\w+)\}", lambda found: names[found[1]], pattern)
+
+
+def everything(one: Twin) -> Iterator[str]:
+    """All that the keys for alpha can read, and what changes of alpha are answered with."""
+    document = one.ask("boss", "GET", "/openapi.json").json()
+    queries = {
+        "/v1/maps/{map_name}/trajectory": ["?session=run"], "/v1/stats": ["", "?map=alpha"],
+        "/v1/jobs": ["", "?map=alpha", "?state=queued", "?kind=associate"],
+        "/v1/events": ["?order=oldest", "?map=alpha&kind=frame.", "?after=0&limit=1000"],
+        "/v1/queries/{query_id}/matches/{frame_id}": ["", "?detail=true"],
+    }  # fmt: skip
+    for pattern, methods in sorted(document["paths"].items()):
+        if "get" in methods:
+            for query in queries.get(pattern, [""]):
+                yield one.told("reader", "GET", path_of(one, pattern) + query)
+    for path in ("frames?limit=3", "frames?limit=2&order=desc", "associations?limit=1",
+                 "jobs?limit=3", "events?limit=5", "events?limit=5&order=oldest"):  # fmt: skip
+        path = path if path.startswith(("jobs", "events")) else f"maps/alpha/{path}"
+        cursor = ""
+        while cursor is not None:
+            page = f"/v1/{path}{cursor and '&cursor='}{cursor}"
+            yield one.told("reader", "GET", page)
+            cursor = one.ask("reader", "GET", page).json()["next_cursor"]
+    frame = {"map": "alpha", "frame_id": "frame-0"}
+    for method, path, body in (
+        ("POST", "/v1/maps/alpha/queries", {"frame_id": "frame-2", "explain": True}),
+        ("POST", "/v1/maps/alpha/localize", {"frame_id": "frame-2"}),
+        ("POST", "/v1/queries", {"maps": "*", "frame": frame}),
+        ("POST", "/v1/similarity", {"frame_a": frame, "frame_b": frame}),
+        ("POST", f"/v1/jobs/{one.ids['reconstruction']}/cancel", None),
+        ("POST", f"/v1/jobs/{one.ids['reconstruction']}/retry", None),
+        ("PATCH", "/v1/maps/alpha/frames/frame-3", {"tags": ["x"]}),
+        ("DELETE", "/v1/maps/alpha/frames/frame-3", None),
+        ("DELETE", f"/v1/maps/alpha/associations/{one.ids['association']}", None),
+        ("POST", "/v1/maps", {"name": "bravo"}),
+        ("GET", "/v1/events", None),
+        ("GET", "/v1/maps/alpha", None),
+        ("DELETE", "/v1/maps/alpha", None),
+        ("GET", "/v1/events", None),
+        ("GET", "/v1/jobs", None),
+    ):  # fmt: skip
+        yield one.told("admin", method, path, **({} if body is None else {"json": body}))
+        one.disturb()
+
+
+def plain(told: list[str]) -> list[str]:
+    """Without times, and with what is by chance numbered as it first came."""
+    numbers: dict[str, int] = {}
+
+    def number(found: re.Match[str]) -> str:
+        return f"<{numbers.setdefault(found[0], len(numbers))}>"
+
+    return [TOOK.sub("<took>", TIMES.sub("<time>", CHANCE.sub(number, one))) for one in told]
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory, small_shots, small_model) -> list[list[str]]:
+    """All that is told, of the quiet one and of the busy one."""
+    found = []
+    with ExitStack() as stack:
+        for busy in (False, True):
+            one = stack.enter_context(twin(tmp_path_factory.mktemp("twin"), small_shots, busy=busy))
+            live(one, small_model)
+            found.append(plain(list(everything(one))))
+    return found
+
+
+def test_what_happens_in_other_maps_moves_nothing_that_is_told(both):
+    quiet, busy = both
+    assert len(quiet) > 60
+    for a, b in zip(quiet, busy, strict=True):
+        assert a == b
+
+
+def test_it_is_all_there(both):
+    """Else the test above would prove nothing."""
+    text = "".join(both[0])
+    for part in ("frame.indexed", "association.found", "cursor=", '"status":"found"', "end_header",
+                 '"frame_id":"frame-3"', "POST /v1/similarity\n200", "VERTEX_SE3"):  # fmt: skip
+        assert part in text, part
+    assert "bravo" not in text.replace('{"name": "bravo"}', "").replace("a map named 'bravo'", "")

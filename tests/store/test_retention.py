@@ -1,0 +1,93 @@
+"""Which events go, and which stay: by map, whatever happens in the others."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+import pytest
+from sqlalchemy import Connection
+
+from sceneprint.store import Store, open_store
+from sceneprint.store.events import Wanted, anchor_of, holds_anchor, list_events, tell
+from sceneprint.store.maps import add_map, find_map, keep_model, remove_map
+from sceneprint.store.retention import floor_of, floors, remove_events, spent_numbers
+
+
+@pytest.fixture
+def empty(tmp_path: Path) -> Store:
+    return open_store(f"sqlite:///{tmp_path / 'sceneprint.db'}", tmp_path / "blobs")
+
+
+@pytest.fixture
+def filled(empty: Store) -> Store:
+    """Two maps, made by the events 1 and 2; then hall, shop and none in turn, 3 to 62."""
+    with empty.database.write() as connection:
+        keep_model(connection, "m" * 64, "small", b"")
+        for name in ("hall", "shop"):
+            add_map(connection, name, None, "m" * 64)
+        for i in range(60):
+            tell(connection, "frame.received", ("hall", "shop", None)[i % 3])
+    return empty
+
+
+def numbers_of(connection: Connection, name: str | None) -> list[int]:
+    return [one.number for one in list_events(connection, Wanted()) if one.map == name]
+
+
+def expected(connection: Connection, kept: int, anchors: Collection[int]) -> set[int]:
+    """Of each map all but the newest, the one before these, and the anchors."""
+    gone: set[int] = set()
+    for name, more in (("hall", 1), ("shop", 1), (None, 0)):
+        numbers = numbers_of(connection, name)
+        gone |= set(numbers[: max(len(numbers) - kept - more, 0)]) - set(anchors)
+    return gone
+
+
+@pytest.mark.parametrize("kept", [1, 10, 19, 20, 21, 62])
+def test_what_is_not_kept_goes_and_the_anchors_stay(filled, kept):
+    with filled.database.write() as connection:
+        anchor = anchor_of(connection, "shop")
+        found = spent_numbers(connection, kept, (6, 33), 99)
+        assert set(found) == expected(connection, kept, (6, 33))
+        assert len(found) == len(set(found))
+        assert spent_numbers(connection, kept, (6, 33), 5) == found[:5]
+        remove_events(connection, found)
+        assert spent_numbers(connection, kept, (6, 33), 99) == []
+        assert holds_anchor(connection, anchor)
+
+
+def test_what_happens_elsewhere_moves_nothing(filled):
+    shop = Wanted(frozenset(("shop",)))
+    with filled.database.write() as connection:
+        before = {after: floor_of(connection, shop, 10, after) for after in range(62)}
+        own = floors(connection, 10)["shop"]
+        assert own == numbers_of(connection, "shop")[-11]
+        assert {after for after, floor in before.items() if floor > after} == set(range(own))
+        for _ in range(500):
+            tell(connection, "frame.received", "hall")
+            tell(connection, "key.created")
+        assert floors(connection, 10)["shop"] == own
+        for after in before:  # the same is missed
+            assert (floor_of(connection, shop, 10, after) > after) == (after < own)
+        gone = spent_numbers(connection, 10, (), 9999)
+        shops = [one for one in numbers_of(connection, "shop") if one < own]
+        assert [one for one in gone if one in numbers_of(connection, "shop")] == shops
+        assert floor_of(connection, Wanted(), 10, 0) > own
+
+
+def test_what_is_left_of_maps_that_are_gone_is_bounded_together(filled):
+    with filled.database.write() as connection:
+        remove_map(connection, find_map(connection, "hall"))
+        rest = sorted(numbers_of(connection, "hall") + numbers_of(connection, None))
+        assert floors(connection, 10)[None] == rest[-11]
+        hall = Wanted(frozenset(("hall",)))
+        assert floor_of(connection, hall, 10, 0) == rest[-11]
+        gone = spent_numbers(connection, 10, (), 99)
+        assert set(gone) - set(numbers_of(connection, "shop")) == set(rest[:-10])
+
+
+def test_nothing_goes_of_nothing(empty):
+    with empty.database.read() as connection:
+        assert spent_numbers(connection, 10, (), 99) == []
+        assert floor_of(connection, Wanted(), 10, 0) == 0
