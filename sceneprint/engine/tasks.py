@@ -13,10 +13,10 @@ import time
 import traceback
 from collections.abc import Callable, Collection
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Any
 
 from sceneprint.engine.leases import renewed
+from sceneprint.engine.slices import Handler, Outcome, Swept, Task
 from sceneprint.engine.uploads import sweep_deleted
 from sceneprint.engine.wire import tell_job
 from sceneprint.errors import (
@@ -28,7 +28,6 @@ from sceneprint.errors import (
     NotFound,
     SceneprintError,
     SnapshotError,
-    StoreError,
     UnknownJob,
     UnusableStore,
 )
@@ -40,7 +39,6 @@ from sceneprint.store.idempotency import Once
 from sceneprint.store.listing import find_job
 from sceneprint.store.maps import find_map, map_of
 from sceneprint.store.parts import JobFile, add_files, append_items, files_of, remove_parts
-from sceneprint.store.records import MapRow
 
 log = logging.getLogger(__name__)
 
@@ -50,70 +48,6 @@ SLICE_S = 15.0
 LEFT_S = 5.0
 #: Errors that trying again cannot help: what was asked for cannot be done.
 HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, SnapshotError)
-
-
-class Swept(StoreError):
-    """A deletion removed a file between its making and the commit that would have referred to it;
-    nothing was stored."""
-
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """A long job in hand.
-
-    Parameters
-    ----------
-    claim : on the job
-    map : that it is about; None where it is of none
-    """
-
-    claim: queue.Claim
-    map: MapRow | None
-
-    @property
-    def data(self) -> dict[str, Any]:
-        """What was asked for."""
-        return self.claim.job.data or {}
-
-    @property
-    def progress(self) -> dict[str, Any]:
-        """How far the slices before have come: of the last `Outcome`; empty before the first."""
-        return self.claim.job.progress or {}
-
-    @property
-    def of_map(self) -> MapRow:
-        """The map, of a kind of job that always has one."""
-        if self.map is None:
-            raise ValueError(f"job {self.claim.job.id} is of no map")
-        return self.map
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What a slice came to.
-
-    Parameters
-    ----------
-    over : whether the job is done
-    progress : `done` and `total` for people, and whatever the next slice needs to go on
-    items : found in this slice
-    files : made in this slice, blobs that are there
-    result : in short, at the end
-    drop : names of files of the job that are of no use any more
-    event : kind of the event that tells of the end, such as association.found; its data is `result`
-    """
-
-    over: bool
-    progress: dict[str, Any]
-    items: list[dict[str, Any]] = field(default_factory=list)
-    files: list[JobFile] = field(default_factory=list)
-    result: dict[str, Any] | None = None
-    drop: Collection[str] = ()
-    event: str | None = None
-
-
-#: Does a slice of a job until the time of `time.monotonic` that is given; may be done again.
-Handler = Callable[[Task, float], Outcome]
 
 
 class Tasks:

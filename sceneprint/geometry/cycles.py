@@ -19,14 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.rigid import rotation_angle
+from sceneprint.geometry.runs import Ints64, Run
 from sceneprint.types import Floats
-
-Ints64 = NDArray[np.int64]
-
-
-#: The way across a gap in odometry, metres: no loop reaches over it.
-_BROKEN = 1e6
 
 
 @dataclass(frozen=True)
@@ -62,22 +56,6 @@ class Edges:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
-    """Where a robot was, frame by frame.
-
-    Parameters
-    ----------
-    poses : (m, 4, 4) T_parent_sensor; NaN where not known
-    metres, radians : (m,) way up to each frame; very long across a gap in odometry, NaN without a
-        pose
-    """
-
-    poses: Floats
-    metres: Floats
-    radians: Floats
-
-
-@dataclass(frozen=True, eq=False)
 class Verdicts:
     """What the loops say of each edge.
 
@@ -91,28 +69,6 @@ class Verdicts:
     kept: NDArray[np.bool_]
     loops: Ints64
     closed: Ints64
-
-
-def run_of(poses: Floats, parents: Ints64) -> Run:
-    """A run from the poses of its frames, in the order in which they were taken.
-
-    Parameters
-    ----------
-    poses : (m, 4, 4) T_parent_sensor; NaN where not known
-    parents : (m,) which parent frame each is given in; odometry is broken where it changes
-    """
-    known = np.isfinite(poses).all(axis=(1, 2))
-    metres, radians = np.zeros(len(poses)), np.zeros(len(poses))
-    last, far_m, far_rad = -1, 0.0, 0.0
-    for i in np.flatnonzero(known).tolist():
-        if last >= 0 and parents[i] == parents[last]:
-            far_m += float(np.linalg.norm(poses[i, :3, 3] - poses[last, :3, 3]))
-            far_rad += rotation_angle(poses[i, :3, :3] @ poses[last, :3, :3].T)
-        elif last >= 0:
-            far_m += _BROKEN
-        metres[i], radians[i], last = far_m, far_rad, i
-    metres[~known] = np.nan
-    return Run(poses, metres, radians)
 
 
 def verdicts(edges: Edges, source: Run, target: Run, p: CycleParameters | None = None) -> Verdicts:

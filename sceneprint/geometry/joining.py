@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.rigid import nearest_rotation
+from sceneprint.geometry.votes import Votes
 from sceneprint.types import Floats
 
 Strength = Literal["strong", "weak"]
@@ -39,25 +40,6 @@ class JoiningParameters:
     strong_frames: int = 5
     strong_share: float = 0.5  #: of all votes
     strong_extent_m: float = 1.0  #: that they reach over: at one place all may be wrong alike
-
-
-@dataclass(frozen=True, eq=False)
-class Votes:
-    """What associations say of two parent frames.
-
-    Parameters
-    ----------
-    transforms : (n, 4, 4) T_a_b
-    places : (n, 3) metres, where the frame of each was, in b
-    source, target : (n,) its frames in b and in a
-    weights : (n,) positive
-    """
-
-    transforms: Floats
-    places: Floats
-    source: NDArray[np.int64]
-    target: NDArray[np.int64]
-    weights: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,28 +68,6 @@ class Join:
     def support(self) -> int:
         """How many votes agree."""
         return int(self.agree.sum())
-
-
-def votes_of(
-    transforms: Floats, source_poses: Floats, target_poses: Floats,
-    source: NDArray[np.int64], target: NDArray[np.int64], weights: Floats,
-) -> Votes:  # fmt: skip
-    """Associations as votes.
-
-    Parameters
-    ----------
-    transforms : (n, 4, 4) T_target_source
-    source_poses, target_poses : (n, 4, 4) T_b_source, T_a_target
-    source, target, weights : as in Votes
-    """
-    R = source_poses[:, :3, :3].transpose(0, 2, 1)
-    whole = np.zeros_like(transforms)
-    there = target_poses @ transforms
-    whole[:, :3, :3] = there[:, :3, :3] @ R
-    places = source_poses[:, :3, 3]
-    whole[:, :3, 3] = there[:, :3, 3] - np.einsum("nij,nj->ni", whole[:, :3, :3], places)
-    whole[:, 3, 3] = 1.0
-    return Votes(whole, places, source, target, weights)
 
 
 def join(votes: Votes, seed: int = 0, p: JoiningParameters | None = None) -> Join:

@@ -10,58 +10,20 @@ import hashlib
 import os
 import re
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from io import FileIO
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Literal
 
 from sceneprint.errors import DamagedBlob, UnusableStore
 from sceneprint.store.faults import unusable
+from sceneprint.store.incoming import IncomingBlob
 from sceneprint.writing import make_folder, sync_folder, write_durable
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 #: What a blob is found to be.
 Condition = Literal["sound", "missing", "damaged"]
-
-
-class IncomingBlob:
-    """A blob that comes in parts; see `Blobs.incoming`.
-
-    Parameters
-    ----------
-    file : that it is written to
-    what : to say where that fails
-    keep : gives the file its name
-    """
-
-    def __init__(self, file: BinaryIO | FileIO, what: str, keep: Callable[[str], None]) -> None:
-        self._file, self._what, self._keep = file, what, keep
-        self._hashed = hashlib.sha256()
-        #: Bytes so far.
-        self.size = 0
-
-    def write(self, data: bytes) -> None:
-        """Add to it."""
-        try:
-            left = memoryview(data)
-            while left:  # a file without a buffer may take a part alone
-                left = left[self._file.write(left) or 0 :]
-        except OSError as error:
-            raise unusable(self._what, error) from error
-        self._hashed.update(data)
-        self.size += len(data)
-
-    def keep(self) -> str:
-        """End it; when this returns it survives the loss of power. Returns its digest."""
-        digest = self._hashed.hexdigest()
-        try:
-            os.fsync(self._file.fileno())
-            self._keep(digest)
-        except OSError as error:
-            raise unusable(self._what, error) from error
-        return digest
 
 
 class Blobs:

@@ -19,9 +19,14 @@ from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableS
 from sceneprint.store.faults import explained
 from sceneprint.store.revisions import known_revisions, migration_config
 from sceneprint.store.sealed import Sealed, sealed_file
+from sceneprint.store.sqlite import (
+    BUSY_S,
+    HELD_S,
+    begin_sqlite,
+    configure_sealed,
+    configure_sqlite,
+)
 
-#: Seconds a writer waits for another, and waits after somebody has waited so long in vain.
-BUSY_S, HELD_S = 10.0, 0.1
 #: Alembic keeps the migration that runs in a variable of its module.
 _migrating = threading.Lock()
 
@@ -173,47 +178,9 @@ def _opened(url: URL) -> tuple[Database, Engine]:
     else:
         # SQLite waits for a writer itself, fairly enough; readers never wait in WAL
         engine = create_engine(url, connect_args={"timeout": BUSY_S}, pool_size=16, max_overflow=-1)
-    event.listen(engine, "connect", _configure_sqlite if sealed is None else _configure_sealed)
-    event.listen(engine, "begin", _begin_sqlite)
+    event.listen(engine, "connect", configure_sqlite if sealed is None else configure_sealed)
+    event.listen(engine, "begin", begin_sqlite)
     return Database(engine, sealed), engine
-
-
-def _configure_sqlite(connection: Any, _record: Any) -> None:
-    connection.isolation_level = None  # transactions begin where `_begin_sqlite` says
-    for pragma in (
-        "journal_mode = WAL",
-        "synchronous = FULL",  # a commit that was acknowledged survives the power
-        "foreign_keys = ON",
-        f"busy_timeout = {_milliseconds(BUSY_S)}",
-        "cache_size = -32000",
-    ):
-        connection.execute(f"PRAGMA {pragma}").close()
-
-
-def _configure_sealed(connection: Any, _record: Any) -> None:
-    connection.isolation_level = None
-
-
-def _begin_sqlite(connection: Connection) -> None:
-    wait_s: float | None = connection.get_execution_options().get("sceneprint_write")
-    if wait_s is None:
-        connection.exec_driver_sql("BEGIN")
-        return
-    if connection.get_execution_options().get("sceneprint_unchecked"):
-        connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # within a transaction it is late
-    # a reader that turns writer half way would fail where another wrote in between
-    if wait_s == BUSY_S:
-        connection.exec_driver_sql("BEGIN IMMEDIATE")
-        return
-    connection.exec_driver_sql(f"PRAGMA busy_timeout = {_milliseconds(wait_s)}")
-    try:
-        connection.exec_driver_sql("BEGIN IMMEDIATE")
-    finally:
-        connection.exec_driver_sql(f"PRAGMA busy_timeout = {_milliseconds(BUSY_S)}")
-
-
-def _milliseconds(seconds: float) -> int:
-    return int(1000 * seconds)
 
 
 def _migrate(database: Database, engine: Engine) -> None:

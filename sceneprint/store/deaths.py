@@ -15,6 +15,25 @@ from sceneprint.store.records import JobRow, job_row
 from sceneprint.store.tables import jobs
 
 
+def bury(connection: Connection) -> list[JobRow]:
+    """Give up jobs whose workers fall silent again and again: a frame that kills its worker."""
+    now = time.time()
+    rows = connection.execute(
+        update(jobs)
+        .where(
+            jobs.c.state == JobState.RUNNING,
+            jobs.c.leased_until < now,
+            jobs.c.attempts >= queue.MAXIMUM_ATTEMPTS,
+        )
+        .values(
+            state=JobState.DEAD, finished_at=now, leased_until=None,
+            error=f"its worker fell silent, and {queue.MAXIMUM_ATTEMPTS} tries are over",
+        )
+        .returning(jobs)
+    ).mappings()  # fmt: skip
+    return [job_row(row) for row in rows]
+
+
 def fail_of_dead(
     connection: Connection, job_id: str, token: int, error: str, traceback: str, *, counts: bool
 ) -> JobRow | None:

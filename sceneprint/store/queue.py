@@ -16,7 +16,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, and_, func, insert, or_, select, update
 
-from sceneprint.errors import JobOver, LostLease
+from sceneprint.errors import LostLease
 from sceneprint.logs import request_id
 from sceneprint.schemas import JobState
 from sceneprint.store.listing import find_job
@@ -139,25 +139,6 @@ def _first(connection: Connection, *due: ColumnElement[bool]) -> tuple[int, int,
     return None if found is None else (-found.priority, found.attempts, found.number)
 
 
-def bury(connection: Connection) -> list[JobRow]:
-    """Give up jobs whose workers fall silent again and again: a frame that kills its worker."""
-    now = time.time()
-    rows = connection.execute(
-        update(jobs)
-        .where(
-            jobs.c.state == JobState.RUNNING,
-            jobs.c.leased_until < now,
-            jobs.c.attempts >= MAXIMUM_ATTEMPTS,
-        )
-        .values(
-            state=JobState.DEAD, finished_at=now, leased_until=None,
-            error=f"its worker fell silent, and {MAXIMUM_ATTEMPTS} tries are over",
-        )
-        .returning(jobs)
-    ).mappings()  # fmt: skip
-    return [job_row(row) for row in rows]
-
-
 def renew(connection: Connection, held: Claim, lease_s: float) -> None:
     """Extend a lease.
 
@@ -254,46 +235,6 @@ def give_back(connection: Connection, held: Claim, after_s: float = 0.0) -> None
         connection, held, state=JobState.QUEUED, attempts=held.job.attempts - 1,
         leased_until=None, worker=None, run_after=time.time() + after_s,
     )  # fmt: skip
-
-
-def cancel(connection: Connection, job: JobRow) -> None:
-    """Cancel a job; a worker that is at it learns so when it brings its result.
-
-    Raises
-    ------
-    JobOver : there is nothing left to cancel.
-    """
-    if job.state.over:
-        raise JobOver(f"Job {job.id} is {job.state}: {job.state.sentence} Nothing is left to do.")
-    connection.execute(
-        update(jobs)
-        .where(jobs.c.number == job.number)
-        .values(state=JobState.CANCELLED, finished_at=time.time(), leased_until=None)
-    )
-
-
-def revive(connection: Connection, job: JobRow) -> None:
-    """Queue a job again that is over, with all its tries before it."""
-    connection.execute(
-        update(jobs)
-        .where(jobs.c.number == job.number)
-        .values(
-            state=JobState.QUEUED, attempts=0, failures=0, error=None, traceback=None,
-            finished_at=None, leased_until=None, worker=None, run_after=time.time(),
-        )
-    )  # fmt: skip
-
-
-def cancel_of(connection: Connection, frame_number: int) -> None:
-    """Cancel what is still to be done for a frame."""
-    connection.execute(
-        update(jobs)
-        .where(
-            jobs.c.frame_number == frame_number,
-            jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING)),
-        )
-        .values(state=JobState.CANCELLED, finished_at=time.time(), leased_until=None)
-    )
 
 
 def _due(now: float) -> ColumnElement[bool]:

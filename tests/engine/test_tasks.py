@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import select, update
 
 from sceneprint.engine import Engine
-from sceneprint.engine.tasks import Outcome, Task
+from sceneprint.engine.slices import Outcome, Task
 from sceneprint.engine.uploads import sweep
 from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
 from sceneprint.schemas import Job, JobState, NewMap

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.cycles import CycleParameters, Edges, Run, run_of, verdicts
+from sceneprint.geometry.cycles import CycleParameters, Edges, verdicts
 from sceneprint.geometry.rigid import difference, inverse
+from sceneprint.geometry.runs import Run, run_of
 from sceneprint.types import Floats
 
 

@@ -6,11 +6,12 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import update
+from sqlalchemy import Connection, event, update
 
 from sceneprint.schemas import JobState
 from sceneprint.store import Store, listing, open_store, queue
@@ -157,3 +158,22 @@ class Hand:
 @pytest.fixture
 def hand(store: Store) -> Hand:
     return Hand(store)
+
+
+@pytest.fixture(scope="session")
+def plans() -> Callable[[Connection], AbstractContextManager[list[str]]]:
+    """How SQLite goes about every statement of a connection, while it is looked at."""
+
+    @contextmanager
+    def looked_at(connection: Connection) -> Iterator[list[str]]:
+        told: list[str] = []
+
+        def explain(_: Any, cursor: Any, statement: str, parameters: Any, *__: Any) -> None:
+            cursor.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)
+            told.extend(row[3] for row in cursor.fetchall())
+
+        event.listen(connection, "before_cursor_execute", explain)
+        yield told
+        event.remove(connection, "before_cursor_execute", explain)
+
+    return looked_at

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import Connection, event, update
+from sqlalchemy import Connection, update
 
 from sceneprint.schemas import FrameState
 from sceneprint.schemas.browsing import FrameListing, Run
@@ -23,6 +23,7 @@ from sceneprint.store.sessions import count_run, list_runs, poses_of_run
 from sceneprint.store.tables import frames
 
 Received = Callable[..., FrameRow]
+Plans = Callable[[Connection], AbstractContextManager[list[str]]]
 START = datetime(2026, 11, 16, 9, 30, tzinfo=UTC)
 
 
@@ -189,20 +190,6 @@ def test_poses_of_a_run_are_those_of_plain_python(
         )
 
 
-@contextmanager
-def plans(connection: Connection) -> Iterator[list[str]]:
-    """How SQLite goes about every statement."""
-    told: list[str] = []
-
-    def explain(_: Any, cursor: Any, statement: str, parameters: Any, *__: Any) -> None:
-        cursor.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)
-        told.extend(row[3] for row in cursor.fetchall())
-
-    event.listen(connection, "before_cursor_execute", explain)
-    yield told
-    event.remove(connection, "before_cursor_execute", explain)
-
-
 SEARCHED = "USING COVERING INDEX ix_frames_searched"
 
 
@@ -225,7 +212,7 @@ SEARCHED = "USING COVERING INDEX ix_frames_searched"
     ],
 )  # fmt: skip
 def test_each_list_takes_the_index_that_is_meant_for_it(
-    store: Store, hall: MapRow, wanted: dict[str, Any], way: str
+    store: Store, hall: MapRow, plans: Plans, wanted: dict[str, Any], way: str
 ) -> None:
     listing = FrameListing.model_validate(wanted)
     for beyond in (None, 7):
@@ -235,7 +222,9 @@ def test_each_list_takes_the_index_that_is_meant_for_it(
         assert not any(step.startswith("SCAN") for step in told), told
 
 
-def test_sessions_are_counted_without_reading_a_row(store: Store, hall: MapRow) -> None:
+def test_sessions_are_counted_without_reading_a_row(
+    store: Store, hall: MapRow, plans: Plans
+) -> None:
     with store.database.read() as connection, plans(connection) as told:
         list_runs(connection, hall.number, ("a", "b"), 9)
         count_run(connection, hall.number, Run(session="s"))

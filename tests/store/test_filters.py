@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 import pytest
-from sqlalchemy import Connection, event, update
+from sqlalchemy import Connection, update
 
 from sceneprint.schemas import Filter, FrameState
 from sceneprint.store import Store
@@ -18,6 +18,7 @@ from sceneprint.store.records import FrameRow, MapRow
 from sceneprint.store.tables import frames
 
 Received = Callable[..., FrameRow]
+Plans = Callable[[Connection], AbstractContextManager[list[str]]]
 NOBODY = Taken(None, None, None)
 
 
@@ -87,20 +88,6 @@ def test_own_session_is_that_of_the_robot(store: Store, hall: MapRow, indexed: R
         found(store, hall, NOBODY, not_within_s=10)
 
 
-@contextmanager
-def plans(connection: Connection) -> Iterator[list[str]]:
-    """How SQLite goes about every statement."""
-    told: list[str] = []
-
-    def explain(_: Any, cursor: Any, statement: str, parameters: Any, *__: Any) -> None:
-        cursor.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)
-        told.extend(row[3] for row in cursor.fetchall())
-
-    event.listen(connection, "before_cursor_execute", explain)
-    yield told
-    event.remove(connection, "before_cursor_execute", explain)
-
-
 BOX = {"min": {"x": 0, "y": 0, "z": 0}, "max": {"x": 1, "y": 1, "z": 1}}
 
 
@@ -116,7 +103,9 @@ BOX = {"min": {"x": 0, "y": 0, "z": 0}, "max": {"x": 1, "y": 1, "z": 1}}
         {"exclude_frames": ["a"]},
     ],
 )
-def test_no_filter_reads_other_maps(store: Store, hall: MapRow, wanted: dict[str, Any]) -> None:
+def test_no_filter_reads_other_maps(
+    store: Store, hall: MapRow, plans: Plans, wanted: dict[str, Any]
+) -> None:
     with store.database.read() as connection, plans(connection) as told:
         passing(connection, hall.number, Filter.model_validate(wanted), Taken("r1", "s", 1.0))
     assert told

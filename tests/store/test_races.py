@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from sceneprint.schemas import JobState
-from sceneprint.store import Store, listing, queue
+from sceneprint.store import Store, deaths, listing, queue
 from sceneprint.store.maps import find_map, next_revision
 from sceneprint.store.records import JobRow, MapRow
 
@@ -108,6 +108,6 @@ def test_threads_that_outlive_their_leases_take_effect_once(
     assert raised == []
     assert sorted(effects) == sorted(set(effects))
     with store.database.write() as connection:
-        dead = [job.number for job in queue.bury(connection)]
+        dead = [job.number for job in deaths.bury(connection)]
         assert sorted(effects + dead) == [job.number for job in jobs]
         assert find_map(connection, "hall").revision == len(effects)

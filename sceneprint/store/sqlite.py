@@ -1,0 +1,51 @@
+"""How SQLite is set up: what a connection is told when it opens, and how a transaction begins."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import Connection
+
+#: Seconds a writer waits for another, and waits after somebody has waited so long in vain.
+BUSY_S, HELD_S = 10.0, 0.1
+
+
+def configure_sqlite(connection: Any, _record: Any) -> None:
+    """Tell a connection that may write what all of them are told."""
+    connection.isolation_level = None  # transactions begin where `begin_sqlite` says
+    for pragma in (
+        "journal_mode = WAL",
+        "synchronous = FULL",  # a commit that was acknowledged survives the power
+        "foreign_keys = ON",
+        f"busy_timeout = {_milliseconds(BUSY_S)}",
+        "cache_size = -32000",
+    ):
+        connection.execute(f"PRAGMA {pragma}").close()
+
+
+def configure_sealed(connection: Any, _record: Any) -> None:
+    """Tell a connection to a file that may be read alone."""
+    connection.isolation_level = None
+
+
+def begin_sqlite(connection: Connection) -> None:
+    """Begin a transaction: of a writer at once with the lock, for which it waits so long."""
+    wait_s: float | None = connection.get_execution_options().get("sceneprint_write")
+    if wait_s is None:
+        connection.exec_driver_sql("BEGIN")
+        return
+    if connection.get_execution_options().get("sceneprint_unchecked"):
+        connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # within a transaction it is late
+    # a reader that turns writer half way would fail where another wrote in between
+    if wait_s == BUSY_S:
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+        return
+    connection.exec_driver_sql(f"PRAGMA busy_timeout = {_milliseconds(wait_s)}")
+    try:
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+    finally:
+        connection.exec_driver_sql(f"PRAGMA busy_timeout = {_milliseconds(BUSY_S)}")
+
+
+def _milliseconds(seconds: float) -> int:
+    return int(1000 * seconds)
