@@ -36,10 +36,12 @@ if TYPE_CHECKING:
         sign,
         validate,
     )
-    from sceneprint.types import Frame, Geometry, Intrinsics
+    from sceneprint.scans import decode_cloud
+    from sceneprint.types import Cloud, Frame, Geometry, Intrinsics
 
 __all__ = [
     "Client",
+    "Cloud",
     "Frame",
     "Geometry",
     "Intrinsics",
@@ -50,6 +52,7 @@ __all__ = [
     "Signer",
     "Validation",
     "associate",
+    "decode_cloud",
     "distance",
     "diversify",
     "find_sequences",
@@ -70,6 +73,7 @@ __version__ = _version("sceneprint")
 
 _HOME = {
     "Client": "client",
+    "Cloud": "types",
     "Frame": "types",
     "Geometry": "types",
     "Intrinsics": "types",
@@ -80,6 +84,7 @@ _HOME = {
     "Signer": "pipeline",
     "Validation": "geometry.validation",
     "associate": "matches",
+    "decode_cloud": "scans",
     "distance": "pipeline",
     "diversify": "pipeline",
     "find_sequences": "datasets",

@@ -3,6 +3,7 @@
     SceneprintError
       x FrameError              the caller's frame cannot be used; trying again cannot help
         - UnreadableFrame       its bytes do not decode to a depth image
+        - UnreadableCloud       its bytes do not decode to a point cloud
         - InvalidIntrinsics     its camera is not a camera
         - InvalidPose           its pose is not a rigid transform
         - UselessFrame          it decodes, but there is nothing in it to sign
@@ -59,6 +60,8 @@ a mistake of the programmer who calls.
 """
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 def kebab_case(name: str) -> str:
@@ -70,12 +73,27 @@ class SceneprintError(Exception):
     """Base of every error raised on purpose."""
 
 
+@contextmanager
+def naming(subject: str) -> Iterator[None]:
+    """Let errors raised inside begin with what they are about."""
+    try:
+        yield
+    except SceneprintError as error:
+        if not subject:
+            raise
+        raise type(error)(f"{subject}: {error}") from error
+
+
 class FrameError(SceneprintError):
     """The caller's frame cannot be used."""
 
 
 class UnreadableFrame(FrameError):
     """The bytes do not decode to a depth image."""
+
+
+class UnreadableCloud(FrameError):
+    """The bytes do not decode to a point cloud."""
 
 
 class InvalidIntrinsics(FrameError):

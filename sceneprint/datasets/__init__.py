@@ -1,9 +1,10 @@
-"""Frames in and out: depth images, cameras, poses, and the sequences they come in.
+"""Frames in and out: depth images, cameras, clouds, poses, and the sequences they come in.
 
 path  --find_sequences-->  Sequence  --FrameReference.read-->  Frame
 bytes  --decode_frame-->  Frame
 """
 
+from sceneprint.datasets.clouds import CloudSource, find_cloud_source, read_cloud
 from sceneprint.datasets.images import decode_frame, make_frame, read_frame
 from sceneprint.datasets.intrinsics import Camera, find_camera, read_camera
 from sceneprint.datasets.npy import decode_npy
@@ -13,7 +14,6 @@ from sceneprint.datasets.poses import (
     interpolate,
     read_pose,
     read_trajectory,
-    rigid_transform,
 )
 from sceneprint.datasets.records import FrameReference, Layout, Sequence, Split
 from sceneprint.datasets.sequences import find_sequences
@@ -24,9 +24,11 @@ from sceneprint.datasets.writing import (
     write_intrinsics,
     write_pose,
 )
+from sceneprint.geometry.rigid import rigid_transform
 
 __all__ = [
     "Camera",
+    "CloudSource",
     "FrameReference",
     "Layout",
     "Sequence",
@@ -36,10 +38,12 @@ __all__ = [
     "decode_npy",
     "decode_png",
     "find_camera",
+    "find_cloud_source",
     "find_sequences",
     "interpolate",
     "make_frame",
     "read_camera",
+    "read_cloud",
     "read_frame",
     "read_pose",
     "read_trajectory",

@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Literal
 
+from sceneprint import scans
+from sceneprint.datasets import clouds
 from sceneprint.datasets.inflating import FREE, MOST_RATIO
 from sceneprint.datasets.intrinsics import FILE_NAME
 from sceneprint.datasets.members import MOST_MEMBERS, Member, OddName, parts_of, shown
@@ -29,7 +31,7 @@ from sceneprint.errors import DatasetError, SceneprintError, UnreadableArchive
 #: What an archive and its sequence are called where nobody says.
 DEFAULT_NAME = "import"
 _LISTS = ("depth.txt", "groundtruth.txt")
-_TEXTS = (FILE_NAME, "TrainSplit.txt", "TestSplit.txt")
+_TEXTS = (FILE_NAME, clouds.FILE_NAME, "TrainSplit.txt", "TestSplit.txt")
 _MAXIMUM_LIST, _MAXIMUM_TEXT, _MAXIMUM_TEXTS = 1 << 26, 1 << 16, 1 << 27  #: bytes; of all of them
 _PARENTS = ("0", "1", "2", "3", "4")  #: a camera is looked for above the frames: not beyond these
 
@@ -69,7 +71,8 @@ class Archive:
         ------
         UnreadableArchive : its member is damaged, encrypted or too large.
         """
-        return self._read(self._members[reference.path], MAXIMUM_BYTES)
+        limit = MAXIMUM_BYTES if reference.cloud is None else scans.MAXIMUM_BYTES
+        return self._read(self._members[reference.path], limit)
 
     def told(self, error: SceneprintError) -> str:
         """What an error says, without the private folder."""
@@ -198,9 +201,10 @@ def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iter
         archive.lay_out(own)
         if not archive.sequences and not archive.refused:
             raise UnreadableArchive(
-                "There is no depth image in the archive, or only in archives within it. Pack a "
-                "7-Scenes scene or sequence, a TUM RGB-D folder (depth.txt), or a folder of "
-                "16-bit PNG or float NPY images, with its intrinsics.json."
+                "There is no depth image or cloud in the archive, or only in archives within it. "
+                "Pack a 7-Scenes scene or sequence, a TUM RGB-D folder (depth.txt), or a folder of "
+                "16-bit PNG or float NPY images, with its intrinsics.json; or one of PLY, PCD, "
+                "KITTI .bin, LAS or LAZ clouds."
             )
         yield archive
 
@@ -226,5 +230,7 @@ def _wanted(parts: tuple[str, ...]) -> Wanted | None:
         return "text"
     lowered = name.lower()
     if lowered.endswith((".png", ".npy")) and not lowered.endswith(".color.png"):
+        return "image"
+    if clouds.is_cloud(name):
         return "image"
     return None

@@ -1,24 +1,12 @@
-"""What every reader here needs: bytes up to a limit, and errors that name their file."""
+"""What every reader here needs: bytes and text of files, up to a limit."""
 
 from __future__ import annotations
 
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from sceneprint.errors import SceneprintError
-
-
-@contextmanager
-def naming(subject: str) -> Iterator[None]:
-    """Let errors raised inside begin with what they are about."""
-    try:
-        yield
-    except SceneprintError as error:
-        if not subject:
-            raise
-        raise type(error)(f"{subject}: {error}") from error
 
 
 def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.datasets import npy, png
-from sceneprint.datasets.files import naming, read_bytes
-from sceneprint.datasets.poses import rigid_transform
-from sceneprint.errors import InvalidIntrinsics, UnreadableFrame, UselessFrame
+from sceneprint.datasets.files import read_bytes
+from sceneprint.errors import InvalidIntrinsics, UnreadableFrame, UselessFrame, naming
 from sceneprint.geometry.rectification import ray_to_axis, undistort
+from sceneprint.geometry.rigid import rigid_transform
+from sceneprint.scans.npy_headers import SIGNATURE
 from sceneprint.types import Floats, Floats32, Frame, Intrinsics
 
 #: What some sensors store, besides 0, where they measured nothing.
@@ -147,7 +148,7 @@ def _decode(data: bytes) -> NDArray[np.uint16] | Floats32:
         raise UnreadableFrame("The file is empty. Copy or write it again.")
     if data.startswith(png.SIGNATURE):
         return png.decode_png(data)
-    if data.startswith(npy.SIGNATURE):
+    if data.startswith(SIGNATURE):
         return npy.decode_npy(data)
     raise UnreadableFrame(
         "This is neither PNG nor NPY. Write the depth as a 16-bit greyscale PNG, or as a "

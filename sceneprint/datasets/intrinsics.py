@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from sceneprint.datasets.files import naming, read_text
-from sceneprint.errors import DatasetError, InvalidIntrinsics
+from sceneprint.datasets.files import read_text
+from sceneprint.errors import DatasetError, InvalidIntrinsics, naming
 from sceneprint.types import Intrinsics
 
 FILE_NAME = "intrinsics.json"

@@ -10,6 +10,7 @@ import os
 import re
 from pathlib import Path, PurePosixPath
 
+from sceneprint.datasets.clouds import FILE_NAME, find_cloud_source, is_cloud
 from sceneprint.datasets.files import data_lines, read_text
 from sceneprint.datasets.intrinsics import find_camera
 from sceneprint.datasets.poses import interpolate, read_trajectory
@@ -56,12 +57,19 @@ def natural(name: str) -> tuple[list[tuple[int, str]], str]:
 
 
 def layout_of(files: list[str]) -> Layout | None:
-    """Return the layout that these file names show, or None if they hold no depth."""
+    """Return the layout that these file names show, or None if they hold neither depth nor points.
+
+    Of depth images and points in one folder it is the images, unless clouds.json is there too.
+    """
     if any(_SEVEN_SCENES.fullmatch(file) for file in files):
         return Layout.SEVEN_SCENES
     if _DEPTH_LIST in files:
         return Layout.TUM
-    return Layout.PLAIN if any(map(_is_depth, files)) else None
+    if FILE_NAME in files and any(map(_may_be_cloud, files)):
+        return Layout.CLOUDS
+    if any(map(_is_depth, files)):
+        return Layout.PLAIN
+    return Layout.CLOUDS if any(map(is_cloud, files)) else None
 
 
 def references(
@@ -71,7 +79,7 @@ def references(
 
     Parameters
     ----------
-    folder : with `intrinsics.json` in it or above it
+    folder : with `intrinsics.json` in it or above it, if it holds depth images
     files : names of the files to take, in order, as `list_folder` gives them
     layout : of the folder
     name : of the sequence; frames are named after it
@@ -79,7 +87,7 @@ def references(
     Raises
     ------
     DatasetError : there is no intrinsics.json, depth.txt is damaged, or two frames would
-        have one name.
+        have one name; or clouds.json says what it cannot.
     InvalidIntrinsics : intrinsics.json describes no camera.
     InvalidPose : groundtruth.txt holds a line that is no pose.
     """
@@ -87,6 +95,8 @@ def references(
         frames = _seven_scenes(folder, files, name)
     elif layout is Layout.TUM:
         frames = _tum(folder, files, name)
+    elif layout is Layout.CLOUDS:
+        frames = _clouds(folder, files, name)
     else:
         frames = _plain(folder, files, name)
     first: dict[str, Path] = {}
@@ -117,6 +127,20 @@ def _plain(folder: Path, files: list[str], name: str) -> tuple[FrameReference, .
         for file in files
         if _is_depth(file)
     )
+
+
+def _clouds(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
+    source, present = find_cloud_source(folder), set(files)
+    # beside clouds.json a .npy is of points
+    wanted = _may_be_cloud if FILE_NAME in present else is_cloud
+    frames = []
+    for file in filter(wanted, files):
+        stem = Path(file).stem
+        pose = folder / f"{stem}.pose.txt" if f"{stem}.pose.txt" in present else None
+        frames.append(
+            FrameReference(f"{name}/{stem}", folder / file, None, pose_source=pose, cloud=source)
+        )
+    return tuple(frames)
 
 
 def _tum(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
@@ -166,6 +190,10 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
         return entry.is_dir()
     except OSError:  # a symlink to itself
         return False
+
+
+def _may_be_cloud(file: str) -> bool:
+    return is_cloud(file) or file.lower().endswith(".npy")
 
 
 def _is_depth(file: str) -> bool:

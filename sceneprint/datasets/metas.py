@@ -11,8 +11,11 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from sceneprint.datasets.clouds import CloudSource
+from sceneprint.datasets.intrinsics import Camera
 from sceneprint.datasets.records import FrameReference, Sequence
 from sceneprint.errors import InvalidRequest
+from sceneprint.scans import SUFFIXES, Unsaid
 from sceneprint.schemas import CameraIntrinsics, FrameMeta, GivenPose
 from sceneprint.schemas.frames import GivenBase
 
@@ -42,14 +45,13 @@ def meta_of(
     with_pose : send the pose where it is known
     parent_frame : what its pose leads to; default: the session's name. Sequences of one scene
         share it: `Sequence.parent_frame`
-    base : where the camera sits on the robot
+    base : where the sensor sits on the robot
 
     Raises
     ------
     InvalidPose : the file of the pose holds none.
     InvalidRequest : a name is empty, too long or not printable.
     """
-    camera, lens = reference.camera, reference.camera.intrinsics
     sequence = reference.name.rpartition("/")[0] or reference.path.absolute().parent.name
     T_parent_sensor = reference.pose if with_pose else None
     stamp, pose = reference.timestamp, None
@@ -61,7 +63,21 @@ def meta_of(
     return checked(
         FrameMeta,
         "What is known of the frame",
-        intrinsics=CameraIntrinsics(
+        **(_of_depth(reference.camera) if reference.camera else _of_cloud(reference)),
+        robot=robot,
+        session=sequence if session is None else session,
+        captured_at=None if stamp is None else datetime.fromtimestamp(stamp, UTC),
+        pose=pose,
+        T_base_sensor=base,
+        tags=list(tags),
+    )
+
+
+def _of_depth(camera: Camera) -> dict[str, Any]:
+    """How the samples of a depth image are read."""
+    lens = camera.intrinsics
+    return {
+        "intrinsics": CameraIntrinsics(
             width=lens.width,
             height=lens.height,
             fx=lens.fx,
@@ -70,15 +86,23 @@ def meta_of(
             cy=lens.cy,
             distortion=list(lens.distortion),
         ),
-        depth_scale=camera.depth_scale,
-        depth_along_ray=camera.along_ray,
-        robot=robot,
-        session=sequence if session is None else session,
-        captured_at=None if stamp is None else datetime.fromtimestamp(stamp, UTC),
-        pose=pose,
-        T_base_sensor=base,
-        tags=list(tags),
-    )
+        "depth_scale": camera.depth_scale,
+        "depth_along_ray": camera.along_ray,
+    }
+
+
+def _of_cloud(reference: FrameReference) -> dict[str, Any]:
+    """How the points of a cloud are read; a KITTI scan's name alone says that it is one."""
+    source = reference.cloud or CloudSource()
+    told = source.file_format
+    if told is None and SUFFIXES.get(reference.path.suffix.lower()) == "kitti":
+        told = "kitti"
+    known: dict[str, Any] = {"format": told, "units_per_metre": source.units_per_metre}
+    if source.viewpoint is None:
+        known["viewpoint"] = None
+    elif not isinstance(source.viewpoint, Unsaid):
+        known["viewpoint"] = dict(zip("xyz", source.viewpoint, strict=True))
+    return known
 
 
 def session_of(sequence: Sequence) -> str:

@@ -7,10 +7,12 @@ from enum import Enum
 from pathlib import Path
 from typing import Literal
 
+from sceneprint.datasets.clouds import CloudSource, read_cloud
 from sceneprint.datasets.images import read_frame
 from sceneprint.datasets.intrinsics import Camera
 from sceneprint.datasets.poses import read_pose
-from sceneprint.types import Floats, Frame
+from sceneprint.errors import DatasetError
+from sceneprint.types import AnyFrame, Floats, Frame
 
 Split = Literal["train", "test"]
 
@@ -24,6 +26,9 @@ class Layout(Enum):
     TUM = "TUM RGB-D"
     #: Depth files of any name, PNG or NPY, in natural order; no poses.
     PLAIN = "plain"
+    #: Files of points (PLY, PCD, KITTI .bin, LAS, LAZ) of any name, each with `NAME.pose.txt`
+    #: where its pose is known.
+    CLOUDS = "clouds"
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,17 +38,28 @@ class FrameReference:
     Parameters
     ----------
     name : unique in what `find_sequences` returned, such as "seq-01/frame-000000"
-    path : the depth file
-    camera : the sensor
+    path : the depth image, or the file of points
+    camera : the sensor; None for points
     timestamp : seconds, or None where the layout has none
     pose_source : file of the pose, the pose itself, or None where unknown
+    cloud : how the points are read; None for a depth image. One of this and `camera` is given
     """
 
     name: str
     path: Path
-    camera: Camera
+    camera: Camera | None
     timestamp: float | None = None
     pose_source: Path | Floats | None = None
+    cloud: CloudSource | None = None
+
+    def __post_init__(self) -> None:
+        if (self.camera is None) == (self.cloud is None):
+            raise ValueError("a frame is a depth image with a camera, or a cloud with its source")
+
+    @property
+    def kind(self) -> Literal["depth", "cloud"]:
+        """What its file holds."""
+        return "depth" if self.cloud is None else "cloud"
 
     @property
     def pose(self) -> Floats | None:
@@ -57,8 +73,24 @@ class FrameReference:
             return read_pose(self.pose_source)
         return self.pose_source
 
-    def read(self) -> Frame:
-        """Return the frame; raises as `read_frame` and `pose`."""
+    def read(self) -> AnyFrame:
+        """Return the frame; raises as `read_frame`, `read_cloud` and `pose`."""
+        if self.cloud is None:
+            return self.read_depth()
+        return read_cloud(self.path, self.cloud, name=self.name, pose=self.pose).cloud
+
+    def read_depth(self) -> Frame:
+        """Return the frame, where only a depth image will do; raises as `read_frame` and `pose`.
+
+        Raises
+        ------
+        DatasetError : it is a cloud.
+        """
+        if self.camera is None:
+            raise DatasetError(
+                f"{self.path}: This is a cloud, and a depth image is needed here. Name a folder or "
+                "file of depth images."
+            )
         return read_frame(
             self.path,
             self.camera.intrinsics,

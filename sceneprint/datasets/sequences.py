@@ -10,10 +10,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from sceneprint.datasets.clouds import FILE_NAME as CLOUDS_FILE
+from sceneprint.datasets.clouds import is_cloud
 from sceneprint.datasets.files import data_lines, read_text
+from sceneprint.datasets.intrinsics import find_camera
 from sceneprint.datasets.layouts import layout_of, list_folder, references
 from sceneprint.datasets.records import Layout, Sequence, Split
+from sceneprint.datasets.sizes import HEAD
 from sceneprint.errors import DatasetError, SceneprintError
+from sceneprint.scans import format_of
 
 _DEPTH = 4  #: folders below the one given that are looked into
 _MAXIMUM_FOLDERS = 10_000  #: that are looked into; more is no data set but a disk
@@ -32,7 +37,8 @@ def find_sequences(path: Path | str) -> tuple[Sequence, ...]:
 
     Understood are a 7-Scenes sequence or scene (with TrainSplit.txt, TestSplit.txt), a TUM
     RGB-D folder, a folder of depth images (PNG or NPY; `*.color.png` and `*rgb*` are left
-    out), one depth image, and folders of these. A sequence is named by its place below
+    out), a folder of point clouds (PLY, PCD, KITTI .bin, LAS, LAZ; NPY beside a clouds.json),
+    one depth image or cloud, and folders of these. A sequence is named by its place below
     the path, or by its own folder where that is the path.
 
     Parameters
@@ -45,8 +51,8 @@ def find_sequences(path: Path | str) -> tuple[Sequence, ...]:
 
     Raises
     ------
-    DatasetError : nothing is there, there is no intrinsics.json, a list names what is not
-        there, or two scenes have one name.
+    DatasetError : nothing is there, there is no intrinsics.json for depth, a list names what is
+        not there, or two scenes have one name.
     InvalidIntrinsics : an intrinsics.json describes no camera.
     InvalidPose : a groundtruth.txt holds a line that is no pose.
     """
@@ -60,9 +66,10 @@ def find_sequences(path: Path | str) -> tuple[Sequence, ...]:
     found = tuple(_sequence(*one, _name(one[0], root)) for one in _walk(root))
     if not found:
         raise DatasetError(
-            f"{path}: There is no depth image here or up to {_DEPTH} folders below. Name a "
-            "7-Scenes scene or sequence (frame-000000.depth.png), a TUM RGB-D folder "
-            "(depth.txt), a folder of 16-bit PNG or float NPY depth images, or one such file."
+            f"{path}: There is no depth image or cloud here or up to {_DEPTH} folders below. Name "
+            "a 7-Scenes scene or sequence (frame-000000.depth.png), a TUM RGB-D folder "
+            "(depth.txt), a folder of 16-bit PNG or float NPY depth images, one of PLY, PCD, "
+            "KITTI .bin, LAS or LAZ clouds, or one such file."
         )
     _check_parent_frames(found)
     return found
@@ -116,9 +123,11 @@ def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
             )
         files, folders = list_folder(folder)
         layout = layout_of(files)
-        # a scene may hold a picture of itself beside its sequences
-        scene = any(_SEQUENCE_FOLDER.fullmatch(name) for name in folders)
-        if layout is not None and not (layout is Layout.PLAIN and scene):
+        # a scene may hold a picture or a mesh of itself beside its sequences
+        scene = any(_SEQUENCE_FOLDER.fullmatch(name) for name in folders) or (
+            layout is Layout.CLOUDS and "depth" in folders
+        )
+        if layout is not None and not (layout in (Layout.PLAIN, Layout.CLOUDS) and scene):
             yield folder, files, layout
         elif depth < _DEPTH:
             waiting += [
@@ -141,16 +150,39 @@ def _sequence(folder: Path, files: list[str], layout: Layout, name: str) -> Sequ
 
 
 def _single(file: Path) -> Sequence:
-    """Return a sequence of one frame, its pose beside it if the layout is 7-Scenes."""
-    folder, pose = file.parent, file.name.removesuffix(".depth.png") + ".pose.txt"
-    layout = layout_of([file.name])
-    if layout is Layout.SEVEN_SCENES:
-        files = [file.name, *([pose] if (folder / pose).is_file() else [])]
+    """Return a sequence of one frame, its pose beside it unless it is a depth image of any name."""
+    folder, points = file.parent, is_cloud(file.name) or _is_npy_of_points(file)
+    stem = file.stem if points else file.name.removesuffix(".depth.png")
+    pose = f"{stem}.pose.txt"
+    layout = Layout.CLOUDS if points else layout_of([file.name])
+    if layout in (Layout.SEVEN_SCENES, Layout.CLOUDS):
+        # beside clouds.json a .npy is of points; what it says is read from the disk, if it is there
+        known = [pose] if (folder / pose).is_file() else []
+        files = [file.name, *known, *([CLOUDS_FILE] if points else [])]
         return _sequence(folder, files, layout, folder.name)
     # what is named outright is taken, whatever its name; its content decides
     frames = references(folder, ["x.png"], Layout.PLAIN, folder.name)
     frame = replace(frames[0], name=f"{folder.name}/{file.stem}", path=file)
     return Sequence(folder.name, folder, Layout.PLAIN, folder.name, None, (frame,))
+
+
+def _is_npy_of_points(file: Path) -> bool:
+    """Whether clouds.json is beside it; or no camera, and its content is N x 3 or N x 4."""
+    if file.suffix.lower() != ".npy":
+        return False
+    if (file.parent / CLOUDS_FILE).is_file():
+        return True
+    try:
+        find_camera(file.parent)
+    except DatasetError:
+        pass
+    else:
+        return False
+    try:
+        with file.open("rb") as opened:
+            return format_of(opened.read(HEAD)) == "npy"
+    except OSError:  # whoever reads the frame says why
+        return False
 
 
 def _split(folder: Path) -> Split | None:

@@ -9,6 +9,7 @@ import struct
 
 from sceneprint.datasets import npy, png
 from sceneprint.errors import UnreadableFrame
+from sceneprint.scans.npy_headers import SIGNATURE
 
 #: Bytes that are enough to know: of a PNG 24, of an NPY file its whole header.
 HEAD = 10_016
@@ -24,7 +25,7 @@ def size_of(head: bytes) -> tuple[int, int] | None:
     if head.startswith(png.SIGNATURE) and len(head) >= 24:
         width, height = struct.unpack_from(">II", head, 16)
         return width, height
-    if head.startswith(npy.SIGNATURE):
+    if head.startswith(SIGNATURE):
         try:
             return npy.image_size(head)
         except UnreadableFrame:  # whoever decodes it says why

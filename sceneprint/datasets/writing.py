@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from sceneprint.datasets.intrinsics import FILE_NAME, Camera
-from sceneprint.datasets.poses import rigid_transform
 from sceneprint.geometry.quaternions import quaternion_of
+from sceneprint.geometry.rigid import rigid_transform
 from sceneprint.types import Floats, Floats32
 from sceneprint.writing import write_whole
 

@@ -1,0 +1,222 @@
+"""The door for points: the bytes of a file in, a `Cloud` out.
+
+bytes  --decode_scan-->  Scan: the cloud, and how it was read
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from sceneprint.errors import UnreadableCloud, UselessFrame, naming
+from sceneprint.geometry.rigid import rigid_transform
+from sceneprint.scans.arrays import read_kitti, read_npy
+from sceneprint.scans.formats import CloudFormat, format_of
+from sceneprint.scans.las import read_las
+from sceneprint.scans.pcd import read_pcd
+from sceneprint.scans.ply import read_ply
+from sceneprint.scans.raw import MAXIMUM_BYTES, Position, RawPoints
+from sceneprint.scans.thinning import thinned
+from sceneprint.types import Cloud, Floats, Floats32
+
+#: Fewest and most points of a cloud; of more, one to a voxel is kept.
+FEWEST_POINTS, MOST_POINTS = 10, 5_000_000
+
+#: Farthest that a point may be from the viewpoint, metres.
+FARTHEST_M = 10_000.0
+
+#: Farthest that a viewpoint may be from the origin of its file, metres: half round the Earth.
+_FARTHEST_VIEWPOINT_M = 2e7
+
+_READERS = {
+    "ply": read_ply,
+    "pcd": read_pcd,
+    "kitti": read_kitti,
+    "npy": read_npy,
+    "las": read_las,
+}
+
+
+class Unsaid(Enum):
+    """What is given for a viewpoint of which nothing is said."""
+
+    UNSAID = "unsaid"
+
+
+UNSAID = Unsaid.UNSAID
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A cloud, and how it was read.
+
+    Parameters
+    ----------
+    cloud : its points, from the viewpoint
+    file_format : of the file
+    viewpoint : that was used, metres in the file's axes; None where there is none
+    given : how many points the file has, missing ones too
+    """
+
+    cloud: Cloud
+    file_format: CloudFormat
+    viewpoint: Position | None
+    given: int
+
+
+def decode_cloud(
+    data: bytes,
+    *,
+    file_format: CloudFormat | None = None,
+    viewpoint: Position | Unsaid | None = UNSAID,
+    units_per_metre: float = 1.0,
+    name: str = "",
+    pose: Floats | None = None,
+) -> Cloud:
+    """Return the cloud of a file's bytes; as `decode_scan`."""
+    return decode_scan(
+        data,
+        file_format=file_format,
+        viewpoint=viewpoint,
+        units_per_metre=units_per_metre,
+        name=name,
+        pose=pose,
+    ).cloud
+
+
+def decode_scan(
+    data: bytes,
+    *,
+    file_format: CloudFormat | None = None,
+    viewpoint: Position | Unsaid | None = UNSAID,
+    units_per_metre: float = 1.0,
+    name: str = "",
+    pose: Floats | None = None,
+) -> Scan:
+    """Return the cloud of the bytes of a PLY, PCD, KITTI, NPY, LAS or LAZ file.
+
+    Parameters
+    ----------
+    data : the whole file
+    file_format : of it; where None its first bytes tell, which those of a KITTI scan do not
+    viewpoint : where the sensor was, metres in the file's axes; None for points of many views;
+        nothing said: the VIEWPOINT of a PCD file, else the origin, as sensors write
+    units_per_metre : of the file's coordinates, 1000 for millimetres
+    name : what to call the frame in lines and errors
+    pose : (4, 4) T_parent_sensor, or None where unknown
+
+    Returns
+    -------
+    scan : points at the place of the viewpoint are at the origin, the axes stay; points that are
+        missing (NaN, infinite) are left out
+
+    Raises
+    ------
+    UnreadableCloud : the bytes are of no such format, or damaged; there are more than 20 million
+        points, or one is more than 10 km from the viewpoint.
+    UselessFrame : fewer than 10 points are there.
+    InvalidPose : the pose is not a rigid transform.
+    MissingDependency : the file is LAZ, and lazrs is not installed.
+    """
+    with naming(name):
+        _check_units(units_per_metre)
+        if len(data) > MAXIMUM_BYTES:
+            raise UnreadableCloud(
+                f"The file has {len(data)} bytes, the limit is {MAXIMUM_BYTES}. "
+                "Thin the cloud out, or send it in parts."
+            )
+        found = _format(data, file_format)
+        raw = _READERS[found](data)
+        place = _place(viewpoint, raw, units_per_metre)
+        # lengths are checked above: a header of twenty million points has bytes for them
+        points = _from(raw, place or (0.0, 0.0, 0.0), units_per_metre)
+        missing = raw.count - len(points)
+        if len(points) < FEWEST_POINTS:
+            raise UselessFrame(
+                f"{missing} of {raw.count} points are missing, and the {len(points)} left are "
+                f"fewer than {FEWEST_POINTS}. Check that the sensor saw something."
+            )
+        note = f"{missing} missing points left out" if missing else ""
+        if len(points) > MOST_POINTS:
+            before = len(points)
+            points, edge = thinned(points, MOST_POINTS)
+            told = f"thinned from {before} points to {len(points)}, one to {100 * edge:.1f} cm"
+            note = f"{note}; {told}" if note else told
+        cloud = Cloud(
+            points,
+            has_viewpoint=place is not None,
+            name=name,
+            pose=None if pose is None else rigid_transform(pose),
+            note=note,
+        )
+        return Scan(cloud, found, place, raw.count)
+
+
+def _format(data: bytes, told: CloudFormat | None) -> CloudFormat:
+    found = format_of(data)
+    if told == "kitti" and found is not None:
+        raise UnreadableCloud(
+            f"This is no KITTI scan: it begins as a {found.upper()} file does. Say that, or "
+            "nothing, for its format."
+        )
+    if told is not None and told not in _READERS:
+        raise UnreadableCloud(
+            f"{told!r:.40} is no format of points. Known are {', '.join(_READERS)}."
+        )
+    if not data:
+        raise UnreadableCloud("The file is empty. Copy or write it again.")
+    if told is None and found is None:
+        raise UnreadableCloud(
+            "This is none of PLY, PCD, LAS, LAZ and NPY of shape (N, 3) or (N, 4), by its first "
+            "bytes. Write one of these; for a KITTI scan (.bin), say kitti as its format."
+        )
+    chosen = told or found
+    assert chosen is not None
+    return chosen
+
+
+def _check_units(units: float) -> None:
+    if not (math.isfinite(units) and 1e-6 <= units <= 1e9):
+        raise UnreadableCloud(
+            f"The units per metre are {units}, no such number. Say 1 for metres, 1000 for "
+            "millimetres."
+        )
+
+
+def _place(told: Position | Unsaid | None, raw: RawPoints, units: float) -> Position | None:
+    """Where the sensor was, metres; None where it was nowhere."""
+    if isinstance(told, Unsaid):
+        x, y, z = raw.viewpoint or (0.0, 0.0, 0.0)
+        told = (x / units, y / units, z / units)
+    if told is not None and not all(abs(value) <= _FARTHEST_VIEWPOINT_M for value in told):
+        raise UnreadableCloud(
+            f"The viewpoint {told} is not finite, or none on Earth. Give where the sensor was, in "
+            "metres along the axes of the points."
+        )
+    return told
+
+
+def _from(raw: RawPoints, place: Position, units: float) -> Floats32:
+    """Points (n, 3) from a place, metres, without those that are missing."""
+    points, n = np.empty((raw.count, 3), np.float32), 0
+    with np.errstate(all="ignore"):  # what overflows is no number, and so missing
+        for block in raw.blocks:
+            block /= units
+            block -= place
+            present = block[np.isfinite(block).all(axis=1)]
+            _check_reach(np.abs(present).max(initial=0.0))
+            points[n : n + len(present)] = present
+            n += len(present)
+    return points if n == raw.count else points[:n].copy()
+
+
+def _check_reach(far: float) -> None:
+    if far > FARTHEST_M:
+        raise UnreadableCloud(
+            f"A point lies {far:.6g} m from the viewpoint along an axis, and at most "
+            f"{FARTHEST_M:g} m is read. Say units_per_metre if these are no metres, and shift "
+            "coordinates of a map (UTM) to the sensor, or give the viewpoint in them."
+        )

@@ -1,0 +1,184 @@
+"""Sequences of points: which files are clouds, how they are read, and where their poses are."""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sceneprint.clouds import write_ply
+from sceneprint.datasets import (
+    CloudSource,
+    FrameReference,
+    Layout,
+    find_cloud_source,
+    find_sequences,
+    write_depth_png,
+    write_pose,
+)
+from sceneprint.datasets.archives import open_archive
+from sceneprint.errors import DatasetError, UnreadableCloud
+from sceneprint.types import Cloud
+
+POINTS = np.arange(36, dtype=np.float32).reshape(12, 3) / 8
+
+
+def kitti(points: np.ndarray) -> bytes:
+    return np.concatenate([points, np.zeros((len(points), 1))], axis=1).astype("<f4").tobytes()
+
+
+def pose_at(x: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+def points_of(frame: FrameReference) -> np.ndarray:
+    cloud = frame.read()
+    assert isinstance(cloud, Cloud)
+    assert cloud.name == frame.name
+    return cloud.points
+
+
+@pytest.fixture
+def hall(tmp_path: Path) -> Path:
+    """Nine scans of two formats and a pose."""
+    folder = tmp_path / "hall"
+    folder.mkdir()
+    for i in (2, 10, 1):
+        (folder / f"scan-{i}.ply").write_bytes(write_ply(POINTS + i))
+    (folder / "scan-3.BIN").write_bytes(kitti(POINTS + 3))
+    write_pose(folder / "scan-2.pose.txt", pose_at(2.0))
+    (folder / "notes.txt").write_text("nothing")
+    return folder
+
+
+def test_a_folder_of_clouds(hall: Path) -> None:
+    (sequence,) = find_sequences(hall)
+    assert (sequence.layout, sequence.name, sequence.parent_frame) == (
+        Layout.CLOUDS,
+        "hall",
+        "hall",
+    )
+    names = [frame.name for frame in sequence.frames]
+    assert names == ["hall/scan-1", "hall/scan-2", "hall/scan-3", "hall/scan-10"]
+    for frame, i in zip(sequence.frames, (1, 2, 3, 10), strict=True):
+        assert (frame.kind, frame.camera) == ("cloud", None)
+        np.testing.assert_array_equal(points_of(frame), POINTS + i)
+    assert [frame.pose is not None for frame in sequence.frames] == [False, True, False, False]
+    np.testing.assert_array_equal(sequence.frames[1].read().pose, pose_at(2.0))
+    with pytest.raises(DatasetError, match="This is a cloud, and a depth image is needed"):
+        sequence.frames[0].read_depth()
+
+
+def test_one_cloud(hall: Path) -> None:
+    (sequence,) = find_sequences(hall / "scan-2.ply")
+    assert [frame.name for frame in sequence.frames] == ["hall/scan-2"]
+    np.testing.assert_array_equal(sequence.frames[0].pose, pose_at(2.0))
+    np.save(hall / "points.npy", POINTS)
+    np.save(hall / "image.npy", np.ones((12, 16), np.float32))
+    (frame,) = find_sequences(hall / "points.npy")[0].frames
+    np.testing.assert_array_equal(points_of(frame), POINTS)
+    with pytest.raises(DatasetError, match=r"no intrinsics\.json"):
+        find_sequences(hall / "image.npy")
+
+
+def test_what_clouds_json_says(hall: Path) -> None:
+    said = {"viewpoint": {"x": 1, "y": 0, "z": -2.5}, "units_per_metre": 1000}
+    (hall / "clouds.json").write_text(json.dumps(said))
+    np.save(hall / "scan-4.npy", POINTS)  # of points, beside clouds.json
+    frames = find_sequences(hall)[0].frames
+    assert len(frames) == 5
+    assert frames[0].cloud == CloudSource(None, (1.0, 0.0, -2.5), 1000.0)
+    np.testing.assert_allclose(
+        points_of(frames[0]), (POINTS + 1.0) / 1000 - (1.0, 0.0, -2.5), atol=1e-6
+    )
+    (hall / "clouds.json").write_text('{"viewpoint": null, "format": "kitti"}')
+    assert find_cloud_source(hall) == CloudSource("kitti", None, 1.0)
+    inner = hall / "a" / "b"
+    inner.mkdir(parents=True)
+    assert find_cloud_source(inner) == find_cloud_source(hall)
+    with pytest.raises(UnreadableCloud, match=r"scan-1\.ply: This is no KITTI scan"):
+        find_sequences(hall)[0].frames[0].read()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not JSON"),
+        ("[]", "no JSON object"),
+        ('{"view": 1}', "'view' is no field"),
+        ('{"format": "stl"}', "format is 'stl'"),
+        ('{"format": ["ply"]}', "format is"),
+        ('{"units_per_metre": 0}', "units_per_metre is 0"),
+        ('{"units_per_metre": "mm"}', "units_per_metre is 'mm'"),
+        ('{"units_per_metre": true}', "units_per_metre is True"),
+        ('{"viewpoint": [0, 0, 1]}', r"viewpoint is \[0, 0, 1\]"),
+        ('{"viewpoint": {"x": 0, "y": 0}}', "viewpoint is"),
+        ('{"viewpoint": {"x": 0, "y": 0, "z": 1e999}}', "z is inf"),
+    ],
+)
+def test_clouds_json_that_is_none(hall: Path, text: str, message: str) -> None:
+    (hall / "clouds.json").write_text(text)
+    with pytest.raises(DatasetError, match=rf"clouds\.json: .*{message}"):
+        find_sequences(hall)
+
+
+def test_depth_and_clouds_together(hall: Path, tmp_path: Path) -> None:
+    """Images win, as a mesh often lies beside them, unless clouds.json is there."""
+    write_depth_png(hall / "scan-1.png", np.ones((3, 4), np.float32), 1000.0)
+    with pytest.raises(DatasetError, match=r"no intrinsics\.json"):
+        find_sequences(hall)
+    (hall / "clouds.json").write_text("{}")
+    assert len(find_sequences(hall)[0].frames) == 4
+
+    scene = tmp_path / "scene"
+    (scene / "depth").mkdir(parents=True)
+    (scene / "mesh.ply").write_bytes(write_ply(POINTS))
+    (scene / "depth" / "0.pcd").write_bytes(b"")
+    assert [s.name for s in find_sequences(scene)] == ["depth"]
+
+
+def test_damaged_clouds_and_names(hall: Path) -> None:
+    (hall / "scan-1.ply").write_bytes(b"ply\n")
+    with pytest.raises(UnreadableCloud, match=r"scan-1\.ply: The PLY header has no end_header"):
+        find_sequences(hall)[0].frames[0].read()
+    (hall / "scan-1.ply").unlink()
+    (hall / "scan-3.pcd").write_bytes(b"")
+    with pytest.raises(DatasetError, match="same name, hall/scan-3"):
+        find_sequences(hall)
+
+
+def test_in_an_archive(hall: Path, tmp_path: Path) -> None:
+    (hall / "clouds.json").write_text('{"viewpoint": null}')
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in sorted(hall.iterdir()):
+            archive.write(file, f"hall/{file.name}")
+    with open_archive(packed, tmp_path) as opened:
+        (sequence,) = opened.sequences
+        assert [frame.name for frame in sequence.frames] == [
+            "hall/scan-1", "hall/scan-2", "hall/scan-3", "hall/scan-10",
+        ]  # fmt: skip
+        first = sequence.frames[0]
+        assert first.cloud == CloudSource(None, None, 1.0)
+        assert opened.data_of(first) == (hall / "scan-1.ply").read_bytes()
+        np.testing.assert_array_equal(sequence.frames[1].pose, pose_at(2.0))
+        assert opened.ignored == 1  # the notes
+
+
+def test_a_frame_is_one_or_the_other(hall: Path) -> None:
+    with pytest.raises(ValueError, match="a depth image with a camera, or a cloud"):
+        FrameReference("a", hall / "scan-1.ply", None)
+
+
+def test_a_real_hall(data_root: Path) -> None:
+    (sequence,) = find_sequences(data_root / "lidar" / "hall")
+    assert len(sequence.frames) == 59
+    last = sequence.frames[-1]
+    data = last.path.read_bytes()
+    rows = np.frombuffer(data[data.index(b"DATA binary\n") + 12 :], "<f4").reshape(-1, 4)
+    np.testing.assert_array_equal(points_of(last), rows[:, :3])
+    assert last.pose is not None

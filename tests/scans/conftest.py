@@ -1,0 +1,144 @@
+"""Files of points, written by hand as their formats say, byte for byte."""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+POINTS = np.arange(36, dtype=np.float64).reshape(12, 3) / 4 - 3
+
+Write = Callable[..., bytes]
+
+
+@pytest.fixture
+def points() -> np.ndarray:
+    """Twelve points (12, 3) that every type of number holds exactly, times four."""
+    return POINTS.copy()
+
+
+@pytest.fixture(scope="session")
+def ply() -> Write:
+    """A PLY file of points and a triangle, between them a list of odd lengths."""
+
+    def write(points: np.ndarray = POINTS, form: str = "binary_little_endian") -> bytes:
+        header = (
+            f"ply\nformat {form} 1.0\ncomment by hand\nelement camera 1\n"
+            "property list uchar short marks\nproperty double focal\n"
+            f"element vertex {len(points)}\nproperty uchar red\nproperty float x\n"
+            "property double z\nproperty float y\nelement face 1\n"
+            "property list uchar int vertex_indices\nend_header\n"
+        ).encode()
+        if form == "ascii":
+            rows = "".join(f"7 {x:.9g} {z:.9g} {y:.9g}\n" for x, y, z in points)
+            return header + f"2 5 -6 1.5\n{rows}3 0 1 2\n".encode()
+        order = "<" if "little" in form else ">"
+        body = struct.pack(f"{order}Bhhd", 2, 5, -6, 1.5)
+        for x, y, z in points:
+            body += struct.pack(f"{order}Bfdf", 7, x, z, y)
+        return header + body + struct.pack(f"{order}Biii", 3, 0, 1, 2)
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def pcd() -> Write:
+    """A PCD file of points with two fields more, one of them of three values."""
+
+    def write(
+        points: np.ndarray = POINTS, form: str = "binary", viewpoint: str = "0 0 0 1 0 0 0"
+    ) -> bytes:
+        n = len(points)
+        header = (
+            "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS normal x y z ring\n"
+            "SIZE 4 4 4 8 2\nTYPE F F F F U\nCOUNT 3 1 1 1 1\n"
+            f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {n}\nDATA {form}\n"
+        ).encode()
+        if form == "ascii":
+            rows = (f"0 0 1 {x:.9g} {y:.9g} {z:.9g} 5\n" for x, y, z in points)
+            return header + "".join(rows).encode()
+        if form == "binary":
+            return header + b"".join(
+                struct.pack("<3fffdH", 0, 0, 1, x, y, z, 5) for x, y, z in points
+            )
+        x, y, z = points.T
+        fields = (
+            np.tile(np.array([0, 0, 1], "<f4"), n).tobytes()
+            + x.astype("<f4").tobytes()
+            + y.astype("<f4").tobytes()
+            + z.astype("<f8").tobytes()
+            + np.full(n, 5, "<u2").tobytes()
+        )
+        packed = lzf_of(fields)
+        return header + struct.pack("<II", len(packed), len(fields)) + packed
+
+    return write
+
+
+def lzf_of(data: bytes) -> bytes:
+    """Packed, plainly: the longest repetition that begins here, else the byte itself."""
+    out, i = bytearray(), 0
+    while i < len(data):
+        best, back = 0, 0
+        for distance in range(1, min(i, 40) + 1):
+            n = 0
+            while n < 264 and i + n < len(data) and data[i + n] == data[i + n - distance]:
+                n += 1
+            if n > best:
+                best, back = n, distance - 1
+        if best < 3:
+            out += bytes([0, data[i]])
+            i += 1
+        elif best < 9:
+            out += bytes([(best - 2) << 5 | back >> 8, back & 255])
+            i += best
+        else:
+            out += bytes([7 << 5 | back >> 8, best - 9, back & 255])
+            i += best
+    return bytes(out)
+
+
+@pytest.fixture(scope="session")
+def lzf() -> Callable[[bytes], bytes]:
+    """A plain packer."""
+    return lzf_of
+
+
+@pytest.fixture(scope="session")
+def kitti() -> Write:
+    def write(points: np.ndarray = POINTS) -> bytes:
+        return b"".join(struct.pack("<4f", x, y, z, 0.5) for x, y, z in points)
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def npy() -> Write:
+    def write(array: np.ndarray = POINTS) -> bytes:
+        buffer = io.BytesIO()
+        np.save(buffer, array)
+        return buffer.getvalue()
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def las() -> Write:
+    """A LAS 1.2 file of point format 1, in millimetres from an offset."""
+
+    def write(
+        points: np.ndarray = POINTS, offset: tuple[float, float, float] = (10.0, 20.0, 30.0)
+    ) -> bytes:
+        header = bytearray(227)
+        header[:4], header[24:26] = b"LASF", bytes([1, 2])
+        struct.pack_into("<HII", header, 94, 227, 229, 0)
+        struct.pack_into("<BHI", header, 104, 1, 30, len(points))
+        struct.pack_into("<6d", header, 131, 0.001, 0.001, 0.001, *offset)
+        rows = np.round((points - offset) / 0.001).astype(int)
+        body = b"".join(struct.pack("<iii18x", *row) for row in rows.tolist())
+        return bytes(header) + b"\0\0" + body
+
+    return write

@@ -1,0 +1,70 @@
+"""One cloud in every format: the same points, told apart by their first bytes."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import UnreadableCloud
+from sceneprint.scans import decode_cloud, decode_scan, format_of
+
+Write = Callable[..., bytes]
+
+FORMS = {
+    "ply": ("ascii", "binary_little_endian", "binary_big_endian"),
+    "pcd": ("ascii", "binary", "binary_compressed"),
+}
+
+
+@pytest.mark.parametrize(("name", "form"), [(n, f) for n, fs in FORMS.items() for f in fs])
+def test_forms(request: pytest.FixtureRequest, points: np.ndarray, name: str, form: str) -> None:
+    data = request.getfixturevalue(name)(form=form)
+    scan = decode_scan(data, name="here")
+    np.testing.assert_array_equal(scan.cloud.points, points)
+    assert scan.cloud.points.dtype == np.float32
+    assert scan.cloud.points.flags.writeable
+    assert (scan.file_format, scan.given, scan.viewpoint) == (name, 12, (0, 0, 0))
+    assert (scan.cloud.name, scan.cloud.note, scan.cloud.has_viewpoint) == ("here", "", True)
+    assert format_of(data) == name
+
+
+def test_kitti_has_to_be_said(kitti: Write, points: np.ndarray, ply: Write) -> None:
+    assert format_of(kitti()) is None
+    np.testing.assert_array_equal(decode_cloud(kitti(), file_format="kitti").points, points)
+    with pytest.raises(UnreadableCloud, match=r"by its first bytes.*say kitti"):
+        decode_cloud(kitti())
+    with pytest.raises(UnreadableCloud, match="has 191 bytes, and each point"):
+        decode_cloud(kitti()[:-1], file_format="kitti")
+    with pytest.raises(UnreadableCloud, match="begins as a PLY file"):
+        decode_cloud(ply(), file_format="kitti")
+
+
+@pytest.mark.parametrize("dtype", ["<f4", ">f8", "<f2"])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_npy(npy: Write, points: np.ndarray, dtype: str, order: str) -> None:
+    wide = np.concatenate([points, np.full((12, 1), np.nan)], axis=1)  # intensity may be anything
+    for array in (points, wide):
+        data = npy(np.asarray(array, dtype=dtype, order=order))
+        assert format_of(data) == "npy"
+        np.testing.assert_array_equal(decode_cloud(data).points, points)
+
+
+def test_npy_of_another_shape_or_type(npy: Write) -> None:
+    depth = npy(np.ones((12, 16), np.float32))
+    assert format_of(depth) is None  # an image
+    with pytest.raises(UnreadableCloud, match=r"not that of points, \(N, 3\)"):
+        decode_cloud(depth, file_format="npy")
+    with pytest.raises(UnreadableCloud, match=r"holds .<i8., and points are float32"):
+        decode_cloud(npy(np.ones((12, 3), np.int64)), file_format="npy")
+    with pytest.raises(UnreadableCloud, match="143 of 144 bytes"):
+        decode_cloud(npy(np.ones((12, 3), np.float32))[:-1])
+
+
+def test_nothing_known(ply: Write) -> None:
+    for data, message in ((b"", "empty"), (b"hello", "none of PLY, PCD"), (b"plywood", "none of")):
+        with pytest.raises(UnreadableCloud, match=message):
+            decode_cloud(data)
+    with pytest.raises(UnreadableCloud, match="no PCD file"):
+        decode_cloud(ply(), file_format="pcd")
+    with pytest.raises(UnreadableCloud, match="no format of points"):
+        decode_cloud(ply(), file_format="stl")  # type: ignore[arg-type]

@@ -1,0 +1,149 @@
+"""PCD: its header, its compression, its viewpoint."""
+
+import struct
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sceneprint.errors import UnreadableCloud
+from sceneprint.scans import decode_cloud, decode_scan
+from sceneprint.scans.lzf import inflate
+
+Write = Callable[..., bytes]
+
+
+def test_viewpoint(pcd: Write, points: np.ndarray) -> None:
+    data = pcd(viewpoint="4000 -2000 0 1 0 0 0")
+    scan = decode_scan(data)
+    assert scan.viewpoint == (4000.0, -2000.0, 0.0)
+    np.testing.assert_array_equal(scan.cloud.points, points - (4000.0, -2000.0, 0.0))
+    # in the units of the file, while what a caller says is in metres
+    assert decode_scan(data, units_per_metre=1000).viewpoint == (4.0, -2.0, 0.0)
+    for said in ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), None):
+        scan = decode_scan(data, viewpoint=said)
+        assert scan.viewpoint == said
+        assert scan.cloud.has_viewpoint == (said is not None)
+        np.testing.assert_array_equal(scan.cloud.points, points - (said or (0.0, 0.0, 0.0)))
+    with pytest.raises(UnreadableCloud, match="VIEWPOINT 'nan 0 0"):
+        decode_cloud(pcd(viewpoint="nan 0 0 1 0 0 0"))
+
+
+def test_headers_of_other_writers(pcd: Write, points: np.ndarray) -> None:
+    """Without the comment, without COUNT, with CRLF, of rows and columns, or of version .5."""
+    data = pcd(form="ascii").replace(b"\n0 0 1 ", b"\n")
+    data = data.replace(b"normal ", b"").replace(b"SIZE 4 ", b"SIZE ").replace(b"TYPE F", b"TYPE")
+    data = data.replace(b"COUNT 3 1 1 1 1\n", b"").split(b"\n", 1)[1]
+    for changed in (
+        data,
+        data.replace(b"\n", b"\r\n"),
+        data.replace(b"POINTS 12\n", b"").replace(b"WIDTH 12\nHEIGHT 1\n", b"WIDTH 4\nHEIGHT 3\n"),
+        data.replace(b"VERSION 0.7\nFIELDS", b"VERSION .5\nCOLUMNS").replace(b"HEIGHT 1\n", b""),
+    ):
+        np.testing.assert_array_equal(decode_cloud(changed).points, points)
+
+
+LIES = {
+    "no z": (b"FIELDS normal x y z", b"FIELDS normal x y w", "no single z"),
+    "z of three": (b"COUNT 3 1 1 1 1", b"COUNT 1 1 1 3 1", "no single z"),
+    "a field too few": (b"SIZE 4 4 4 8 2", b"SIZE 4 4 4 8", "5 FIELDS, 4 SIZE"),
+    "half floats": (b"SIZE 4 4 4 8 2", b"SIZE 4 2 4 8 2", "TYPE 'F' and SIZE '2'"),
+    "endless values": (b"COUNT 3 1", b"COUNT 99999999999 1", "99999999999 of TYPE"),
+    "other counts": (b"POINTS 12", b"POINTS 13", "says 13 and 12"),
+    "fifty million": (b"12\nHEIGHT 1\n", b"50000000\n", "50000000"),
+    "more than there are": (b"12\nHEIGHT 1\nV", b"1\nHEIGHT 12\nDATA binary\nV", "points of 30"),
+    "floats for doubles": (b"SIZE 4 4 4 8 2", b"SIZE 4 4 4 4 2", "of 312 bytes follow"),
+    "a negative count": (b"WIDTH 12", b"WIDTH -12", "WIDTH '-12'"),
+    "an unknown form": (b"DATA binary", b"DATA zipped", "DATA 'zipped'"),
+    "twice": (b"HEIGHT 1", b"WIDTH 12", "line 'WIDTH 12'"),
+    "no data": (b"DATA binary", b"# nothing", "no line DATA|has a line"),
+}
+
+
+@pytest.mark.parametrize("case", LIES)
+def test_lies(pcd: Write, case: str) -> None:
+    old, new, message = LIES[case]
+    with pytest.raises(UnreadableCloud, match=message):
+        decode_cloud(pcd().replace(old, new).replace(b"POINTS 12", b"POINTS " + (
+            b"50000000" if case == "fifty million" else b"12"
+        )))  # fmt: skip
+
+
+def test_truncated(pcd: Write) -> None:
+    for form in ("ascii", "binary", "binary_compressed"):
+        whole = pcd(form=form)
+        start = whole.index(b"DATA")
+        for end in (start, start + 8, len(whole) - 5):
+            with pytest.raises(UnreadableCloud):
+                decode_cloud(whole[:end])
+
+
+def compressed(count: int, inflated: int, packed: bytes) -> bytes:
+    header = (
+        f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {count}\nHEIGHT 1\n"
+        f"POINTS {count}\nDATA binary_compressed\n"
+    )
+    return header.encode() + struct.pack("<II", len(packed), inflated) + packed
+
+
+def test_bombs() -> None:
+    zeros = bytes([0, 0]) + bytes([7 << 5, 255, 0]) * 1000  # 1 + 264,000 bytes of 3,002
+    assert inflate(np.frombuffer(zeros, np.uint8), 264_001).sum() == 0
+    with pytest.raises(UnreadableCloud, match=r"announces 240000000 bytes packed into 3002"):
+        decode_cloud(compressed(20_000_000, 240_000_000, zeros))
+    with pytest.raises(UnreadableCloud, match=r"240000000 bytes of points, and 264001 packed"):
+        decode_cloud(compressed(20_000_000, 264_001, zeros))
+    with pytest.raises(UnreadableCloud, match="do not become 120 bytes"):  # and no more than these
+        decode_cloud(compressed(10, 120, zeros))
+    with pytest.raises(UnreadableCloud, match="do not become 132000 bytes"):
+        decode_cloud(compressed(11_000, 132_000, zeros[:1502] + b"\0"))
+    wide = compressed(20_000_000, 2**32 - 1, zeros).replace(b"SIZE 4 4 4", b"SIZE 8 8 8")
+    with pytest.raises(UnreadableCloud, match="480000000 bytes of points, and 4294967295"):
+        decode_cloud(wide)
+
+
+def unpacked(packed: bytes) -> bytes:
+    """By the description of the format, one byte after the other."""
+    out, left = bytearray(), list(packed)
+    while left:
+        control = left.pop(0)
+        if control < 32:
+            taken = [left.pop(0) for _ in range(control + 1)]
+            out += bytes(taken)
+            continue
+        length = (control >> 5) + (left.pop(0) if control >> 5 == 7 else 0) + 2
+        distance = ((control & 31) << 8) + left.pop(0) + 1
+        if distance > len(out):
+            raise IndexError
+        for _ in range(length):
+            out.append(out[-distance])
+    return bytes(out)
+
+
+@settings(max_examples=80, deadline=None, derandomize=True)
+@given(
+    st.lists(st.tuples(st.binary(max_size=12), st.integers(0, 300)), max_size=8).map(
+        lambda parts: b"".join(part * n for part, n in parts)[:4000]
+    )
+)
+def test_packing_round(lzf: Callable[[bytes], bytes], data: bytes) -> None:
+    packed = lzf(data)
+    assert unpacked(packed) == data
+    assert inflate(np.frombuffer(packed, np.uint8), len(data)).tobytes() == data
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(st.binary(max_size=60), st.integers(0, 5))
+def test_any_bytes_inflate_as_the_format_says(packed: bytes, beyond: int) -> None:
+    try:
+        expected = unpacked(packed)
+    except IndexError:
+        expected = None
+    size = (len(expected) if expected is not None else 20) + beyond
+    if expected is None or beyond or size > 88 * len(packed):
+        with pytest.raises(UnreadableCloud):
+            inflate(np.frombuffer(packed, np.uint8), size + 1)
+    else:
+        assert inflate(np.frombuffer(packed, np.uint8), size).tobytes() == expected

@@ -1,0 +1,160 @@
+"""PLY: what its header may say, and what it may not."""
+
+import struct
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from sceneprint.clouds import write_ply
+from sceneprint.errors import UnreadableCloud
+from sceneprint.scans import decode_cloud, decode_scan
+
+Write = Callable[..., bytes]
+
+XYZ = "property float x\nproperty float y\nproperty float z\n"
+BINARY = "ply\nformat binary_little_endian 1.0\n"
+
+
+def test_our_own(points: np.ndarray) -> None:
+    data = write_ply(points, points, np.zeros((12, 3), np.uint8), np.array([[0, 1, 2]]))
+    np.testing.assert_array_equal(decode_cloud(data).points, points)
+
+
+@pytest.mark.parametrize(
+    ("word", "kind"),
+    [("char", "b"), ("uchar", "B"), ("int16", "h"), ("ushort", "H"), ("int", "i"),
+     ("uint32", "I"), ("float32", "f"), ("double", "d")],
+)  # fmt: skip
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_types(word: str, kind: str, order: str) -> None:
+    wanted = np.arange(30).reshape(10, 3)
+    form = "binary_little_endian" if order == "<" else "binary_big_endian"
+    rows = "".join(f"property {word} {name}\n" for name in "xyz")
+    header = f"ply\r\nformat {form} 1.0\r\nelement vertex 10\r\n{rows}end_header\r\n"
+    body = struct.pack(f"{order}30{kind}", *wanted.ravel())
+    np.testing.assert_array_equal(decode_cloud(header.encode() + body).points, wanted)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_vertices_with_lists(points: np.ndarray, order: str) -> None:
+    """Rows of different lengths, the list between the coordinates."""
+    form = "binary_little_endian" if order == "<" else "binary_big_endian"
+    header = (
+        f"ply\nformat {form} 1.0\nelement vertex 12\nproperty float x\n"
+        "property list uint16 double seen\nproperty float y\nproperty double z\nend_header\n"
+    )
+    body = b""
+    for i, (x, y, z) in enumerate(points):
+        body += struct.pack(f"{order}fH{i % 4}dfd", x, i % 4, *[9.0] * (i % 4), y, z)
+    np.testing.assert_array_equal(decode_cloud(header.encode() + body).points, points)
+    with pytest.raises(UnreadableCloud, match="ends in row 12 of 12"):
+        decode_cloud((header.encode() + body)[:-1])
+
+    text = header.replace(form, "ascii")
+    for i, (x, y, z) in enumerate(points):
+        text += f"{x} {i % 4} {'9 ' * (i % 4)}{y} {z}\n"
+    np.testing.assert_array_equal(decode_cloud(text.encode()).points, points)
+
+
+def test_numbers_written_out() -> None:
+    """As Python reads them, or as missing where some printf writes a NaN."""
+    words = [
+        "1", "-1.5", "+.25", "3.", "1e3", "-2.5E-3", "1.7976931348623157e2", "0.1",
+        "123456789.123456789e-5", "0.000000000000000000000000125e24", "1000000000000000000000e-18",
+        "4.9406564584124654e-324", "1e-400", "-0", "007",
+    ]  # fmt: skip
+    rows = "".join(f"{word} 0 1\n\n" for word in words)
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(words)}\n{XYZ}end_header\n"
+    found = decode_cloud((header + rows).encode()).points[:, 0]
+    np.testing.assert_array_equal(found, np.array([float(w) for w in words], np.float32))
+
+    missing = ["nan", "-nan", "NaN(ind)", "inf", "-Infinity", "1.#QNAN", "-1.#IND", "1e400"]
+    rows += "".join(f"{word} 0 1\n" for word in missing)
+    header = header.replace(str(len(words)), str(len(words) + len(missing)))
+    scan = decode_scan((header + rows).encode())
+    assert len(scan.cloud.points) == len(words)
+    assert scan.cloud.note == "8 missing points left out"
+
+
+def test_old_line_ends(points: np.ndarray) -> None:
+    rows = "".join(f"{x} {y} {z}\r" for x, y, z in points)
+    header = f"ply\nformat ascii 1.0\nelement vertex 12\n{XYZ}end_header\n".replace("\n", "\r")
+    np.testing.assert_array_equal(decode_cloud((header + rows).encode()).points, points)
+
+
+def described(lines: str, body: bytes = b"\0" * 120) -> bytes:
+    return f"{BINARY}{lines}end_header\n".encode() + body
+
+
+LIES = {
+    "no vertices": (described("element face 0\nproperty float x\n"), "0 elements called vertex"),
+    "no z": (described("element vertex 10\nproperty float x\nproperty float y\n"), "no single z"),
+    "two x": (described(f"element vertex 10\n{XYZ}property float x\n"), "no single x"),
+    "a list of z": (
+        described("element vertex 10\nproperty float x\nproperty float y\n"
+                  "property list uchar float z\n"),
+        "no single",
+    ),
+    "fifty million": (described(f"element vertex 50000000\n{XYZ}"), "announces 50000000 points"),
+    "more than there are": (described(f"element vertex 11\n{XYZ}"), "at least 132 bytes, and 120"),
+    "fewer than there are": (described(f"element vertex 9\n{XYZ}"), "12 bytes follow"),
+    "doubles for floats": (
+        described(f"element vertex 10\n{XYZ.replace('float', 'double')}"), "240 bytes, and 120",
+    ),
+    "more before": (
+        described(f"element camera 999999999999\nproperty int a\nelement vertex 10\n{XYZ}"),
+        "999999999999 rows of camera",
+    ),
+    "nothing, often": (
+        described(f"element camera 999999999999999\nelement vertex 10\n{XYZ}"), "nothing in them",
+    ),
+    "a list of billions": (
+        described(f"element vertex 10\n{XYZ}element face 1\nproperty list uint int a\n",
+                  b"\0" * 120 + b"\xff\xff\xff\xff" + b"\0" * 9),
+        "row 1 of 1, whose lists",
+    ),
+    "a list of fewer than none": (
+        described(f"element vertex 10\n{XYZ}element face 1\nproperty list char int a\n",
+                  b"\0" * 120 + b"\xff" + b"\0" * 255 * 4),  # as many as an unsigned length tells
+        "row 1 of 1, whose lists",
+    ),
+    "a length that is no count": (
+        described(f"element vertex 10\n{XYZ}property list float int a\n"), "property 'list float",
+    ),
+    "an unknown type": (described("element vertex 10\nproperty quad x\n"), "property 'quad x'"),
+    "a count of words": (described(f"element vertex ten\n{XYZ}"), "count 'ten'"),
+    "a negative count": (described(f"element vertex -10\n{XYZ}"), "count '-10'"),
+    "an unknown line": (described(f"vertices 10\n{XYZ}"), "line 'vertices 10'"),
+    "no format": (b"ply\nelement vertex 10\n" + XYZ.encode() + b"end_header\n", "which format"),
+    "no end": (BINARY.encode() + b"comment " * 20_000, "no end_header"),
+    "many properties": (
+        described("element vertex 10\n" + "property int a\n" * 1001), "more than 1000 properties",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", LIES)
+def test_lies(case: str) -> None:
+    data, message = LIES[case]
+    with pytest.raises(UnreadableCloud, match=message):
+        decode_cloud(data)
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("1 2 3\n" * 9, "bytes follow"),
+        ("1.00 2.00 3.00\n" * 9, "Row 10 of 10.*file ends before"),
+        ("1.0 2.0 3.0\n" * 9 + "1.0 2.0\n", "Row 10 of 10.*fewer values"),
+        ("1.0 2.0 3.0 4.0\n" * 10, "Row 1 of 10.*more values"),
+        ("1.0 2.0 3.0\n" * 4 + "1.0 x 3.0\n" * 6, "Row 5 of 10.*no number"),
+        ("1.0 2.0 3.0\n" * 4 + "1.0 2e 3.0\n" * 6, "Row 5 of 10.*no number"),
+        ("1.0 2.0 3.0\n" * 4 + "1.0 0x2 3.0\n" * 6, "Row 5 of 10.*no number"),
+        ("1.0 2.0 3.0\n" * 4 + "1.0 2.0 3.0\0\n" * 6, "Row 5 of 10.*no number"),
+    ],
+)
+def test_rows_that_are_none(rows: str, message: str) -> None:
+    header = f"ply\nformat ascii 1.0\nelement vertex 10\n{XYZ}end_header\n"
+    with pytest.raises(UnreadableCloud, match=message):
+        decode_cloud((header + rows).encode())
