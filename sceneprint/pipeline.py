@@ -21,13 +21,23 @@ from sceneprint.geometry.retrieval import (
     rank,
     ranking_size,
 )
-from sceneprint.geometry.segmentation import patches_of, segment
+from sceneprint.geometry.sequences import Matching
+from sceneprint.geometry.spheres import range_image
 from sceneprint.geometry.surroundings import compress, surroundings
 from sceneprint.geometry.validation import Validation, ValidationParameters
 from sceneprint.geometry.validation import validate as validate_geometry
+from sceneprint.geometry.voxels import Voxels
 from sceneprint.models import Model
-from sceneprint.signing import Signature, Signer, encode, hierarchy_of, open_signer, see
-from sceneprint.types import Bytes, Frame, Geometry, Surface
+from sceneprint.signing import (
+    Signature,
+    Signer,
+    encode,
+    hierarchy_of,
+    open_signer,
+    patches_for_validation,
+    see,
+)
+from sceneprint.types import AnyFrame, Bytes, Geometry, Surface
 
 __all__ = [
     "Signature",
@@ -43,12 +53,12 @@ __all__ = [
 ]
 
 
-def sign(frame: Frame, signer: Signer) -> Signature:
+def sign(frame: AnyFrame, signer: Signer) -> Signature:
     """The signature psi of a frame: Sec. III-A, III-B, III-F.
 
     Parameters
     ----------
-    frame : depth in metres
+    frame : depth, or a cloud, in metres
     signer : see `open_signer`
 
     Raises
@@ -59,7 +69,7 @@ def sign(frame: Frame, signer: Signer) -> Signature:
     return encode(hierarchy_of(see(frame, p), p, frame.name), signer, frame.name)
 
 
-def prepare(frame: Frame, signer: Signer) -> tuple[Signature, Geometry]:
+def prepare(frame: AnyFrame, signer: Signer) -> tuple[Signature, Geometry]:
     """Signature and geometry artifact of a frame, of one look at its surface.
 
     Raises
@@ -81,9 +91,12 @@ def geometry_of(seen: Surface, model: Model) -> Geometry:
     model : whose parameters and compression are used
     """
     p = model.parameters
-    patches = patches_of(seen, segment(seen, p.validation_segmentation))
+    shown = seen
+    if isinstance(seen, Voxels):
+        shown = range_image(seen.cloud, p.cloud) if seen.cloud.has_viewpoint else seen.plain
+    patches = patches_for_validation(seen, p)
     histograms = surroundings(patches, p.surroundings)
-    return Geometry(seen, patches, compress(histograms, model.compression), model.id)
+    return Geometry(shown, patches, compress(histograms, model.compression), model.id)
 
 
 def distance(a: Signature, b: Signature) -> int:
@@ -150,6 +163,7 @@ def validate(
     seed: int = 0,
     p: ValidationParameters | None = None,
     mode: Mode = "full",
+    matching: Matching = "histograms",
 ) -> Validation:
     """Whether two frames see one place, and the transform between them: Sec. III-E.
 
@@ -159,13 +173,14 @@ def validate(
     seed : of the random choices; the answer echoes it
     p : see ValidationParameters
     mode : "full", or "paper" for the paper's test alone
+    matching : "histograms", or "sequence" for correspondences as the paper finds them: slower
 
     Raises
     ------
     ModelMismatch : the artifacts are of two models.
     """
     _same_model(query, match)
-    return validate_geometry(query, match, seed, p, mode)
+    return validate_geometry(query, match, seed, p, mode, matching)
 
 
 def _stacked(signatures: Sequence[Signature]) -> Bytes:

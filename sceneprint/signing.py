@@ -26,11 +26,13 @@ from sceneprint.geometry.hierarchy import hierarchy
 from sceneprint.geometry.normals import surface
 from sceneprint.geometry.projection import project
 from sceneprint.geometry.properties import neighbour_pairs, pair_properties
-from sceneprint.geometry.segmentation import segment
+from sceneprint.geometry.segmentation import patches_of, segment
+from sceneprint.geometry.supervoxels import supervoxels
 from sceneprint.geometry.table import PairTable
+from sceneprint.geometry.voxels import Voxels, voxels
 from sceneprint.geometry.weights import patch_weights
 from sceneprint.models import Model, ModelParameters, build_table, open_table, read_model
-from sceneprint.types import Bytes, Floats, Frame, Hierarchy, Patches, Surface
+from sceneprint.types import AnyFrame, Bytes, Cloud, Floats, Hierarchy, Patches, Surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,23 +95,29 @@ def open_signer(
     return Signer(read, open_table(read, cache_dir, progress))
 
 
-def see(frame: Frame, p: ModelParameters) -> Surface:
+def see(frame: AnyFrame, p: ModelParameters) -> Surface:
     """Points and normals of what a frame shows: the input of Sec. III.
 
     Parameters
     ----------
-    frame : depth in metres
+    frame : depth, or a cloud, in metres
     p : of the model
+
+    Returns
+    -------
+    surface : an ordered map of a depth image; the Voxels of a cloud
 
     Raises
     ------
     UselessFrame : nothing within the sensor's range.
     """
+    if isinstance(frame, Cloud):
+        return voxels(frame, p.cloud)
     q, camera = inverse_depth(frame, p.depth)
     return surface(q, camera, p.normals)
 
 
-def describe(frame: Frame, p: ModelParameters) -> Hierarchy:
+def describe(frame: AnyFrame, p: ModelParameters) -> Hierarchy:
     """The segmentation hierarchy of a frame; see `see` and `hierarchy_of`."""
     return hierarchy_of(see(frame, p), p, frame.name)
 
@@ -127,13 +135,32 @@ def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy
     ------
     UselessFrame : the samples lie on no surface.
     """
-    finest = segment(seen, p.segmentation)
+    if isinstance(seen, Voxels):
+        finest = supervoxels(seen, p.cloud.seed_px, p.cloud.maximum_patches, p.segmentation)
+        samples, advice = "points", "Check the units of its coordinates and its viewpoint"
+    else:
+        finest = segment(seen, p.segmentation)
+        samples, advice = "depth samples", "Check that the image is depth and its scale is right"
     if finest.max(initial=-1) < 0:
         raise UselessFrame(
-            f"{_named(name)}its depth samples lie on no surface: they are too scattered for "
-            "a patch. Check that the image is depth and its scale is right, or send another."
+            f"{_named(name)}its {samples} lie on no surface: they are too scattered for "
+            f"a patch. {advice}, or send another."
         )
     return hierarchy(seen, finest, p.hierarchy)
+
+
+def patches_for_validation(seen: Surface, p: ModelParameters) -> Patches:
+    """The patches of one size that correspondences are sought among: Sec. III-E.
+
+    Parameters
+    ----------
+    seen : of `see`
+    p : of the model
+    """
+    if isinstance(seen, Voxels):
+        spacing, most = p.cloud.validation_seed_px, p.cloud.maximum_validation_patches
+        return patches_of(seen, supervoxels(seen, spacing, most, p.validation_segmentation))
+    return patches_of(seen, segment(seen, p.validation_segmentation))
 
 
 def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:

@@ -16,28 +16,14 @@ from sceneprint.geometry.mixture import Mixture
 from sceneprint.geometry.projection import DIMENSION, Projection
 from sceneprint.geometry.properties import DIMENSION as PROPERTY_DIMENSION
 from sceneprint.geometry.surroundings import Compression
-from sceneprint.models.model import SCHEMA_VERSION, Model, ModelParameters, from_mapping
+from sceneprint.models.bounds import check_bounds
+from sceneprint.models.model import SCHEMA_VERSION, Model, parameters_of
 from sceneprint.writing import write_whole
 
 #: Names of the models that ship with the package.
-PRESETS = ("paper", "compact")
+PRESETS = ("paper", "compact", "lidar")
 #: A model of the most components fits; a larger file is refused unread.
 MAXIMUM_BYTES = 16 << 20
-#: Most components: the pair table names them in 16 bits.
-MAXIMUM_COMPONENTS = 2**15 - 1
-#: Least and most of what decides how much memory and time a frame takes.
-BOUNDS = {
-    "bins of the table": (1, 4_000_000),
-    "levels": (1, 16),
-    "patches": (1, 10_000),
-    "pixels": (64, 1 << 20),
-    "iterations": (0, 1000),
-    "window": (1, 16),
-    "patches for validation": (1, 2_000),
-    "iterations for validation": (0, 1000),
-    "bins of the surroundings": (1, 10_000),
-    "bytes of a descriptor": (1, 1024),
-}
 
 
 def write_model(model: Model) -> bytes:
@@ -151,8 +137,8 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
         "mixture.means": (g, DIMENSION),
         "mixture.variances": (g, DIMENSION),
     }
-    parameters = from_mapping(ModelParameters, header["parameters"], "parameters")
-    _check_bounds(parameters, g, len(tensors["compression.matrix"]))
+    parameters = parameters_of(header["parameters"])
+    check_bounds(parameters, g, len(tensors["compression.matrix"]))
     bins = parameters.surroundings.dimension
     shapes["compression.mean"] = (bins,)
     shapes["compression.matrix"] = (len(tensors["compression.matrix"]), bins)
@@ -183,29 +169,3 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
         unrelated_distance=d0,
         provenance=dict(header["provenance"]),
     )
-
-
-def _check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> None:
-    """See that no frame can take unbounded memory or time with these parameters."""
-    if n_components > MAXIMUM_COMPONENTS:
-        raise ValueError(f"{n_components} components are more than {MAXIMUM_COMPONENTS}")
-    t = p.table
-    if min(t.distance_bins, t.angle_bins, t.dihedral_bins) < 1:
-        raise ValueError("every axis of the table should have bins")
-    if not (p.surroundings.scales >= 1e-3).all():
-        raise ValueError("every scale of the surroundings should have a radius and bins")
-    counts = {
-        "bins of the table": t.n_bins,
-        "levels": p.hierarchy.n_levels,
-        "patches": p.segmentation.n_patches,
-        "pixels": p.depth.maximum_pixels,
-        "iterations": max(p.segmentation.iterations, p.hierarchy.iterations),
-        "window": p.normals.radius_px,
-        "patches for validation": p.validation_segmentation.n_patches,
-        "iterations for validation": p.validation_segmentation.iterations,
-        "bins of the surroundings": p.surroundings.dimension,
-        "bytes of a descriptor": n_compressed,
-    }
-    for what, (least, most) in BOUNDS.items():
-        if not least <= counts[what] <= most:
-            raise ValueError(f"{what}: {counts[what]} is not from {least} to {most}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from typing import Any, TypeVar, get_type_hints
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableModel
 from sceneprint.geometry.bins import TableLayout
+from sceneprint.geometry.clouds import CloudParameters
 from sceneprint.geometry.depth import DepthParameters
 from sceneprint.geometry.hierarchy import HierarchyParameters
 from sceneprint.geometry.mixture import Mixture
@@ -22,11 +23,16 @@ from sceneprint.geometry.projection import Projection
 from sceneprint.geometry.properties import PropertyParameters
 from sceneprint.geometry.segmentation import SegmentationParameters
 from sceneprint.geometry.surroundings import Compression, SurroundingsParameters
+from sceneprint.geometry.validation import ValidationParameters
 from sceneprint.geometry.weights import WeightParameters
 from sceneprint.types import Floats32
 
 #: Of the file and of what the numbers in it mean. Raise it when code changes signatures.
 SCHEMA_VERSION = 2
+
+#: Groups of which a file, and an id, hold only the numbers that differ from their defaults: they
+#: came after the first models, which know nothing of them. So their defaults never change.
+SPARSE = ("cloud", "validation")
 
 T = TypeVar("T")
 
@@ -46,6 +52,8 @@ class ModelParameters:
         default_factory=lambda: SegmentationParameters(n_patches=400)
     )
     surroundings: SurroundingsParameters = field(default_factory=SurroundingsParameters)
+    cloud: CloudParameters = field(default_factory=CloudParameters)
+    validation: ValidationParameters = field(default_factory=ValidationParameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +105,7 @@ class Model:
         """Everything but the arrays that changes a signature, an artifact or their meaning."""
         return {
             "schema_version": SCHEMA_VERSION,
-            "parameters": asdict(self.parameters),
+            "parameters": to_mapping(self.parameters),
             "quantiser_step": self.quantiser_step,
             "unrelated_distance": self.unrelated_distance,
         }
@@ -127,15 +135,53 @@ class Model:
         return self.level_length * self.parameters.hierarchy.n_levels
 
 
-def from_mapping(kind: type[T], values: Any, where: str) -> T:
+def to_mapping(parameters: ModelParameters) -> dict[str, Any]:
+    """The numbers of every stage as JSON; of the `SPARSE` groups what differs from the default."""
+    whole = {
+        name: group for name, group in asdict(parameters).items() if name not in SPARSE
+    }  # in the order of the stages
+    for name in SPARSE:
+        group = getattr(parameters, name)
+        different = _differences(group, type(group)())
+        if different:
+            whole[name] = different
+    return whole
+
+
+def parameters_of(values: Any) -> ModelParameters:
+    """What `to_mapping` made, read back.
+
+    Raises
+    ------
+    UnreadableModel : fields are missing, unknown or no numbers.
+    """
+    if not isinstance(values, dict):
+        raise UnreadableModel(f"The model's parameters are {values!r}. Fetch or train it again.")
+    given = {name: value for name, value in values.items() if name not in SPARSE}
+    default = ModelParameters()
+    groups = {
+        name: _changed(getattr(default, name), values.get(name, {}), f"parameters.{name}")
+        for name in SPARSE
+    }
+    return from_mapping(ModelParameters, given, "parameters", **groups)
+
+
+def from_mapping(kind: type[T], values: Any, where: str, **groups: Any) -> T:
     """A parameter record from parsed JSON, nothing missing, nothing unknown.
+
+    Parameters
+    ----------
+    kind : of the record
+    values : parsed JSON
+    where : it stood, for errors
+    groups : fields that are known already, and not in `values`
 
     Raises
     ------
     UnreadableModel : the fields are not those of `kind`.
     """
     hints = get_type_hints(kind)
-    names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    names = {field.name for field in fields(kind)} - set(groups)  # type: ignore[arg-type]
     if not isinstance(values, dict) or set(values) != names:
         given = sorted(values) if isinstance(values, dict) else values
         raise UnreadableModel(
@@ -146,11 +192,46 @@ def from_mapping(kind: type[T], values: Any, where: str) -> T:
     for name, value in values.items():
         if is_dataclass(hints[name]):
             made[name] = from_mapping(hints[name], value, f"{where}.{name}")
-        elif isinstance(value, bool) or not isinstance(value, int | float):
-            raise UnreadableModel(
-                f"The model's {where}.{name} is {value!r}, not a number: the file is damaged. "
-                "Fetch or train it again."
-            )
         else:
-            made[name] = hints[name](value)
-    return kind(**made)
+            made[name] = _number(hints[name], value, f"{where}.{name}")
+    return kind(**made, **groups)
+
+
+def _differences(record: Any, default: Any) -> dict[str, Any]:
+    """What of a record is not as in the default, group by group."""
+    different: dict[str, Any] = {}
+    for one in fields(record):
+        value, usual = getattr(record, one.name), getattr(default, one.name)
+        if is_dataclass(value):
+            value, usual = _differences(value, usual), {}
+        if value != usual:
+            different[one.name] = value
+    return different
+
+
+def _changed(default: T, values: Any, where: str) -> T:
+    """A record as the default is, but for the values given."""
+    hints = get_type_hints(type(default))
+    unknown = sorted(set(values) - set(hints)) if isinstance(values, dict) else values
+    if unknown or not isinstance(values, dict):
+        raise UnreadableModel(
+            f"The model's {where} has {unknown}, which this version of sceneprint does not know. "
+            "Use the version that wrote it, or a later one."
+        )
+    made = {
+        name: _changed(getattr(default, name), value, f"{where}.{name}")
+        if is_dataclass(hints[name])
+        else _number(hints[name], value, f"{where}.{name}")
+        for name, value in values.items()
+    }
+    return replace(default, **made)  # type: ignore[type-var]
+
+
+def _number(kind: Any, value: Any, where: str) -> Any:
+    """A number or truth value of the kind a field has."""
+    if isinstance(value, bool) is not (kind is bool) or not isinstance(value, bool | int | float):
+        raise UnreadableModel(
+            f"The model's {where} is {value!r}, not a number: the file is damaged. "
+            "Fetch or train it again."
+        )
+    return kind(value)

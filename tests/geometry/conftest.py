@@ -33,3 +33,8 @@ def validation_goldens() -> ModuleType:
 @pytest.fixture(scope="session")
 def scenes() -> ModuleType:
     return beside("scenes")
+
+
+@pytest.fixture(scope="session")
+def cloud_scenes() -> ModuleType:
+    return beside("cloud_scenes")

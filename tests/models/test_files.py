@@ -217,7 +217,9 @@ def test_a_parameter_that_is_no_number(data: bytes) -> None:
 
 
 def test_paths_that_hold_no_model(tmp_path: Path) -> None:
-    with pytest.raises(UnreadableModel, match=r"cannot be read .*presets \(paper, compact\)"):
+    with pytest.raises(
+        UnreadableModel, match=r"cannot be read .*presets \(paper, compact, lidar\)"
+    ):
         read_model(tmp_path / "none")
     with pytest.raises(UnreadableModel, match="cannot be read"):
         read_model(tmp_path)

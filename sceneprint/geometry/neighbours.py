@@ -1,0 +1,188 @@
+"""Which points are near which, and which of them touch.
+
+    places (N, 3), heights (N)  --linked-->  Links
+
+One kind of nearness for all: closer than 1 in place, and closer than 1 in a height besides.
+Whoever asks divides by the reach. Points are visited cell by cell of a grid, each with all that
+the cells around it hold.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.geometry.kernel import kernel
+from sceneprint.types import Floats, Ints32
+
+Ints64 = NDArray[np.int64]
+_REACH = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """Neighbours of N points: those of i are `indices[offsets[i] : offsets[i + 1]]`, i left out.
+
+    Parameters
+    ----------
+    offsets : (N + 1,) int64
+    indices : (M,) int32
+    """
+
+    offsets: Ints64
+    indices: Ints32
+
+    def among(self, keep: NDArray[np.bool_], linked: NDArray[np.bool_]) -> Links:
+        """Those of `linked` (M,) between the points kept (N,), which are numbered anew."""
+        number = np.cumsum(keep) - 1
+        of = np.repeat(keep, np.diff(self.offsets))
+        held = linked & of & keep[self.indices]
+        sums = np.concatenate([[0], np.cumsum(held)])
+        counts = np.diff(sums[self.offsets])[keep]
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        return Links(offsets, number[self.indices[held]].astype(np.int32))
+
+    def touching(
+        self, places: Floats, reach: float, at: Floats, normals: Floats, gaps: Floats
+    ) -> NDArray[np.bool_]:
+        """Which links (M,) are short, and between surfaces that are not one behind the other.
+
+        Parameters
+        ----------
+        places : (N, 3) as `linked` took them
+        reach : in their units
+        at, normals : (N, 3)
+        gaps : (N,) farther than this from the planes of both there is a gap, metres
+        """
+        keep = np.empty(len(self.indices), np.bool_)
+        _touch(places, reach * reach, at, normals, gaps, self.offsets, self.indices, keep)
+        return keep
+
+
+@kernel
+def _grid(cells: Ints64, order: Ints64, table: Ints64, starts: Ints64) -> int:
+    """Enter runs of points in one cell (cells sorted by `order`) into a hash table."""
+    mask = len(table) - 1
+    n = 0
+    for i in range(len(order)):
+        key = cells[order[i]]
+        if i > 0 and cells[order[i - 1]] == key:
+            continue
+        starts[n] = i
+        at = _hash(key) & mask
+        while table[at] >= 0:
+            at = (at + 1) & mask
+        table[at] = n
+        n += 1
+    starts[n] = len(order)
+    return n
+
+
+@kernel
+def _hash(key: int) -> int:
+    spread = key * -7046029254386353131
+    return (spread >> 29) ^ spread
+
+
+@kernel
+def _link(
+    places: Floats, heights: Floats, cells: Ints64, order: Ints64, table: Ints64, starts: Ints64,
+    n_cells: int, counts: Ints64, begins: Ints64,
+) -> Ints32:  # fmt: skip
+    """Neighbours of each point, all in one array: where they begin, and how many they are."""
+    mask = len(table) - 1
+    indices = np.empty(16 * len(order) + 16, np.int32)
+    total = 0
+    around = np.empty(27, np.int64)
+    span = 2 * _REACH
+    for c in range(n_cells):
+        key = cells[order[starts[c]]]
+        found = 0
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                for dz in range(-1, 2):
+                    wanted = key + (dx * span + dy) * span + dz
+                    at = _hash(wanted) & mask
+                    while table[at] >= 0:
+                        if cells[order[starts[table[at]]]] == wanted:
+                            around[found] = table[at]
+                            found += 1
+                            break
+                        at = (at + 1) & mask
+        for k in range(starts[c], starts[c + 1]):
+            i = order[k]
+            x, y, z, h = places[i, 0], places[i, 1], places[i, 2], heights[i]
+            begins[i] = total
+            for f in range(found):
+                a, b = starts[around[f]], starts[around[f] + 1]
+                if total + b - a > len(indices):
+                    longer = np.empty(2 * len(indices) + b - a, np.int32)
+                    longer[:total] = indices[:total]
+                    indices = longer
+                for m in range(a, b):
+                    j = order[m]
+                    dx_, dy_, dz_ = places[j, 0] - x, places[j, 1] - y, places[j, 2] - z
+                    if dx_ * dx_ + dy_ * dy_ + dz_ * dz_ >= 1.0 or j == i:
+                        continue
+                    if abs(heights[j] - h) >= 1.0:
+                        continue
+                    indices[total] = j
+                    total += 1
+            counts[i] = total - begins[i]
+    return indices
+
+
+@kernel
+def _reorder(indices: Ints32, begins: Ints64, offsets: Ints64, out: Ints32) -> None:
+    for i in range(len(begins)):
+        for k in range(offsets[i + 1] - offsets[i]):
+            out[offsets[i] + k] = indices[begins[i] + k]
+
+
+def linked(places: Floats, heights: Floats) -> Links:
+    """All pairs of points that are near each other.
+
+    Parameters
+    ----------
+    places : (N, 3), in units of the reach, within 2^19 of the origin
+    heights : (N,), in units of its gate
+    """
+    n = len(places)
+    cell = np.clip(np.floor(places), -_REACH + 1, _REACH - 2).astype(np.int64) + _REACH
+    cells = (cell[:, 0] * 2 * _REACH + cell[:, 1]) * 2 * _REACH + cell[:, 2]
+    order = np.argsort(cells, kind="stable")
+    table = np.full(1 << max((2 * n - 1).bit_length(), 1), -1, np.int64)
+    starts = np.empty(n + 1, np.int64)
+    n_cells = _grid(cells, order, table, starts)
+    counts, begins = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    offsets = np.zeros(n + 1, np.int64)
+    found = _link(places, heights, cells, order, table, starts, n_cells, counts, begins)
+    np.cumsum(counts, out=offsets[1:])
+    indices = np.empty(int(offsets[-1]), np.int32)
+    _reorder(found, begins, offsets, indices)
+    return Links(offsets, indices)
+
+
+@kernel
+def _touch(
+    places: Floats, square: float, at: Floats, normals: Floats, gaps: Floats, offsets: Ints64,
+    indices: Ints32, keep: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Whether two are close, and one of them lies on the plane of the other."""
+    for i in range(len(at)):
+        for k in range(offsets[i], offsets[i + 1]):
+            j = indices[k]
+            x, y, z = (
+                places[j, 0] - places[i, 0],
+                places[j, 1] - places[i, 1],
+                places[j, 2] - places[i, 2],
+            )
+            if x * x + y * y + z * z > square:
+                keep[k] = False
+                continue
+            dx, dy, dz = at[j, 0] - at[i, 0], at[j, 1] - at[i, 1], at[j, 2] - at[i, 2]
+            one = abs(dx * normals[i, 0] + dy * normals[i, 1] + dz * normals[i, 2])
+            other = abs(dx * normals[j, 0] + dy * normals[j, 1] + dz * normals[j, 2])
+            keep[k] = min(one, other) <= max(gaps[i], gaps[j])

@@ -1,0 +1,59 @@
+"""Exact clouds: a room of six planes seen from inside, by directions in any number."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sceneprint.types import Cloud, Floats
+
+#: Walls of the room, from the viewpoint: x, y, z from -> to, metres.
+LOW, HIGH = np.array([-2.0, -1.6, -1.1]), np.array([2.6, 1.9, 1.4])
+
+
+def directions(n: int, seed: int = 0, half_deg: float = 180.0) -> Floats:
+    """(n, 3) unit vectors, uniform within an angle of the x axis."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(np.cos(np.radians(half_deg)), 1.0, n)
+    turn = rng.uniform(0, 2 * np.pi, n)
+    flat = np.sqrt(1 - x * x)
+    return np.column_stack([x, flat * np.cos(turn), flat * np.sin(turn)])
+
+
+def in_room(rays: Floats) -> tuple[Floats, Floats]:
+    """Where rays meet the walls, and the normals there, (n, 3) each."""
+    with np.errstate(divide="ignore"):
+        reach = np.where(rays > 0, HIGH / rays, LOW / rays)
+    wall = reach.argmin(axis=1)
+    row = np.arange(len(rays))
+    normals = np.zeros_like(rays)
+    normals[row, wall] = -np.sign(rays[row, wall])
+    return rays * reach[row, wall][:, None], normals
+
+
+def room(n: int = 40_000, seed: int = 0, half_deg: float = 180.0) -> Cloud:
+    """The room as a cloud about the viewpoint, without noise."""
+    return Cloud(in_room(directions(n, seed, half_deg))[0].astype(np.float32))
+
+
+def off_walls(points: Floats) -> Floats:
+    """How far points lie from the nearest wall, metres."""
+    gaps = np.concatenate([points - LOW, HIGH - points], axis=-1)
+    result: Floats = np.abs(gaps).min(axis=-1)
+    return result
+
+
+def rotation(seed: int) -> Floats:
+    """A rotation drawn uniformly: (3, 3)."""
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    q[:, 0] *= np.linalg.det(q)
+    return np.asarray(q, float)
+
+
+def shuffled(cloud: Cloud, seed: int = 1) -> Cloud:
+    order = np.random.default_rng(seed).permutation(len(cloud.points))
+    return Cloud(cloud.points[order], cloud.has_viewpoint, cloud.name)
+
+
+def turned(cloud: Cloud, R: Floats) -> Cloud:
+    return Cloud((cloud.points @ R.T).astype(np.float32), cloud.has_viewpoint, cloud.name)

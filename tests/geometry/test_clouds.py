@@ -1,0 +1,82 @@
+"""Which points of a cloud are looked at, and the axes that turn with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import UselessFrame
+from sceneprint.geometry.clouds import CloudParameters, principal_axes, within_range
+from sceneprint.types import Cloud
+
+P = CloudParameters(minimum_points=3)
+
+
+def test_points_out_of_range_are_left_out() -> None:
+    ranges = np.array([0.29, 0.31, 1.0, 9.99, 10.01, 500.0])
+    points = (ranges[:, None] * np.array([0.6, 0.0, -0.8])).astype(np.float32)
+    np.testing.assert_array_equal(within_range(Cloud(points), P), points[1:4])
+    # nothing is known of ranges where there is no viewpoint
+    np.testing.assert_array_equal(within_range(Cloud(points, has_viewpoint=False), P), points)
+
+
+@pytest.mark.parametrize(
+    ("factor", "says"),
+    [(1000.0, "if the coordinates are millimetres, say 1000 units per metre"), (0.01, "units")],
+)
+def test_out_of_range_names_the_range_and_what_to_do(
+    cloud_scenes: ModuleType, factor: float, says: str
+) -> None:
+    cloud = cloud_scenes.room(500)
+    with pytest.raises(UselessFrame, match=r"0 of its 500 .* 0\.3 to 10 m.* median") as caught:
+        within_range(Cloud(cloud.points * np.float32(factor), name="scan"), P)
+    assert says in str(caught.value)
+    assert "lidar" in str(caught.value)
+    assert str(caught.value).startswith("scan: ")
+
+
+def test_too_few_points_are_none_of_the_range() -> None:
+    with pytest.raises(UselessFrame, match=r"10 points are too few .* at least 64"):
+        within_range(Cloud(np.ones((10, 3), np.float32)), CloudParameters())
+
+
+def test_axes_are_eigenvectors_signed_by_skew(cloud_scenes: ModuleType) -> None:
+    points = cloud_scenes.room(5000).points
+    axes = principal_axes(points)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    moments = axes @ (points.astype(float).T @ points) @ axes.T
+    off = moments - np.diag(np.diag(moments))
+    assert np.abs(off).max() < 1e-3 * moments.max()
+    assert (np.diff(np.diag(moments)) < 0).all()
+    assert ((points @ axes[:2].T) ** 3).sum(axis=0).min() > 0
+
+
+def test_axes_turn_with_the_cloud(cloud_scenes: ModuleType) -> None:
+    cloud = cloud_scenes.room(5000, half_deg=60)
+    axes = principal_axes(cloud.points)
+    for seed in range(5):
+        R = cloud_scenes.rotation(seed)
+        turned = principal_axes(cloud_scenes.turned(cloud, R).points)
+        np.testing.assert_allclose(turned, axes @ R.T, atol=1e-6)
+
+
+def test_axes_know_no_order(cloud_scenes: ModuleType) -> None:
+    cloud = cloud_scenes.room(5000)
+    there = principal_axes(cloud_scenes.shuffled(cloud).points)
+    np.testing.assert_array_equal(there, principal_axes(cloud.points))
+
+
+def test_no_extent_has_the_given_axes() -> None:
+    np.testing.assert_array_equal(principal_axes(np.zeros((4, 3), np.float32)), np.eye(3))
+
+
+def test_defaults_never_change() -> None:
+    """Models without these numbers in their files were made with them."""
+    assert replace(CloudParameters()) == CloudParameters(
+        0.3, 10.0, 64, 1 / 146, 0.02, 5.2, 8.2, 1200, 600, 76800, 0.03, 3, 0.05, 0.006, 0.006,
+        9, 0.3, 0.12, 1 / 146, 3, 6, 0.95,
+    )  # fmt: skip

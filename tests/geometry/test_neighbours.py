@@ -1,0 +1,114 @@
+"""Neighbours against all pairs, and planes against numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.fitting import least_axis, plane_facing, plane_seen
+from sceneprint.geometry.neighbours import Links, linked
+from sceneprint.types import Floats
+
+
+def of(links: Links) -> list[set[int]]:
+    return [
+        set(links.indices[a:b].tolist())
+        for a, b in zip(links.offsets[:-1], links.offsets[1:], strict=True)
+    ]
+
+
+def naive(places: Floats, heights: Floats) -> list[set[int]]:
+    near = np.linalg.norm(places[:, None] - places[None], axis=2) < 1
+    near &= np.abs(heights[:, None] - heights[None]) < 1
+    np.fill_diagonal(near, False)
+    return [set(np.flatnonzero(row).tolist()) for row in near]
+
+
+@pytest.mark.parametrize("spread", [0.5, 3.0, 400_000.0])
+def test_links_are_all_pairs_that_are_near(spread: float) -> None:
+    rng = np.random.default_rng(3)
+    seeds = rng.uniform(-spread, spread, (12, 3))
+    places = np.repeat(seeds, 20, axis=0) + rng.normal(size=(240, 3))
+    heights = rng.uniform(0, 3, 240)
+    assert of(linked(places, heights)) == naive(places, heights)
+
+
+def test_no_points_no_links() -> None:
+    assert len(linked(np.empty((0, 3)), np.empty(0)).indices) == 0
+
+
+def test_links_among_those_kept() -> None:
+    rng = np.random.default_rng(4)
+    places = rng.uniform(-1.5, 1.5, (80, 3))
+    links = linked(places, np.zeros(80))
+    keep, held = rng.random(80) < 0.7, rng.random(len(links.indices)) < 0.8
+    number = {int(i): k for k, i in enumerate(np.flatnonzero(keep))}
+    wanted: list[set[int]] = [set() for _ in number]
+    sources = np.repeat(np.arange(80), np.diff(links.offsets))
+    for i, j, is_held in zip(sources.tolist(), links.indices.tolist(), held, strict=True):
+        if is_held and i in number and j in number:
+            wanted[number[i]].add(number[j])
+    assert of(links.among(keep, held)) == wanted
+
+
+def test_surfaces_one_behind_the_other_do_not_touch() -> None:
+    x = np.arange(10) * 0.1
+    front = np.column_stack([x, np.zeros(10), np.zeros(10)])
+    behind = front + np.array([0, 0, 0.2])
+    at, normals = np.concatenate([front, behind]), np.tile([0.0, 0.0, -1.0], (20, 1))
+    links = linked(at / 0.5, np.zeros(20))
+    touching = links.touching(at / 0.5, 0.7, at, normals, np.full(20, 0.05))
+    there = of(links.among(np.ones(20, np.bool_), touching))
+    for i, found in enumerate(there):
+        assert found == {j for j in range(20) if i // 10 == j // 10 and 0 < abs(i - j) <= 3}
+    # where one lies on the other's plane, as at a crease, they do
+    normals[10:] = [1.0, 0.0, 0.0]
+    touching = links.touching(at / 0.5, 0.7, at, normals, np.full(20, 0.05))
+    assert 10 in of(links.among(np.ones(20, np.bool_), touching))[0]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_least_axis_is_the_eigenvector_of_the_least(seed: int) -> None:
+    half = np.random.default_rng(seed).normal(size=(3, 3)) * [1.0, 0.3, 1e-3]
+    m = half @ half.T
+    values, vectors = np.linalg.eigh(m)
+    found, axis = np.zeros(3), np.zeros(3)
+    least_axis(m.copy(), found, axis)
+    np.testing.assert_allclose(np.sort(found), values, atol=1e-12)
+    assert abs(axis @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_facing_normals_are_numpys_components() -> None:
+    rng = np.random.default_rng(6)
+    places = rng.uniform(-2, 2, (400, 3)) * [1, 1, 0.02] + [0, 0, 5]
+    links = linked(places, np.zeros(400))
+    normals, at = np.zeros_like(places), places.copy()
+    limits = np.array([5.0, 1e-9])
+    plane_facing(places, links.offsets, links.indices, 10.0, limits, normals, at)
+    for i, found in enumerate(of(links)):
+        group = places[sorted({i, *found})]
+        if len(group) < 5:
+            assert not normals[i].any()
+            continue
+        centre = group.mean(axis=0)
+        axis = np.linalg.svd(group - centre)[2][2]
+        axis = axis if axis @ places[i] < 0 else -axis
+        np.testing.assert_allclose(normals[i], axis, atol=1e-7)
+        assert (at[i] - centre) @ axis == pytest.approx(0.0, abs=1e-9)
+    assert (np.abs(normals[:, 2]) > 0.99).mean() > 0.9
+
+
+def test_seen_planes_are_exact_beside_a_step() -> None:
+    y, z = (one.reshape(-1) for one in np.meshgrid(np.arange(-1, 1, 0.05), np.arange(-1, 1, 0.05)))
+    left, right = np.array([0.3, 0.02, -0.1]), np.array([0.25, 0.0, 0.0])  # a of a . p = 1
+    rays = np.column_stack([np.full(len(y), 3.0), y, z])
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    q = np.where(y < 0, rays @ left, rays @ right)
+    links = linked(rays / 0.06, -np.log(q) / 0.05)
+    planes = np.zeros_like(rays)
+    gates, limits = np.array([0.05, 0.006, 0.006]), np.array([6.0, 0.0])
+    plane_seen(q, rays, links.offsets, links.indices, gates, limits, planes)
+    inner = np.abs(z) < 0.9
+    for side, a in ((y < 0, left), (y > 0, right)):
+        found = planes[side & inner & (np.abs(y) < 0.9)]
+        np.testing.assert_allclose(found, np.broadcast_to(a, found.shape), atol=1e-9)

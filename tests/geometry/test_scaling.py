@@ -1,0 +1,113 @@
+"""Every length is known to be one, and a larger world under longer lengths is the same."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.clouds import CloudParameters
+from sceneprint.geometry.scaling import POWERS, scaled
+from sceneprint.models import ModelParameters
+from sceneprint.pipeline import Signer, prepare, validate
+from sceneprint.types import Cloud
+
+#: Numbers that no scale changes; a new one belongs here or in POWERS.
+BARE = {
+    "DepthParameters": {"same_surface", "focal_length_px"},
+    "NormalParameters": {"depth_gate", "plane_gate", "minimum_spread", "minimum_cosine"},
+    "SegmentationParameters": {"normal_weight", "minimum_size"},
+    "HierarchyParameters": {"factor", "normal_weight"},
+    "WeightParameters": {"size_exponent", "coherence_exponent"},
+    "PropertyParameters": {"angular_tolerance", "colinearity"},
+    "TableLayout": {"distance_exponent"},
+    "CloudParameters": {
+        "voxel_angle", "seed_px", "validation_seed_px", "same_surface", "range_gate",
+        "plane_gate", "minimum_spread", "minimum_cosine", "image_angle", "gap_cosine",
+    },
+    "AcceptanceParameters": {
+        "residual_rad", "violation_weight", "evidence", "plane_overlap", "strong", "weak",
+        "ambiguous", "ambiguous_share", "stiffness", "blind_ambiguous_share",
+        "blind_evidence", "blind_plane_overlap",
+    },
+    "RivalParameters": {
+        "same_direction", "least_crossing", "hopeful_share", "hopeful_violations", "refuted",
+        "rival_rad",
+    },
+    "PlaneParameters": {"coplanar"},
+    "RefinementParameters": {"normal_cosine"},
+    "AlignmentParameters": {"violation_weight", "same_rad"},
+    "ConsensusParameters": {"angle_tolerance", "inlier_cosine"},
+    "SequenceParameters": {"angle_scale", "gap_cost", "swap_cost"},
+    "AgreementParameters": {"normal_cosine"},
+    "CovarianceParameters": {"independent", "free"},
+}  # fmt: skip
+
+
+def leaves(record: Any) -> list[tuple[Any, str]]:
+    found: list[tuple[Any, str]] = []
+    for one in fields(record):
+        value = getattr(record, one.name)
+        if is_dataclass(value):
+            found += leaves(value)
+        elif isinstance(value, float):
+            found.append((type(record), one.name))
+    return found
+
+
+def test_every_number_is_a_length_or_bare() -> None:
+    unknown = [
+        (kind.__name__, name)
+        for kind, name in leaves(ModelParameters())
+        if name not in POWERS.get(kind, {}) and name not in BARE.get(kind.__name__, set())
+    ]
+    assert unknown == []
+    for kind, powers in POWERS.items():
+        assert set(powers) <= {one.name for one in fields(kind)}
+        assert not set(powers) & BARE.get(kind.__name__, set())
+
+
+def test_scaled_by_hand() -> None:
+    p = scaled(ModelParameters(), 4.0)
+    assert p.properties.radius == 12.0
+    assert p.cloud.noise_gate == CloudParameters().noise_gate / 4
+    assert p.validation.alignment.consensus.normal_weight == pytest.approx(0.05 * 16)
+    assert (
+        p.validation.rivals.first.first_gate
+        == ModelParameters().validation.rivals.first.first_gate * 4
+    )
+    assert p.hierarchy == ModelParameters().hierarchy
+    assert scaled(p, 0.25) == ModelParameters()
+
+
+def test_a_larger_world_signs_and_validates_the_same(
+    cloud_scenes: ModuleType, small_signer: Signer
+) -> None:
+    """A power of two changes no digit of a float: so the bytes are the same."""
+    model = small_signer.model
+    small = replace(model.parameters, cloud=CloudParameters(voxel_angle=0.02, image_angle=0.02))
+    step = np.array([0.12, -0.1, 0.05])
+    R = cloud_scenes.rotation(1)
+    here = cloud_scenes.in_room(cloud_scenes.directions(30_000, 1, 75))[0]
+    there = (cloud_scenes.in_room(cloud_scenes.directions(30_000, 2, 80))[0] - step) @ R.T
+    made = []
+    for factor in (1.0, 8.0):
+        larger = replace(small_signer, model=replace(model, parameters=scaled(small, factor)))
+        made.append(
+            [prepare(Cloud((one * factor).astype(np.float32)), larger) for one in (here, there)]
+        )
+    for (a, _), (b, _) in zip(*made, strict=True):
+        assert a.n_patches == b.n_patches
+        np.testing.assert_allclose(a.vector.astype(int), b.vector.astype(int), atol=1)
+    first = validate(made[0][0][1], made[0][1][1], 3, small.validation)
+    second = validate(made[1][0][1], made[1][1][1], 3, scaled(small.validation, 8.0))
+    assert first.T_match_query is not None
+    assert second.T_match_query is not None
+    assert (first.status, first.strength) == (second.status, second.strength)
+    np.testing.assert_allclose(second.T_match_query[:3, :3], first.T_match_query[:3, :3], atol=1e-5)
+    np.testing.assert_allclose(
+        second.T_match_query[:3, 3], 8 * first.T_match_query[:3, 3], atol=1e-4
+    )

@@ -1,0 +1,123 @@
+"""Voxels and supervoxels of an exact room: normals, connection, gaps, order, turning."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.clouds import CloudParameters
+from sceneprint.geometry.segmentation import SegmentationParameters, patches_of
+from sceneprint.geometry.supervoxels import supervoxels
+from sceneprint.geometry.voxels import Voxels, voxels
+from sceneprint.types import Cloud, Ints32
+
+P = CloudParameters(voxel_angle=0.03, voxel_size=0.06)
+S = SegmentationParameters()
+
+
+def parts(seen: Voxels, labels: Ints32) -> list[int]:
+    """How many parts each patch is in, by a walk over its links."""
+    found = []
+    links = seen.links
+    for k in range(int(labels.max()) + 1):
+        left, n = set(np.flatnonzero(labels[0] == k).tolist()), 0
+        while left:
+            n += 1
+            stack = [left.pop()]
+            while stack:
+                i = stack.pop()
+                near = links.indices[links.offsets[i] : links.offsets[i + 1]].tolist()
+                fresh = left.intersection(near)
+                left -= fresh
+                stack += fresh
+        found.append(n)
+    return found
+
+
+@pytest.mark.parametrize("has_viewpoint", [True, False])
+def test_voxels_lie_on_the_walls(cloud_scenes: ModuleType, has_viewpoint: bool) -> None:
+    cloud = replace(cloud_scenes.room(60_000), has_viewpoint=has_viewpoint)
+    seen = voxels(cloud, P)
+    points, normals = seen.points[0].astype(float), seen.normals[0]
+    inner = np.abs(normals).max(axis=1) > 0.9999
+    assert inner.mean() > 0.75
+    off = cloud_scenes.off_walls(points[inner])
+    assert np.quantile(off, 0.95) < 1e-4
+    assert ((points * normals).sum(axis=1) < 0).mean() > 0.999  # the centroid is near the origin
+    size = cloud_scenes.HIGH - cloud_scenes.LOW
+    whole = 2 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
+    assert seen.areas.sum() == pytest.approx(whole, rel=0.2)
+
+
+@pytest.mark.parametrize("has_viewpoint", [True, False])
+def test_patches_hang_together_and_respect_edges(
+    cloud_scenes: ModuleType, has_viewpoint: bool
+) -> None:
+    seen = voxels(replace(cloud_scenes.room(60_000), has_viewpoint=has_viewpoint), P)
+    labels = supervoxels(seen, 5.0, 1000, S)
+    assert (labels >= 0).mean() > 0.97
+    assert set(parts(seen, labels)) == {1}
+    patches = patches_of(seen, labels)
+    assert len(patches) > 100
+    assert np.median(patches.coherences) > 0.9999
+    assert np.mean(np.abs(patches.normals).max(axis=1) > 0.99) > 0.8
+    assert patches.sizes.min() >= max(S.minimum_pixels, S.minimum_size * 25)
+
+
+def test_no_patch_crosses_a_gap() -> None:
+    grid = np.arange(-0.6, 0.6, 0.01)
+    y, z = (one.reshape(-1) for one in np.meshgrid(grid, grid))
+    # a board before a wall, 18 cm apart at 1.4 m
+    x = np.where((np.abs(y) < 0.25) & (np.abs(z) < 0.25), 1.2, 1.4)
+    scale = x / 1.4
+    seen = voxels(Cloud(np.column_stack([x, y * scale, z * scale]).astype(np.float32)), P)
+    labels = supervoxels(seen, 5.0, 1000, S)[0]
+    depth = seen.points[0, :, 0]
+    for k in range(labels.max() + 1):
+        assert np.ptp(depth[labels == k]) < 0.1
+
+
+def test_any_order_gives_the_same_bytes(cloud_scenes: ModuleType) -> None:
+    cloud = cloud_scenes.room(20_000)
+    for has_viewpoint in (True, False):
+        a = voxels(replace(cloud, has_viewpoint=has_viewpoint), P)
+        b = voxels(replace(cloud_scenes.shuffled(cloud), has_viewpoint=has_viewpoint), P)
+        assert a.points.tobytes() == b.points.tobytes()
+        assert a.normals.tobytes() == b.normals.tobytes()
+        assert supervoxels(a, 5.0, 1000, S).tobytes() == supervoxels(b, 5.0, 1000, S).tobytes()
+
+
+def test_patches_turn_with_the_cloud(cloud_scenes: ModuleType) -> None:
+    cloud = cloud_scenes.room(30_000, half_deg=70)
+    R = cloud_scenes.rotation(3)
+    made = []
+    for one in (cloud, cloud_scenes.turned(cloud, R)):
+        seen = voxels(one, P)
+        made.append(patches_of(seen, supervoxels(seen, 5.0, 1000, S)))
+    plain, turned = made
+    assert len(turned) == pytest.approx(len(plain), rel=0.05)
+    there = plain.means @ R.T
+    nearest = np.linalg.norm(there[:, None] - turned.means[None], axis=2).min(axis=1)
+    assert np.median(nearest) < 0.01  # patches are 0.3 m across
+    assert np.mean(nearest < 0.05) > 0.8
+
+
+def test_no_more_than_are_wanted(cloud_scenes: ModuleType) -> None:
+    cloud = cloud_scenes.room(30_000)
+    few = replace(P, maximum_pixels=3000)
+    for has_viewpoint in (True, False):
+        seen = voxels(replace(cloud, has_viewpoint=has_viewpoint), few)
+        assert 1000 < len(seen.sides) <= 3000
+        assert seen.sides.min() > 0.03
+        assert 5 < supervoxels(seen, 2.0, 20, S).max() + 1 <= 20
+
+
+def test_voxels_grow_with_range(cloud_scenes: ModuleType) -> None:
+    seen = voxels(cloud_scenes.room(30_000), P)
+    ranges = np.linalg.norm(seen.points[0], axis=1)
+    np.testing.assert_allclose(seen.sides, 0.03 * ranges, rtol=1e-5)
+    plain = voxels(replace(cloud_scenes.room(30_000), has_viewpoint=False), P)
+    np.testing.assert_allclose(plain.sides, 0.06)

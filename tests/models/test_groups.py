@@ -1,0 +1,84 @@
+"""The groups that came later: absent where they are as usual, and then no part of the id."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from sceneprint.errors import UnreadableModel
+from sceneprint.geometry.clouds import CloudParameters
+from sceneprint.geometry.validation import ValidationParameters
+from sceneprint.models import Model, ModelParameters, parse_model, read_model, write_model
+from sceneprint.models.model import parameters_of, to_mapping
+
+
+@pytest.mark.parametrize(
+    ("preset", "start"), [("paper", "c8883ac257b4"), ("compact", "da1ec0e37999")]
+)
+def test_ids_of_shipped_models_stay(preset: str, start: str) -> None:
+    model = read_model(preset)
+    assert model.id.startswith(start)
+    assert not {"cloud", "validation"} & set(model.header["parameters"])
+    assert model.parameters.cloud == CloudParameters()
+    assert model.parameters.validation == ValidationParameters()
+
+
+def changed(model: Model) -> Model:
+    p = model.parameters
+    coarse = replace(p.validation.alignment.coarse, stride=9, first_gate=0.5)
+    alignment = replace(p.validation.alignment, coarse=coarse)
+    validation = replace(p.validation, minimum_patches=7, alignment=alignment)
+    cloud = replace(p.cloud, maximum_range=60.0)
+    return replace(model, parameters=replace(p, cloud=cloud, validation=validation))
+
+
+def test_only_what_differs_is_written(small_model: Model) -> None:
+    model = changed(small_model)
+    written = model.header["parameters"]
+    assert written["cloud"] == {"maximum_range": 60.0}
+    assert written["validation"] == {
+        "minimum_patches": 7,
+        "alignment": {"coarse": {"first_gate": 0.5, "stride": 9}},
+    }
+    assert model.id != small_model.id
+    read = parse_model(write_model(model), "a file")
+    assert (read.id, read.parameters) == (model.id, model.parameters)
+
+
+@pytest.mark.parametrize(
+    ("group", "value"),
+    [
+        ("cloud", {"maximum_reach": 3.0}),
+        ("cloud", {"maximum_range": "far"}),
+        ("cloud", {"maximum_pixels": True}),
+        ("cloud", [1.0]),
+        ("cloud", None),
+        ("validation", {"alignment": {"coarse": {"strides": 2}}}),
+        ("validation", {"alignment": 3}),
+    ],
+)
+def test_what_is_not_known_is_refused(group: str, value: Any) -> None:
+    with pytest.raises(UnreadableModel, match=f"parameters.{group}"):
+        parameters_of(to_mapping(ModelParameters()) | {group: value})
+
+
+@pytest.mark.parametrize(
+    "cloud",
+    [
+        CloudParameters(maximum_pixels=1 << 21),
+        CloudParameters(radius_px=40),
+        CloudParameters(minimum_range=0.0),
+        CloudParameters(maximum_range=0.2),
+        CloudParameters(voxel_size=0.0),
+        CloudParameters(image_angle=1e-9),
+        CloudParameters(same_surface=0.0),
+        CloudParameters(seed_px=0.0),
+        CloudParameters(range_gate=0.0),
+    ],
+)
+def test_what_would_take_for_ever_is_refused(small_model: Model, cloud: CloudParameters) -> None:
+    model = replace(small_model, parameters=replace(small_model.parameters, cloud=cloud))
+    with pytest.raises(UnreadableModel):
+        parse_model(write_model(model), "a file")
