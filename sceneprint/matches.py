@@ -15,6 +15,7 @@ from sceneprint.geometry.association import preferred, voters
 from sceneprint.geometry.averaging import PoseAverage, average_poses
 from sceneprint.geometry.covariance import place_covariance, transported
 from sceneprint.geometry.retrieval import Ranking
+from sceneprint.geometry.sequences import Matching
 from sceneprint.geometry.validation import Validation, ValidationParameters
 from sceneprint.pipeline import validate
 from sceneprint.types import Floats, Geometry
@@ -63,6 +64,7 @@ def associate(
     p: ValidationParameters | None = None,
     mode: Mode = "full",
     go_on: Callable[[], bool] = lambda: True,
+    matching: Matching = "histograms",
 ) -> list[Match]:
     """Candidates validated in the order of R until `k` are accepted: Sec. III-E.
 
@@ -73,7 +75,7 @@ def associate(
     among : positions in R to try, rising: C, or the first of R
     open_geometry : artifact of a row of the database; a row without one is passed over
     k : accepted ones after which to stop, at least 1
-    seed, p, mode : see `validate`
+    seed, p, mode, matching : see `validate`
     go_on : asked before each; where it says no, the rest is left
 
     Returns
@@ -97,7 +99,7 @@ def associate(
         geometry = open_geometry(index)
         if geometry is None:
             continue
-        validation = validate(query, geometry, seed, p, mode)
+        validation = validate(query, geometry, seed, p, mode, matching)
         tried.append(
             Match(
                 index,

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sceneprint.artifacts import read_geometry
 from sceneprint.engine.deadlines import Deadline
 from sceneprint.engine.healing import sign_again
 from sceneprint.engine.searching import Searched
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
-from sceneprint.geometry.acceptance import AcceptanceParameters, Mode
+from sceneprint.geometry.acceptance import Mode
 from sceneprint.geometry.validation import ValidationParameters
 from sceneprint.matches import Match, associate
 from sceneprint.schemas import Query, ValidationOptions
@@ -55,18 +55,23 @@ def wanted_of(query: Query) -> int:
     return query.candidates or max(CANDIDATES, query.k)
 
 
-def thresholds(given: ValidationOptions | None) -> tuple[ValidationParameters | None, Mode]:
-    """What a validation is done with, as `validate` takes it; None for the defaults."""
+def thresholds(
+    given: ValidationOptions | None, p: ValidationParameters
+) -> tuple[ValidationParameters, Mode]:
+    """What a validation is done with, as `validate` takes it: the model's `p`, but for what was
+    given.
+    """
     if given is None:
-        return None, "full"
-    own = given.model_dump(exclude={"mode", "residual_deg"})
-    acceptance = AcceptanceParameters(residual_rad=math.radians(given.residual_deg), **own)
-    return ValidationParameters(acceptance=acceptance), given.mode
+        return p, "full"
+    own = given.model_dump(exclude={"mode", "residual_deg"}, exclude_unset=True)
+    if "residual_deg" in given.model_fields_set:
+        own["residual_rad"] = math.radians(given.residual_deg)
+    return replace(p, acceptance=replace(p.acceptance, **own)), given.mode
 
 
 def validated(
     store: Store, searched: Searched, chosen: Sequence[int], geometry: Geometry | None,
-    query: Query, deadline: Deadline,
+    query: Query, deadline: Deadline, p: ValidationParameters,
 ) -> Validated:  # fmt: skip
     """Try candidates in the order of R.
 
@@ -77,6 +82,7 @@ def validated(
     chosen : positions in R of the candidates
     geometry : of the query; None where validation was not asked for
     query, deadline : see there
+    p : of the model
     """
     if geometry is None:
         return Validated(chosen, [], {}, NOT_ASKED, deadline.reached)
@@ -96,7 +102,7 @@ def validated(
 
     matches = associate(
         geometry, ranking, chosen, open_geometry, query.k, query.seed,
-        *thresholds(query.validation), deadline.allows,
+        *thresholds(query.validation, p), deadline.allows,
     )  # fmt: skip
     owner = dict(zip(ranking.indices.tolist(), searched.owners.tolist(), strict=True))
     for i, part in enumerate(searched.parts):

@@ -28,6 +28,9 @@ class AcceptanceParameters:
     ambiguous: float = 0.14  #: ambiguity from which on nothing is accepted
     ambiguous_share: float = 0.5  #: nor from this share of `plane_overlap` on
     stiffness: float = 1e-5  #: least ratio of the eigenvalues of the information
+    blind_evidence: float = 0.4  #: least where nothing is known of free space
+    blind_plane_overlap: float = 0.3  #: and least of `plane_overlap`
+    blind_ambiguous_share: float = 0.75  #: of which, in the place of both above: fewer rivals fall
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,8 @@ class Evidence:
 
     Parameters
     ----------
-    residual_m, residual_rad, overlap, plane_overlap, violations : as in Validation
+    residual_m, residual_rad, overlap, plane_overlap : as in Validation
+    violations : as in Validation; None where there is no evidence of free space
     stiffness : the less of both directions', as in Alignment
     """
 
@@ -44,12 +48,12 @@ class Evidence:
     residual_rad: float
     overlap: float
     plane_overlap: float
-    violations: float
+    violations: float | None
     stiffness: float
 
     def total(self, p: AcceptanceParameters) -> float:
         """For less against."""
-        return self.overlap - p.violation_weight * self.violations
+        return self.overlap - p.violation_weight * (self.violations or 0.0)
 
 
 def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status, str] | None:
@@ -66,11 +70,15 @@ def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status,
         return "rejected", f"the two directions disagree by {e.residual_m:.2g} m, {degrees:.2g} deg"
     if mode == "paper":
         return None
-    if e.total(p) < p.evidence:
-        if e.overlap < p.evidence:
+    blind = e.violations is None
+    evidence = p.blind_evidence if blind else p.evidence
+    if e.total(p) < evidence:
+        if e.violations is None:
+            return "rejected", f"only {e.overlap:.0%} agrees, and free space is not known"
+        if e.overlap < evidence:
             return "rejected", f"only {e.overlap:.0%} of the surfaces agree"
         return "rejected", f"{e.violations:.1%} lies where the other frame saw through"
-    if e.plane_overlap < p.plane_overlap:
+    if e.plane_overlap < (p.blind_plane_overlap if blind else p.plane_overlap):
         return "rejected", f"what agrees is mostly one plane ({e.plane_overlap:.0%} by planes)"
     if e.stiffness < p.stiffness:
         return "ambiguous", "what the frames share leaves a direction free, as a plane does"
@@ -81,8 +89,13 @@ def belief(
     e: Evidence, ambiguity: float, p: AcceptanceParameters
 ) -> tuple[Status, Strength | None, str]:
     """How far to believe a transform that nothing but its rivals speaks against."""
-    if ambiguity >= min(p.ambiguous, p.ambiguous_share * e.plane_overlap):
+    most = min(p.ambiguous, p.ambiguous_share * e.plane_overlap)
+    if e.violations is None:  # no rival is refuted by free space either
+        most = p.blind_ambiguous_share * e.plane_overlap
+    if ambiguity >= most:
         return "ambiguous", None, "another transform explains the frames as well"
+    if e.violations is None:
+        return "accepted", "weak", "surfaces agree, but nothing is known of free space"
     if ambiguity >= p.weak:
         return "accepted", "weak", "another transform is not ruled out"
     if e.total(p) < p.strong:

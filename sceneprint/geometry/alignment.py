@@ -13,6 +13,7 @@ import numpy as np
 from sceneprint.geometry.agreement import AgreementParameters, agreements, sampled
 from sceneprint.geometry.consensus import ConsensusParameters, consensus
 from sceneprint.geometry.matching import MatchingParameters, correspondences
+from sceneprint.geometry.projecting import kind_of
 from sceneprint.geometry.registration import (
     COARSE,
     FINE,
@@ -22,6 +23,7 @@ from sceneprint.geometry.registration import (
     refined_all,
 )
 from sceneprint.geometry.rigid import difference
+from sceneprint.geometry.sequences import Matching, SequenceParameters, sequence_correspondences
 from sceneprint.types import Floats, Floats32, Geometry, Surface
 
 
@@ -37,6 +39,8 @@ class AlignmentParameters:
     same_rad: float = math.radians(6.0)
     coarse: RefinementParameters = COARSE
     fine: RefinementParameters = FINE
+    lever: float = 1.0  #: in `stiffness` a radian counts as much as this many metres
+    sequence: SequenceParameters = field(default_factory=SequenceParameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +69,7 @@ def align(
     rng: np.random.Generator,
     p: AlignmentParameters,
     agreement_p: AgreementParameters,
+    matching: Matching = "histograms",
 ) -> Alignment | None:
     """The transform from source to target: Sec. III-E, in one direction.
 
@@ -77,12 +82,16 @@ def align(
     source, target : geometry artifacts
     rng : of the patches drawn
     p, agreement_p : see there
+    matching : what correspondences are found by
 
     Returns
     -------
     alignment : or None where no three correspondences agree, or no hypothesis survives refinement
     """
-    pairs = correspondences(source.descriptors, target.descriptors, rng, p.matching)
+    if matching == "sequence":
+        pairs = sequence_correspondences(source.patches, target.patches, rng, p.sequence)
+    else:
+        pairs = correspondences(source.descriptors, target.descriptors, rng, p.matching)
     hypotheses = consensus(source.patches, target.patches, pairs, p.consensus)
     points = sampled(source.surface, agreement_p.stride)
     if not len(hypotheses):
@@ -95,10 +104,12 @@ def align(
     scores = _scores(points, target.surface, refined, p, agreement_p)
     order = np.argsort(-scores, kind="stable")
     best, others = refined[order[0]], refined[order[1:]]
-    fine = refine(sampled(source.surface, p.fine.stride), target.surface, best, p.fine)
+    finely = sampled(source.surface, p.fine.stride)
+    fine = refine(finely, target.surface, best, p.fine, kind_of(source.surface.camera))
     if fine is None:
         return Alignment(best, others, 0.0, points, None)
-    eigenvalues = np.linalg.eigvalsh(fine.information)
+    scale = np.array([p.lever] * 3 + [1.0] * 3)
+    eigenvalues = np.linalg.eigvalsh(fine.information / np.outer(scale, scale))
     stiffness = max(float(eigenvalues[0] / eigenvalues[-1]), 0.0)
     return Alignment(fine.T, others, stiffness, points, fine)
 

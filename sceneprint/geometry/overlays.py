@@ -28,8 +28,9 @@ STEP_COLOURS = np.array(
 
 
 def overlay(
-    source: Surface, target: Surface, T_target_source: Floats, colour: Colour = "source"
-) -> tuple[Floats, Floats, Bytes]:
+    source: Surface, target: Surface, T_target_source: Floats, colour: Colour = "source",
+    p: AgreementParameters | None = None,
+) -> tuple[Floats, Floats, Bytes]:  # fmt: skip
     """Both surfaces as one coloured cloud, the source's points first.
 
     Parameters
@@ -39,6 +40,7 @@ def overlay(
     colour : "source" tells the frames apart, "normal" the directions of the surfaces (x, y, z in
         the target's frame from -1 to 1 as red, green, blue from 0 to 255), "residual" how far a
         point is from the other's surface (`STEPS`)
+    p : when points agree and when they violate free space
 
     Returns
     -------
@@ -56,7 +58,7 @@ def overlay(
     if colour == "source":
         of = np.repeat(np.array([SOURCE, TARGET], np.uint8), [len(ours), len(theirs)], axis=0)
         return points, normals, of
-    p = AgreementParameters()
+    p = p or AgreementParameters()
     steps: NDArray[np.intp] = np.concatenate(
         [
             residual_steps(ours, target, T, STEPS, p),

@@ -4,6 +4,8 @@
 
 Projective point-to-plane alignment: every point is compared with the plane that the target saw in
 its direction. Depth errors of structured-light sensors grow with z^2, so far points weigh less.
+Where the target has no viewpoint, a point is compared with the plane of the nearest one that faces
+the same way; all else is the same.
 """
 
 from __future__ import annotations
@@ -12,10 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sceneprint.geometry.agreement import camera_of, sampled
+from sceneprint.geometry.agreement import sampled
 from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.projecting import PINHOLE, depth_at, depth_of, grown, kind_of, project
 from sceneprint.geometry.rigid import solve_positive, turned
-from sceneprint.types import Floats, Floats32, Surface
+from sceneprint.geometry.targets import Target, nearest_alike, target_of
+from sceneprint.types import Floats, Floats32, Ints32, Surface
 
 
 @dataclass(frozen=True)
@@ -27,8 +31,12 @@ class RefinementParameters:
     first_gate: float  #: farther from the plane a point is forgotten, metres, at first
     last_gate: float  #: and at last
     normal_cosine: float = 0.7  #: of the angle between normals that may belong together
-    reference_depth: float = 5.0**0.5  #: gates grow by max(1, z^2 / this^2)
+    reference_depth: float = 5.0**0.5  #: gates grow by max(1, (z / this)^growth)
     minimum_points: int = 20  #: fewer fix no transform
+    growth: int = 2  #: 2 as a depth sensor's noise, 1 or 0 as a scanner's
+    weight_depth: float = 1.0  #: where weights begin to fall as 1 / z^4, metres
+    nearest: float = 0.1  #: points this near the target's camera are not compared, metres
+    reach: float = 0.25  #: to a point of a target in no order, metres
 
 
 #: To see whether it leads anywhere.
@@ -61,54 +69,70 @@ class Refined:
 
 @kernel
 def _nearest_pixel(
-    points: Floats32, u: int, v: int, x: float, y: float, z: float
+    camera: Floats, points: Floats32, u: int, v: int, x: float, y: float, z: float
 ) -> tuple[int, int, float]:
     """Of the 3 x 3 pixels about (u, v), the one whose point is nearest: column, row, squared."""
-    column, row, nearest = -1, -1, 1e9
+    column, row, nearest = -9, -1, 1e9
     for line in range(v - 1, v + 2):
         for place in range(u - 1, u + 2):
-            if points[line, place, 2] > 0:
-                ex, ey, ez = (
-                    x - points[line, place, 0], y - points[line, place, 1],
-                    z - points[line, place, 2],
-                )  # fmt: skip
-                square = ex * ex + ey * ey + ez * ez
-                if square < nearest:
-                    nearest, column, row = square, place, line
+            ex, ey, ez = (
+                x - points[line, place, 0], y - points[line, place, 1],
+                z - points[line, place, 2],
+            )  # fmt: skip
+            square = ex * ex + ey * ey + ez * ez
+            if square < nearest and depth_at(camera, points, line, place) > 0:
+                nearest, column, row = square, place, line
     return column, row, nearest
+
+
+@kernel
+def _add(
+    A: Floats, g: Floats, row: Floats, x: float, y: float, z: float,
+    mx: float, my: float, mz: float, residual: float, weight: float,
+) -> None:  # fmt: skip
+    """One point's share of the normal equations: (x, y, z) moved, on a plane with that normal."""
+    row[0], row[1], row[2] = y * mz - z * my, z * mx - x * mz, x * my - y * mx
+    row[3], row[4], row[5] = mx, my, mz
+    for a in range(6):
+        wa = weight * row[a]
+        g[a] -= wa * residual
+        for b in range(a + 1):
+            A[a, b] += wa * row[b]
 
 
 @kernel
 def _accumulate(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
-    gate: float, least_cosine: float, reference: float, A: Floats, g: Floats,
+    gate: float, numbers: Floats, A: Floats, g: Floats,
 ) -> tuple[int, float]:  # fmt: skip
     """Normal equations of one Gauss-Newton step; returns how many points took part, and the sum
     of their weighted squares.
     """
     height, width = points.shape[0], points.shape[1]
+    least_cosine, reference, kind, per_depth = numbers[3], numbers[4], numbers[8], numbers[7]
+    # on a closed sphere the first column has a neighbour before it: the last
+    edge = 0.0 if camera[0] == 1 and camera[6] > 0 else 1.0
     row = np.zeros(6)
-    A[:] = 0.0
-    g[:] = 0.0
     used, squares = 0, 0.0
     for i in range(len(source)):
         px, py, pz = source[i, 0], source[i, 1], source[i, 2]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        if not z > 0.1:
-            continue
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        column, line = x / z * camera[0] + camera[2] + 0.5, y / z * camera[1] + camera[3] + 0.5
-        if not (column >= 1 and line >= 1 and column < width - 1 and line < height - 1):
+        column, line, depth = project(camera, x, y, z)
+        if not (column >= edge and line >= 1 and column < width - edge and line < height - 1):
             continue
-        u, v, square = _nearest_pixel(points, int(column), int(line), x, y, z)
-        if u < 0:
+        u = int(column)
+        if u == width - 1:  # of a closed sphere; negative columns count from the last
+            u -= width
+        u, v, square = _nearest_pixel(camera, points, u, int(line), x, y, z)
+        if v < 0:
             continue
         mx, my, mz = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
         residual = (
             (x - points[v, u, 0]) * mx + (y - points[v, u, 1]) * my + (z - points[v, u, 2]) * mz
         )
-        limit = gate * max(1.0, (z / reference) ** 2)
+        limit = gate * grown(depth, reference, numbers[6])
         if abs(residual) > limit or square > 9.0 * limit * limit:
             continue
         nx, ny, nz = source[i, 3], source[i, 4], source[i, 5]
@@ -120,26 +144,53 @@ def _accumulate(
         if cosine < least_cosine:
             continue
         tukey = 1.0 - (residual / limit) ** 2
-        weight = tukey * tukey / (0.25 + (pz**4 + z**4) * 0.125)
-        row[0], row[1], row[2] = y * mz - z * my, z * mx - x * mz, x * my - y * mx
-        row[3], row[4], row[5] = mx, my, mz
-        for a in range(6):
-            wa = weight * row[a]
-            g[a] -= wa * residual
-            for b in range(a + 1):
-                A[a, b] += wa * row[b]
+        near, far = np.float32(depth_of(kind, px, py, pz) * per_depth), depth * per_depth
+        weight = tukey * tukey / (0.25 + (near**4 + far**4) * 0.125)
+        _add(A, g, row, x, y, z, mx, my, mz, residual, weight)
         squares += weight * residual * residual
         used += 1
-    for a in range(6):
-        for b in range(a):
-            A[b, a] = A[a, b]
+    return used, squares
+
+
+@kernel
+def _accumulate_near(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
+    chain: Ints32, T: Floats, gate: float, numbers: Floats, A: Floats, g: Floats,
+) -> tuple[int, float]:  # fmt: skip
+    """As `_accumulate`, on a target whose points are in no order."""
+    least_cosine, kind, per_depth = numbers[3], numbers[8], numbers[7]
+    row, at, facing = np.zeros(6), np.empty(3), np.empty(3)
+    used, squares = 0, 0.0
+    for i in range(len(source)):
+        for a in range(3):
+            at[a] = T[a, 3]
+            facing[a] = 0.0
+            for b in range(3):
+                at[a] += T[a, b] * source[i, b]
+                facing[a] += T[a, b] * source[i, 3 + b]
+        n, _ = nearest_alike(points, normals, camera, heads, chain, at, facing, least_cosine)
+        if n < 0:
+            continue
+        mx, my, mz = normals[0, n, 0], normals[0, n, 1], normals[0, n, 2]
+        residual = (
+            (at[0] - points[0, n, 0]) * mx + (at[1] - points[0, n, 1]) * my
+            + (at[2] - points[0, n, 2]) * mz
+        )  # fmt: skip
+        if abs(residual) > gate:
+            continue
+        tukey = 1.0 - (residual / gate) ** 2
+        near = np.float32(depth_of(kind, source[i, 0], source[i, 1], source[i, 2]) * per_depth)
+        weight = tukey * tukey / (0.25 + near**4 * 0.25)
+        _add(A, g, row, at[0], at[1], at[2], mx, my, mz, residual, weight)
+        squares += weight * residual * residual
+        used += 1
     return used, squares
 
 
 @kernel
 def refine_in_place(
-    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
-    numbers: Floats, information: Floats,
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats,
+    heads: Ints32, chain: Ints32, T: Floats, numbers: Floats, information: Floats,
 ) -> tuple[int, float]:  # fmt: skip
     """Gauss-Newton on T; the points that took part in the last step, 0 where it was lost, and
     their mean weighted square before it.
@@ -151,9 +202,17 @@ def refine_in_place(
     for iteration in range(iterations):
         share = iteration / max(iterations - 1, 1)
         gate = numbers[1] * (numbers[2] / numbers[1]) ** share
-        used, squares = _accumulate(
-            source, points, normals, camera, T, gate, numbers[3], numbers[4], A, g
-        )
+        A[:] = 0.0
+        g[:] = 0.0
+        if camera[0] == 2:
+            used, squares = _accumulate_near(
+                source, points, normals, camera, heads, chain, T, gate, numbers, A, g
+            )
+        else:
+            used, squares = _accumulate(source, points, normals, camera, T, gate, numbers, A, g)
+        for a in range(6):
+            for b in range(a):
+                A[b, a] = A[a, b]
         if used < minimum:
             return 0, 0.0
         for a in range(6):
@@ -177,36 +236,43 @@ def refine_in_place(
     return used, squares / max(used, 1)
 
 
-def numbers_of(p: RefinementParameters) -> Floats:
-    """The parameters as the kernel takes them."""
+def numbers_of(p: RefinementParameters, kind: int) -> Floats:
+    """The parameters as the kernel takes them, and the kind of the source's camera."""
     return np.array(
         [p.iterations, p.first_gate, p.last_gate, p.normal_cosine, p.reference_depth,
-         p.minimum_points],
+         p.minimum_points, p.growth, 1.0 / p.weight_depth, kind],
         float,
     )  # fmt: skip
 
 
+def compared(surface: Surface, p: RefinementParameters) -> Target:
+    """A surface made ready for `refine_in_place`."""
+    return target_of(surface, p.nearest, p.reach)
+
+
 def refine(
-    source: Floats32, target: Surface, T_target_source: Floats, p: RefinementParameters
-) -> Refined | None:
+    source: Floats32, target: Surface, T_target_source: Floats, p: RefinementParameters,
+    kind: int = PINHOLE,
+) -> Refined | None:  # fmt: skip
     """Lay a source's points onto the target's surface, from a transform near by: Sec. III-E.
 
     Parameters
     ----------
     source : (N, 6) float32 points and normals, of `agreement.sampled` with the stride of `p`
-    target : (h, w) surface
+    target : (h, w) surface, or points in no order
     T_target_source : (4, 4) where to start
     p : see RefinementParameters
+    kind : of the source's camera, `projecting.kind_of`: by what its points weigh
 
     Returns
     -------
     refined : or None where fewer than `minimum_points` stay within the gates, or they fix no step
     """
     T, information = np.array(T_target_source, float), np.zeros((6, 6))
+    t = compared(target, p)
     used, mean_square = refine_in_place(
-        source, target.points, target.normals, camera_of(target.camera), T,
-        numbers_of(p), information,
-    )  # fmt: skip
+        source, t.points, t.normals, t.camera, t.heads, t.chain, T, numbers_of(p, kind), information
+    )
     return Refined(T, information, used, mean_square) if used else None
 
 
@@ -214,13 +280,13 @@ def refined_all(
     source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
 ) -> Floats:
     """Each of the hypotheses (n, 4, 4) refined; those that lose the surface are left out."""
-    points, camera = sampled(source, p.stride), camera_of(target.camera)
-    numbers, information = numbers_of(p), np.zeros((6, 6))
+    points, t = sampled(source, p.stride), compared(target, p)
+    numbers, information = numbers_of(p, kind_of(source.camera)), np.zeros((6, 6))
     kept = []
     for hypothesis in hypotheses:
         T = hypothesis.copy()
         used, _ = refine_in_place(
-            points, target.points, target.normals, camera, T, numbers, information
+            points, t.points, t.normals, t.camera, t.heads, t.chain, T, numbers, information
         )
         if used:
             kept.append(T)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sceneprint.geometry.agreement import (
     AgreementParameters,
-    camera_of,
+    looked_up,
     sampled,
     tolerances,
     weigh_agreement,
@@ -53,13 +53,13 @@ class Traces:
 
 @kernel
 def _judge(
-    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
-    numbers: Floats, out: Verdicts,
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats,
+    heads: Ints32, chain: Ints32, T: Floats, numbers: Floats, out: Verdicts,
 ) -> None:  # fmt: skip
     one = np.ones(1, np.float32)
     for i in range(len(source)):
         inliers, violations = weigh_agreement(
-            source[i : i + 1], one, points, normals, camera, T, numbers
+            source[i : i + 1], one, points, normals, camera, heads, chain, T, numbers
         )
         if inliers > 0:
             out[i] = 1
@@ -72,8 +72,9 @@ def judged(
 ) -> Verdicts:
     """What becomes of each of a source's points (N, 6): (N,) NEITHER, AGREES or VIOLATES."""
     out = np.zeros(len(source), np.uint8)
+    t = looked_up(target, p)
     _judge(
-        source, target.points, target.normals, camera_of(target.camera),
+        source, t.points, t.normals, t.camera, t.heads, t.chain,
         np.ascontiguousarray(T_target_source), tolerances(p), out,
     )  # fmt: skip
     return out

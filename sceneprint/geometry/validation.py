@@ -28,9 +28,11 @@ from sceneprint.geometry.agreement import AgreementParameters, agreement, sample
 from sceneprint.geometry.alignment import Alignment, AlignmentParameters, align
 from sceneprint.geometry.covariance import CovarianceParameters, pair_covariance
 from sceneprint.geometry.planes import explained, plane_view
-from sceneprint.geometry.registration import FINE, refine
+from sceneprint.geometry.projecting import kind_of
+from sceneprint.geometry.registration import FINE, RefinementParameters, refine
 from sceneprint.geometry.rigid import inverse, inverses, nearest_rotation, rotation_angle
 from sceneprint.geometry.rivals import RivalParameters, best_rival
+from sceneprint.geometry.sequences import Matching
 from sceneprint.types import Floats, Geometry
 
 
@@ -58,13 +60,15 @@ class Validation:
         else None
     reason : a short sentence
     T_match_query : (4, 4) query coordinates to the match's, x_match = T @ x_query; the best there
-        is, whatever the status; None where the frames gave no hypothesis at all
+        is, whatever the status: halfway between the two directions, or where these disagree, the
+        one that more speaks for; None where the frames gave no hypothesis at all
     residual_m, residual_rad : of the two directions composed, T_match_query T_query_match;
         infinite where there is none
     overlap : share of both frames' points that agree under the transform, 0 to 1
     plane_overlap : the same with every plane counting as much as another, however large, 0 to 1:
         low where only a floor or a wall agrees
-    violations : free-space violations, as a share of violations and inliers, 0 to 1
+    violations : free-space violations, as a share of violations and of the inliers counted with
+        them, 0 to 1; None where neither frame has a viewpoint: no evidence of free space
     inliers : points of both frames that agree under the transform
     ambiguity : share of both frames that agrees under the best rival that free space does not
         refute, every plane counting the same; 0 to 1. Rivals are looked for only where all else
@@ -82,7 +86,7 @@ class Validation:
     residual_rad: float
     overlap: float
     plane_overlap: float
-    violations: float
+    violations: float | None
     inliers: int
     ambiguity: float
     T_rival: Floats | None
@@ -98,7 +102,9 @@ def middle(a: Floats, b: Floats) -> Floats:
     return result
 
 
-def refined_at(query: Geometry, match: Geometry, T_match_query: Floats) -> Floats | None:
+def refined_at(
+    query: Geometry, match: Geometry, T_match_query: Floats, p: RefinementParameters | None = None
+) -> Floats | None:
     """Both directions refined from one given transform, and their middle.
 
     What is left of the error when the start was the truth is the sensors' and the reference
@@ -108,8 +114,10 @@ def refined_at(query: Geometry, match: Geometry, T_match_query: Floats) -> Float
     -------
     (4, 4) T_match_query, or None where the frames do not overlap there
     """
-    there = refine(sampled(query.surface, FINE.stride), match.surface, T_match_query, FINE)
-    back = refine(sampled(match.surface, FINE.stride), query.surface, inverse(T_match_query), FINE)
+    p = p or FINE
+    a, b = query.surface, match.surface
+    there = refine(sampled(a, p.stride), b, T_match_query, p, kind_of(a.camera))
+    back = refine(sampled(b, p.stride), a, inverse(T_match_query), p, kind_of(b.camera))
     if there is None or back is None:
         return None
     return middle(there.T, inverse(back.T))
@@ -121,6 +129,7 @@ def validate(
     seed: int = 0,
     p: ValidationParameters | None = None,
     mode: Mode = "full",
+    matching: Matching = "histograms",
 ) -> Validation:
     """Align a query with a candidate both ways, and decide: Sec. III-E.
 
@@ -134,28 +143,35 @@ def validate(
 
     Raises
     ------
-    ValueError : the descriptors have different lengths, an unknown mode, or a negative seed.
+    ValueError : the descriptors have different lengths, an unknown mode or matching, or a
+        negative seed.
     """
     if mode not in ("full", "paper"):
         raise ValueError(f"mode {mode!r} is neither 'full' nor 'paper'")
+    if matching not in ("histograms", "sequence"):
+        raise ValueError(f"matching {matching!r} is neither 'histograms' nor 'sequence'")
     p = p or ValidationParameters()
     fewest = min(len(query.patches), len(match.patches))
     if fewest < p.minimum_patches:
         return _nothing(
             f"a frame has {fewest} patches, and {p.minimum_patches} are needed to tell places "
             "apart",
-            seed,
-        )
-    there = align(query, match, np.random.default_rng((seed, 0)), p.alignment, p.agreement)
-    back = align(match, query, np.random.default_rng((seed, 1)), p.alignment, p.agreement)
+            seed, query, match,
+        )  # fmt: skip
+    numbers = p.alignment, p.agreement, matching
+    there = align(query, match, np.random.default_rng((seed, 0)), *numbers)
+    back = align(match, query, np.random.default_rng((seed, 1)), *numbers)
     if there is None or back is None:
-        return _nothing("no correspondences agree on a transform that the surfaces bear out", seed)
+        why = "no correspondences agree on a transform that the surfaces bear out"
+        return _nothing(why, seed, query, match)
     return _decided(query, match, there, back, seed, p, mode)
 
 
-def _nothing(reason: str, seed: int) -> Validation:
+def _nothing(reason: str, seed: int, query: Geometry, match: Geometry) -> Validation:
+    blind = query.surface.camera is None and match.surface.camera is None
+    violations = None if blind else 0.0
     return Validation(
-        "rejected", None, reason, None, math.inf, math.inf, 0.0, 0.0, 0.0, 0, 0.0, None, seed
+        "rejected", None, reason, None, math.inf, math.inf, 0.0, 0.0, violations, 0, 0.0, None, seed
     )
 
 
@@ -164,27 +180,26 @@ def _decided(
     p: ValidationParameters, mode: Mode,
 ) -> Validation:  # fmt: skip
     composed = there.T @ back.T  # reading R5: the residual transform T_Q^X T_X^Q itself
-    T = middle(there.T, inverse(back.T))
-    of_query = agreement(there.points, match.surface, T, p.agreement)
-    of_match = agreement(back.points, query.surface, inverse(T), p.agreement)
-    inliers = of_query.inliers + of_match.inliers
-    violated = of_query.violations + of_match.violations
+    residual = float(np.linalg.norm(composed[:3, 3])), rotation_angle(composed[:3, :3])
+    limits = p.acceptance.residual_m, p.acceptance.residual_rad
+    found = [middle(there.T, inverse(back.T))]
+    if residual[0] > limits[0] or residual[1] > limits[1]:
+        found = [there.T, inverse(back.T)]  # halfway between two places is neither of them
     views = plane_view(query, p.rivals.planes), plane_view(match, p.rivals.planes)
-    e = Evidence(
-        residual_m=float(np.linalg.norm(composed[:3, 3])),
-        residual_rad=rotation_angle(composed[:3, :3]),
-        overlap=inliers / max(of_query.points + of_match.points, 1),
-        plane_overlap=float(explained(*views, T[None], p.agreement).share[0]),
-        violations=violated / max(inliers + violated, 1),
-        stiffness=min(there.stiffness, back.stiffness),
-    )
+    shares = explained(*views, np.stack(found), p.agreement).share
+    told = [
+        (*_evidence(query, match, there, back, T, residual, float(share), p), T)
+        for T, share in zip(found, shares, strict=True)
+    ]
+    e, inliers, T = max(told, key=lambda one: one[0].total(p.acceptance))
     ambiguity, T_rival = 0.0, None
     strength: Strength | None = None
     against = objection(e, p.acceptance, mode)
     if against is not None:
         status, reason = against
     elif mode == "paper":
-        status, strength, reason = "accepted", "strong", "the two directions agree"
+        strength = "weak" if e.violations is None else "strong"
+        status, reason = "accepted", "the two directions agree"
     else:
         voted = np.concatenate([there.others, inverses(back.others)])
         ambiguity, T_rival = best_rival(*views, T, voted, p.rivals, p.agreement)
@@ -196,3 +211,24 @@ def _decided(
         status, strength, reason, T, e.residual_m, e.residual_rad, e.overlap, e.plane_overlap,
         e.violations, inliers, ambiguity, T_rival, seed, covariance,
     )  # fmt: skip
+
+
+def _evidence(
+    query: Geometry, match: Geometry, there: Alignment, back: Alignment, T: Floats,
+    residual: tuple[float, float], plane_overlap: float, p: ValidationParameters,
+) -> tuple[Evidence, int]:  # fmt: skip
+    """What speaks for a transform and against it, and how many points agree under it."""
+    of_query = agreement(there.points, match.surface, T, p.agreement)
+    of_match = agreement(back.points, query.surface, inverse(T), p.agreement)
+    inliers = of_query.inliers + of_match.inliers
+    seen = [one for one in (of_query, of_match) if one.violations is not None]
+    violated = sum(one.violations or 0 for one in seen)
+    agreeing = sum(one.inliers for one in seen)
+    e = Evidence(
+        *residual,
+        overlap=inliers / max(of_query.points + of_match.points, 1),
+        plane_overlap=plane_overlap,
+        violations=violated / max(agreeing + violated, 1) if seen else None,
+        stiffness=min(there.stiffness, back.stiffness),
+    )
+    return e, inliers

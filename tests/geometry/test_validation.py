@@ -17,6 +17,7 @@ from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.errors import ModelMismatch
 from sceneprint.geometry.acceptance import AcceptanceParameters, Mode
 from sceneprint.geometry.agreement import agreement, sampled
+from sceneprint.geometry.alignment import align
 from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.geometry.validation import (
     Validation,
@@ -348,6 +349,42 @@ def test_what_is_told_is_counted_under_the_transform_told(
         assert v.violations == violations / max(inliers + violations, 1)
         violated.append(violations)
     assert max(violated) > 10
+
+
+def test_where_the_directions_disagree_the_better_one_is_told(rooms: list[Views]) -> None:
+    """Halfway between two places is neither of them; near each other it is better than both."""
+    p, apart, met = ValidationParameters(), 0, 0
+    couples = [(rooms[0][i][1], rooms[room][j][1]) for room in (0, 1) for i, j in ((0, 1), (3, 0))]
+    for query, match in couples:
+        there, back = (
+            align(a, b, np.random.default_rng((0, i)), p.alignment, p.agreement)
+            for i, (a, b) in enumerate(((query, match), (match, query)))
+        )
+        assert there is not None
+        assert back is not None
+        found = validate(query, match)
+        told = [there.T, inverse(back.T)]
+        assert found.T_match_query is not None
+        same = [np.array_equal(T, found.T_match_query) for T in told]
+        if found.residual_m < 0.08 and found.residual_rad < math.radians(5):
+            met += 1
+            np.testing.assert_array_equal(middle(*told), found.T_match_query)
+            continue
+        apart += 1
+        assert sum(same) == 1
+        totals = []
+        for T in told:
+            of_query = agreement(there.points, match.surface, T, p.agreement)
+            of_match = agreement(back.points, query.surface, inverse(T), p.agreement)
+            inliers = of_query.inliers + of_match.inliers
+            violations = (of_query.violations or 0) + (of_match.violations or 0)
+            overlap = inliers / (of_query.points + of_match.points)
+            totals.append(overlap - 5 * violations / (inliers + violations))
+        assert same[int(np.argmax(totals))]
+        assert found.overlap - 5 * (found.violations or 0) == pytest.approx(max(totals))
+        assert found.status == "rejected"
+    assert apart >= 1
+    assert met >= 1
 
 
 def test_a_free_direction_is_seen_without_rivals(model: Model) -> None:

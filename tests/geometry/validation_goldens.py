@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sceneprint.types import Floats, Floats32, Intrinsics, Patches, Surface
+from sceneprint.types import Floats, Floats32, Intrinsics, Patches, Sphere, Surface
 
 #: Pixels are a degree wide; the ray of pixel (20, 15) is the optical axis.
 CAMERA = Intrinsics(41, 31, 57.0, 57.0, 20.0, 15.0)
@@ -37,6 +37,44 @@ def seen_at(pixel: tuple[float, float], z: float, normal: Floats = TOWARDS) -> F
     """One point of `sampled`, at that depth in that pixel."""
     x, y = (pixel[0] - CAMERA.cx) / CAMERA.fx * z, (pixel[1] - CAMERA.cy) / CAMERA.fy * z
     return np.array([[x, y, z, *normal]], np.float32)
+
+
+#: Pixels ten degrees wide about an axis; column 0 looks just past -180 degrees.
+TEN = math.radians(10.0)
+BALL = Sphere(36, 17, TEN, -math.pi + TEN / 2, math.radians(80.0))
+
+
+def ray(azimuth: float, elevation: float, pole: int = 2) -> Floats:
+    """The direction, given in degrees."""
+    a, e = math.radians(azimuth), math.radians(elevation)
+    return np.roll([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)], pole - 2)
+
+
+def ball(ranges: float | Floats, camera: Sphere = BALL) -> Surface:
+    """A sphere about the viewpoint of this range, 0 where missing, seen from inside."""
+    r = np.broadcast_to(ranges, (camera.height, camera.width))
+    azimuths = np.degrees(camera.left + camera.step * np.arange(camera.width))
+    elevations = np.degrees(camera.top - camera.step * np.arange(camera.height))
+    rays = np.array([[ray(a, e, camera.pole) for a in azimuths] for e in elevations])
+    valid = r > 0
+    normals = np.where(valid[..., None], -rays, 0.0).astype(np.float32)
+    points = (rays * r[..., None]).astype(np.float32)
+    return Surface(points, normals, valid, np.ones(r.shape, np.float32), camera)
+
+
+def faced(azimuth: float, elevation: float, r: float) -> Floats32:
+    """One point of `sampled`, in that direction, that faces the viewpoint."""
+    u = ray(azimuth, elevation)
+    return np.array([[*(u * r), *-u]], np.float32)
+
+
+def in_no_order(points: Floats, normals: Floats) -> Surface:
+    """Points of a cloud without a viewpoint."""
+    n = (1, len(points))
+    return Surface(
+        np.array(points, np.float32)[None], np.array(normals, np.float32)[None],
+        np.ones(n, np.bool_), np.ones(n, np.float32), None,
+    )  # fmt: skip
 
 
 def quarter(axis: int, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Floats:
@@ -84,6 +122,189 @@ def check_rigid(module: ModuleType) -> None:
     assert module.solve_positive(np.array([[4.0, 2], [2, 10]]), np.array([10.0, 14]), x)
     np.testing.assert_allclose(x, [2, 1], atol=1e-12)
     assert not module.solve_positive(np.array([[1.0, 2], [2, 4]]), np.ones(2), x)
+
+
+def check_projecting(module: ModuleType) -> None:
+    def seen(camera: Any, at: Any) -> tuple[float, ...]:
+        found = module.project(module.camera_of(camera, 0.1), *map(float, at))
+        return tuple(round(value, 9) for value in found)
+
+    assert seen(CAMERA, (0, 0, 2)) == (20.5, 15.5, 2.0)
+    assert seen(CAMERA, (0.2, 0.1, 2)) == (26.2, 18.35, 2.0)
+    assert seen(Intrinsics(9, 9, 10.0, 20.0, 1.0, 2.0), (1, 1, 1)) == (11.5, 22.5, 1.0)
+    for z in (0.1, 0.09, 0.0, -2.0, math.nan):
+        assert seen(CAMERA, (0, 0, z))[:2] == (-1.0, -1.0)
+    # azimuth 0 and elevation 0 lie between columns 17 and 18, in row 8
+    for pole in range(3):
+        camera = replace(BALL, pole=pole)
+        for azimuth, elevation, column, line in (
+            (0, 0, 18.0, 8.5), (30, 0, 21.0, 8.5), (-175, 20, 0.5, 6.5), (-179, -70, 0.1, 15.5),
+            (179.5, 0, 35.95, 8.5), (-180, 0, 0.0, 8.5), (90, 80, 27.0, 0.5), (7, 89, 18.7, -0.4),
+        ):  # fmt: skip
+            for r in (0.2, 3.0):
+                found = seen(camera, ray(azimuth, elevation, pole) * r)
+                np.testing.assert_allclose(found[1:], (line, r), atol=1e-6)
+                around = (found[0] - column) % 36
+                assert min(around, 36 - around) < 1e-6, (azimuth, found)
+        assert seen(camera, ray(20, 0, pole) * 0.09)[:2] == (-1.0, -1.0)
+        assert seen(camera, (0, 0, 0)) == (-1.0, -1.0, 0.0)
+    # of an image that is no full turn the far side is beyond the last column
+    some = replace(BALL, width=10)
+    assert seen(some, ray(-175, 0))[0] == 0.5
+    assert seen(some, ray(175, 0))[0] == 35.5
+    # a turn may be a fraction of a pixel more than the image: that is of its first column
+    wide = replace(BALL, step=2 * math.pi / 36.3, left=0.0)
+    assert seen(wide, ray(360 * 35.4 / 36.3, 0))[0] == 35.9
+    assert seen(wide, ray(360 * 35.6 / 36.3, 0))[0] == 0.0
+    assert seen(replace(wide, width=30), ray(360 * 35.6 / 36.3, 0))[0] == 36.1
+    for camera, kind, depth in ((CAMERA, 0, 3.0), (BALL, 1, 7.0), (None, 2, 0.0)):
+        assert module.kind_of(camera) == module.camera_of(camera, 0.0)[0] == kind
+        assert module.depth_of(kind, 2.0, 6.0, 3.0) == depth
+    points = np.zeros((3, 4, 3), np.float32)
+    points[1, 2] = 2.0, 6.0, 3.0
+    for camera, depth in ((CAMERA, 3.0), (BALL, 7.0)):
+        array = module.camera_of(camera, 0.0)
+        assert module.depth_at(array, points, 1, 2) == depth
+        assert module.depth_at(array, points, 2, 1) == 0.0
+    for power, grown in ((0, 1.0), (1, 1.5), (2, 2.25)):
+        assert module.grown(3.0, 2.0, power) == grown
+        assert module.grown(1.0, 2.0, power) == 1.0
+
+
+def check_targets(module: ModuleType) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (300, 3))
+    normals = np.where(rng.random((300, 1)) < 0.5, [0, 0, 1.0], [0, 0.8, 0.6])
+    whole = in_no_order(points, normals)
+    t = module.target_of(whole, 0.1, 0.4)
+    # the first in each small cube, here of 8 cm, in the order given
+    small = np.floor(whole.points[0] / 0.08)
+    first = [i for i in range(300) if not (small[:i] == small[i]).all(axis=1).any()]
+    assert 200 < len(first) < 300
+    np.testing.assert_array_equal(t.points[0], whole.points[0, first])
+    np.testing.assert_array_equal(t.normals[0], whole.normals[0, first])
+    none = 0
+    for at in np.concatenate([rng.uniform(-1.3, 1.3, (60, 3)), [[0.39, 0.0, 9.0]]]):
+        found = module.nearest_alike(
+            t.points, t.normals, t.camera, t.heads, t.chain, at, np.array([0, 0.0, 1]), 0.7
+        )
+        away = np.linalg.norm(t.points[0] - at, axis=1)
+        away[t.normals[0, :, 2] <= 0.7] = np.inf
+        best = int(away.argmin())
+        if away[best] < 0.4:
+            assert found[0] == best
+            np.testing.assert_allclose(found[1], away[best] ** 2, rtol=1e-5)
+        else:
+            assert found[0] == -1
+            none += 1
+    assert 5 < none < 50
+    # of two as far off the first, whichever is walked to first
+    for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
+        pair = np.array([[0.25, 0, 0], [-0.25, 0, 0], [0, 0.25, 0]])[order]
+        t = module.target_of(in_no_order(pair, np.tile([0, 0, 1.0], (3, 1))), 0.1, 0.4)
+        found = module.nearest_alike(
+            t.points, t.normals, t.camera, t.heads, t.chain, np.zeros(3), np.array([0, 0, 1.0]), 0.7
+        )
+        assert found == (0, 0.0625)
+    # a pinhole's and a sphere's maps are looked up as they are
+    for seen in (wall(2.0), ball(2.0)):
+        t = module.target_of(seen, 0.1, 0.4)
+        assert t.points is seen.points
+        assert len(t.heads) == len(t.chain) == 0
+    # at most so many, spread over all that is shown
+    few = module.thinned(whole, 50)
+    assert 25 < few.valid.sum() <= 50
+    assert few.camera is None
+    gap = np.linalg.norm(whole.points[0][:, None] - few.points[0], axis=2)
+    assert gap.min(axis=1).max() < 1.0
+    where = gap.argmin(axis=0)
+    np.testing.assert_array_equal(whole.points[0, where], few.points[0])
+    np.testing.assert_array_equal(whole.normals[0, where], few.normals[0])
+    same = module.thinned(whole, 300)
+    np.testing.assert_array_equal(same.points, whole.points)
+    assert module.thinned(in_no_order(np.ones((9, 3)), np.ones((9, 3))), 4).points.shape == (
+        1,
+        1,
+        3,
+    )
+
+
+def check_agreement_of_clouds(module: ModuleType) -> None:
+    p = module.AgreementParameters(
+        surface_tolerance=0.05, point_tolerance=0.15, normal_cosine=0.7, free_space_margin=0.1,
+        reference_depth=2.0, nearest=0.3, edge_px=1,
+    )  # fmt: skip
+
+    def found(source: Floats32, target: Surface, T: Floats | None = None) -> tuple[float, Any]:
+        result = module.agreement(source, target, np.eye(4) if T is None else T, p)
+        return result.inliers, result.violations
+
+    on, through, nothing = (1, 0), (0, 1), (0, 0)
+    # a sphere of 2 m about the viewpoint, looked at every way, its seam and below it too
+    whole = ball(2.0)
+    for azimuth, elevation in ((0, 0), (100, 30), (-135, -60), (179.9, 0), (-179.9, 10), (5, -80)):
+        for r, expected in (
+            (2.0, on), (1.96, on), (1.94, nothing), (1.91, nothing), (1.89, through),
+            (0.31, through), (0.29, nothing), (2.05, on), (2.10, nothing), (9.0, nothing),
+        ):  # fmt: skip
+            at = round((azimuth + 175) / 10) * 10 - 175, round(elevation / 10) * 10
+            assert found(faced(*at, r), whole) == expected, (at, r)
+    # at four metres everything is four times as wide, and twice where lengths grow linearly
+    p = replace(p, point_tolerance=0.5)
+    for r, square, linear in ((4.19, on, nothing), (4.09, on, on), (4.21, nothing, through)):
+        p = replace(p, growth=2)
+        assert found(faced(5, 0, 4.0), ball(r)) == square
+        p = replace(p, growth=1)
+        assert found(faced(5, 0, 4.0), ball(r)) == linear
+    p = replace(p, growth=2, point_tolerance=0.15)
+    # 10 cm before the far side, which lies beyond a surface just across the seam
+    r = np.full((17, 36), 2.0)
+    r[:, 35] = 1.0
+    for azimuth, expected in ((-175, nothing), (-165, through), (175, on)):
+        assert found(faced(azimuth, 0, 1.0), ball(r)) == expected
+    r = np.full((17, 36), 2.0)
+    r[:, 0] = 1.0
+    assert found(faced(175, 0, 1.0), ball(r)) == nothing
+    # in an image that is no full turn nothing is across it
+    some = replace(BALL, width=18)
+    assert found(faced(-175, 0, 1.0), ball(2.0, some)) == through
+    assert found(faced(175, 0, 1.0), ball(2.0, some)) == nothing
+    r = np.full((17, 18), 2.0)
+    r[:, 17] = 1.0
+    assert found(faced(-175, 0, 1.0), ball(r, some)) == through
+    # transforms act on points and normals
+    T = quarter(0, (0.0, 1.0, 0.0))
+    there = faced(-175, 10, 2.0)
+    before = np.concatenate([(there[0, :3] - T[:3, 3]) @ T[:3, :3], there[0, 3:] @ T[:3, :3]])
+    assert found(before[None].astype(np.float32), whole, T) == on
+    # points in no order: a floor of points 2 cm apart; nothing is known of free space
+    xy = np.array(list(product(np.arange(-10, 11) * 0.02, repeat=2))) + np.array([0.1, 0.0])
+    floor = in_no_order(np.c_[xy, np.zeros(len(xy))], np.broadcast_to([0.0, 0, 1], (len(xy), 3)))
+    up, side = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
+    for at, facing, inliers in (
+        ((0.0, 0.0, 0.04), up, 1), ((0.0, 0.0, 0.06), up, 0), ((0.11, 0.05, -0.04), up, 1),
+        ((0.0, 0.0, 0.04), side, 0), ((0.42, 0.0, 0.0), up, 1), ((0.46, 0.0, 0.0), up, 0),
+        ((0.0, -0.36, 0.0), up, 0), ((0.0, -0.33, 0.01), up, 1), ((0.0, 0.0, -1.0), up, 0),
+        ((0.0, 0.0, -0.06), up, 0),
+    ):  # fmt: skip
+        source = np.array([[*at, *facing]], np.float32)
+        assert found(source, floor) == (inliers, None), at
+        # and carried elsewhere and back
+        T = quarter(1, (3.0, -2.0, 7.0))
+        away = in_no_order(floor.points[0] @ T[:3, :3].T + T[:3, 3], floor.normals[0] @ T[:3, :3].T)
+        assert found(source, away, T) == (inliers, None), at
+    both = np.array([[0, 0, 0, *up], [0.1, 0, 0, *up], [0, 0, 1, *up]], np.float32)
+    weights = np.array([0.5, 0.25, 4.0], np.float32)
+    assert module.agreements(both, floor, np.eye(4)[None], p, weights).tolist() == [[0.75, 0.0]]
+    # of a thousand points in one place one is kept
+    assert len(module.looked_up(in_no_order(np.zeros((1000, 3)), np.ones((1000, 3))), p).chain) == 1
+    # of points in no order as many are taken as of pixels: one of 25
+    assert len(module.sampled(floor, 5)) == 18
+    # of a sphere of four times as many pixels as a depth image every tenth row and column
+    large = Sphere(480, 160, 0.01, 0.0, 1.0)
+    assert module.sampled(ball(2.0, large), 5).shape == (48 * 16, 6)
+    assert module.sampled(whole, 5).shape == (7 * 3, 6)
+    assert len(module.sampled(ball(2.0, large), 1)) == 480 * 160
 
 
 def check_agreement(module: ModuleType) -> None:
@@ -186,7 +407,6 @@ def check_sampling(module: ModuleType) -> None:
     assert rows[:, 2].tolist() == z
     np.testing.assert_array_equal(rows[:, 3:], np.broadcast_to(TOWARDS, (47, 3)))
     assert len(module.sampled(seen, 1)) == 31 * 41 - 1
-    assert module.camera_of(CAMERA).tolist() == [57.0, 57.0, 20.0, 15.0]
 
 
 def check_registration(module: ModuleType) -> None:
@@ -247,6 +467,10 @@ def check_registration(module: ModuleType) -> None:
         ((20.0, 1.0), True), ((20.0, 0.0), False), ((20.0, 29.0), True), ((20.0, 30.0), False),
     ):  # fmt: skip
         assert (once(seen_at(pixel, 2.0), wall(2.0)) is not None) == takes_part, pixel
+    # what shows nothing is not near, though it be nearer to the sensor
+    hole = np.zeros((31, 41))
+    hole[15, 20] = 2.2
+    assert once(seen_at(CENTRE, 1.0), wall(hole), gate=1.5) is not None
     assert once(seen_at(CENTRE, 2.0), wall(0.0)) is None
     assert once(seen_at(CENTRE, -2.0), wall(2.0)) is None
     assert once(np.empty((0, 6), np.float32), wall(2.0)) is None
@@ -261,6 +485,65 @@ def check_registration(module: ModuleType) -> None:
         found = module.refine(some, wall(2.0), np.eye(4), p)
         assert (found and found.points) == points
         assert found is None or np.abs(found.T - np.eye(4)).max() < 2e-3
+
+
+def check_registration_of_clouds(module: ModuleType) -> None:
+    p = module.RefinementParameters(
+        1, 1, 0.1, 0.1, normal_cosine=0.7, reference_depth=2.0, minimum_points=1, reach=0.3
+    )
+
+    def once(source: Floats32, target: Surface, kind: int, p: Any = p) -> Any:
+        return module.refine(source, target, np.eye(4), p, kind)
+
+    # one point, 3 cm before a sphere of 2 m: it faces the viewpoint, so no turn moves it
+    u = ray(-125, 40)
+    found = once(faced(-125, 40, 1.97), ball(2.0), 1)
+    row = np.concatenate([np.zeros(3), u])
+    for kind, near in ((1, 1.97), (2, 0.0), (0, 1.97 * u[2])):
+        weight = (1 - 0.3**2) ** 2 / (0.25 + (near**4 + 1.97**4) / 8)
+        found = once(faced(-125, 40, 1.97), ball(2.0), kind)
+        np.testing.assert_allclose(found.information, weight * np.outer(row, row), atol=1e-6)
+        np.testing.assert_allclose(found.T[:3, 3], 0.03 * u, atol=1e-5)
+    # twice as far before weights fall: as if at half the depth
+    found = once(faced(-125, 40, 1.97), ball(2.0), 1, replace(p, weight_depth=2.0))
+    weight = (1 - 0.3**2) ** 2 / (0.25 + (1.97 / 2) ** 4 / 4)
+    np.testing.assert_allclose(found.information, weight * np.outer(row, row), atol=1e-6)
+    # gates grow with range
+    for r, growth, takes_part in ((4.39, 2, True), (4.21, 1, False), (4.19, 1, True), (4.09, 0, 1)):
+        q = replace(p, growth=growth)
+        assert (once(faced(5, 0, 4.0), ball(r), 1, q) is not None) == bool(takes_part)
+    # across the seam, either way; columns 0 and 35 are neighbours
+    for column, azimuth in ((35, -175), (0, 175), (34, -175), (1, 175)):
+        r = np.zeros((17, 36))
+        r[:, column] = 2.0
+        near = faced(azimuth + (4.9 if azimuth > 0 else -4.9), 0, 2.0)
+        found = once(near, ball(r), 1, replace(p, first_gate=0.2, last_gate=0.2))
+        assert (found is not None) == (column in (0, 35)), column
+    # an image that is no full turn has an edge
+    some = replace(BALL, width=18)
+    for azimuth, takes_part in ((-175, False), (-165, True), (-15, True), (-5, False)):
+        assert (once(faced(azimuth, 0, 2.0), ball(2.0, some), 1) is not None) == takes_part
+    # nor are there nine pixels at the top and at the bottom
+    for elevation, takes_part in ((80, False), (70, True), (-70, True), (-80, False)):
+        assert (once(faced(5, elevation, 2.0), ball(2.0), 1) is not None) == takes_part
+    # on points in no order, by place: the nearest that faces the same way
+    target = in_no_order([[0.2, 0.1, 2.0], [0.2, 0.1, 1.99], [0.4, 0.1, 2.0]],
+                         [[0, 0, -1.0], [1.0, 0, 0], [0, 0, -1.0]])  # fmt: skip
+    source = np.array([[0.2, 0.1, 1.97, 0.0, 0.0, -1.0]], np.float32)
+    row = np.array([-0.1, 0.2, 0.0, 0.0, 0.0, -1.0])
+    for kind, near in ((0, 1.97), (1, math.sqrt(0.05 + 1.97**2)), (2, 0.0)):
+        found = once(source, target, kind)
+        weight = (1 - 0.3**2) ** 2 / (0.25 + near**4 / 4)
+        np.testing.assert_allclose(found.information, weight * np.outer(row, row), atol=1e-6)
+        assert found.points == 1
+        np.testing.assert_allclose(found.T[:3, 3], -0.03 / 1.05 * row[3:], atol=1e-5)
+    for z, takes_part in ((1.91, True), (1.89, False), (2.09, True), (2.11, False)):
+        source[0, 2] = z
+        assert (once(source, target, 0) is not None) == takes_part
+    source[0, :3] = 0.2, 0.42, 2.0  # three decimetres off is out of reach
+    assert once(source, target, 0) is None
+    source[0, 1] = 0.38
+    assert once(source, target, 0) is not None
 
 
 def patches(means: Floats, normals: Floats) -> Patches:

@@ -1,0 +1,250 @@
+"""Sequences of neighbours and their alignment: against an oracle, and under rigid motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.alignment import AlignmentParameters
+from sceneprint.geometry.rigid import difference, inverse, moved
+from sceneprint.geometry.sequences import (
+    SequenceParameters,
+    alignment_cost,
+    coarse,
+    neighbour_sequences,
+    sequence_correspondences,
+)
+from sceneprint.geometry.validation import ValidationParameters, validate
+from sceneprint.models import read_model
+from sceneprint.pipeline import geometry_of
+from sceneprint.signing import see
+from sceneprint.synth import KINECT, take, trajectory
+from sceneprint.synth.synthesis import room_and_rng
+from sceneprint.types import Floats, Frame, Patches
+
+P = SequenceParameters()
+
+
+def patches_at(means: Floats, normals: Floats, areas: Floats | None = None) -> Patches:
+    count = len(means)
+    return Patches(
+        np.asarray(means, float),
+        normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        np.ones(count) if areas is None else areas,
+        np.full(count, 50, np.int32),
+        np.ones(count),
+    )
+
+
+def scattered(seed: int, count: int) -> Patches:
+    rng = np.random.default_rng(seed)
+    means, normals = rng.uniform(-1.5, 1.5, (count, 3)), rng.normal(size=(count, 3))
+    return patches_at(means, normals, rng.uniform(0.01, 0.1, count))
+
+
+def carried(patches: Patches, T: Floats) -> Patches:
+    return replace(patches, means=moved(T, patches.means), normals=patches.normals @ T[:3, :3].T)
+
+
+def motion(seed: int) -> Floats:
+    rng = np.random.default_rng(seed)
+    R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    T = np.eye(4)
+    T[:3, :3] = R * np.linalg.det(R)
+    T[:3, 3] = rng.uniform(-3, 3, 3)
+    return T
+
+
+def oracle(a: Floats, b: Floats) -> float:
+    """The same cost by plain recursion, the least over where the second begins."""
+    m, n = len(a), len(b)
+    scale = np.array([P.length_scale, P.length_scale, P.angle_scale, P.angle_scale])
+
+    def replacing(i: int, j: int) -> float:
+        return min(float((np.abs(a[i] - turned[j]) / scale).sum()) / 2, 1.0)
+
+    best = np.inf
+    for turn in range(n):
+        turned = np.roll(b, -turn, axis=0)
+
+        @lru_cache(None)
+        def cost(i: int, j: int) -> float:
+            if i == 0 or j == 0:
+                return (i + j) * P.gap_cost
+            ways = [
+                cost(i - 1, j) + P.gap_cost,
+                cost(i, j - 1) + P.gap_cost,
+                cost(i - 1, j - 1) + replacing(i - 1, j - 1),
+            ]
+            if i > 1 and j > 1:
+                both = replacing(i - 1, j - 2) + replacing(i - 2, j - 1)
+                ways.append(cost(i - 2, j - 2) + both + P.swap_cost)
+            return min(ways)
+
+        best = min(best, cost(m, n))
+    return best / ((m + n) * P.gap_cost)
+
+
+def symbols(seed: int, count: int) -> Floats:
+    """Neighbours that are alike often enough for every kind of edit to pay."""
+    rng = np.random.default_rng(seed)
+    kinds = rng.uniform(-0.5, 0.5, (5, 4))
+    found: Floats = kinds[rng.integers(0, 5, count)] + rng.normal(0, 0.05, (count, 4))
+    return found
+
+
+def test_alignment_against_plain_recursion() -> None:
+    for seed, (m, n) in enumerate([(1, 1), (2, 2), (3, 5), (7, 6), (8, 8), (12, 9)]):
+        a, b = symbols(2 * seed, m), symbols(2 * seed + 1, n)
+        assert alignment_cost(a, b, P) == pytest.approx(oracle(a, b), abs=1e-12)
+        mixed = a[[1, 0, *range(2, m)]] if m > 1 else a  # two that changed places
+        assert alignment_cost(a, mixed, P) == pytest.approx(oracle(a, mixed), abs=1e-12)
+
+
+def test_the_edits_by_hand() -> None:
+    a = np.arange(4.0)[:, None] * np.ones(4)  # every two of them others: 1 m and 1 rad apart
+    whole = 8 * P.gap_cost
+    assert alignment_cost(a, a, P) == 0.0
+    assert alignment_cost(a, a[[2, 3, 0, 1]], P) == 0.0  # begun elsewhere
+    assert alignment_cost(a, a[:3], P) == pytest.approx(P.gap_cost / (7 * P.gap_cost))
+    assert alignment_cost(a, a[[0, 2, 1, 3]], P) == pytest.approx(P.swap_cost / whole)
+    off = a.copy()
+    off[1, 0] += 0.5 * P.length_scale  # half a scale of one number of four is a quarter
+    assert alignment_cost(a, off, P) == pytest.approx(0.25 / whole)
+    assert alignment_cost(a, a + 100.0, P) == 1.0  # nothing in common
+    assert alignment_cost(a, a[:0], P) == 1.0
+
+
+def test_it_does_not_matter_where_the_round_begins() -> None:
+    a, b = symbols(20, 9), symbols(21, 7)
+    costs = [alignment_cost(a, np.roll(b, k, axis=0), P) for k in range(7)]
+    np.testing.assert_allclose(costs, costs[0], atol=1e-12)
+    assert 0 < costs[0] < 1
+
+
+def test_a_sequence_by_hand() -> None:
+    """Round a patch that looks up: neighbours at 90, 170, 200 and 350 degrees."""
+    degrees = np.radians([90.0, 170.0, 200.0, 350.0])
+    about = np.stack([np.cos(degrees), np.sin(degrees), np.array([0.0, 0.2, -0.1, 0.0])], axis=1)
+    up = np.array([0.0, 0.0, 1.0])
+    normals = np.stack([up, up, up, np.array([-1.0, 0.0, 0.0])])
+    centre = patches_at(np.zeros((1, 3)), up[None])
+    found = neighbour_sequences(centre, patches_at(about, normals), P)
+    assert found.lengths.tolist() == [4]
+    # the widest gap is the 150 degrees from 200 to 350: the round begins with the last
+    np.testing.assert_allclose(found.symbols[0, :4, 0], 1.0, atol=1e-12)
+    np.testing.assert_allclose(found.symbols[0, :4, 1], [0.0, 0.0, 0.2, -0.1], atol=1e-12)
+    right = np.pi / 2
+    np.testing.assert_allclose(found.symbols[0, :4, 2], [right, 0.0, 0.0, 0.0], atol=1e-7)
+    along = np.arccos([-np.cos(degrees[3]), 0.0, 0.2 / np.sqrt(1.04), -0.1 / np.sqrt(1.01)])
+    np.testing.assert_allclose(found.symbols[0, :4, 3], along, atol=1e-12)
+
+
+def test_too_near_and_too_far_are_no_neighbours() -> None:
+    means = np.array([[0.0, 0, 0], [0.05, 0, 0], [0.5, 0, 0], [1.7, 0, 0]])
+    some = patches_at(means, np.tile([0.0, 0.0, 1.0], (4, 1)))
+    found = neighbour_sequences(some, some, P)
+    assert found.lengths.tolist() == [1, 1, 3, 1]
+    alone = patches_at(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
+    assert neighbour_sequences(alone, alone, P).lengths.tolist() == [0]
+    assert len(sequence_correspondences(alone, alone, np.random.default_rng(0), P)) == 0
+
+
+def test_rigid_motion_changes_nothing() -> None:
+    patches = scattered(30, 80)
+    for seed in range(3):
+        other = carried(patches, motion(seed))
+        own, theirs = coarse(patches, P), coarse(other, P)
+        np.testing.assert_allclose(moved(motion(seed), own.means), theirs.means, atol=1e-9)
+        a, b = neighbour_sequences(patches, own, P), neighbour_sequences(other, theirs, P)
+        np.testing.assert_array_equal(a.lengths, b.lengths)
+        np.testing.assert_allclose(a.symbols, b.symbols, atol=1e-7)
+
+
+def test_a_mirror_image_is_another_sequence() -> None:
+    patches = scattered(31, 60)
+    mirror = np.diag([1.0, 1.0, -1.0])
+    other = replace(patches, means=patches.means @ mirror, normals=patches.normals @ mirror)
+    a = neighbour_sequences(patches, patches, P)
+    b = neighbour_sequences(other, other, P)
+    costs = [alignment_cost(a.symbols[i], b.symbols[i], P) for i in range(60)]
+    assert min(costs) > 0.02
+    backwards = [alignment_cost(a.symbols[i], b.symbols[i][::-1], P) for i in range(60)]
+    np.testing.assert_allclose(backwards, 0.0, atol=1e-6)
+
+
+def test_coarse_patches_by_hand() -> None:
+    means = np.array([[0.0, 0, 0], [0.1, 0, 0], [2.0, 0, 0], [2.2, 0, 0], [0.0, 3.0, 0]])
+    areas = np.array([3.0, 1.0, 1.0, 1.0, 0.5])
+    some = patches_at(means, np.tile([0.0, 0.0, 1.0], (5, 1)), areas)
+    # the largest, the farthest from it, the farthest from both
+    found = coarse(some, replace(P, n_coarse=3))
+    expected = np.array([[0.025, 0.0, 0.0], [0.0, 3.0, 0.0], [2.1, 0.0, 0.0]])
+    np.testing.assert_allclose(found.means, expected, atol=1e-12)
+    np.testing.assert_array_equal(found.areas, [4.0, 0.5, 2.0])
+    np.testing.assert_array_equal(found.sizes, [100, 50, 100])
+    assert len(coarse(some, P)) == 5
+
+
+def test_known_correspondences_are_found() -> None:
+    """The same patches from elsewhere, in another order, some gone, a centimetre of noise."""
+    patches, T = scattered(32, 150), motion(9)
+    rng = np.random.default_rng(33)
+    kept = rng.permutation(150)[:120]
+    other = carried(patches, T)
+    other = patches_at(
+        other.means[kept] + rng.normal(0, 0.01, (120, 3)), other.normals[kept], other.areas[kept]
+    )
+    pairs = sequence_correspondences(patches, other, np.random.default_rng(4), P)
+    assert pairs.dtype == np.int32
+    first: dict[int, int] = {}
+    for i, j in pairs.tolist():
+        first.setdefault(i, j)
+    there = [i for i in first if i in kept]
+    right = np.mean([kept[first[i]] == i for i in there])
+    assert right > 0.6
+    again = sequence_correspondences(patches, other, np.random.default_rng(4), P)
+    np.testing.assert_array_equal(pairs, again)
+
+
+def test_golden() -> None:
+    """Every number of the alignment at once: changed only on purpose."""
+    pairs = sequence_correspondences(
+        scattered(40, 50), carried(scattered(40, 50), motion(3)), np.random.default_rng(0),
+        replace(P, n_sources=6, n_coarse=20),
+    )  # fmt: skip
+    nearest = [[2, 37, 40], [12, 27, 33], [15, 7, 41], [24, 48, 47], [29, 43, 34], [38, 24, 48]]
+    assert pairs.tolist() == [[own[0], one] for own in nearest for one in own]
+    costs = [round(alignment_cost(symbols(k, 9), symbols(k + 50, 11), P), 9) for k in range(4)]
+    assert costs == [0.904202517, 0.805803733, 0.744911764, 0.850303579]
+
+
+def test_two_views_are_aligned_by_sequences() -> None:
+    """The whole of validation, with few patches drawn: the transform is found as by histograms."""
+    model = read_model("paper")
+    room, rng = room_and_rng(11, 0)
+    poses = trajectory(room, 61, rng)[12:36:12]
+    query, match = (
+        geometry_of(see(Frame(take(room, T, KINECT, rng), KINECT), model.parameters), model)
+        for T in poses
+    )
+    alignment = AlignmentParameters(sequence=replace(P, n_sources=40, n_coarse=40))
+    p = ValidationParameters(alignment=alignment)
+    found = validate(query, match, 0, p, matching="sequence")
+    assert found.status == "accepted"
+    assert found.T_match_query is not None
+    metres, radians = difference(found.T_match_query, inverse(poses[1]) @ poses[0])
+    assert metres < 0.05
+    assert radians < 0.03
+    # not by the histograms behind one's back
+    blank = replace(query, descriptors=np.zeros_like(query.descriptors))
+    again = validate(blank, match, 0, p, matching="sequence")
+    assert again.T_match_query is not None
+    np.testing.assert_array_equal(again.T_match_query, found.T_match_query)
+    unknown: Any = "letters"
+    with pytest.raises(ValueError, match="neither"):
+        validate(query, match, matching=unknown)

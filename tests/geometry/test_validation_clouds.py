@@ -1,0 +1,267 @@
+"""Validation of clouds: scans about a viewpoint, clouds without one, and depth beside either."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sceneprint.artifacts import read_geometry, write_geometry
+from sceneprint.geometry.acceptance import AcceptanceParameters, Evidence, belief, objection
+from sceneprint.geometry.rigid import difference, inverse, moved
+from sceneprint.geometry.scaling import scaled
+from sceneprint.geometry.validation import Validation, ValidationParameters, validate
+from sceneprint.models import Model, read_model
+from sceneprint.pipeline import geometry_of
+from sceneprint.signing import see
+from sceneprint.synth import KINECT, take
+from sceneprint.synth.poses import pose as looking
+from sceneprint.synth.rooms import Room
+from sceneprint.synth.synthesis import room_and_rng
+from sceneprint.types import Cloud, Floats, Floats32, Frame, Geometry, Sphere
+
+Make = Callable[[Cloud | Frame], Geometry]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A scan: T_room_sensor, its points, and its artifact as it is read back."""
+
+    T: Floats
+    points: Floats32
+    scan: Geometry
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return read_model("paper")
+
+
+@pytest.fixture(scope="module")
+def made(model: Model) -> Make:
+    def make(frame: Cloud | Frame) -> Geometry:
+        return read_geometry(write_geometry(geometry_of(see(frame, model.parameters), model)))
+
+    return make
+
+
+def pose(x: float, y: float, yaw: float) -> Floats:
+    """A sensor upright in a room, 1.2 m over its floor."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", yaw, degrees=True).as_matrix()
+    T[:3, 3] = x, y, 1.2
+    return T
+
+
+def scanned(room: Room, T: Floats, rng: np.random.Generator) -> Floats32:
+    """120 rings of 480 beams, from 45 degrees below to 45 above, good to a centimetre."""
+    azimuth = np.linspace(-math.pi, math.pi, 480, endpoint=False)
+    elevation = np.radians(np.linspace(-45, 45, 120))[:, None]
+    flat = np.cos(elevation)
+    rays = np.stack(
+        [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation) + 0 * azimuth], axis=-1
+    ).reshape(-1, 3)
+    there = (rays @ T[:3, :3].T).astype(np.float32)
+    hits = room.caster.cast(np.broadcast_to(T[:3, 3], there.shape).astype(np.float32), there)
+    met = hits.face >= 0
+    ranges = hits.distance[met] + rng.normal(0, 0.01, int(met.sum()))
+    points: Floats32 = (rays[met] * ranges[:, None]).astype(np.float32)
+    return points
+
+
+@pytest.fixture(scope="module")
+def rooms(made: Make) -> list[tuple[Room, list[View]]]:
+    """Two furnished rooms, scanned twice each, half a metre and 100 degrees apart."""
+    found = []
+    for number in (2, 5):
+        room, rng = room_and_rng(11, number)
+        middle = room.outline.mean(axis=0)
+        views = []
+        for T in (pose(*middle, 20.0), pose(middle[0] + 0.4, middle[1] - 0.3, 120.0)):
+            points = scanned(room, T, rng)
+            views.append(View(T, points, made(Cloud(points))))
+        found.append((room, views))
+    return found
+
+
+@pytest.fixture(scope="module")
+def fused(rooms: list[tuple[Room, list[View]]], made: Make) -> list[list[Geometry]]:
+    """The same points in the room's coordinates, of nobody's view."""
+    return [
+        [made(Cloud(moved(v.T, v.points).astype(np.float32), has_viewpoint=False)) for v in views]
+        for _, views in rooms
+    ]
+
+
+def off(v: Validation, T: Floats) -> tuple[float, float]:
+    """Metres and degrees from a transform."""
+    assert v.T_match_query is not None, v.reason
+    metres, radians = difference(v.T_match_query, T)
+    return metres, math.degrees(radians)
+
+
+def test_two_scans_of_a_room(rooms: list[tuple[Room, list[View]]]) -> None:
+    for _, (query, match) in rooms:
+        assert isinstance(query.scan.surface.camera, Sphere)
+        v = validate(query.scan, match.scan)
+        metres, degrees = off(v, inverse(match.T) @ query.T)
+        assert metres < 0.01
+        assert degrees < 0.2
+        assert (v.status, v.strength) == ("accepted", "strong")
+        assert v.overlap > 0.4
+        assert v.violations is not None
+        assert v.violations < 0.01
+        assert v.covariance is not None
+        assert np.linalg.eigvalsh(v.covariance)[0] > 0
+
+
+def test_a_turned_scan_turns_the_transform(
+    rooms: list[tuple[Room, list[View]]], made: Make
+) -> None:
+    _, (query, match) = rooms[0]
+    before = validate(query.scan, match.scan)
+    assert before.T_match_query is not None
+    for turn in Rotation.random(2, rng=np.random.default_rng(3)):
+        R = turn.as_matrix()
+        v = validate(made(Cloud((query.points @ R.T).astype(np.float32))), match.scan)
+        expected = before.T_match_query.copy()
+        expected[:3, :3] = expected[:3, :3] @ R.T
+        metres, degrees = off(v, expected)
+        assert metres < 0.02
+        assert degrees < 0.5
+        assert (v.status, v.strength) == ("accepted", "strong")
+
+
+def test_other_rooms_and_mirror_images_are_rejected(
+    rooms: list[tuple[Room, list[View]]], made: Make
+) -> None:
+    for query, match in product(rooms[0][1], rooms[1][1]):
+        assert validate(query.scan, match.scan).status != "accepted"
+    _, (query, match) = rooms[0]
+    mirrored = made(Cloud(query.points * np.array([1, -1, 1], np.float32)))
+    for one in (query, match):
+        assert validate(mirrored, one.scan).status != "accepted"
+
+
+def test_a_depth_image_beside_the_cloud_of_the_same_view(
+    rooms: list[tuple[Room, list[View]]], made: Make
+) -> None:
+    room, (first, _) = rooms[0]
+    T = looking(np.array([first.T[0, 3], first.T[1, 3], 1.4, 0.4, -0.3, 0.0]))
+    depth = take(room, T, KINECT, np.random.default_rng(1))
+    y, x = np.nonzero((depth > 0.4) & (depth < 6))
+    z = depth[y, x].astype(float)
+    points = np.stack([(x - KINECT.cx) / KINECT.fx * z, (y - KINECT.cy) / KINECT.fy * z, z], axis=1)
+    image, cloud = made(Frame(depth, KINECT)), made(Cloud(points.astype(np.float32)))
+    assert isinstance(cloud.surface.camera, Sphere)
+    for v in (validate(image, cloud), validate(cloud, image)):
+        metres, degrees = off(v, np.eye(4))
+        assert metres < 0.02
+        assert degrees < 0.5
+        assert (v.status, v.strength) == ("accepted", "strong")
+        assert v.overlap > 0.6
+
+
+def test_where_there_is_no_viewpoint_a_match_is_weak(
+    rooms: list[tuple[Room, list[View]]], fused: list[list[Geometry]]
+) -> None:
+    for query, match in fused:
+        assert query.surface.camera is None
+        v = validate(query, match)
+        metres, degrees = off(v, np.eye(4))
+        assert metres < 0.02
+        assert degrees < 0.3
+        assert (v.status, v.strength) == ("accepted", "weak")
+        assert v.violations is None
+        assert "free space" in v.reason
+    v = validate(*fused[0], mode="paper")
+    assert (v.status, v.strength, v.violations) == ("accepted", "weak", None)
+    for query, match in product(fused[0], fused[1]):
+        v = validate(query, match)
+        assert (v.status, v.violations) == ("rejected", None)
+    # of one with a viewpoint and one without, free space is known in one direction
+    for (_, views), clouds in zip(rooms, fused, strict=True):
+        for v, T in (
+            (validate(views[0].scan, clouds[1]), views[0].T),
+            (validate(clouds[1], views[0].scan), inverse(views[0].T)),
+        ):
+            metres, degrees = off(v, T)
+            assert metres < 0.02
+            assert degrees < 0.3
+            assert v.status == "accepted"
+            assert v.violations is not None
+            assert v.violations < 0.02
+
+
+def test_an_empty_square_room_without_a_viewpoint_is_ambiguous(made: Make) -> None:
+    rng = np.random.default_rng(4)
+    clouds = []
+    for _ in range(2):
+        points = rng.uniform(-1, 1, (40_000, 3))
+        axis = rng.choice(3, len(points), p=[0.3, 0.3, 0.4])
+        side = np.take_along_axis(points, axis[:, None], axis=1)[:, 0]
+        points[np.arange(len(points)), axis] = np.where(side > 0, 1.0, -1.0)
+        clouds.append(made(Cloud((points * [2, 2, 1.3]).astype(np.float32), has_viewpoint=False)))
+    v = validate(*clouds)
+    assert v.status != "accepted"
+    assert v.ambiguity > 0.75 * v.plane_overlap or v.status == "rejected"
+
+
+def test_everything_five_times_as_large(
+    rooms: list[tuple[Room, list[View]]], made: Make, model: Model
+) -> None:
+    p = scaled(model.parameters, 5.0)
+    large = replace(model, parameters=p)
+    _, views = rooms[1]
+    query, match = (
+        geometry_of(see(Cloud((view.points * 5).astype(np.float32)), p), large) for view in views
+    )
+    small = [geometry_of(see(Cloud(v.points), model.parameters), model) for v in views]
+    v, u = validate(query, match, 0, p.validation), validate(*small)
+    assert v.T_match_query is not None
+    assert u.T_match_query is not None
+    T = u.T_match_query.copy()
+    T[:3, 3] *= 5
+    metres, degrees = off(v, T)
+    assert metres < 0.005
+    assert degrees < 0.01
+    assert (v.status, v.strength, v.reason) == (u.status, u.strength, u.reason)
+    for name in ("overlap", "plane_overlap", "violations", "ambiguity"):
+        assert getattr(v, name) == pytest.approx(getattr(u, name), abs=0.01)
+    assert v.residual_m == pytest.approx(5 * u.residual_m, abs=0.002)
+    assert v.covariance is not None
+    assert u.covariance is not None
+    size = np.sqrt(np.diag(v.covariance)) / np.sqrt(np.diag(u.covariance))
+    np.testing.assert_allclose(size, [5, 5, 5, 1, 1, 1], rtol=0.05)
+    # with the numbers of a room it is another thing
+    assert validate(query, match, 0).T_match_query is None or v.covariance[0, 0] > 0
+
+
+def test_without_evidence_of_free_space_more_must_agree() -> None:
+    p = AcceptanceParameters(
+        evidence=0.2, plane_overlap=0.15, strong=0.3, weak=0.05, ambiguous=0.14,
+        ambiguous_share=0.5, blind_evidence=0.4, blind_plane_overlap=0.3,
+        blind_ambiguous_share=0.75,
+    )  # fmt: skip
+    seen = Evidence(0.01, 0.01, overlap=0.5, plane_overlap=0.4, violations=0.0, stiffness=1.0)
+    blind = replace(seen, violations=None)
+    assert objection(seen, p, "full") is objection(blind, p, "full") is None
+    for name, enough, too_little in (("overlap", 0.41, 0.39), ("plane_overlap", 0.31, 0.29)):
+        assert objection(replace(blind, **{name: enough}), p, "full") is None
+        against = objection(replace(blind, **{name: too_little}), p, "full")
+        assert against is not None
+        assert against[0] == "rejected"
+        assert objection(replace(seen, **{name: too_little}), p, "full") is None
+    assert belief(seen, 0.0, p)[:2] == ("accepted", "strong")
+    for ambiguity in (0.0, 0.1, 0.29):  # three quarters of what agrees are 0.3
+        status, strength, reason = belief(blind, ambiguity, p)
+        assert (status, strength) == ("accepted", "weak")
+        assert "free space" in reason
+    assert belief(blind, 0.31, p)[:2] == ("ambiguous", None)
+    assert belief(seen, 0.15, p)[:2] == ("ambiguous", None)
+    assert ValidationParameters().acceptance == AcceptanceParameters()

@@ -1,0 +1,212 @@
+"""Geometry artifacts of clouds: what comes back, to which precision, and what is refused."""
+
+from __future__ import annotations
+
+import math
+import struct
+import tracemalloc
+import zlib
+
+import numpy as np
+import pytest
+
+from sceneprint.artifacts import MAXIMUM_POINTS, read_geometry, write_geometry
+from sceneprint.errors import UnreadableGeometry
+from sceneprint.geometry.framing import directions
+from sceneprint.types import (
+    Camera,
+    Floats,
+    Floats32,
+    Geometry,
+    Intrinsics,
+    Patches,
+    Sphere,
+    Surface,
+)
+
+#: Bytes of magic, schema and checksum; and of sizes, camera, step and model id.
+HEAD, BODY = 11, 10 + 4 * 8 + 32
+SPHERE = Sphere(90, 40, math.radians(4.0), 0.3, math.radians(80.0), 1)
+
+
+def unit(v: Floats) -> Floats32:
+    result: Floats32 = (v / np.linalg.norm(v, axis=-1, keepdims=True)).astype(np.float32)
+    return result
+
+
+def holding(points: Floats, valid: np.ndarray, camera: Camera | None, patches: int = 3) -> Geometry:
+    """An artifact of these points, with normals of every direction."""
+    rng = np.random.default_rng(1)
+    shown = valid[..., None]
+    normals = np.where(shown, unit(rng.normal(size=points.shape)), 0.0).astype(np.float32)
+    seen = np.where(shown, points, 0.0).astype(np.float32)
+    surface = Surface(seen, normals, valid, valid.astype(np.float32), camera)
+    rows = Patches(
+        rng.normal(size=(patches, 3)), unit(rng.normal(size=(patches, 3))).astype(float),
+        rng.random(patches), np.arange(patches, dtype=np.int32), rng.random(patches),
+    )  # fmt: skip
+    return Geometry(surface, rows, rng.integers(0, 256, (patches, 16), np.uint8), "5a" * 32)
+
+
+def scan(camera: Sphere = SPHERE, nearest: float = 0.5, farthest: float = 80.0) -> Geometry:
+    """An artifact of a sphere whose ranges are spread evenly over their magnitudes."""
+    rng = np.random.default_rng(2)
+    shape = camera.height, camera.width
+    r = np.exp(rng.uniform(math.log(nearest), math.log(farthest), shape))
+    return holding(directions(camera) * r[..., None], rng.random(shape) < 0.8, camera)
+
+
+def fused(count: int, span: float = 20.0, far: float = 0.0) -> Geometry:
+    points = np.random.default_rng(3).uniform(-span / 2, span / 2, (1, count, 3)) + far
+    return holding(points, np.ones((1, count), np.bool_), None)
+
+
+def sealed(data: bytes, at: int, field: bytes) -> bytes:
+    """The artifact with a field of its body changed, and the checksum that fits."""
+    body = bytearray(data[HEAD:])
+    body[at : at + len(field)] = field
+    return data[: HEAD - 4] + struct.pack("<I", zlib.crc32(body)) + bytes(body)
+
+
+def assert_same(read: Geometry, was: Geometry, half_a_step: float) -> None:
+    """What is not of the surface is the same, and normals are to 0.005 degrees."""
+    np.testing.assert_array_equal(read.surface.valid, was.surface.valid)
+    gap = np.abs(read.surface.points - was.surface.points).max()
+    assert gap <= half_a_step
+    turn = np.linalg.norm(read.surface.normals - was.surface.normals, axis=2)
+    assert np.degrees(turn.max()) < 0.005
+    assert (read.surface.camera, read.model_id) == (was.surface.camera, was.model_id)
+    np.testing.assert_array_equal(read.descriptors, was.descriptors)
+    np.testing.assert_array_equal(read.patches.means, was.patches.means.astype(np.float32))
+    assert read.surface.points.dtype == read.surface.normals.dtype == np.float32
+    assert not read.surface.points[~read.surface.valid].any()
+
+
+@pytest.mark.parametrize("pole", [0, 1, 2])
+def test_a_scan_comes_back(pole: int) -> None:
+    was = scan(Sphere(90, 40, math.radians(4.0), 0.3, math.radians(80.0), pole))
+    data = write_geometry(was)
+    read = read_geometry(data)
+    # steps of range are the power of two of which 65535 reach 80 m: 1/512 m
+    assert_same(read, was, 1 / 1024 + 1e-5)
+    ranges = [np.linalg.norm(g.surface.points[was.surface.valid], axis=1) for g in (read, was)]
+    assert np.abs(ranges[0] - ranges[1]).max() <= 1 / 1024 + 1e-5
+    assert data[5:7] == b"\2\0"
+    assert len(data) == HEAD + BODY + 6 * 90 * 40 + 3 * (36 + 16)
+    assert write_geometry(read) == data
+
+
+def test_areas_of_a_scan() -> None:
+    """Of a sphere seen from its middle they add up to its own, but for the caps left out."""
+    camera = Sphere(180, 89, math.radians(2.0), 0.0, math.radians(88.0))
+    geometry = holding(directions(camera) * 3.0, np.ones((89, 180), np.bool_), camera)
+    geometry.surface.normals[:] = -directions(camera)
+    read = read_geometry(write_geometry(geometry))
+    band = 4 * math.pi * 9 * math.sin(math.radians(89.0))
+    assert float(read.surface.areas.sum()) == pytest.approx(band, rel=1e-3)
+
+
+def test_points_in_no_order_come_back() -> None:
+    for count, span, far in ((1, 1.0, 0.0), (500, 20.0, 0.0), (500, 60.0, 5000.0), (9, 0.0, 2.0)):
+        was = fused(count, span, far)
+        data = write_geometry(was)
+        # 20 m in steps of a power of two; far from the origin 32 bits tell half a millimetre
+        assert_same(read_geometry(data), was, max(span / 65535, abs(far) * 2.0**-22) + 1e-6)
+        assert read_geometry(data).surface.camera is None
+        assert len(data) == HEAD + BODY + 10 * count + 3 * (36 + 16)
+        assert write_geometry(read_geometry(data)) == data
+
+
+def test_no_more_points_than_pixels_are_kept() -> None:
+    rng = np.random.default_rng(4)
+    flat = np.concatenate([rng.uniform(-9, 9, (1, 60_000, 2)), np.zeros((1, 60_000, 1))], axis=2)
+    data = write_geometry(holding(flat, np.ones((1, 60_000), np.bool_), None))
+    kept = read_geometry(data).surface.points[0]
+    assert 15_000 < len(kept) <= MAXIMUM_POINTS
+    assert len(data) <= 262_144
+    # spread over all of it: nowhere a square of half a metre is empty
+    filled, _, _ = np.histogram2d(kept[:, 0], kept[:, 1], bins=36, range=[(-9, 9), (-9, 9)])
+    assert filled.min() > 5
+
+
+def test_every_damaged_byte_is_noticed() -> None:
+    rng = np.random.default_rng(5)
+    for data in (write_geometry(scan()), write_geometry(fused(300))):
+        some = rng.integers(HEAD + BODY, len(data), 40).tolist()
+        for at in [*range(HEAD + BODY), *some, len(data) - 1]:
+            damaged = bytearray(data)
+            damaged[at] ^= 1 << int(rng.integers(8))
+            with pytest.raises(UnreadableGeometry):
+                read_geometry(bytes(damaged))
+        for length in (0, 4, HEAD, HEAD + BODY - 1, HEAD + BODY, len(data) - 1):
+            with pytest.raises(UnreadableGeometry, match="Sign the frame again"):
+                read_geometry(data[:length])
+
+
+def test_numbers_that_no_cloud_has() -> None:
+    nan, endless = math.nan, math.inf
+    of_scan, of_points = write_geometry(scan()), write_geometry(fused(300))
+    for at, values, match in (
+        (10, (0.0, -1.0, nan, endless, 4.0), "no camera"),  # step of the sphere
+        (18, (nan, endless), "no camera"), (26, (nan, -endless), "no camera"),
+        (34, (0.0, -1.0, nan, endless, 1e-13, 17.0), "step of range"),
+    ):  # fmt: skip
+        for value in values:
+            with pytest.raises(UnreadableGeometry, match=match):
+                read_geometry(sealed(of_scan, at, struct.pack("<d", value)))
+    for at, values in ((10, (nan, endless, 1e7)), (26, (nan,)), (34, (nan, 0.0, 17.0))):
+        for value in values:
+            with pytest.raises(UnreadableGeometry, match=r"no cloud has|step of range"):
+                read_geometry(sealed(of_points, at, struct.pack("<d", value)))
+    for kind, pole in ((0, 0), (3, 0), (1, 3), (1, 255)):
+        with pytest.raises(UnreadableGeometry):
+            read_geometry(sealed(of_scan, 8, bytes([kind, pole])))
+    with pytest.raises(UnreadableGeometry, match="no cloud has"):
+        read_geometry(sealed(of_points, 8, bytes([2, 1])))
+    # a map of two rows, or more points than are kept, is none of a cloud in no order
+    with pytest.raises(UnreadableGeometry, match="no cloud has"):
+        read_geometry(sealed(of_points, 0, struct.pack("<HH", 150, 2)))
+
+
+def test_sizes_that_the_bytes_do_not_hold() -> None:
+    for data in (write_geometry(scan()), write_geometry(fused(300))):
+        tracemalloc.start()
+        try:
+            for at, size in ((0, 0), (0, 65535), (2, 65535), (4, 65535), (6, 0), (6, 65535)):
+                with pytest.raises(UnreadableGeometry, match="is damaged"):
+                    read_geometry(sealed(data, at, struct.pack("<H", size)))
+            with pytest.raises(UnreadableGeometry, match="is damaged"):
+                read_geometry(sealed(data, 0, struct.pack("<4H", *[65535] * 4)))
+            assert tracemalloc.get_traced_memory()[1] < 4 * len(data)
+        finally:
+            tracemalloc.stop()
+
+
+def test_any_numbers_make_finite_points() -> None:
+    """What is read, whatever its bytes, can be validated with."""
+    rng = np.random.default_rng(6)
+    read = 0
+    for data in (write_geometry(scan()), write_geometry(fused(300))):
+        for _ in range(150):
+            at = int(rng.integers(8, BODY - 32))
+            field = rng.integers(0, 256, int(rng.integers(1, 9)), np.uint8).tobytes()
+            hostile = sealed(data, at, field[: BODY - 32 - at])
+            try:
+                surface = read_geometry(hostile).surface
+            except UnreadableGeometry:
+                continue
+            read += 1
+            for array in (surface.points, surface.normals, surface.areas):
+                assert np.isfinite(array).all()
+    assert read > 20
+
+
+def test_a_depth_image_keeps_its_schema() -> None:
+    camera = Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.0)
+    y, x = np.mgrid[:3, :4]
+    points = np.dstack([(x - 2) / 5 * 2.0, (y - 1) / 5 * 2.0, np.full((3, 4), 2.0)])
+    data = write_geometry(holding(points, np.ones((3, 4), np.bool_), camera))
+    assert data[5:7] == b"\1\0"
+    # and one of a cloud is not read as one of an image
+    with pytest.raises(UnreadableGeometry):
+        read_geometry(data[:5] + b"\2\0" + data[7:])
