@@ -57,6 +57,7 @@ siege: $(STAMP)
 models: $(STAMP)
 	$(BIN)/sceneprint train --preset paper --out sceneprint/presets/paper.safetensors
 	$(BIN)/sceneprint train --preset compact --out sceneprint/presets/compact.safetensors
+	$(BIN)/sceneprint train --preset lidar --out sceneprint/presets/lidar.safetensors
 
 lock: $(STAMP)
 	$(BIN)/python -m pip install --quiet uv

@@ -1,6 +1,6 @@
-"""Learning a model: synthetic rooms and, if wished, frames of one's own, to a `Model`.
+"""Learning a model: synthetic scenes and, if wished, frames of one's own, to a `Model`.
 
-    rooms, frames  --train-->  Model
+    rooms or sites, frames  --train-->  Model
 
 What is learnt (projection, mixture) lives with its stage in `geometry`; here the stages are
 put in order, and the quantiser and d0 are fixed from the signatures that come out.
@@ -14,25 +14,31 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from multiprocessing import get_context
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from sceneprint.datasets import FrameReference
 from sceneprint.errors import FrameError, TrainingError
 from sceneprint.geometry.encoding import quantise
-from sceneprint.geometry.hierarchy import HierarchyParameters
 from sceneprint.geometry.mixture import MixtureParameters, fit_mixture
 from sceneprint.geometry.projection import fit_projection, project
 from sceneprint.geometry.properties import neighbour_pairs, pair_properties
 from sceneprint.geometry.retrieval import distances
-from sceneprint.geometry.segmentation import patches_of, segment
 from sceneprint.geometry.surroundings import fit_compression, surroundings
 from sceneprint.geometry.weights import patch_weights
 from sceneprint.models import Model, ModelParameters
-from sceneprint.signing import float_signature, hierarchy_of, open_signer, see, table_statistics
-from sceneprint.synth import synthesise_room
-from sceneprint.types import Bytes, Floats, Floats32, Frame, Patches
+from sceneprint.recipes import Scenes
+from sceneprint.signing import (
+    float_signature,
+    hierarchy_of,
+    open_signer,
+    patches_for_validation,
+    see,
+    table_statistics,
+)
+from sceneprint.synth import synthesise_room, synthesise_survey
+from sceneprint.types import AnyFrame, Bytes, Floats, Floats32, Patches
 
 #: Called with the stage's name, steps done and their total.
 Report = Callable[[str, int, int], None]
@@ -42,7 +48,7 @@ Report = Callable[[str, int, int], None]
 class TrainingParameters:
     """What a model is trained on and how; all of it decides the outcome."""
 
-    rooms: int = 100  #: synthetic rooms
+    rooms: int = 100  #: synthetic rooms, or sites
     views: int = 6  #: frames taken in each
     seed: int = 0  #: of rooms, of the pairs drawn and of the fits
     pairs: int = 240_000  #: properties that projection and mixture are fitted to
@@ -50,6 +56,7 @@ class TrainingParameters:
     descriptors: int = 128  #: bytes of a descriptor
     histograms: int = 40_000  #: of surroundings, that their compression is fitted to
     clipped_share: float = 0.0005  #: of signature components, beyond the quantiser's range
+    scenes: Scenes = "rooms"  #: seen by a depth camera, or by a laser
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,25 +77,6 @@ class Draw:
     histograms: int
 
 
-#: Sizes of the presets: G components, H levels.
-PRESET_SIZES = {"paper": (1250, 4), "compact": (256, 2)}
-
-
-def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
-    """Parameters of a preset: `paper` has the sizes of Sec. III-F, `compact` a tenth of them.
-
-    Raises
-    ------
-    TrainingError : no such preset.
-    """
-    if preset not in PRESET_SIZES:
-        raise TrainingError(
-            f"There is no preset {preset!r}. Choose one of {', '.join(PRESET_SIZES)}."
-        )
-    g, h = PRESET_SIZES[preset]
-    return ModelParameters(hierarchy=HierarchyParameters(h)), MixtureParameters(g)
-
-
 def train(
     name: str,
     model_p: ModelParameters,
@@ -103,7 +91,7 @@ def train(
     Parameters
     ----------
     name : what to call the model
-    model_p, mixture_p : its parameters, such as those of a preset
+    model_p, mixture_p : its parameters, such as those of a preset: see `recipes.py`
     p : see TrainingParameters
     references : frames of one's own beside the rooms, each with the name of its place
     jobs : processes that make and segment frames
@@ -143,7 +131,7 @@ def train(
         for step, mixture in enumerate(fit, 1):  # noqa: B007 -- the last one is kept
             tell("mixture", step, mixture_p.iterations)
     seen = {
-        "training": asdict(p),
+        "training": _written(p),
         "mixture": asdict(mixture_p),
         "own_frames": len(references),
         "frames_used": len(lessons),
@@ -151,6 +139,14 @@ def train(
     }
     fitted = Model(name, model_p, projection, mixture, compression, 1.0, 1.0, seen)
     return calibrated(fitted, lessons, p)
+
+
+def _written(p: TrainingParameters) -> dict[str, Any]:
+    """As provenance has them: of rooms nothing is said, as before there were other scenes."""
+    written = asdict(p)
+    if p.scenes == "rooms":
+        del written["scenes"]
+    return written
 
 
 def _silent(stage: str, done: int, total: int) -> None:
@@ -201,12 +197,21 @@ def _lessons(
 def _room_lessons(
     model_p: ModelParameters, p: TrainingParameters, draw: Draw, index: int
 ) -> list[Lesson]:
-    room = synthesise_room(p.seed, index, p.views)
+    name, frames = _scene(p, index)
     return [
         lesson
-        for view, frame in enumerate(room.frames)
-        for lesson in _lesson(frame, room.name, (p.seed, 0, index, view), model_p, draw)
+        for view, frame in enumerate(frames)
+        for lesson in _lesson(frame, name, (p.seed, 0, index, view), model_p, draw)
     ]
+
+
+def _scene(p: TrainingParameters, index: int) -> tuple[str, Sequence[AnyFrame]]:
+    """The frames of one synthetic scene, and what it is called."""
+    if p.scenes == "sites":
+        survey = synthesise_survey(p.seed, index, p.views)
+        return survey.name, survey.clouds
+    room = synthesise_room(p.seed, index, p.views)
+    return room.name, room.frames
 
 
 def _own_lesson(
@@ -221,7 +226,7 @@ def _own_lesson(
 
 
 def _lesson(
-    frame: Frame, place: str, seed: tuple[int, ...], model_p: ModelParameters, draw: Draw
+    frame: AnyFrame, place: str, seed: tuple[int, ...], model_p: ModelParameters, draw: Draw
 ) -> list[Lesson]:
     rng = np.random.default_rng(seed)
     try:
@@ -239,7 +244,7 @@ def _lesson(
             drawn.append(pair_properties(level, pairs[some], model_p.properties))
     if not drawn:
         return []
-    own = patches_of(seen, segment(seen, model_p.validation_segmentation))
+    own = patches_for_validation(seen, model_p)
     some = rng.permutation(len(own))[: draw.histograms]
     histograms = surroundings(own, model_p.surroundings)[some]
     return [Lesson(place, np.concatenate(drawn), histograms, patches.levels)]

@@ -15,9 +15,10 @@ from sceneprint.geometry.segmentation import SegmentationParameters, patches_of,
 from sceneprint.geometry.surroundings import surroundings
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import distance, open_signer, sign
+from sceneprint.recipes import preset_parameters
 from sceneprint.signing import see
 from sceneprint.synth import synthesise_room
-from sceneprint.training import TrainingParameters, preset_parameters, train
+from sceneprint.training import TrainingParameters, train
 
 MODEL = ModelParameters(
     segmentation=SegmentationParameters(n_patches=200),
@@ -101,5 +102,5 @@ def test_presets() -> None:
     assert (mixture.n_components, model.hierarchy.n_levels) == (1250, 4)
     model, mixture = preset_parameters("compact")
     assert (mixture.n_components, model.hierarchy.n_levels) == (256, 2)
-    with pytest.raises(TrainingError, match=r"no preset .large.\. Choose one of paper, compact"):
+    with pytest.raises(TrainingError, match=r"no preset .large.\. Choose .* compact, lidar\."):
         preset_parameters("large")

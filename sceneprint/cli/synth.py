@@ -1,4 +1,4 @@
-"""`sceneprint synth`: synthetic rooms as a data set in 7-Scenes layout."""
+"""`sceneprint synth`: synthetic rooms, or sites scanned by a laser, as a data set."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import Any
 from tqdm import tqdm
 
 from sceneprint.cli.numbers import positive, whole
+from sceneprint.clouds import write_ply
 from sceneprint.datasets import Camera, write_depth_png, write_intrinsics, write_pose
 from sceneprint.errors import DatasetError
 
@@ -27,10 +28,17 @@ def add_to(commands: Any) -> None:
         "synth",
         help="make synthetic rooms with known poses",
         description="Ray-cast furnished rooms as a Kinect would see them, and write them in "
-        "7-Scenes layout: OUT/room-000/seq-01/frame-000000.depth.png and .pose.txt.",
+        "7-Scenes layout: OUT/room-000/seq-01/frame-000000.depth.png and .pose.txt. With "
+        "--sensor lidar: halls, storeys and blocks as a spinning laser would see them, "
+        "OUT/site-000/scan-000000.ply and .pose.txt.",
     )
     command.add_argument("out", type=Path, metavar="OUT", help="folder; new or empty")
-    command.add_argument("--rooms", type=positive, default=4, metavar="N", help="default: 4")
+    command.add_argument(
+        "--sensor", choices=("kinect", "lidar"), default="kinect", help="default: kinect"
+    )
+    command.add_argument(
+        "--rooms", type=positive, default=4, metavar="N", help="or sites (default: 4)"
+    )
     command.add_argument(
         "--views", type=positive, default=25, metavar="M", help="of each room (default: 25)"
     )
@@ -38,7 +46,8 @@ def add_to(commands: Any) -> None:
     command.add_argument(
         "--path",
         action="store_true",
-        help="views along a hand-held path, a few centimetres apart, not scattered",
+        help="views along a hand-held path, a few centimetres apart, not scattered; with "
+        "--sensor lidar a walk, 1.5 m apart",
     )
     command.add_argument("--perfect", action="store_true", help="without sensor noise")
     command.add_argument(
@@ -58,13 +67,14 @@ def run(options: argparse.Namespace) -> int:
     with tqdm(total=options.rooms, desc="synth", unit="room", disable=None) as bar:
         for _ in _rooms(options):
             bar.update()
-    print(f"{options.rooms} rooms of {options.views} views in {options.out}")
+    made = "sites" if options.sensor == "lidar" else "rooms"
+    print(f"{options.rooms} {made} of {options.views} views in {options.out}")
     return 0
 
 
 def _rooms(options: argparse.Namespace) -> Iterator[None]:
     make = partial(
-        _write_room,
+        _write_site if options.sensor == "lidar" else _write_room,
         options.out,
         options.seed,
         options.views,
@@ -91,3 +101,17 @@ def _write_room(
         write_depth_png(sequence / f"frame-{number:06d}.depth.png", frame.depth, DEPTH_SCALE)
         if frame.pose is not None:
             write_pose(sequence / f"frame-{number:06d}.pose.txt", frame.pose)
+
+
+def _write_site(
+    out: Path, seed: int, views: int, index: int, *, along_path: bool, perfect: bool
+) -> None:
+    from sceneprint.synth import synthesise_survey
+
+    survey = synthesise_survey(seed, index, views, along_path=along_path, perfect=perfect)
+    folder = out / survey.name
+    folder.mkdir(parents=True)
+    for number, cloud in enumerate(survey.clouds):
+        (folder / f"scan-{number:06d}.ply").write_bytes(write_ply(cloud.points))
+        if cloud.pose is not None:
+            write_pose(folder / f"scan-{number:06d}.pose.txt", cloud.pose)

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from sceneprint.cli.numbers import metres, positive, whole
 from sceneprint.datasets import FrameReference, find_sequences
 from sceneprint.errors import TrainingError
-from sceneprint.models import save_model
+from sceneprint.models import ModelParameters, save_model
 
 
 def add_to(commands: Any) -> None:
@@ -22,15 +22,23 @@ def add_to(commands: Any) -> None:
     command = commands.add_parser(
         "train",
         help="train a model",
-        description="Train a model on synthetic rooms. The shipped presets suit depth cameras "
-        "indoors; docs/model.md says when to train one of your own.",
+        description="Train a model on synthetic rooms, or, for the preset lidar, on synthetic "
+        "halls, storeys and blocks. The shipped presets suit depth cameras indoors, and spinning "
+        "lasers; docs/model.md says when to train one of your own.",
     )
     command.add_argument("--out", type=Path, required=True, metavar="FILE", help="model file")
     command.add_argument(
-        "--preset", choices=("paper", "compact"), default="paper", help="size (default: paper)"
+        "--preset",
+        choices=("paper", "compact", "lidar"),
+        default="paper",
+        help="size and, of lidar, lengths and scenes (default: paper)",
     )
     command.add_argument(
-        "--rooms", type=whole, default=100, metavar="N", help="synthetic rooms (default: 100)"
+        "--rooms",
+        type=whole,
+        default=100,
+        metavar="N",
+        help="synthetic rooms, or sites (default: 100)",
     )
     command.add_argument("--seed", type=whole, default=0, metavar="S")
     command.add_argument(
@@ -47,10 +55,13 @@ def add_to(commands: Any) -> None:
         type=metres,
         nargs=2,
         metavar=("MIN", "MAX"),
-        help="the sensor's range, metres (default: 0.3 9)",
+        help="the sensor's range, metres (default: 0.3 9; of lidar 0.6 60)",
     )
     command.add_argument(
-        "--radius", type=metres, metavar="R", help="reach of a patch, metres (default: 3)"
+        "--radius",
+        type=metres,
+        metavar="R",
+        help="reach of a patch, metres (default: 3; of lidar 15)",
     )
     command.add_argument(
         "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help="processes"
@@ -60,7 +71,8 @@ def add_to(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Train and write the model."""
-    from sceneprint.training import TrainingParameters, preset_parameters, train
+    from sceneprint.recipes import preset_parameters, preset_scenes
+    from sceneprint.training import TrainingParameters, train
 
     references: list[tuple[str, FrameReference]] = [
         (f"{path.resolve()}: {sequence.parent_frame}", reference)
@@ -71,14 +83,17 @@ def run(options: argparse.Namespace) -> int:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     if options.out.is_dir():
         raise TrainingError(f"{options.out}: is a folder. Name the file that the model shall be.")
-    p = TrainingParameters(rooms=options.rooms, seed=options.seed, projection=options.projection)
+    scenes, views = preset_scenes(options.preset)
+    p = TrainingParameters(
+        rooms=options.rooms,
+        views=views,
+        seed=options.seed,
+        projection=options.projection,
+        scenes=scenes,
+    )
     model_p, mixture_p = preset_parameters(options.preset)
     if options.range is not None:
-        least, most = options.range
-        if least >= most:
-            raise TrainingError(f"--range {least:g} {most:g}: give the smaller distance first.")
-        depth = replace(model_p.depth, minimum_depth=least, maximum_depth=most)
-        model_p = replace(model_p, depth=depth)
+        model_p = _of_range(model_p, *options.range)
     if options.radius is not None:
         properties = replace(model_p.properties, radius=options.radius)
         model_p = replace(model_p, properties=properties)
@@ -92,6 +107,17 @@ def run(options: argparse.Namespace) -> int:
         f"{model.provenance['pairs_used']} pairs"
     )
     return 0
+
+
+def _of_range(p: ModelParameters, least: float, most: float) -> ModelParameters:
+    """The same for a sensor of another range, of depth images and of clouds."""
+    if least >= most:
+        raise TrainingError(f"--range {least:g} {most:g}: give the smaller distance first.")
+    return replace(
+        p,
+        depth=replace(p.depth, minimum_depth=least, maximum_depth=most),
+        cloud=replace(p.cloud, minimum_range=least, maximum_range=most),
+    )
 
 
 class _Bars:

@@ -1,0 +1,105 @@
+"""The spinning scanner: what it measures of a box, and at which angles."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprint.synth.mesh import Mesh
+from sceneprint.synth.rays import Caster
+from sceneprint.synth.solids import box
+from sceneprint.synth.spinning import Spinning, scan
+from sceneprint.types import Floats, Floats32
+
+HALF = np.array([6.0, 4.0, 2.0])  #: of the box scanned from within, metres
+SENSOR = Spinning(
+    rings=16,
+    lowest=math.radians(-15),
+    highest=math.radians(15),
+    azimuth_step=math.radians(0.4),
+    blind_width=0.0,
+)
+
+
+def inside_out(mesh: Mesh) -> Mesh:
+    return replace(mesh, faces=mesh.faces[:, ::-1].copy())
+
+
+@pytest.fixture(scope="module")
+def shell() -> Caster:
+    return Caster(inside_out(box(*(2 * HALF), (0.0, 0.0, -HALF[2]))))
+
+
+def pose(yaw: float, at: tuple[float, float, float]) -> Floats:
+    T = np.eye(4)
+    T[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+    T[:3, 3] = at
+    return T
+
+
+def ranges(points: Floats32) -> Floats:
+    return np.asarray(np.linalg.norm(points.astype(float), axis=1))
+
+
+def from_walls(points: Floats32, T: Floats) -> Floats:
+    """Distance of each point from the nearest of the six sides."""
+    world = points @ T[:3, :3].T + T[:3, 3]
+    return np.asarray(np.abs(np.abs(world) - HALF).min(axis=1))
+
+
+def test_every_point_lies_on_a_wall_within_noise(shell: Caster) -> None:
+    T = pose(0.7, (1.0, -0.5, 0.3))
+    points = scan(shell, T, SENSOR, np.random.default_rng(0))
+    assert (points.dtype, points.shape[1]) == (np.float32, 3)
+    off = from_walls(points, T)
+    # noise is along the ray, so off the wall it is no more: three sigmas hold 99.7 %
+    assert (off < 3 * math.hypot(SENSOR.sigma, SENSOR.ring_sigma)).mean() > 0.99
+    assert 0.003 < off.mean() < SENSOR.sigma
+
+
+def test_without_errors_nothing_is_lost_and_all_is_exact(shell: Caster) -> None:
+    T = pose(-2.0, (0.0, 1.0, 0.0))
+    ideal = replace(SENSOR, sigma=0.0, ring_sigma=0.0, loss=0.0, grazing=0.0)
+    points = scan(shell, T, ideal, np.random.default_rng(0))
+    assert len(points) == 16 * 900
+    assert from_walls(points, T).max() < 1e-4
+    # straight ahead of the turned sensor, by hand: the wall x = -6 lies along azimuth pi + 2
+    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    ahead = np.abs(azimuth - (2.0 + math.pi - 2 * math.pi)) < math.radians(0.21)
+    lowest = np.abs(elevation - elevation.min()) < 1e-4
+    expected = 6.0 / (math.cos(math.radians(15)) * np.cos(math.radians(0.2)))
+    assert ranges(points[ahead & lowest]) == pytest.approx(expected, abs=2e-3)
+
+
+def test_rings_are_at_the_stated_elevations(shell: Caster) -> None:
+    points = scan(shell, np.eye(4), SENSOR, np.random.default_rng(0))
+    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    assert np.unique(np.round(elevation, 2)) == pytest.approx(np.arange(-15.0, 15.1, 2.0), abs=0.01)
+
+
+def test_range_limits_and_the_carrier_hide_points(shell: Caster) -> None:
+    seen = scan(shell, np.eye(4), replace(SENSOR, minimum=4.5, maximum=6.5), _rng())
+    assert ranges(seen).min() >= 4.5
+    assert ranges(seen).max() <= 6.5 + 1e-5
+    blind = replace(SENSOR, blind_middle=math.pi, blind_width=1.0, blind_below=0.0)
+    points = scan(shell, np.eye(4), blind, _rng())
+    behind = np.abs(np.arctan2(points[:, 1], points[:, 0])) > math.pi - 0.49
+    assert behind.any()
+    assert points[behind, 2].min() > 0.0  # only lasers that look over the carrier
+    assert points[~behind, 2].min() < 0.0
+
+
+def test_far_and_grazing_returns_are_lost_first() -> None:
+    """Of a floor, all comes back from close by and little from where the ray only grazes it."""
+    floor = Caster(box(200.0, 200.0, 1.0, (0.0, 0.0, -2.5)))
+    sensor = replace(SENSOR, lowest=math.radians(-30), highest=math.radians(-2), grazing=0.1)
+    points = scan(floor, np.eye(4), sensor, _rng())
+    near = (ranges(points) < 5).sum()
+    assert near / (900 * (sensor.elevations < -math.asin(1.5 / 5)).sum()) > 0.95
+    assert (ranges(points) > 35).sum() < 0.5 * 900
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(3)

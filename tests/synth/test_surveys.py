@@ -1,0 +1,62 @@
+"""Synthetic sites scanned by a laser: one seed, one site; walkable, no wall crossed."""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from sceneprint.synth.rounds import STEP
+from sceneprint.synth.spinning import Spinning
+from sceneprint.synth.surveys import Survey, premises_and_rng, synthesise_survey
+
+#: few points, so that a scan takes a millisecond
+SMALL = Spinning(rings=8, azimuth_step=0.03)
+
+
+def digest(survey: Survey) -> str:
+    h = hashlib.sha256()
+    for cloud in survey.clouds:
+        assert cloud.pose is not None
+        h.update(cloud.points.tobytes() + cloud.pose.tobytes() + cloud.name.encode())
+    return h.hexdigest()
+
+
+def test_the_same_seed_gives_the_same_bytes_in_any_order() -> None:
+    first = digest(synthesise_survey(5, 0, 2, sensor=SMALL))
+    assert digest(synthesise_survey(5, 2, 2, sensor=SMALL)) != first
+    assert digest(synthesise_survey(6, 0, 2, sensor=SMALL)) != first
+    assert digest(synthesise_survey(5, 0, 2, sensor=SMALL)) == first
+
+
+@pytest.mark.parametrize("kind", ["hall", "storey", "block"])
+def test_a_walk_stays_where_one_can_walk(kind: str) -> None:
+    survey = synthesise_survey(7, 1, 12, along_path=True, kind=kind, sensor=SMALL)
+    assert (survey.name, survey.kind, len(survey.clouds)) == ("site-001", kind, 12)
+    premises, _ = premises_and_rng(7, 1, kind)
+    poses = np.stack([cloud.pose for cloud in survey.clouds if cloud.pose is not None])
+    at = poses[:, :3, 3]
+    assert np.linalg.norm(np.diff(at[:, :2], axis=0), axis=1).max() < STEP + 1e-6
+    assert np.ptp(at[:, :2], axis=0).max() > 3.0  # it leads somewhere
+    np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1.0, atol=1e-12)
+    assert (poses[:, 2, 2] > 0.98).all()  # carried upright
+    # nothing stands where the scanner passes
+    cells = premises.floor.points[premises.floor.claimed]
+    gaps = np.linalg.norm(at[:, None, :2] - cells[None], axis=2).min(axis=1)
+    assert gaps.min() > premises.floor.cell / 2
+
+
+def test_scans_of_one_walk_agree_in_world_coordinates() -> None:
+    """Points of one scan lie on what the next one sees: the poses are those of the scans."""
+    hall = synthesise_survey(8, 0, 2, along_path=True, perfect=True)
+    a, b = (c.points @ c.pose[:3, :3].T + c.pose[:3, 3] for c in hall.clouds if c.pose is not None)
+    from scipy.spatial import cKDTree
+
+    near, _ = cKDTree(b).query(a[::50])
+    assert np.median(near) < 0.1
+    assert len(hall.clouds[0].points) > 10_000
+
+
+def test_the_scanner_of_each_site_is_its_own() -> None:
+    sensors = {synthesise_survey(9, index, 1).sensor for index in range(3)}
+    assert len(sensors) == 3
+    assert all(0.2 < sensor.azimuth_step * 180 / np.pi * 1.2 < 0.8 for sensor in sensors)

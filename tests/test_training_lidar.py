@@ -1,0 +1,68 @@
+"""The preset for lasers: learnt from sites, at lengths of its own, and good enough to find by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.bins import TableLayout
+from sceneprint.geometry.mixture import MixtureParameters
+from sceneprint.models import Model, ModelParameters, read_model
+from sceneprint.pipeline import distance, open_signer, sign
+from sceneprint.recipes import preset_parameters, preset_scenes
+from sceneprint.synth import Spinning, synthesise_survey
+from sceneprint.training import TrainingParameters, train
+
+TRAINING = TrainingParameters(
+    rooms=2, views=2, seed=3, pairs=3000, histograms=1500, descriptors=32, scenes="sites"
+)
+
+
+@pytest.fixture(scope="module")
+def trained() -> Model:
+    model_p, _ = preset_parameters("lidar")
+    small = replace(model_p, table=TableLayout(8, 9, 8))
+    return train("tiny", small, MixtureParameters(n_components=16, iterations=3), TRAINING)
+
+
+def test_provenance_says_sites(trained: Model) -> None:
+    seen = trained.provenance
+    assert seen["training"]["scenes"] == "sites"
+    assert (seen["training"]["rooms"], seen["frames_used"], seen["own_frames"]) == (2, 4, 0)
+
+
+def test_scenes_and_lengths_are_the_presets_own() -> None:
+    assert [preset_scenes(name) for name in ("paper", "compact", "lidar")] == [
+        ("rooms", 6), ("rooms", 6), ("sites", 3),
+    ]  # fmt: skip
+    lidar, mixture = preset_parameters("lidar")
+    assert (mixture.n_components, lidar.hierarchy.n_levels) == (256, 2)
+    assert lidar.properties.radius == 5 * ModelParameters().properties.radius
+    assert lidar.surroundings.far_radius == 8.0
+    assert (lidar.cloud.minimum_range, lidar.cloud.maximum_range) == (0.6, 60.0)
+    assert preset_parameters("paper")[0] == ModelParameters()
+
+
+def test_neighbours_in_a_hall_are_nearest(trained: Model) -> None:
+    """Of a walk of 30 m, the scan one step away is nearer in signature than those far off."""
+    sensor = Spinning(rings=32, azimuth_step=0.01)
+    walk = synthesise_survey(4, 3, 21, along_path=True, kind="hall", sensor=sensor).clouds
+    signer = open_signer(trained, cached=False)
+    signed = [sign(cloud, signer) for cloud in walk[::4]]
+    beside = sign(walk[9], signer)
+    at = np.stack([cloud.pose[:2, 3] for cloud in walk if cloud.pose is not None])
+    apart = np.linalg.norm(at[::4] - at[9], axis=1)
+    found = int(np.argmin([distance(beside, one) for one in signed]))
+    assert apart[found] < 5.0 < np.median(apart)  # 1.5 or 4.5 m; the others are 7 to 16 m off
+
+
+def test_the_preset_ships_as_its_recipe_says() -> None:
+    model = read_model("lidar")
+    assert model.name == "lidar"
+    assert model.signature_bytes == 25 * 256 * 2
+    assert model.parameters == preset_parameters("lidar")[0]
+    assert model.provenance["training"]["scenes"] == "sites"
+    assert model.provenance["own_frames"] == 0
+    assert model.id not in {read_model(name).id for name in ("paper", "compact")}
