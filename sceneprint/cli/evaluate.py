@@ -31,6 +31,8 @@ each PATH may have ranges of its own, several joined by +; all PATHs make one da
 without ranges, the TrainSplit.txt and TestSplit.txt of each scene say what is what: one row for
 each scene, and with several also Average and Combine (all scenes in one database):
   sceneprint evaluate 7scenes --db-step 10 --query-step 10
+a scanner that comes back to where it was, more than 30 m of travel later:
+  sceneprint evaluate hall --model lidar --gap-m 30 --within 5 --baselines
 """
 
 
@@ -83,6 +85,20 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
         help="all of their frames are in the database",
     )
     command.add_argument(
+        "--gap-m",
+        type=_metres,
+        metavar="METRES",
+        help="a frame is query and database frame at once (--db and --queries may meet, and are "
+        "everything without), and finds only what was taken more than so much travel before it",
+    )
+    command.add_argument(
+        "--within",
+        type=_metres,
+        metavar="METRES",
+        help="recall: a frame is the query's place where its pose is this near (default: where "
+        "the two overlap by half)",
+    )
+    command.add_argument(
         "--absent",
         action="store_true",
         help="a query may find only frames of other scenes: everything accepted is wrong",
@@ -99,6 +115,20 @@ def _add_method(command: argparse.ArgumentParser) -> None:
         choices=("full", "paper"),
         default="full",
         help="accept on all evidence, or as the paper on the residual alone (default: full)",
+    )
+    command.add_argument(
+        "--matching",
+        choices=("histograms", "sequence"),
+        default="histograms",
+        help="find correspondences by histograms, or as the paper by aligned sequences of "
+        "neighbours, which is slower (default: histograms)",
+    )
+    command.add_argument(
+        "--baselines",
+        nargs="*",
+        metavar="NAME",
+        help="rank by these as well: thumbnail_l1, thumbnail_zncc, fpfh_vlad, rings (after the "
+        "PATHs; without names: by all, and those not made for the frames say so)",
     )
     command.add_argument(
         "--candidates",
@@ -128,6 +158,17 @@ def _share(text: str) -> float:
     return share
 
 
+def _metres(text: str) -> float:
+    """A finite number above 0."""
+    try:
+        metres = float(text)
+    except ValueError:
+        metres = -1.0
+    if not 0 < metres < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of metres above 0")
+    return metres
+
+
 def run(options: argparse.Namespace) -> int:
     """Evaluate, print, and write what was asked for."""
     from sceneprint.evaluation.frames import Store
@@ -137,6 +178,7 @@ def run(options: argparse.Namespace) -> int:
     from sceneprint.evaluation.table import table
 
     protocol = _protocol(options)
+    baselines = _baselines(options.baselines)
     own = Settings()
     signer = open_for(options, own)
     if (options.levels or 1) > (most := signer.model.parameters.hierarchy.n_levels):
@@ -149,9 +191,13 @@ def run(options: argparse.Namespace) -> int:
         metric=options.metric,
         levels=options.levels,
         mode=options.mode,
+        matching=options.matching,
         candidates=options.candidates,
         max_overlap=options.max_overlap,
         absent=options.absent,
+        gap_m=options.gap_m,
+        within_m=options.within,
+        baselines=baselines,
         seed=options.seed,
         jobs=options.jobs,
         cache_dir=own.cache_dir,
@@ -206,7 +252,23 @@ def _protocol(options: argparse.Namespace) -> Protocol:
         queries=parse_ranges(options.queries) if both[1] else None,
         database_step=options.db_step,
         query_step=options.query_step,
+        shared=options.gap_m is not None,
     )
+
+
+def _baselines(names: list[str] | None) -> tuple[str, ...]:
+    """The baselines to ask, in the order of BASELINES."""
+    from sceneprint.evaluation.baselines.baseline import BASELINES
+
+    if names is None:
+        return ()
+    unknown = [name for name in names if name not in BASELINES]
+    if unknown:
+        raise DatasetError(
+            f"--baselines {unknown[0]}: There is no such baseline. Choose from "
+            f"{', '.join(BASELINES)}; the PATHs go before."
+        )
+    return tuple(name for name in BASELINES if name in names or not names)
 
 
 def _asked(options: argparse.Namespace, model_id: str) -> dict[str, Any]:
@@ -221,9 +283,13 @@ def _asked(options: argparse.Namespace, model_id: str) -> dict[str, Any]:
         "query_step",
         "max_overlap",
         "absent",
+        "gap_m",
+        "within",
+        "baselines",
         "metric",
         "levels",
         "mode",
+        "matching",
         "candidates",
         "seed",
     )

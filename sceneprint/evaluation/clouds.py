@@ -113,7 +113,7 @@ def cloud_figure(name: str, ranked: Cloud, diverse: Cloud, ratio: float | None) 
         (axes[0], ranked, "without diversification (VR)"),
         (axes[1], diverse, "with diversification (VDR)"),
     ):
-        for cell, (view, turned) in zip(line, _turns().items(), strict=True):
+        for cell, (view, turned) in zip(line, turns().items(), strict=True):
             cell.imshow(rendered(cloud, turned @ level, everything))
             cell.set_axis_off()
             cell.set_title(f"{cloud.views} views {what}, {view}", loc="left", fontsize=10)
@@ -126,7 +126,7 @@ def cloud_figure(name: str, ranked: Cloud, diverse: Cloud, ratio: float | None) 
     return figure
 
 
-def _turns() -> dict[str, Floats]:
+def turns() -> dict[str, Floats]:
     """Rotations from the query's frame to a viewer's: x right, y down, z away from him."""
     return {"from above": _about_x(90), "at a slant": _about_x(35) @ _about_y(30)}
 

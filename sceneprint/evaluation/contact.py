@@ -13,7 +13,7 @@ import numpy as np
 from sceneprint.evaluation.plots import RIGHT, UNDECIDED, WRONG, new_figure
 from sceneprint.evaluation.records import VIEWS, Outcome, Pair
 from sceneprint.geometry.retrieval import similarity
-from sceneprint.types import Bytes, Frame
+from sceneprint.types import AnyFrame, Bytes, Cloud, Floats32
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,8 +25,8 @@ QUERIES, ROWS = 6, ("R", "DR", "VDR")
 
 def contact_sheet(
     outcomes: Sequence[Outcome],
-    query: Callable[[int], Frame],
-    database: Callable[[int], Frame],
+    query: Callable[[int], AnyFrame],
+    database: Callable[[int], AnyFrame],
     unrelated_distance: float | None,
 ) -> Figure:
     """Six queries, evenly chosen, beside five matches of each row.
@@ -73,12 +73,15 @@ def contact_sheet(
     return figure
 
 
-def depth_colours(frame: Frame, width: int = 160) -> Bytes:
-    """(h, width, 3) uint8: near warm, far cool, missing dark."""
+def depth_colours(frame: AnyFrame, width: int = 160) -> Bytes:
+    """(h, width, 3) uint8: near warm, far cool, missing dark; of a cloud all round, z up."""
     from matplotlib import colormaps
 
-    step = max(frame.depth.shape[1] // width, 1)
-    depth = frame.depth[::step, ::step]
+    if isinstance(frame, Cloud):
+        depth = _panorama(frame, width)
+    else:
+        step = max(frame.depth.shape[1] // width, 1)
+        depth = frame.depth[::step, ::step]
     seen = depth > 0
     low, high = np.percentile(depth[seen], [2, 98]) if seen.any() else (0.0, 1.0)
     level = np.clip((high - depth) / max(high - low, 1e-6), 0, 1)
@@ -87,7 +90,20 @@ def depth_colours(frame: Frame, width: int = 160) -> Bytes:
     return colours
 
 
-def _thumbnail(cell: Any, frame: Frame, colour: str) -> None:
+def _panorama(cloud: Cloud, width: int) -> Floats32:
+    """(width / 2, width) metres: the nearest point in each direction, 0 where there is none."""
+    points = cloud.points.astype(float)
+    far = np.linalg.norm(points, axis=1)
+    points, far = points[far > 0], far[far > 0]
+    cell = 2 * np.pi / width
+    x = ((np.pi - np.arctan2(points[:, 1], points[:, 0])) / cell).astype(int) % width
+    y = np.minimum(((np.pi / 2 - np.arcsin(points[:, 2] / far)) / cell).astype(int), width // 2 - 1)
+    nearest = np.full((width // 2, width), np.inf)
+    np.minimum.at(nearest, (y, x), far)
+    return np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)
+
+
+def _thumbnail(cell: Any, frame: AnyFrame, colour: str) -> None:
     cell.imshow(depth_colours(frame), aspect="equal")
     cell.spines[:].set(visible=True, color=colour, linewidth=3)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sceneprint.evaluation.records import VIEWS, Outcome, Pair
 from sceneprint.geometry.rigid import moved
-from sceneprint.types import Floats, Frame
+from sceneprint.types import AnyFrame, Cloud, Floats
 
 #: Edge of a voxel, metres; depth from which surface is not counted; every so manieth pixel.
 VOXEL, FARTHEST, PIXELS = 0.02, 4.0, 2
@@ -23,7 +23,7 @@ Voxels = NDArray[np.int64]
 
 
 def diversity(
-    outcomes: Sequence[Outcome], poses: Sequence[Floats], database: Callable[[int], Frame]
+    outcomes: Sequence[Outcome], poses: Sequence[Floats], database: Callable[[int], AnyFrame]
 ) -> dict[str, Any]:
     """How far the first five lie from the query and from each other, and what they cover.
 
@@ -74,7 +74,7 @@ def equal_views(outcome: Outcome) -> tuple[list[Pair], list[Pair]]:
 
 
 def coverage(
-    outcomes: Sequence[Outcome], database: Callable[[int], Frame]
+    outcomes: Sequence[Outcome], database: Callable[[int], AnyFrame]
 ) -> list[tuple[int, int] | None]:
     """Voxels covered by VR's and VDR's views of each query; None with fewer than two views."""
 
@@ -92,7 +92,7 @@ def coverage(
     return result
 
 
-def voxels(frame: Frame) -> Voxels:
+def voxels(frame: AnyFrame) -> Voxels:
     """The voxels that a frame sees, each once, as numbers that are the same for all frames."""
     points = points_of(frame, PIXELS, FARTHEST)
     if frame.pose is None:
@@ -104,8 +104,15 @@ def voxels(frame: Frame) -> Voxels:
     return np.unique((x << 42) | (y << 21) | z)
 
 
-def points_of(frame: Frame, step: int, farthest: float) -> Floats:
-    """(N, 3) metres, sensor frame: every `step`-th pixel both ways that is nearer than that."""
+def points_of(frame: AnyFrame, step: int, farthest: float) -> Floats:
+    """(N, 3) metres, sensor frame: every `step`-th pixel both ways that is nearer than that.
+
+    Of a cloud all points that are nearer than that to the sensor.
+    """
+    if isinstance(frame, Cloud):
+        every: Floats = frame.points.astype(float)
+        near: Floats = every[np.linalg.norm(every, axis=1) < farthest]
+        return near
     k = frame.intrinsics
     y, x = np.mgrid[0 : k.height : step, 0 : k.width : step]
     z = frame.depth[::step, ::step].astype(float)

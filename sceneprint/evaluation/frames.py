@@ -6,7 +6,7 @@ Protocol  --prepare_all-->  Member, ... and what could not be used; depth and ge
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -17,9 +17,10 @@ from sceneprint.errors import FrameError
 from sceneprint.evaluation.protocol import Chosen
 from sceneprint.evaluation.records import Member
 from sceneprint.evaluation.workers import Watch, map_over, unwatched
+from sceneprint.geometry.validation import ValidationParameters
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, open_signer, prepare
-from sceneprint.types import Bytes, Frame, Geometry, Intrinsics
+from sceneprint.types import AnyFrame, Bytes, Cloud, Frame, Geometry, Intrinsics
 
 
 @dataclass(frozen=True)
@@ -33,16 +34,27 @@ class Store:
 
     folder: Path
 
-    def keep(self, number: int, frame: Frame, geometry: Geometry) -> None:
+    def keep(self, number: int, frame: AnyFrame, geometry: Geometry) -> None:
         """Lay a frame aside."""
+        (self.folder / f"{number}.geometry").write_bytes(write_geometry(geometry))
+        if isinstance(frame, Cloud):
+            seen = "seen" if frame.has_viewpoint else "fused"
+            np.save(self.folder / f"{number}.{seen}.npy", np.ascontiguousarray(frame.points))
+            return
         k = frame.intrinsics
         camera = np.array([k.width, k.height, k.fx, k.fy, k.cx, k.cy])
         np.save(self.folder / f"{number}.depth.npy", np.ascontiguousarray(frame.depth))
         np.save(self.folder / f"{number}.camera.npy", camera)
-        (self.folder / f"{number}.geometry").write_bytes(write_geometry(geometry))
 
-    def frame(self, member: Member) -> Frame:
-        """The depth image again, with the pose of the evaluation."""
+    def is_depth(self, member: Member) -> bool:
+        """Whether the frame is a depth image and no cloud."""
+        return (self.folder / f"{member.number}.depth.npy").exists()
+
+    def frame(self, member: Member) -> AnyFrame:
+        """The depth image or cloud again, with the pose of the evaluation."""
+        for has_viewpoint, seen in ((True, "seen"), (False, "fused")):
+            if (path := self.folder / f"{member.number}.{seen}.npy").exists():
+                return Cloud(np.load(path), has_viewpoint, member.name, member.pose)
         depth = np.load(self.folder / f"{member.number}.depth.npy")
         width, height, *rest = np.load(self.folder / f"{member.number}.camera.npy").tolist()
         camera = Intrinsics(int(width), int(height), *rest)
@@ -62,12 +74,14 @@ class Prepared:
     queries, database : in the order of the protocol
     left_out : (name, reason) of the others
     milliseconds : median time to sign a frame and work out its geometry; None without frames
+    validation : of the model
     """
 
     queries: list[Member]
     database: list[Member]
     left_out: list[tuple[str, str]]
     milliseconds: float | None
+    validation: ValidationParameters = field(default_factory=ValidationParameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +124,7 @@ def prepare_all(
     cache_dir : of derived files of the model
     watch : told of each frame
     """
-    asked = {one.scene for one in chosen if one.use == "query"}
+    asked = {one.scene for one in chosen if one.is_for("query")}
     length = signer.model.level_length * levels if levels else None
     tasks = [_Task(i, one, one.scene in asked, length) for i, one in enumerate(chosen)]
     # a process of its own opens the model itself: a table is too large to send
@@ -122,10 +136,13 @@ def prepare_all(
         if done.member is None:
             left_out.append((one.name, done.reason))
         else:
-            by_use[one.use].append(done.member)
+            for use in ("query", "database"):
+                if one.is_for(use):
+                    by_use[use].append(done.member)
             spent.append(done.milliseconds)
     median = float(np.median(spent)) if spent else None
-    return Prepared(by_use["query"], by_use["database"], left_out, median)
+    validation = signer.model.parameters.validation
+    return Prepared(by_use["query"], by_use["database"], left_out, median, validation)
 
 
 def _open(model: Signer | Model, cache_dir: Path | None, store: Store) -> tuple[Signer, Store]:

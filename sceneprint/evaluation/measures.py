@@ -128,7 +128,11 @@ def validation(outcomes: Sequence[Outcome]) -> dict[str, float | int | None]:
     other scenes `pairs_of_other_scenes`, `accepted_of_other_scenes`,
     `accepted_strong_of_other_scenes`.
     """
-    pairs = [p for o in outcomes for p in o.pairs.values()]
+    return validation_of([p for o in outcomes for p in o.pairs.values()])
+
+
+def validation_of(pairs: Sequence[Pair]) -> dict[str, float | int | None]:
+    """The same of some pairs; precision is null where none of them was accepted."""
     accepted = [p for p in pairs if p.accepted]
     right = [p for p in pairs if p.right]
     clear = [p for p in right if p.overlap_least >= OVERLAPS]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -18,7 +18,8 @@ from sceneprint.geometry.acceptance import Mode
 from sceneprint.geometry.association import voters
 from sceneprint.geometry.averaging import average_poses
 from sceneprint.geometry.rigid import inverse
-from sceneprint.geometry.validation import refined_at
+from sceneprint.geometry.sequences import Matching
+from sceneprint.geometry.validation import ValidationParameters, refined_at
 from sceneprint.pipeline import validate
 from sceneprint.types import Floats, Geometry
 
@@ -84,17 +85,27 @@ class Judge:
     geometry : gives that of a frame by its number in the store
     mode : see `validate`
     seed : of every pair, as a service has one for all that it validates
+    p : of the model
+    matching : see `validate`
     """
 
     geometry: Callable[[int], Geometry]
     mode: Mode
     seed: int
+    p: ValidationParameters = field(default_factory=ValidationParameters)
+    matching: Matching = "histograms"
 
 
-def open_judge(store: Store, mode: Mode, seed: int) -> Judge:
+def open_judge(
+    store: Store,
+    mode: Mode,
+    seed: int,
+    p: ValidationParameters,
+    matching: Matching = "histograms",
+) -> Judge:
     """Make ready to validate frames of a store."""
     # neighbouring queries have many candidates in common
-    return Judge(lru_cache(128)(store.geometry), mode, seed)
+    return Judge(lru_cache(128)(store.geometry), mode, seed, p, matching)
 
 
 def views_to_average(pairs: Sequence[Pair]) -> list[Pair]:
@@ -118,19 +129,19 @@ def judge(judging: Judge, task: Task) -> Judged:
     averaged views of C: the bound that registration of these pairs can reach.
     """
     of = {c.match: c for c in task.candidates}
-    pairs = {c.match: _validated(judging, task, c) for c in task.candidates}
+    pairs = {c.match: validated(judging, task, c) for c in task.candidates}
     selected = [pairs[match] for match in task.selection]
     views = views_to_average(selected)
     start = time.perf_counter()
     average = _average(task, of, {p.match: p.validation.T_match_query for p in views})
     spent = 1e3 * (time.perf_counter() - start)
     refined = {
-        pair.match: _refined(judging, task, of[pair.match])
+        pair.match: refined_from_truth(judging, task, of[pair.match])
         for pair in (*in_preferred_order(selected)[:1], *views)
         if pair.same_scene
     }
     for match, T in refined.items():
-        bound = Error() if T is None else pose_error(T, _truth(task, of[match]))
+        bound = Error() if T is None else pose_error(T, truth(task, of[match]))
         pairs[match] = replace(pairs[match], bound=bound)
     ranked = views_to_average([pairs[match] for match in task.ranking])
     return Judged(
@@ -142,16 +153,17 @@ def judge(judging: Judge, task: Task) -> Judged:
     )
 
 
-def _truth(task: Task, candidate: Candidate) -> Floats:
+def truth(task: Task, candidate: Candidate) -> Floats:
     """T_match_query by the true poses."""
-    truth: Floats = inverse(candidate.pose) @ task.pose
-    return truth
+    T: Floats = inverse(candidate.pose) @ task.pose
+    return T
 
 
-def _validated(judging: Judge, task: Task, candidate: Candidate) -> Pair:
+def validated(judging: Judge, task: Task, candidate: Candidate) -> Pair:
+    """What validation makes of a query and one candidate, and how far off it is."""
     query, match = judging.geometry(task.number), judging.geometry(candidate.number)
     start = time.perf_counter()
-    validation = validate(query, match, seed=judging.seed, mode=judging.mode)
+    validation = validate(query, match, judging.seed, judging.p, judging.mode, judging.matching)
     spent = 1e3 * (time.perf_counter() - start)
     same, T = candidate.scene == task.scene, validation.T_match_query
     return Pair(
@@ -159,7 +171,7 @@ def _validated(judging: Judge, task: Task, candidate: Candidate) -> Pair:
         scene=candidate.scene,
         validation=validation,
         same_scene=same,
-        error=pose_error(T, _truth(task, candidate)) if same and T is not None else Error(),
+        error=pose_error(T, truth(task, candidate)) if same and T is not None else Error(),
         bound=None,
         overlap_mean=candidate.overlap_mean,
         overlap_least=candidate.overlap_least,
@@ -167,9 +179,10 @@ def _validated(judging: Judge, task: Task, candidate: Candidate) -> Pair:
     )
 
 
-def _refined(judging: Judge, task: Task, candidate: Candidate) -> Floats | None:
+def refined_from_truth(judging: Judge, task: Task, candidate: Candidate) -> Floats | None:
+    """Where refinement ends that is started at the true pose; see `refined_at`."""
     query, match = judging.geometry(task.number), judging.geometry(candidate.number)
-    return refined_at(query, match, _truth(task, candidate))
+    return refined_at(query, match, truth(task, candidate), judging.p.alignment.fine)
 
 
 def _average(task: Task, of: dict[int, Candidate], transforms: dict[int, Floats | None]) -> Error:

@@ -23,7 +23,7 @@ from sceneprint.evaluation.plots import (
 from sceneprint.evaluation.records import VIEWS
 from sceneprint.evaluation.run import Evaluation
 from sceneprint.models import Model
-from sceneprint.types import Frame
+from sceneprint.types import AnyFrame, Frame
 from sceneprint.writing import write_whole
 
 
@@ -51,10 +51,10 @@ def save_pictures(
     share = levels / model.parameters.hierarchy.n_levels
     d0 = model.unrelated_distance * share if used["metric"] == "l1" else None
 
-    def query(number: int) -> Frame:
+    def query(number: int) -> AnyFrame:
         return store.frame(prepared.queries[number])
 
-    def database(match: int) -> Frame:
+    def database(match: int) -> AnyFrame:
         return store.frame(prepared.database[match])
 
     drawn = {
@@ -64,11 +64,13 @@ def save_pictures(
         "contact.png": contact_sheet(outcomes, query, database, d0),
     }
     paths = []
-    chosen = _typical(evaluation, database)
+    # of depth images alone: what a scanner sees fills no picture of this kind
+    depth = all(map(store.is_depth, (*prepared.queries, *prepared.database)))
+    chosen = _typical(evaluation, database) if depth else None
     if chosen is not None:
         number, ratio = chosen
         ranked, diverse = (
-            merged(query(number), pairs[:VIEWS], database)
+            merged(_depth(query(number)), pairs[:VIEWS], lambda match: _depth(database(match)))
             for pairs in equal_views(outcomes[number])
         )
         if len(ranked.points) + len(diverse.points):
@@ -79,6 +81,12 @@ def save_pictures(
     for name, figure in drawn.items():
         save_figure(figure, folder / name)
     return [folder / name for name in drawn] + paths
+
+
+def _depth(frame: AnyFrame) -> Frame:
+    if not isinstance(frame, Frame):
+        raise TypeError(f"{frame.name} is no depth image")
+    return frame
 
 
 def _typical(evaluation: Evaluation, database: Any) -> tuple[int, float] | None:

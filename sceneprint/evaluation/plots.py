@@ -94,7 +94,9 @@ def acceptance_figure(outcomes: Sequence[Outcome]) -> Figure:
     _sweep(axes[0], found, [100 * p.validation.residual_m for p in found], 10, "residual, cm")
     degrees = [math.degrees(p.validation.residual_rad) for p in found]
     _sweep(axes[1], found, degrees, 10, "residual, degrees")
-    _sweep(axes[2], found, [p.validation.violations for p in found], 0.2, "free-space violations")
+    seen = [(p, v) for p in found if (v := p.validation.violations) is not None]
+    pairs_seen, violations = [p for p, _ in seen], [v for _, v in seen]
+    _sweep(axes[2], pairs_seen, violations, 0.2, "free-space violations")
     _sweep(axes[3], found, [p.validation.overlap for p in found], 1, "overlap", least=True)
     _sweep(axes[4], found, [p.validation.ambiguity for p in found], 0.2, "ambiguity")
     _bins(axes[5], pairs)

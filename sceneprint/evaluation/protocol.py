@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +15,7 @@ from sceneprint.datasets import FrameReference, find_sequences
 from sceneprint.datasets import Sequence as Run
 from sceneprint.errors import DatasetError
 
-Use = Literal["database", "query"]
+Use = Literal["database", "query", "both"]
 
 _RANGE = re.compile(r"(\d{1,9})?:(\d{1,9})?(?::(\d{1,9}))?", re.ASCII)
 _OWN_RANGES = re.compile(r"(.+)@((?:db|queries)=[^@]*)", re.DOTALL)
@@ -60,7 +60,7 @@ class Chosen:
     ----------
     name : unique in the protocol
     scene : its parent frame; frames of one scene have comparable poses
-    use : database or query
+    use : database, query, or both: what it may find is then limited by the travel between
     reference : where it is
     """
 
@@ -68,6 +68,10 @@ class Chosen:
     scene: str
     use: Use
     reference: FrameReference
+
+    def is_for(self, use: Use) -> bool:
+        """Whether the frame takes part as this."""
+        return self.use in (use, "both")
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +141,7 @@ def choose(
     queries: Ranges | None = None,
     database_step: int = 1,
     query_step: int = 1,
+    shared: bool = False,
 ) -> Protocol:
     """Tell the frames of each path to the database or the queries; no frame is read.
 
@@ -149,18 +154,22 @@ def choose(
     distractors : paths of which every frame is in the database
     database, queries : for paths without ranges of their own
     database_step, query_step : take every so manieth frame, where a range says no step itself
+    shared : a frame may be both, and paths without ranges are, as a whole, both
 
     Raises
     ------
     DatasetError : nothing says what is database and what query, a range lies outside its path,
         a frame is chosen twice, two scenes have one name, or there is no query.
     """
-    gathered = _Gathered()
+    gathered = _Gathered(shared=shared)
+    every = (Range(None, None, None),)
     splits = []
     for part in parts:
         of_db, of_queries = part.database, part.queries
         if of_db is None and of_queries is None:
             of_db, of_queries = database, queries
+            if shared:
+                of_db, of_queries = of_db or every, of_queries or every
         splits.append(of_db is None and of_queries is None)
         if splits[-1]:
             gathered.add_split(part.path, database_step, query_step)
@@ -168,20 +177,45 @@ def choose(
         gathered.add_ranges(part.path, of_db or (), "database", database_step)
         gathered.add_ranges(part.path, of_queries or (), "query", query_step)
     for path in distractors:
-        gathered.add_ranges(path, (Range(None, None, None),), "database", 1)
+        gathered.add_ranges(path, every, "database", 1)
     frames = tuple(gathered.frames.values())
-    for use, option in (("query", "--queries"), ("database", "--db or --distractors")):
-        if not any(frame.use == use for frame in frames):
+    wanted: tuple[tuple[Use, str], ...] = (
+        ("query", "--queries"),
+        ("database", "--db or --distractors"),
+    )
+    for use, option in wanted:
+        if not any(frame.is_for(use) for frame in frames):
             raise DatasetError(
                 f"No frame is chosen as {use}, so there is nothing to measure. Add {option}."
             )
     return Protocol(frames, all(splits))
 
 
+def every_frame(paths: Sequence[Path]) -> tuple[Chosen, ...]:
+    """All frames of all paths, in order, each as a query; no frame is read.
+
+    Raises
+    ------
+    DatasetError : a frame is there twice, or two scenes have one name.
+    """
+    places = [path.resolve() for path in paths]
+    for i, place in enumerate(places):
+        for j in range(i):
+            if place.is_relative_to(places[j]) or places[j].is_relative_to(place):
+                raise DatasetError(
+                    f"{paths[i]}: Its frames are those of {paths[j]} too. Give each path once."
+                )
+    gathered = _Gathered()
+    for path in paths:
+        gathered.add_ranges(path, (Range(None, None, None),), "query", 1)
+    return tuple(gathered.frames.values())
+
+
 class _Gathered:
     """Frames so far, by the file they are in."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, shared: bool = False) -> None:
+        self._shared = shared
         self.frames: dict[Path, Chosen] = {}
         self._names: set[str] = set()
         self._places: dict[str, Path] = {}
@@ -220,9 +254,13 @@ class _Gathered:
                     f"{path}: Another scene is called {scene} too, {self._places[scene]}. "
                     "Rename one of the folders."
                 )
-            if file in self.frames:
+            known = self.frames.get(file)
+            if known is not None and self._shared and known.use != use:
+                self.frames[file] = replace(known, use="both")
+                continue
+            if known is not None:
                 raise DatasetError(
-                    f"{path}: {reference.name} is chosen twice, as {self.frames[file].use} and as "
+                    f"{path}: {reference.name} is chosen twice, as {known.use} and as "
                     f"{use}. A frame must not be asked for itself: give ranges that do not meet."
                 )
             own = reference.name.startswith(f"{scene}/")

@@ -16,6 +16,8 @@ from sceneprint.types import Bytes, Floats
 
 #: Views of a query that are averaged, counted and drawn.
 VIEWS = 5
+#: A transform between rooms' frames is right within these metres and degrees.
+RIGHT = (0.10, 10.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +66,7 @@ class Pair:
     bound : error of refinement started at the true pose; None where it was not asked for
     overlap_mean, overlap_least : as in `Overlaps`; 0 for another scene
     milliseconds : that validation took
+    limits : metres and degrees to which its transform is to be right
     """
 
     match: int
@@ -75,6 +78,7 @@ class Pair:
     overlap_mean: float
     overlap_least: float
     milliseconds: float
+    limits: tuple[float, float] = RIGHT
 
     @property
     def accepted(self) -> bool:
@@ -83,8 +87,8 @@ class Pair:
 
     @property
     def right(self) -> bool:
-        """Whether the transform is right to 10 cm and 10 degrees, accepted or not."""
-        return self.error.within(0.10, 10)
+        """Whether the transform is right to its limits, accepted or not."""
+        return self.error.within(*self.limits)
 
 
 @dataclass(frozen=True, eq=False)

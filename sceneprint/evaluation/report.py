@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from sceneprint.evaluation.beside import baseline_rows, recalls
 from sceneprint.evaluation.diversity import diversity
 from sceneprint.evaluation.lost import lost, place_of
 from sceneprint.evaluation.measures import absent, bound, oracle_and_random, rows, validation
 from sceneprint.evaluation.records import Error, Outcome, Pair
 from sceneprint.evaluation.run import Evaluation
-from sceneprint.types import Floats, Frame
+from sceneprint.types import AnyFrame, Floats
 
 #: Of JSON: raised when a key changes its meaning.
 SCHEMA_VERSION = 1
@@ -27,7 +28,7 @@ ROWS = ("R", "VR", "DR", "VDR", "pose_average", "pose_average_vr")
 
 def figures(
     evaluation: Evaluation,
-    database: Callable[[int], Frame],
+    database: Callable[[int], AnyFrame],
     settings: dict[str, Any],
 ) -> dict[str, Any]:
     """Every figure of an evaluation, ready for JSON.
@@ -35,7 +36,7 @@ def figures(
     At the top, all queries against the whole database (of several scenes, the paper's
     `Combine`). `by_scene` has the same for the queries of each scene, where there are several;
     `scenes` has each scene with a database of its own and `average` the mean of their rows,
-    for a 7-Scenes table.
+    for a 7-Scenes table. `recall` and `baselines`: see there.
 
     Parameters
     ----------
@@ -53,6 +54,9 @@ def figures(
     }
     found["left_out"] = [{"name": n, "reason": why} for n, why in prepared.left_out]
     found |= measured(evaluation.outcomes, poses, database)
+    found["recall"] = recalls(evaluation)
+    if evaluation.compared:
+        found["baselines"] = baseline_rows(evaluation)
     scenes = list(dict.fromkeys(o.scene for o in evaluation.outcomes))
     if len(scenes) > 1:
         found["by_scene"] = {
@@ -65,7 +69,10 @@ def figures(
             for scene, outcomes in evaluation.alone.items()
         }
         found["average"] = average([found["scenes"][scene] for scene in found["scenes"]])
-    found["milliseconds"] = {"prepare": prepared.milliseconds} | milliseconds(evaluation.outcomes)
+    found["milliseconds"] = {
+        "prepare": prepared.milliseconds,
+        **milliseconds(evaluation.outcomes),
+    }
     names = [member.name for member in prepared.database]
     found["per_query"] = [per_query(outcome, names) for outcome in evaluation.outcomes]
     found["mistakes"] = mistakes(evaluation.outcomes, names)
@@ -74,7 +81,7 @@ def figures(
 
 
 def measured(
-    outcomes: Sequence[Outcome], poses: Sequence[Floats], database: Callable[[int], Frame]
+    outcomes: Sequence[Outcome], poses: Sequence[Floats], database: Callable[[int], AnyFrame]
 ) -> dict[str, Any]:
     """All figures of some queries."""
     return {

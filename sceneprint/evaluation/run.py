@@ -6,7 +6,7 @@ Protocol  --evaluate-->  Evaluation
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -14,15 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import DatasetError
+from sceneprint.evaluation.baselines.baseline import open_baselines
+from sceneprint.evaluation.comparing import Compared, compare, registered
 from sceneprint.evaluation.frames import Prepared, Store, prepare_all
-from sceneprint.evaluation.overlap import Overlaps, View, overlap, view_of
+from sceneprint.evaluation.overlap import AnyView, Overlaps, overlap, view_of
 from sceneprint.evaluation.pairs import Candidate, Judged, Task, judge, open_judge
-from sceneprint.evaluation.protocol import Protocol
+from sceneprint.evaluation.protocol import Protocol, Use
 from sceneprint.evaluation.ranking import Ranked, rank
+from sceneprint.evaluation.recall import OVERLAP, metres_apart
 from sceneprint.evaluation.records import Member, Outcome
+from sceneprint.evaluation.travel import travelled
 from sceneprint.evaluation.workers import Watch, map_over, unwatched
 from sceneprint.geometry.acceptance import Mode
 from sceneprint.geometry.retrieval import Metric
+from sceneprint.geometry.sequences import Matching
 from sceneprint.pipeline import Signer
 
 #: Depth images that are held in memory at once, of queries and of the database.
@@ -37,11 +42,16 @@ class Settings:
     ----------
     metric : of signatures
     levels : of the signatures to use, finest first; None for all
-    mode : of validation
+    mode, matching : of validation
     candidates : size of C, and of the part of R that is validated
     max_overlap : a query may find only database frames that overlap it by less (by the smaller
         direction, within 10 cm); None for all
     absent : a query may find only frames of other scenes
+    gap_m : a query may find only frames more than so much travel before it, or of other runs;
+        None for all
+    within_m : a frame is the query's place where it was taken within so many metres; None: where
+        the two overlap by half
+    baselines : names of other ways to rank, asked the same; see BASELINES
     seed : of every pair that is validated
     jobs : processes; no figure depends on it
     cache_dir : of derived files of the model; None for the user's
@@ -50,9 +60,13 @@ class Settings:
     metric: Metric = "l1"
     levels: int | None = None
     mode: Mode = "full"
+    matching: Matching = "histograms"
     candidates: int = 10
     max_overlap: float | None = None
     absent: bool = False
+    gap_m: float | None = None
+    within_m: float | None = None
+    baselines: tuple[str, ...] = ()
     seed: int = 0
     jobs: int = 1
     cache_dir: Path | None = None
@@ -68,11 +82,18 @@ class Evaluation:
     outcomes : of all queries, against the whole database
     alone : of a 7-Scenes table of several scenes, the outcomes of each scene with a database of
         its own; else empty
+    allowed, relevant : (Q, N), whether a query may find a frame, and whether it shows its place
+    compared : of each baseline that was asked for
+    within_m : as in Settings
     """
 
     prepared: Prepared
     outcomes: list[Outcome]
     alone: dict[str, list[Outcome]]
+    allowed: NDArray[np.bool_]
+    relevant: NDArray[np.bool_]
+    within_m: float | None = None
+    compared: tuple[Compared, ...] = ()
 
 
 def evaluate(
@@ -91,7 +112,11 @@ def evaluate(
     Raises
     ------
     DatasetError : no query or no database frame could be used.
+    MissingDependency : a baseline needs a library that is absent.
     """
+    baselines = open_baselines(
+        settings.baselines, signer.model.parameters.depth.maximum_depth
+    )  # what cannot be measured is said before the work
     prepared = prepare_all(
         protocol.frames,
         signer,
@@ -101,17 +126,22 @@ def evaluate(
         cache_dir=settings.cache_dir,
         watch=watch,
     )
-    for use, members in (("query", prepared.queries), ("database", prepared.database)):
+    used: tuple[tuple[Use, list[Member]], ...] = (
+        ("query", prepared.queries),
+        ("database", prepared.database),
+    )
+    for use, members in used:
         if not members:
-            own = {one.name for one in protocol.frames if one.use == use}
+            own = {one.name for one in protocol.frames if one.is_for(use)}
             name, reason = next(left for left in prepared.left_out if left[0] in own)
             raise DatasetError(
                 f"No {use} frame can be used. The first that was left out is {name}: "
                 f"{reason.rstrip('.')}. Choose other frames."
             )
     truth = overlaps_of(prepared, store, watch)
+    allowed = _allowed(prepared, truth, settings)
     every = np.arange(len(prepared.queries)), np.arange(len(prepared.database))
-    outcomes = _ask(prepared, truth, *every, store, settings, watch)
+    outcomes = _ask(prepared, truth, allowed, *every, store, settings, watch)
     alone: dict[str, list[Outcome]] = {}
     scenes = list(dict.fromkeys(q.scene for q in prepared.queries))
     if protocol.split and len(scenes) > 1 and not settings.absent:
@@ -119,8 +149,35 @@ def evaluate(
             q = np.flatnonzero([m.scene == scene for m in prepared.queries])
             d = np.flatnonzero([m.scene == scene for m in prepared.database])
             if len(d):
-                alone[scene] = _ask(prepared, truth, q, d, store, settings, watch)
-    return Evaluation(prepared, outcomes, alone)
+                alone[scene] = _ask(prepared, truth, allowed, q, d, store, settings, watch)
+    if settings.within_m is None:
+        relevant = truth.mean >= OVERLAP
+    else:
+        relevant = metres_apart(prepared.queries, prepared.database) <= settings.within_m
+    opening = partial(
+        open_judge, store, settings.mode, settings.seed, prepared.validation, settings.matching
+    )
+    compared = []
+    for baseline in baselines:
+        one = compare(baseline, prepared, store, allowed, signer, settings.seed, watch)
+        first = registered(opening(), one.rankings, prepared, truth.mean, truth.least)
+        compared.append(replace(one, first=first))
+    return Evaluation(
+        prepared, outcomes, alone, allowed, relevant, settings.within_m, tuple(compared)
+    )
+
+
+def _allowed(prepared: Prepared, truth: Overlaps, settings: Settings) -> NDArray[np.bool_]:
+    """Which database frames a query may find, (Q, N)."""
+    allowed = np.ones(truth.mean.shape, np.bool_)
+    if settings.absent:
+        scenes = [np.array([m.scene for m in of]) for of in (prepared.queries, prepared.database)]
+        allowed &= scenes[0][:, None] != scenes[1]
+    if settings.max_overlap is not None:
+        allowed &= truth.least < settings.max_overlap
+    if settings.gap_m is not None:
+        allowed &= travelled(prepared.queries, prepared.database) > settings.gap_m
+    return allowed
 
 
 def overlaps_of(prepared: Prepared, store: Store, watch: Watch = unwatched) -> Overlaps:
@@ -136,7 +193,7 @@ def overlaps_of(prepared: Prepared, store: Store, watch: Watch = unwatched) -> O
     return Overlaps(mean, least)
 
 
-def _steps(prepared: Prepared, store: Store) -> Iterator[tuple[int, View, int, list[View]]]:
+def _steps(prepared: Prepared, store: Store) -> Iterator[tuple[int, AnyView, int, list[AnyView]]]:
     """Each query with each block of the database; two blocks are in memory at a time."""
     for first in range(0, len(prepared.queries), BLOCK):
         own = [view_of(store.frame(m)) for m in prepared.queries[first : first + BLOCK]]
@@ -149,6 +206,7 @@ def _steps(prepared: Prepared, store: Store) -> Iterator[tuple[int, View, int, l
 def _ask(
     prepared: Prepared,
     truth: Overlaps,
+    may: NDArray[np.bool_],
     of_queries: NDArray[np.intp],
     of_database: NDArray[np.intp],
     store: Store,
@@ -160,11 +218,7 @@ def _ask(
     database = prepared.database
     same = np.array([q.scene for q in queries])[:, None] == np.array([d.scene for d in database])
     allowed = np.zeros(same.shape, np.bool_)
-    allowed[:, of_database] = True
-    if settings.absent:
-        allowed &= ~same
-    if settings.max_overlap is not None:
-        allowed &= truth.least[of_queries] < settings.max_overlap
+    allowed[:, of_database] = may[np.ix_(of_queries, of_database)]
     ranked = rank(
         np.stack([q.signature for q in queries]),
         np.stack([d.signature for d in database]),
@@ -178,7 +232,9 @@ def _ask(
         _task(query, database, one, local, i, settings.candidates)
         for i, (query, one) in enumerate(zip(queries, ranked, strict=True))
     ]
-    opening = partial(open_judge, store, settings.mode, settings.seed)
+    opening = partial(
+        open_judge, store, settings.mode, settings.seed, prepared.validation, settings.matching
+    )
     judged = watch(map_over(tasks, judge, opening, settings.jobs), "validate", len(tasks))
     return [
         _outcome(queries[i], ranked[i], one, allowed[i], same[i], local, i, settings.candidates)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from sceneprint.evaluation.recall import FIRST
 from sceneprint.evaluation.report import ROWS
 
 _NAMES = {"pose_average": "pose average", "pose_average_vr": "  of VR's views"}
@@ -23,7 +24,9 @@ def table(found: dict[str, Any]) -> list[str]:
         lines += ["Average", *_rows(found["average"]), "", "Combine"]
     lines += _rows(found)
     lines += [_chance(found[name], name) for name in ("oracle", "random")]
-    lines += ["", *_sentences(found), ""]
+    baselines = found.get("baselines", {})
+    lines += [_accuracy(n, row) + _overlap(row) for n, row in baselines.items() if "recall" in row]
+    lines += ["", *_recalls(found), "", *_sentences(found), ""]
     for scene, figures in found.get("by_scene", {}).items():
         lines += [f"queries of {scene}, among all", *_rows(figures), _lost(figures), ""]
     if found["left_out"]:
@@ -55,6 +58,32 @@ def _overlap(row: dict[str, Any]) -> str:
     return "".join(f"{_share(row[key]):>10}" for key in keys) + (
         f"{_share(row['right_scene']):>8}" if "right_scene" in row else ""
     )
+
+
+def _recalls(found: dict[str, Any]) -> list[str]:
+    """Recall by every way to rank, and what a query costs beside the signature."""
+    if "recall" not in found:  # of figures that were kept before there was one
+        return []
+    within = found["recall"]["within_m"]
+    place = "overlap by half" if within is None else f"taken within {within:g} m"
+    able = found["recall"]["R"]["queries"]
+    lines = [
+        f"{f'{able} queries with a frame that is their place ({place}), recall':58}"
+        f"{'@1':>10}{'@5':>10}{'@10':>10}{'ms':>10}{'x ours':>8}"
+    ]
+    lines += [_recall(name, found["recall"][name]) for name in ("R", "DR", "random")]
+    for name, row in found.get("baselines", {}).items():
+        if "recall" not in row:
+            lines.append(f"{name:18}not asked: {row['reason']}")
+            continue
+        spent = row["milliseconds"]["describe"] + row["milliseconds"]["rank"]
+        ratio = f"{spent:>10.1f}{_share(row['ratio'], 2):>8}"
+        lines.append(_recall(name, row["recall"]) + ratio)
+    return lines
+
+
+def _recall(name: str, row: dict[str, Any]) -> str:
+    return f"{name:58}" + "".join(f"{_share(row.get(f'at_{k}')):>10}" for k in FIRST)
 
 
 def _chance(row: dict[str, Any], name: str) -> str:

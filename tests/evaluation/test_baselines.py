@@ -1,0 +1,302 @@
+"""The baselines: descriptors by hand, and the command from end to end."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.cli import main
+from sceneprint.datasets import find_sequences
+from sceneprint.evaluation.baselines.baseline import BASELINES
+from sceneprint.evaluation.baselines.fpfh import FpfhVlad, features, vlad
+from sceneprint.evaluation.baselines.rings import (
+    Rings,
+    ring_descriptor,
+    ring_distance,
+    ring_distances,
+)
+from sceneprint.evaluation.baselines.thumbnails import Thumbnails, thumbnail
+from sceneprint.evaluation.diversity import points_of
+from sceneprint.models import Model, save_model
+from sceneprint.types import Cloud, Floats, Floats32, Frame
+
+
+def turned(points: Floats, sectors: int) -> Floats:
+    """Turned about z by so many of sixty sectors."""
+    angle = 2 * np.pi * sectors / 60
+    c, s = np.cos(angle), np.sin(angle)
+    result: Floats = points @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+    return result
+
+
+def walls(seed: int) -> Floats:
+    """A few hundred points about the sensor, none near the edge of a sector."""
+    rng = np.random.default_rng(seed)
+    sectors = rng.integers(0, 60, 400) + rng.uniform(0.2, 0.8, 400)
+    angle, radius = sectors * 2 * np.pi / 60, rng.uniform(1, 79, 400)
+    return np.stack(
+        [radius * np.cos(angle), radius * np.sin(angle), rng.uniform(-1.5, 9, 400)], axis=1
+    )
+
+
+def test_the_rings_of_five_points_by_hand() -> None:
+    points = np.array(
+        [
+            [3.0, 0.1, 0.5],  # the first ring of 4 m, the first sector of 6 degrees
+            [3.5, 0.1, 1.5],  # the same cell, and higher
+            [0.1, 9.0, -0.5],  # the third ring; 89 degrees: sector 14
+            [-50.0, -0.1, 3.0],  # ring 12; just over 180 degrees: sector 30
+            [80.0, 0.1, 9.0],  # beyond the last ring
+        ]
+    )
+    found = ring_descriptor(points)
+    assert found.shape == (20, 60)
+    assert {tuple(at) for at in np.argwhere(found)} == {(0, 0), (2, 14), (12, 30)}
+    assert found[0, 0] == np.float32(3.5)  # 1.5 m, lifted by 2
+    assert found[2, 14] == np.float32(1.5)
+    assert found[12, 30] == np.float32(5.0)
+
+
+def test_another_axis_may_point_up() -> None:
+    points = walls(1)
+    for pole in (0, 1):  # z, x, y onto pole, next, after
+        moved = np.empty_like(points)
+        for k, axis in ((0, pole), (1, (pole + 1) % 3), (2, (pole + 2) % 3)):
+            moved[:, axis] = points[:, (2 + k) % 3]
+        np.testing.assert_array_equal(ring_descriptor(moved, pole=pole), ring_descriptor(points))
+
+
+def test_turning_by_sectors_shifts_the_columns() -> None:
+    points = walls(2)
+    own, other = ring_descriptor(points), ring_descriptor(turned(points, 7))
+    np.testing.assert_array_equal(np.roll(own, 7, axis=1), other)
+    distance, shift = ring_distance(own, other)
+    assert shift == 7
+    assert distance == pytest.approx(0.0, abs=1e-12)
+
+
+def plain_distance(a: Floats32, b: Floats32) -> float:
+    """The distance as it is printed, one cosine at a time."""
+    best = 2.0
+    for shift in range(a.shape[1]):
+        moved, total, count = np.roll(b, -shift, axis=1).astype(float), 0.0, 0
+        for s in range(a.shape[1]):
+            x, y = a[:, s].astype(float), moved[:, s]
+            if x.any() and y.any():
+                total += 1 - float(x @ y / np.linalg.norm(x) / np.linalg.norm(y))
+                count += 1
+        best = min(best, total / count) if count else best
+    return best
+
+
+def test_ring_distance_against_the_plain_loop() -> None:
+    own = ring_descriptor(walls(3)[:120])
+    others = np.stack([ring_descriptor(walls(seed)[:120]) for seed in (4, 5)])
+    found = ring_distances(own, others)
+    np.testing.assert_allclose(found, [plain_distance(own, o) for o in others], atol=1e-12)
+    assert min(found) > 0.05
+    assert ring_distance(own, np.zeros_like(own))[0] == 2.0  # nothing to compare
+
+
+def test_a_thumbnail_by_hand() -> None:
+    depth = np.zeros((4, 4), np.float32)
+    depth[0, 0], depth[1, 1] = 2.0, 4.0  # one cell of four pixels, two of them seen
+    depth[3, 2:] = 1.0
+    found = thumbnail(depth, 2, 2)
+    np.testing.assert_array_equal(found, np.array([[0.375, 0.0], [0.0, 1.0]], np.float32))
+
+
+def test_thumbnails_compared_by_hand() -> None:
+    own = np.array([[0.5, 0.0], [0.25, 1.0]], np.float32)
+    other = np.array([[0.75, 0.5], [0.0, 0.5]], np.float32)
+    by_difference, by_correlation = Thumbnails("l1"), Thumbnails("zncc")
+    # both have filled two cells: 0.25 and 0.5 apart
+    stack = np.stack([other, own, np.zeros_like(own)])
+    np.testing.assert_array_equal(by_difference.distances(own, stack), [0.375, 0.0, np.inf])
+    a, b = by_correlation.finish(own), by_correlation.finish(other)
+    assert np.linalg.norm(a) == pytest.approx(1.0)
+    assert a.sum() == pytest.approx(0.0, abs=1e-6)
+    found = by_correlation.distances(a, np.stack([b, a, by_correlation.finish(0 * own + 1)]))
+    np.testing.assert_allclose(found[1:], [0.0, 1.0], atol=1e-6)
+    # less their means 7/12 and 7/12: (-1, 0, -4, 5) and (2, -1, 0, -1), twelfths
+    assert found[0] == pytest.approx(1 + 7 / np.sqrt(42 * 6), abs=1e-6)
+
+
+def test_vlad_by_hand() -> None:
+    words = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
+    local = np.array([[3.0, 0.0], [0.0, 4.0], [10.0, 2.0]], np.float32)
+    # the first word is left (3, 4): 0.6, 0.8; the second (0, 2): 0, 1; the third nothing
+    expected = np.array([0.6, 0.8, 0.0, 1.0, 0.0, 0.0]) / np.sqrt(2)
+    np.testing.assert_allclose(vlad(local, words), expected, atol=1e-7)
+    assert not vlad(words.astype(np.float32), words).any()
+
+
+def test_fpfh_knows_a_cloud_that_was_turned(with_open3d: None) -> None:
+    rng = np.random.default_rng(6)
+    flat = rng.uniform(0, 2, (6000, 2))
+    floor = np.column_stack([flat[:3000], np.zeros(3000)])
+    wall = np.column_stack([flat[3000:, 0], np.full(3000, 2.0), flat[3000:, 1]])
+    points = np.concatenate([floor, wall]) + np.array([-1.0, 1.0, -1.2])
+    own = features(points)
+    assert own.shape[1] == 33
+    sums = (own.astype(float) ** 2).reshape(len(own), 3, 11).sum(axis=2)
+    np.testing.assert_allclose(sums, 1.0, atol=1e-5)  # shares of each histogram
+    np.testing.assert_array_equal(features(points), own)
+    # words of something else: of a frame's own features they leave nothing but rounding
+    stairs = np.concatenate([points + k * np.array([0.3, 0.2, 0.25]) for k in range(3)])
+    learnt = [features(stairs[::2] * scale) for scale in (0.5, 0.8)]
+    asked, again = FpfhVlad(), FpfhVlad()
+    asked.learn(learnt, 2, seed=0)
+    again.learn(learnt, 2, seed=0)
+    descriptor = asked.finish(own)
+    np.testing.assert_array_equal(again.finish(own), descriptor)
+    floors = asked.finish(features(floor + np.array([-1.0, 1.0, -1.2])))
+    near = asked.finish(features(turned(points, 10)))
+    distances = asked.distances(descriptor, np.stack([near, floors]))
+    assert distances[0] < 0.5 * distances[1]
+
+
+def test_which_frames_each_is_made_for(room_frames: tuple[Frame, ...]) -> None:
+    seen, fused = Cloud(np.ones((3, 3), np.float32)), Cloud(np.ones((3, 3), np.float32), False)
+    made_for = {
+        name: [make(9.0).takes(frame) for frame in (room_frames[0], seen, fused)]
+        for name, make in BASELINES.items()
+    }
+    assert made_for == {
+        "thumbnail_l1": [True, False, False],
+        "thumbnail_zncc": [True, False, False],
+        "fpfh_vlad": [True, True, True],
+        "rings": [False, True, False],
+    }
+    assert Rings().read(seen).sum() > 0
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve views along a path through a synthetic room."""
+    out = tmp_path_factory.mktemp("baselines") / "rooms"
+    arguments = ["synth", out, "--rooms", 1, "--views", 12, "--seed", 9, "--path", "--jobs", 1]
+    assert main([str(a) for a in arguments]) == 0
+    return out / "room-000"
+
+
+@pytest.fixture(scope="module")
+def model_file(small_model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("model") / "small.safetensors"
+    save_model(small_model, path)
+    return path
+
+
+def evaluated(folder: Path, *arguments: object) -> dict[str, Any]:
+    path = folder / "figures.json"
+    assert main(["evaluate", *map(str, arguments), "--jobs", "1", "--json", str(path)]) == 0
+    found: dict[str, Any] = json.loads(path.read_text(), parse_constant=pytest.fail)
+    return found
+
+
+def test_baselines_are_rows_of_the_same_table(
+    room: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = (room, "--db", "0:12:2", "--queries", "1:12:4", "--model", model_file)
+    found = evaluated(tmp_path, *asked, "--baselines", "rings", "thumbnail_l1")
+    assert list(found["baselines"]) == ["thumbnail_l1", "rings"]
+    row = found["baselines"]["thumbnail_l1"]
+    # neighbours on a path look alike: the thumbnail finds one, and it is registered as ours is
+    assert row["recall"] == {"queries": 3, "at_1": 1.0, "at_5": 1.0, "at_10": 1.0}
+    assert row["within_10cm_10deg"] == 1.0
+    assert set(found["R"]) - {"right_scene"} <= set(row)
+    assert row["ratio"] > 0
+    assert (
+        "made for frames such as room-000/seq-01/frame-000001"
+        in (found["baselines"]["rings"]["reason"])
+    )
+    out = capsys.readouterr().out
+    assert "3 queries with a frame that is their place (overlap by half), recall" in out
+    assert "not asked: it is not made for frames" in out
+    again = evaluated(tmp_path, *asked, "--baselines", "thumbnail_l1")
+    for key in ("milliseconds", "ratio"):
+        again["baselines"]["thumbnail_l1"].pop(key)
+        row.pop(key)
+    assert again["baselines"]["thumbnail_l1"] == row
+
+
+def test_frames_that_come_back(room: Path, model_file: Path, tmp_path: Path) -> None:
+    """Every frame asks those before it by more than 20 cm of travel."""
+    poses = [np.loadtxt(room / "seq-01" / f"frame-{i:06d}.pose.txt") for i in range(12)]
+    steps = [np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in pairwise(poses)]
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    gap = float(along[11] / 3)
+    found = evaluated(
+        tmp_path, room, "--gap-m", gap, "--within", 0.5, "--model", model_file, "--candidates", 3
+    )
+    assert found["counts"] == {"queries": 12, "database": 12, "left_out": 0}
+    names = {one["name"]: one["ranking"] for one in found["per_query"]}
+    for i in range(12):
+        own = names[f"room-000/seq-01/frame-{i:06d}"]
+        before = [f"room-000/seq-01/frame-{j:06d}" for j in range(12) if along[i] - along[j] > gap]
+        assert set(own) <= set(before)
+        assert len(own) == min(3, len(before))
+    apart = [
+        [np.linalg.norm(poses[i][:3, 3] - poses[j][:3, 3]) for j in range(12)
+         if along[i] - along[j] > gap]
+        for i in range(12)
+    ]  # fmt: skip
+    able = [a for a in apart if a and min(a) <= 0.5]
+    assert found["recall"]["R"]["queries"] == len(able)
+    assert found["recall"]["within_m"] == 0.5
+    share = float(np.mean([np.mean(np.array(a) <= 0.5) for a in able])) if able else None
+    assert found["recall"]["random"]["at_1"] == pytest.approx(share)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--baselines", "sift"], "There is no such baseline"),
+        (["--gap-m", "-1"], "--gap-m"),
+        (["--within", "inf"], "--within"),
+    ],
+)
+def test_wrong_options(
+    room: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = main(["evaluate", str(room), "--db", "0:4", "--queries", "5:6", *arguments])
+    except SystemExit as stopped:
+        code = int(stopped.code or 0)
+    assert code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_clouds_are_evaluated_as_depth_images_are(
+    room: Path, model_file: Path, tmp_path: Path
+) -> None:
+    """Views of the room as files of points: ranked, validated, and beside the ring descriptor."""
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    (sequence,) = find_sequences(room)
+    for i, reference in enumerate(sequence.frames[:6]):
+        frame = reference.read_depth()
+        points = points_of(frame, 3, 9.0).astype("<f4")
+        header = (
+            f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {len(points)}\n"
+            f"HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA binary\n"
+        )
+        (folder / f"scan-{i:03d}.pcd").write_bytes(header.encode() + points.tobytes())
+        assert frame.pose is not None
+        np.savetxt(folder / f"scan-{i:03d}.pose.txt", frame.pose)
+    found = evaluated(
+        tmp_path, folder, "--db", "0:6:2", "--queries", "1:6:4", "--within", 1, "--candidates", 2,
+        "--model", model_file, "--baselines", "rings", "thumbnail_l1",
+        "--plots", tmp_path / "plots",
+    )  # fmt: skip
+    assert found["counts"] == {"queries": 2, "database": 3, "left_out": 0}
+    assert found["VDR"]["within_10cm_10deg"] == 1.0
+    assert found["baselines"]["rings"]["recall"]["queries"] == 2
+    assert "made for" in found["baselines"]["thumbnail_l1"]["reason"]
+    assert (tmp_path / "plots" / "contact.png").exists()
+    assert not (tmp_path / "plots" / "cloud.png").exists()

@@ -1,0 +1,98 @@
+"""What is drawn, from overlaps made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.evaluation.overlap import Overlaps
+from sceneprint.evaluation.pair_drawing import BINS, Drawing, Drawn, Place, draw, inside
+from sceneprint.types import Floats
+
+ALL = Drawing(pairs=1000, negatives=0, apart=1)
+NO_PLANES = np.zeros(100, bool)
+
+
+def places(scene: str, n: int, run: str = "run") -> list[Place]:
+    return [Place(scene, f"{scene}/{run}", i) for i in range(n)]
+
+
+def of_matrix(least: Floats, mean: Floats | None = None) -> Overlaps:
+    both = np.maximum(least, least.T)
+    return Overlaps(both if mean is None else np.maximum(mean, mean.T), both)
+
+
+def couples(drawn: list[Drawn], name: str | None) -> set[tuple[int, int]]:
+    return {(one.query, one.match) for one in drawn if one.bin == name}
+
+
+def test_the_edges_of_the_bins() -> None:
+    assert BINS == ("10-30", "30-50", "50-70", "70-100")
+    overlap = np.array([0.0, 0.099, 0.1, 0.299, 0.3, 0.5, 0.7, 1.0])
+    found = {name: np.flatnonzero(inside(overlap, name)).tolist() for name in BINS}
+    assert found == {"10-30": [2, 3], "30-50": [4], "50-70": [5], "70-100": [6, 7]}
+
+
+def test_every_pair_has_its_bin_and_the_later_frame_asks() -> None:
+    least = np.zeros((5, 5))
+    least[1, 0], least[2, 0], least[2, 1], least[3, 0], least[3, 1] = 0.2, 0.4, 0.6, 1.0, 0.05
+    mean = least.copy()
+    mean[4, 0] = 0.02  # one direction sees something
+    drawn = draw(places("a", 5), of_matrix(least, mean), NO_PLANES[:5], ALL)
+    assert couples(drawn, "10-30") == {(1, 0)}
+    assert couples(drawn, "30-50") == {(2, 0)}
+    assert couples(drawn, "50-70") == {(2, 1)}
+    assert couples(drawn, "70-100") == {(3, 0)}
+    assert couples(drawn, None) == {(3, 2), (4, 1), (4, 2), (4, 3)}  # (3, 1) is neither
+    assert {one.kind for one in drawn if one.bin is None} == {"same_scene"}
+    assert {one.overlap_least for one in drawn if one.bin == "50-70"} == {0.6}
+
+
+def test_neighbours_of_one_sequence_are_left_out() -> None:
+    four = [*places("a", 3), *places("a", 3, "other")]
+    drawn = draw(four, of_matrix(np.full((6, 6), 0.8)), NO_PLANES[:6], replace(ALL, apart=2))
+    within = {(2, 0), (5, 3)}
+    between = {(i, j) for i in (3, 4, 5) for j in (0, 1, 2)}  # two runs have no neighbours
+    assert couples(drawn, "70-100") == within | between
+
+
+def test_so_many_of_each_bin_each_once_and_the_same_every_time() -> None:
+    rng = np.random.default_rng(1)
+    truth = of_matrix(np.tril(rng.random((40, 40)), -1))
+    few = replace(ALL, pairs=20, seed=3)
+    drawn = draw(places("a", 40), truth, NO_PLANES[:40], few)
+    assert [len(couples(drawn, name)) for name in BINS] == [20, 20, 20, 20]
+    assert draw(places("a", 40), truth, NO_PLANES[:40], few) == drawn
+    other = draw(places("a", 40), truth, NO_PLANES[:40], replace(few, seed=4))
+    assert couples(other, "30-50") != couples(drawn, "30-50")
+    assert all(truth.least[one.query, one.match] == one.overlap_least for one in drawn)
+
+
+def test_pairs_of_two_scenes_are_shared_out_and_a_quarter_is_planar() -> None:
+    n = 20
+    three = [*places("a", n), *places("b", n), *places("c", n)]
+    planar: NDArray[np.bool_] = np.zeros(3 * n, bool)
+    planar[[1, n + 2]] = True
+    nothing = Overlaps(np.zeros((60, 60)), np.zeros((60, 60)))
+    drawn = draw(three, nothing, planar, Drawing(pairs=0, negatives=100, apart=1))
+    assert len(drawn) == len({(one.query, one.match) for one in drawn}) == 100
+    assert {one.kind for one in drawn} == {"cross_scene"}
+    counts: dict[str, list[bool]] = {}
+    for one in drawn:
+        key = three[one.query].scene + three[one.match].scene
+        counts.setdefault(key, []).append(one.planar)
+        assert one.planar == (planar[one.query] or planar[one.match])
+    assert {key: len(flags) for key, flags in counts.items()} == {"ab": 34, "ac": 33, "bc": 33}
+    assert sum(counts["ab"]) >= 8  # a quarter, and what chance adds
+    assert sum(counts["ac"]) >= 8
+    assert sum(counts["ac"]) < 20
+
+
+def test_where_less_is_to_be_had_less_is_drawn() -> None:
+    two = [*places("a", 2), *places("b", 3)]
+    nothing = Overlaps(np.zeros((5, 5)), np.zeros((5, 5)))
+    drawn = draw(two, nothing, NO_PLANES[:5], Drawing(pairs=9, negatives=50, apart=1))
+    kinds = [one.kind for one in drawn]
+    assert (kinds.count("cross_scene"), kinds.count("same_scene")) == (6, 1 + 3)

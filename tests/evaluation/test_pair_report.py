@@ -1,0 +1,185 @@
+"""Figures of pairs, worked out by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.evaluation.pair_drawing import BINS, Drawn
+from sceneprint.evaluation.pair_report import pair_figures
+from sceneprint.evaluation.pair_run import PairEvaluation
+from sceneprint.evaluation.pair_statistics import curves, evidence, residual
+from sceneprint.evaluation.pair_table import pair_table
+from sceneprint.evaluation.pair_trying import Other, Tried
+from sceneprint.evaluation.records import RIGHT, Error, Member, Pair
+from sceneprint.evaluation.report import to_json
+from sceneprint.geometry.acceptance import AcceptanceParameters
+
+ACCEPTANCE = AcceptanceParameters()
+CM3, CM7, CM15, AWAY = Error(0.03, 0.0), Error(0.07, 0.0), Error(0.15, 0.0), Error(2.0, 1.0)
+
+
+def member(number: int, scene: str) -> Member:
+    return Member(number, f"{scene}/{number}", scene, np.eye(4), np.empty(0, np.uint8))
+
+
+MEMBERS = [member(0, "here"), member(1, "here"), member(2, "there")]
+
+
+def overlapping(name: str, pair: Pair, bound: Error = CM3) -> Tried:
+    drawn = Drawn(1, 0, "overlapping", name, 0.4, int(name.split("-")[0]) / 100, planar=False)
+    return Tried(drawn, replace(pair, overlap_least=drawn.overlap_least, bound=bound), None, None)
+
+
+def negative(pair: Pair, *, planar: bool = False, cross: bool = True) -> Tried:
+    kind = "cross_scene" if cross else "same_scene"
+    drawn = Drawn(0, 2 if cross else 1, kind, None, 0.0, 0.0, planar)  # type: ignore[arg-type]
+    return Tried(drawn, replace(pair, overlap_least=0.0), None, None)
+
+
+@pytest.fixture
+def tried(make_pair: Callable[..., Pair]) -> list[Tried]:
+    """Two pairs of the first bin and three of the second, five negatives, one of them accepted."""
+    strange = {"scene": "there"}
+    return [
+        overlapping("10-30", make_pair(0, "rejected", off=AWAY), CM7),
+        overlapping("10-30", make_pair(0, "rejected", off=CM15)),
+        overlapping("30-50", make_pair(0, off=CM3)),
+        overlapping("30-50", make_pair(0, off=CM7)),
+        overlapping("30-50", make_pair(0, "ambiguous", off=CM7)),
+        negative(make_pair(2, "rejected", **strange)),
+        negative(make_pair(2, "rejected", **strange), planar=True),
+        negative(make_pair(2, "rejected", **strange), planar=True),
+        negative(make_pair(2, strength="weak", **strange)),
+        negative(make_pair(1, "rejected", off=AWAY), cross=False),
+    ]
+
+
+def evaluation(tried: list[Tried]) -> PairEvaluation:
+    planes = np.array([0.2, 0.7, 0.6])
+    return PairEvaluation(MEMBERS, RIGHT, ACCEPTANCE, planes, tried, [("here/9", "empty")], 5.0)
+
+
+@pytest.fixture
+def found(tried: list[Tried]) -> dict[str, Any]:
+    return pair_figures(evaluation(tried), {"seed": 0, "right": RIGHT})
+
+
+def test_bins(found: dict[str, Any]) -> None:
+    first, second, third, _ = (found["bins"][name] for name in BINS)
+    assert [one["pairs"] for one in (first, second, third)] == [2, 3, 0]
+    assert first["success"] == {"within_5cm_5deg": 0, "within_10cm_10deg": 0, "right": 0}
+    assert first["bound"] == {"within_5cm_5deg": 0.5, "within_10cm_10deg": 1, "right": 1}
+    assert second["success"]["within_5cm_5deg"] == pytest.approx(1 / 3)
+    assert second["success"]["right"] == 1.0  # accepted or not
+    assert set(third["success"].values()) == {None}
+
+
+def test_precision_is_null_where_none_was_accepted(found: dict[str, Any]) -> None:
+    first, second, third, _ = (found["bins"][name]["validation"] for name in BINS)
+    assert (first["precision"], first["recall"], first["accepted"]) == (None, None, 0)
+    assert (second["precision"], second["accepted"]) == (1.0, 2)
+    assert second["recall"] == pytest.approx(2 / 3)
+    assert (third["precision"], third["pairs"]) == (None, 0)
+    overall = found["validation"]
+    assert overall["accepted"] == 3
+    assert overall["precision"] == pytest.approx(2 / 3)
+    assert overall["recall_overlap_30"] == pytest.approx(2 / 3)
+
+
+def test_negatives_and_how_many_may_be(found: dict[str, Any]) -> None:
+    of = found["negatives"]
+    counts = [of["cross_scene"][k] for k in ("pairs", "planar", "accepted", "accepted_strong")]
+    assert counts == [4, 2, 1, 0]
+    assert of["cross_scene_planar"]["upper"] == pytest.approx(1 - math.sqrt(0.05))
+    assert of["same_scene"]["pairs"] == 1
+    assert of["by_scenes"] == {"here | there": of["cross_scene"]}
+    assert found["scenes"]["here"]["validation"]["accepted"] == 2
+    assert found["scenes"]["there"]["validation"]["precision"] is None
+    assert found["counts"]["planar"] == {"here": 1, "there": 1}
+
+
+def test_failures_are_named_the_worst_first(found: dict[str, Any]) -> None:
+    told = [(one["number"], one["what"], one["match"]) for one in found["failures"]]
+    assert told == [
+        (8, "wrongly_accepted", "there/2"),
+        (4, "not_believed", "here/0"),
+        (1, "near", "here/0"),
+        (0, "not_found", "here/0"),
+    ]
+    assert found["failures"][0]["translation_m"] is None  # there is no truth
+    assert found["failures"][2]["translation_m"] == pytest.approx(0.15)
+    assert found["failures"][3]["reason"] == "as given"
+
+
+def test_a_wider_limit_makes_more_right(tried: list[Tried]) -> None:
+    wide = [replace(one, pair=replace(one.pair, limits=(0.3, 3.0))) for one in tried]
+    found = pair_figures(replace(evaluation(wide), limits=(0.3, 3.0)), {"right": (0.3, 3.0)})
+    assert found["bins"]["10-30"]["success"]["right"] == 0.5
+    assert found["bins"]["10-30"]["success"]["within_10cm_10deg"] == 0.0
+    assert [one["what"] for one in found["failures"]].count("not_believed") == 2
+
+
+def test_statistics(make_pair: Callable[..., Pair]) -> None:
+    v = make_pair(0).validation
+    assert evidence(replace(v, overlap=0.5, violations=0.04), ACCEPTANCE) == pytest.approx(0.3)
+    assert evidence(replace(v, overlap=0.5, violations=None), ACCEPTANCE) == 0.5
+    assert residual(replace(v, residual_m=0.04, residual_rad=0.0), ACCEPTANCE) == 0.5
+    assert residual(
+        replace(v, residual_m=0.04, residual_rad=math.radians(10)), ACCEPTANCE
+    ) == pytest.approx(2.0)
+
+
+def test_curves(make_pair: Callable[..., Pair]) -> None:
+    def one(right: bool, status: str, **told: Any) -> Pair:
+        pair = make_pair(0, status, off=CM3 if right else AWAY)
+        return replace(pair, validation=replace(pair.validation, **told))
+
+    pairs = [
+        one(True, "accepted", overlap=0.6, residual_m=0.01, ambiguity=0.0),
+        one(True, "ambiguous", overlap=0.4, residual_m=0.02, ambiguity=0.2),
+        one(False, "rejected", overlap=0.5, residual_m=0.03, ambiguity=0.0),
+        one(False, "rejected", T_match_query=None, overlap=0.9, residual_m=0.0, ambiguity=0.0),
+    ]
+    found = curves(pairs, ACCEPTANCE)
+    assert found["overlap"]["area"] == pytest.approx(3 / 4)  # without a transform: last of all
+    assert found["overlap"]["right_at"] == {"0": 0.5, "0.01": 0.5, "0.05": 0.5}
+    assert found["residual"]["area"] == 1.0  # small is good
+    assert (found["ambiguity"]["right"], found["ambiguity"]["wrong"]) == (2, 0)
+    assert found["ambiguity"]["area"] is None
+    assert (found["violations"]["right"], found["violations"]["wrong"]) == (2, 2)
+    blind = [replace(p, validation=replace(p.validation, violations=None)) for p in pairs]
+    assert curves(blind, ACCEPTANCE)["violations"]["area"] == 0.5  # nothing is known
+
+
+def test_baselines_beside_ours(tried: list[Tried]) -> None:
+    others = {
+        "FPFH + RANSAC": Other(CM15, CM7, CM3, 400.0),
+        "FPFH + FGR": Other(AWAY, AWAY, AWAY, 200.0),
+    }
+    beside = [
+        replace(one, others=others, milliseconds=100.0) for one in tried if one.drawn.bin == "30-50"
+    ]
+    beside.append(replace(tried[0], others={}, milliseconds=100.0))  # too few points for them
+    found = pair_figures(evaluation([*beside, *tried[5:]]), {})["baselines"]
+    ransac, fgr = (found["methods"][name] for name in others)
+    of = ransac["bins"]["30-50"]
+    assert [of[step]["within_10cm_10deg"] for step in ("start", "icp", "ours")] == [0, 1, 1]
+    assert [of[step]["within_5cm_5deg"] for step in ("start", "icp", "ours")] == [0, 0, 1]
+    assert ransac["bins"]["10-30"]["icp"]["right"] == 0.0  # none is a failure
+    assert (ransac["time_ratio"], fgr["time_ratio"]) == (0.25, 0.5)
+    assert (found["pairs"], found["milliseconds"]) == (4, 100.0)
+
+
+def test_the_json_is_one_and_the_table_says_it(found: dict[str, Any]) -> None:
+    assert json.loads(to_json(found)) == json.loads(json.dumps(found))
+    lines = "\n".join(pair_table(found))
+    assert "1 wrongly accepted, 1 not believed, 1 near, 1 not found" in lines
+    assert "here | there" in lines
+    assert f"{1 - math.sqrt(0.05):.5f}" in lines

@@ -1,0 +1,75 @@
+"""Bounds of rates against scipy and their definition; curves against counting pairs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import beta, binom
+
+from sceneprint.evaluation.rates import roc, upper_bound
+
+
+@pytest.mark.parametrize(("seen", "of"), [(0, 1), (0, 2000), (1, 10), (3, 40), (9, 10), (37, 700)])
+def test_the_bound_is_that_of_clopper_and_pearson(seen: int, of: int) -> None:
+    bound = upper_bound(seen, of)
+    assert bound is not None
+    assert bound == pytest.approx(beta.ppf(0.95, seen + 1, of - seen), rel=1e-9)
+    # what it means: so few are seen with a chance of 5 % there, and with less above
+    assert binom.cdf(seen, of, bound) == pytest.approx(0.05, rel=1e-6)
+
+
+def test_none_seen_is_the_rule_of_three() -> None:
+    assert upper_bound(0, 2000) == pytest.approx(1 - 0.05 ** (1 / 2000), rel=1e-12)
+    assert upper_bound(0, 2000) == pytest.approx(3 / 2000, rel=3e-3)
+    assert upper_bound(0, 2000, 0.99) == pytest.approx(4.6 / 2000, rel=2e-3)
+
+
+def test_the_ends() -> None:
+    assert upper_bound(0, 0) is None
+    assert upper_bound(5, 5) == 1.0
+    for seen, of in ((3, 2), (-1, 2)):
+        with pytest.raises(ValueError, match="is no rate"):
+            upper_bound(seen, of)
+
+
+def test_a_curve_by_hand() -> None:
+    right = np.array([True, True, False, True, False])
+    curve = roc(np.array([5.0, 4.0, 3.0, 3.0, 1.0]), right)
+    assert curve is not None
+    np.testing.assert_allclose(curve.true, [0, 1 / 3, 2 / 3, 1, 1])
+    np.testing.assert_allclose(curve.false, [0, 0, 0, 1 / 2, 1])
+    np.testing.assert_array_equal(curve.thresholds, [np.inf, 5, 4, 3, 1])
+    assert curve.area == pytest.approx((2 + 2 + 1.5) / 6)  # of six couples one is a tie
+    assert [curve.true_at(share) for share in (0.0, 0.49, 0.5)] == [2 / 3, 2 / 3, 1.0]
+    assert curve.thinned() == [
+        [0.0, 0.0, np.inf], [0.0, 1 / 3, 5.0], [0.0, 2 / 3, 4.0], [0.5, 1.0, 3.0], [1.0, 1.0, 1.0]
+    ]  # fmt: skip
+
+
+def test_the_area_is_the_share_of_couples_in_order() -> None:
+    rng = np.random.default_rng(4)
+    scores = rng.normal(size=400).round(1)
+    scores[:30] = -np.inf
+    right = rng.random(400) < 0.3 + 0.3 * (scores > 0)
+    curve = roc(scores, right)
+    assert curve is not None
+    good, bad = scores[right][:, None], scores[~right]
+    assert curve.area == pytest.approx(((good > bad) + (good == bad) / 2).mean())
+
+
+def test_a_long_curve_is_thinned_and_keeps_its_ends() -> None:
+    rng = np.random.default_rng(5)
+    right = rng.random(3000) < 0.5
+    curve = roc(rng.normal(size=3000) + right, right)
+    assert curve is not None
+    points = curve.thinned(50)
+    assert 30 < len(points) <= 50
+    assert points[0][:2] == [0.0, 0.0]
+    assert points[-1][:2] == [1.0, 1.0]
+    steps = np.diff(np.array(points)[:, :2].sum(axis=1))
+    assert 0 < steps.min() <= steps.max() < 0.06
+
+
+def test_there_is_no_curve_of_one_kind() -> None:
+    assert roc(np.arange(3.0), np.ones(3, bool)) is None
+    assert roc(np.arange(0.0), np.ones(0, bool)) is None
