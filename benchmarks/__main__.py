@@ -54,7 +54,7 @@ def real_frames(n: int) -> list[Frame]:
         for reference in sequence.frames
     ]
     step = max(len(found) // n, 1)
-    return [reference.read() for reference in found[::step][:n]]
+    return [reference.read_depth() for reference in found[::step][:n]]
 
 
 def synthetic_frames(n: int) -> list[Frame]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from sceneprint.evaluation.overlap import View, overlap, view_of
+from sceneprint.evaluation.overlap import AnyView, overlap, view_of
 from sceneprint.evaluation.protocol import choose, parse_part
 from sceneprint.geometry.retrieval import Ints64, Metric, cross_distances
 from sceneprint.pipeline import Signer, open_signer, sign
@@ -88,7 +88,7 @@ def recordings(root: Path, name: str, parts: list[str]) -> Shots:
     """Frames of a protocol."""
     chosen = choose([parse_part(str(root / part)) for part in parts]).frames
     for one in tqdm(chosen, desc=name, unit="frame", disable=None):
-        yield one.scene, one.use == "query", replace(one.reference.read(), name=one.name)
+        yield one.scene, one.use == "query", replace(one.reference.read_depth(), name=one.name)
 
 
 def rooms(seed: int, count: int) -> Shots:
@@ -102,7 +102,7 @@ def rooms(seed: int, count: int) -> Shots:
 
 def prepare(shots: Shots, signers: dict[int, Signer], known: Known, highest: float) -> Trial:
     """Sign what is not `known` yet, and allow what overlaps by less than `highest`."""
-    frames: tuple[list[tuple[str, str, View]], ...] = ([], [])
+    frames: tuple[list[tuple[str, str, AnyView]], ...] = ([], [])
     for scene, is_query, frame in shots:
         if frame.name not in known:
             known[frame.name] = {n: sign(frame, signer).vector for n, signer in signers.items()}

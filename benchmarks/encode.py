@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.errors import MissingDependency
+from sceneprint.evaluation.registration_baselines import (
+    FEATURES,
+    NORMALS,
+    VOXEL,
+    Clock,
+    open3d,
+    points_of,
+)
 from sceneprint.geometry.counting import count_pairs
 from sceneprint.geometry.depth import inverse_depth
 from sceneprint.geometry.encoding import quantise, statistics_of_counts
@@ -22,24 +28,7 @@ from sceneprint.pipeline import Signer, geometry_of, sign
 from sceneprint.signing import float_signature, see
 from sceneprint.types import Floats, Frame
 
-T = TypeVar("T")
-
-#: FPFH as its users run it: voxel, then normals (radius, neighbours), features (the same).
-VOXEL, NORMALS, FEATURES = 0.05, (0.10, 30), (0.25, 100)
-
-
-class Clock:
-    """Milliseconds by stage, for one frame."""
-
-    def __init__(self) -> None:
-        self.stages: dict[str, float] = {}
-
-    def run(self, stage: str, call: Callable[[], T]) -> T:
-        """Time one call and add it to its stage."""
-        start = time.perf_counter()
-        result = call()
-        self.stages[stage] = self.stages.get(stage, 0.0) + 1e3 * (time.perf_counter() - start)
-        return result
+__all__ = ["Clock", "measure", "open3d", "points_of", "signing_stages"]
 
 
 def signing_stages(frame: Frame, signer: Signer) -> dict[str, float]:
@@ -75,31 +64,6 @@ def artifact_stages(frame: Frame, signer: Signer) -> tuple[dict[str, float], int
     data = clock.run("artifact to bytes", lambda: write_geometry(geometry))
     clock.run("artifact from bytes", lambda: read_geometry(data))
     return clock.stages, len(data)
-
-
-def open3d() -> Any:
-    """The open3d module.
-
-    Raises
-    ------
-    MissingDependency : it, or a system library it needs, is absent.
-    """
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise MissingDependency(
-            f"open3d cannot be imported ({error}). On Debian or Ubuntu: "
-            "apt install libgl1 libegl1 libx11-6 libusb-1.0-0 libgomp1"
-        ) from error
-    return open3d
-
-
-def points_of(frame: Frame, minimum: float, maximum: float) -> Floats:
-    """All samples within range as points, (N, 3) metres; not part of any timing."""
-    k = frame.intrinsics
-    y, x = np.nonzero((frame.depth >= minimum) & (frame.depth <= maximum))
-    z = frame.depth[y, x].astype(float)
-    return np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=1)
 
 
 def fpfh_stages(points: Floats, o3d: Any) -> dict[str, float]:

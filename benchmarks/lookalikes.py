@@ -88,7 +88,7 @@ def other_rooms(
     def drawn(which: int) -> Geometry:
         index = int(rng.integers(len(sequences[which]) // 10 or 1)) * 10 % len(sequences[which])
         if (which, index) not in known:
-            known[which, index] = geometry(sequences[which][index].read(), model)
+            known[which, index] = geometry(sequences[which][index].read_depth(), model)
         return known[which, index]
 
     outcomes: Counter[str] = Counter()
@@ -100,7 +100,7 @@ def other_rooms(
 
 def overlapping(recording: list[FrameReference], n: int, seed: int) -> list[tuple[Frame, Frame]]:
     """`n` pairs of every 20th frame of a recording that overlap by half, the smaller direction."""
-    frames = [reference.read() for reference in recording[::20]]
+    frames = [reference.read_depth() for reference in recording[::20]]
     found = [(p.query, p.match) for p in pairs_among(frames) if p.overlap >= 0.5]
     return [found[i] for i in np.random.default_rng(seed).permutation(len(found))[:n]]
 

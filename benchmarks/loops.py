@@ -24,7 +24,7 @@ from benchmarks.__main__ import recordings
 from sceneprint.client import Client
 from sceneprint.client.frames import sendable
 from sceneprint.datasets import FrameReference, find_sequences
-from sceneprint.evaluation.overlap import View, overlap, view_of
+from sceneprint.evaluation.overlap import AnyView, overlap, view_of
 from sceneprint.geometry.rigid import difference, inverse, nearest_rotation, rotation_angle
 from sceneprint.schemas.associations import Association, Edge
 from sceneprint.types import Floats
@@ -126,7 +126,7 @@ class Truth:
 
     def __init__(self, of: Recording, ids: dict[str, int]) -> None:
         self._of, self._ids = of, ids
-        self._views: dict[int, View] = {}
+        self._views: dict[int, AnyView] = {}
 
     def judge(self, edges: Sequence[Edge]) -> Judged:
         """Hold edges against it."""
@@ -152,9 +152,9 @@ class Truth:
         both = [self._view(self._ids[one]) for one in (edge.from_frame, edge.to_frame)]
         return overlap(*both)[1]
 
-    def _view(self, i: int) -> View:
+    def _view(self, i: int) -> AnyView:
         if i not in self._views:
-            self._views[i] = view_of(self._of.references[i].read())
+            self._views[i] = view_of(self._of.references[i].read_depth())
         return self._views[i]
 
 

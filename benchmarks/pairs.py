@@ -57,7 +57,7 @@ def real_pairs(recordings: Path, n: int, step: int = 25) -> list[FramePair]:
     scenes = recordings / "7scenes"
     if not scenes.is_dir():
         return []
-    frames = [reference.read() for reference in find_sequences(scenes)[0].frames[::step]]
+    frames = [reference.read_depth() for reference in find_sequences(scenes)[0].frames[::step]]
     return _spread(pairs_among(frames, apart=2), n)
 
 

@@ -10,26 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.encode import FEATURES, NORMALS, VOXEL, Clock, open3d, points_of
+from benchmarks.encode import Clock, open3d, points_of
 from benchmarks.pairs import FramePair
 from sceneprint.errors import MissingDependency
+from sceneprint.evaluation.registration_baselines import METHODS, register
 from sceneprint.geometry.rigid import difference
 from sceneprint.models import Model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
 from sceneprint.types import Floats, Frame
 
-#: RANSAC: farthest correspondence (metres), points a hypothesis, least ratio of edge lengths, ...
-CORRESPONDENCE, POINTS, EDGES = 0.075, 3, 0.9
-#: ... hypotheses at the most, and confidence at which it stops.
-HYPOTHESES, CONFIDENCE = 100_000, 0.999
-#: ICP, point to plane: voxel of both clouds, and farthest correspondence, metres.
-ICP_VOXEL, ICP_CORRESPONDENCE = 0.02, 0.05
+#: The one of Open3D's methods that is timed here; `sceneprint evaluate-pairs` has the others.
+METHOD = METHODS[0]
 #: A transform is right within this, metres and radians.
 RIGHT = (0.10, float(np.radians(10.0)))
 
@@ -54,54 +50,6 @@ class RegistrationFigures:
     share: float | None
     share_of_stored: float | None
     note: str
-
-
-def register_by_open3d(query: Floats, match: Floats, o3d: Any, clock: Clock) -> Floats:
-    """FPFH + RANSAC + ICP of two clouds (N, 3), metres: T_match_query (4, 4).
-
-    The finer clouds and the normals that ICP asks for are counted as its own.
-    """
-    register, cloud_of = o3d.pipelines.registration, o3d.geometry.PointCloud
-    search = o3d.geometry.KDTreeSearchParamHybrid
-    clouds = [cloud_of(o3d.utility.Vector3dVector(points)) for points in (query, match)]
-    thin = clock.run("voxel grid", lambda: [c.voxel_down_sample(VOXEL) for c in clouds])
-    clock.run("normals", lambda: [c.estimate_normals(search(*NORMALS)) for c in thin])
-    features = clock.run(
-        "features", lambda: [register.compute_fpfh_feature(c, search(*FEATURES)) for c in thin]
-    )
-    o3d.utility.random.seed(0)
-    found = clock.run(
-        "RANSAC",
-        lambda: register.registration_ransac_based_on_feature_matching(
-            thin[0],
-            thin[1],
-            features[0],
-            features[1],
-            True,
-            CORRESPONDENCE,
-            register.TransformationEstimationPointToPoint(False),
-            POINTS,
-            [
-                register.CorrespondenceCheckerBasedOnEdgeLength(EDGES),
-                register.CorrespondenceCheckerBasedOnDistance(CORRESPONDENCE),
-            ],
-            register.RANSACConvergenceCriteria(HYPOTHESES, CONFIDENCE),
-        ),
-    )
-
-    def refine() -> Any:
-        fine = [c.voxel_down_sample(ICP_VOXEL) for c in clouds]
-        fine[1].estimate_normals(search(*NORMALS))  # point to plane asks for the target's only
-        return register.registration_icp(
-            fine[0],
-            fine[1],
-            ICP_CORRESPONDENCE,
-            found.transformation,
-            register.TransformationEstimationPointToPlane(),
-        )
-
-    refined = clock.run("ICP", refine)
-    return np.array(refined.transformation, np.float64)
 
 
 def register_by_us(query: Frame, match: Frame, model: Model, clock: Clock) -> Floats | None:
@@ -152,10 +100,9 @@ def measure(pairs: Sequence[FramePair], model: Model, warm_up: int = 1) -> Regis
                 points_of(frame, p.minimum_depth, p.maximum_depth)
                 for frame in (pair.query, pair.match)
             ]
-            clock = Clock()
-            found = register_by_open3d(clouds[0], clouds[1], o3d, clock)
-            theirs.append(clock.stages)
-            open3d_right.append(is_right(found, pair.T_match_query))
+            attempt = register(clouds[0], clouds[1], o3d, [METHOD])[METHOD]
+            theirs.append(attempt.stages)
+            open3d_right.append(is_right(attempt.refined, pair.T_match_query))
     sums, other = [sum(row.values()) for row in ours], [sum(row.values()) for row in theirs]
     alone = [row["validation"] for row in ours]
     return RegistrationFigures(

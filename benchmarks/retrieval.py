@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from sceneprint.datasets import find_sequences
+from sceneprint.datasets import Sequence, find_sequences
 from sceneprint.evaluation.overlap import overlaps, view_of
 from sceneprint.geometry.encoding import quantise
 from sceneprint.geometry.retrieval import distances
@@ -84,9 +84,19 @@ def recall_at_10(stored: Floats, exact: Floats) -> float:
     return float(np.mean(kept))
 
 
-def measure(split: str, frames: list[Frame], signer: Signer) -> Figures:
-    """Figures of one split; `frames` are all frames of the sequence."""
-    database, queries = ([frames[i] for i in part] for part in SPLITS[split])
+def measure(split: str, sequence: Sequence, signer: Signer, every: int = 1) -> Figures:
+    """Figures of one split.
+
+    Parameters
+    ----------
+    split : one of SPLITS
+    sequence : redkitchen
+    signer : see there
+    every : take so many-th frame of both parts alone
+    """
+    database, queries = (
+        [sequence.frames[i].read_depth() for i in part[::every]] for part in SPLITS[split]
+    )
     d, q = float_signatures(database, signer), float_signatures(queries, signer)
     step = signer.model.quantiser_step
     d8: Bytes = np.stack([quantise(one, step) for one in d])
@@ -118,9 +128,9 @@ def main() -> int:
     parser.add_argument("--split", choices=SPLITS, action="append")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    frames = [reference.read() for reference in find_sequences(options.scene)[0].frames]
+    sequence = find_sequences(options.scene)[0]
     signer = open_signer(options.model)
-    rows = [measure(split, frames, signer) for split in options.split or SPLITS]
+    rows = [measure(split, sequence, signer) for split in options.split or SPLITS]
     print(f"model {signer.model.label}")
     print("split    mean overlap  (oracle, random)  top-1 @.5  top-5 @.5  top-1 @.3  recall@10")
     for r in rows:

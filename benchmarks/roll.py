@@ -11,7 +11,7 @@ import argparse
 import math
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from tqdm import tqdm
@@ -34,9 +34,16 @@ class RolledView:
 
     room: Room
     pose: Floats
+    _seen: dict[tuple[float, bool], Frame] = field(default_factory=dict, repr=False)
 
     def seen(self, degrees: float, round_lens: bool) -> Frame:
-        """The depth image after a roll about the optical axis, noise-free."""
+        """The depth image after a roll about the optical axis, noise-free; rendered once."""
+        asked = (degrees, round_lens)
+        if asked not in self._seen:
+            self._seen[asked] = self._render(degrees, round_lens)
+        return self._seen[asked]
+
+    def _render(self, degrees: float, round_lens: bool) -> Frame:
         a = math.radians(degrees)
         roll = np.eye(4)
         roll[:2, :2] = [[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]

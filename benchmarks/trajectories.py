@@ -145,7 +145,7 @@ def recorded(root: Path) -> Iterator[tuple[int, int, int, Frame]]:
     for place in ("7scenes/redkitchen", "tum/fr1_rpy", "sun3d/studyroom2"):
         for sequence in find_sequences(root / place):
             for number, reference in enumerate(sequence.frames):
-                yield role_in_recording(number), run, -1, reference.read()
+                yield role_in_recording(number), run, -1, reference.read_depth()
             run += 1
 
 

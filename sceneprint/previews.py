@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sceneprint.pictures import UNKNOWN, normal_colours
 from sceneprint.schemas.outputs import WIDTHS
 from sceneprint.types import Bytes, Floats, Ints32, Surface
+from sceneprint.vistas import vista_of
 
 #: Most rows: a picture that would be higher is made narrower.
 MOST_ROWS = 2560
@@ -46,7 +47,8 @@ _TO_PRIMARIES = np.array(
 
 
 def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
-    """Depth by a colour map of equal steps to the eye: near is yellow, far is violet.
+    """Depth by a colour map of equal steps to the eye: near is yellow, far is violet. Of a cloud
+    its range, or seen from above its height: high is yellow.
 
     Parameters
     ----------
@@ -54,26 +56,31 @@ def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
 
     Returns
     -------
-    colours : (h, w, 3) uint8; dark grey where nothing is known
-    meaning : `near_m` and `far_m`, the depths of the ends of the colour map
+    colours : (h', w', 3) uint8, as `vista_of` has the pixels; dark grey where nothing is known
+    meaning : `near_m` and `far_m`, the depths or ranges of the ends of the colour map; of heights
+        `low_m` and `high_m`, from their mean
     """
-    z = surface.points[..., 2].astype(np.float64)
-    seen = z[surface.valid]
+    vista = vista_of(surface)
+    z, shown = vista.of(vista.distances), vista.shown
+    seen = z[shown]
     near, far = np.percentile(seen, _RANGE).tolist() if seen.size else (0.0, 0.0)
     place = np.clip((far - z) / max(far - near, 1e-9), 0.0, 1.0) * (len(_VIRIDIS) - 1)
+    if vista.what == "height":
+        place = len(_VIRIDIS) - 1 - place
     steps = np.arange(len(_VIRIDIS))
     mixed = np.stack([np.interp(place, steps, _VIRIDIS[:, c]) for c in range(3)], axis=-1)
+    ends, words = ("near_m", "far_m"), (f"{near:.2f} m or nearer", f"{far:.2f} m or farther")
+    if vista.what == "height":
+        ends, words = ("low_m", "high_m"), (f"{far:.2f} m or higher", f"{near:.2f} m or lower")
     meaning = {
-        "near_m": f"{near:.4f}",
-        "far_m": f"{far:.4f}",
-        "Description": f"depth: yellow {near:.2f} m or nearer, violet {far:.2f} m or farther, "
-        "dark grey unknown",
+        **dict(zip(ends, (f"{near:.4f}", f"{far:.4f}"), strict=True)),
+        "Description": f"{vista.what}: yellow {words[0]}, violet {words[1]}, dark grey unknown",
     }
-    return np.where(surface.valid[..., None], np.rint(mixed).astype(np.uint8), UNKNOWN), meaning
+    return np.where(shown[..., None], np.rint(mixed).astype(np.uint8), UNKNOWN), meaning
 
 
 def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
-    """Unit normals in the optical frame: red, green, blue are 127.5 (1 + x, y, z).
+    """Unit normals in the sensor's axes: red, green, blue are 127.5 (1 + x, y, z).
 
     Parameters
     ----------
@@ -81,14 +88,17 @@ def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
 
     Returns
     -------
-    colours : (h, w, 3) uint8; dark grey where nothing is known
+    colours : (h', w', 3) uint8, as `vista_of` has the pixels; dark grey where nothing is known
     meaning : in words
     """
+    vista = vista_of(surface)
+    frame = "optical frame" if vista.what == "depth" else "sensor's frame"
     text = (
-        "normals in the optical frame: red, green, blue are 127.5 (1 + n) of x right, y down, "
-        "z ahead; dark grey unknown"
+        f"normals in the {frame}: red, green, blue are 127.5 (1 + n) of {vista.axes}; dark grey "
+        "unknown"
     )
-    return normal_colours(surface.normals, surface.valid), {"Description": text}
+    normals = vista.of(surface.normals.reshape(-1, 3))
+    return normal_colours(normals, vista.shown), {"Description": text}
 
 
 def patches_view(labels: Ints32) -> tuple[Bytes, dict[str, str]]:

@@ -89,7 +89,7 @@ class Settings(BaseSettings):
     query_s: float = Field(default=3600.0, ge=1, le=31_536_000)
     #: Streams of events that one service process keeps open at once; more are refused (503).
     event_streams: int = Field(default=64, ge=0, le=10_000)
-    #: Newest events that are kept; older ones are removed, 200 bytes each.
+    #: Newest events of each map that are kept; older ones are removed, 200 bytes each.
     events_kept: int = Field(default=1_000_000, ge=1000)
 
     @field_validator("cors_origins", mode="before")

@@ -51,11 +51,11 @@ ROUTES = (
 UPLOADS = 12
 
 DESCRIPTION = """\
-Where have I seen this before? Upload depth frames to a map, and ask where another was taken: pure
-geometry, no colour, no pose prior. docs/api.md is a tour with curl.
+Where have I seen this before? Upload depth frames or point clouds to a map, and ask where another
+was taken: pure geometry, no colour, no pose prior. docs/api.md is a tour with curl.
 
-Lengths are metres. Camera frames are optical: x right, y down, z forward. Refusals are problem
-documents (RFC 9457) that say what happened, why, and what to do.
+Lengths are metres. Camera frames are optical (x right, y down, z forward), clouds keep the axes of
+their sensor. Refusals are problem documents (RFC 9457) that say what happened, why, and what to do.
 """
 
 

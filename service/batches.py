@@ -69,7 +69,8 @@ async def frames_of(request: Request) -> AsyncIterator[Incoming]:
         if not files or len(files) != len(form.getlist("frame")):
             raise InvalidRequest(
                 f"The form has no file part `frame`, or one that is no file. Send 1 to "
-                f"{MOST_OF_BATCH} depth images in parts of that name, each with a file name.",
+                f"{MOST_OF_BATCH} depth images or point clouds in parts of that name, each with a "
+                "file name.",
                 (("frame", "not files alone"),),
             )
         texts = texts_of(form)

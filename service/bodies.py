@@ -78,7 +78,7 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
         if not isinstance(frame, UploadFile) or len(form.getlist("frame")) != 1:
             raise InvalidRequest(
                 "The form has no file part `frame`, or more than one part of that name. Send the "
-                "depth image in it, with a file name.",
+                "depth image or point cloud in it, with a file name.",
                 (("frame", "not one file"),),
             )
         texts = texts_of(form)
@@ -175,7 +175,8 @@ async def read_json(request: Request) -> Any:
 def _meta(text: str | None) -> FrameMeta:
     if text is None:
         raise InvalidRequest(
-            "The form has no field `meta`. Send JSON in it, at least the camera's intrinsics.",
+            "The form has no field `meta`. Send JSON in it: of a depth image at least the camera's "
+            "intrinsics, of a point cloud {}.",
             (("meta", "missing"),),
         )
     try:

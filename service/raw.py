@@ -1,6 +1,7 @@
 """A frame as the whole body of a request, and what is known of it in the query string.
 
 curl --data-binary @frame.png -H 'Content-Type: image/png' '...?fx=585&fy=585&cx=320&cy=240'
+curl --data-binary @scan.ply -H 'Content-Type: application/ply' '...?robot=spot'
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import errno
 import tempfile
 from collections.abc import Mapping, Sequence
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO, cast, get_args
 
 from fastapi import Request
 from pydantic import ValidationError
@@ -16,17 +17,22 @@ from starlette.datastructures import UploadFile
 
 from sceneprint.datasets.sizes import HEAD, size_of
 from sceneprint.errors import InvalidRequest, MalformedBody, StoreFull, UnusableStore
+from sceneprint.scans import format_of
 from sceneprint.schemas import FrameMeta
+from sceneprint.schemas.frames import CloudFormat
 from service.problems import invalid
 
 #: Types of a body that is a frame; its first bytes decide which of them it is.
-TYPES = ("image/png", "application/x-npy", "application/octet-stream")
+TYPES = ("image/png", "application/x-npy", "application/ply", "application/octet-stream")
 #: Bytes of a body that are kept in memory until they are read; the rest waits on disk.
 _IN_MEMORY = 1 << 20
 
 _CAMERA = ("fx", "fy", "cx", "cy", "width", "height", "distortion")
-_PLAIN = ("depth_scale", "depth_along_ray", "robot", "session", "captured_at")
-_OTHERS = ("tags", "pose", "parent_frame", "base", "base_frame")
+_PLAIN = (
+    "depth_scale", "depth_along_ray", "units_per_metre", "format", "robot", "session",
+    "captured_at",
+)  # fmt: skip
+_OTHERS = ("viewpoint", "tags", "pose", "parent_frame", "base", "base_frame")
 _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
@@ -48,13 +54,19 @@ def parameters() -> list[dict[str, Any]]:
         "distortion": (text, "k1,k2,p1,p2[,k3] of OpenCV."),
         "depth_scale": (number, "stored units per metre; default: 1000."),
         "depth_along_ray": ({"type": "boolean"}, "samples are ranges along the pixel's ray."),
+        "viewpoint": (text, "of a point cloud: x,y,z in metres; `none` where there is none."),
+        "units_per_metre": (number, "of a point cloud; default: 1."),
+        "format": (
+            {"type": "string", "enum": list(get_args(CloudFormat))},
+            "of a point cloud: needed for `kitti` alone.",
+        ),
         "robot": (text, "who took it."),
         "session": (text, "in which run."),
         "captured_at": ({"type": "string", "format": "date-time"}, "when, with its time zone."),
         "tags": (text, "with commas between."),
         "pose": (text, f"T_parent_sensor as {','.join(_SEVEN)}: metres, unit quaternion."),
         "parent_frame": (text, "what `pose` leads to; default: ROBOT/SESSION."),
-        "base": (text, "T_base_sensor, written as `pose`: where the camera sits on the robot."),
+        "base": (text, "T_base_sensor, written as `pose`: where the sensor sits on the robot."),
         "base_frame": (text, "what the robot calls its base; default: base_link."),
     }
     return [
@@ -167,9 +179,13 @@ def _fields(given: Mapping[str, str], head: bytes) -> dict[str, Any]:
     if "distortion" in camera:
         camera["distortion"] = camera["distortion"].split(",")
     size = size_of(head)
-    if size is not None:
+    # an array of three or four columns is a cloud, unless somebody speaks of a camera
+    is_image = bool(camera) or ("format" not in given and format_of(head) is None)
+    if size is not None and is_image:
         camera = {"width": size[0], "height": size[1], **camera}
-    found: dict[str, Any] = {"intrinsics": camera}
+    found: dict[str, Any] = {"intrinsics": camera} if camera else {}
+    if "viewpoint" in given:
+        found["viewpoint"] = _viewpoint(given["viewpoint"])
     found |= {name: given[name] for name in _PLAIN if name in given}
     if given.get("tags"):
         found["tags"] = given["tags"].split(",")
@@ -203,6 +219,19 @@ def add_transform(
             f"The query string has `{frame}`, and no `{name}`. Send both.",
             ((frame, f"without {name}"),),
         )
+
+
+def _viewpoint(text: str) -> dict[str, Any] | str | None:
+    if text in ("none", "file"):
+        return None if text == "none" else text
+    parts = text.split(",")
+    if len(parts) != 3:
+        raise InvalidRequest(
+            f"`viewpoint` has {len(parts)} numbers. Send x,y,z in metres with commas between, or "
+            "`none` where the cloud was seen from no single place.",
+            (("viewpoint", "not three numbers"),),
+        )
+    return dict(zip("xyz", parts, strict=True))
 
 
 def _transform(name: str, text: str) -> dict[str, Any]:

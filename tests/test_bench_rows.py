@@ -18,12 +18,13 @@ import pytest
 
 from benchmarks import dpp, readiness, registration, scan, search, service
 from benchmarks.__main__ import BEGIN, END, Rows, page
-from benchmarks.encode import Clock, EncodeFigures, open3d, points_of
+from benchmarks.encode import EncodeFigures, open3d, points_of
 from benchmarks.machine import Machine
 from benchmarks.pairs import FramePair, pairs_among, real_pairs, synthetic_pairs
 from sceneprint.cli.demo_building import write_building
 from sceneprint.datasets import Camera, write_depth_png, write_intrinsics
 from sceneprint.errors import MissingDependency
+from sceneprint.evaluation.registration_baselines import register
 from sceneprint.geometry.diversity import diversify
 from sceneprint.geometry.retrieval import distances, pairwise_distances, rank
 from sceneprint.models import Model
@@ -141,7 +142,7 @@ def test_without_open3d_the_row_says_so(
     assert list(figures.stages) == ["geometry of both frames", "validation"]
     assert figures.ours == pytest.approx(sum(figures.stages.values()))
     text = "\n".join(registration.table(figures))
-    assert "Open3D | not measured: open3d cannot be imported" in text
+    assert "Open3D | not measured: The baselines need Open3D, which cannot be imported" in text
 
 
 def test_open3d_finds_a_frame_in_itself(room_frames: tuple[Frame, ...]) -> None:
@@ -149,10 +150,10 @@ def test_open3d_finds_a_frame_in_itself(room_frames: tuple[Frame, ...]) -> None:
         o3d = open3d()
     except MissingDependency as error:
         pytest.skip(str(error))
-    clock, points = Clock(), points_of(room_frames[0], 0.3, 9.0)
-    found = registration.register_by_open3d(points, points, o3d, clock)
-    np.testing.assert_allclose(found, np.eye(4), atol=1e-3)
-    assert list(clock.stages) == ["voxel grid", "normals", "features", "RANSAC", "ICP"]
+    points = points_of(room_frames[0], 0.3, 9.0)
+    found = register(points, points, o3d, [registration.METHOD])[registration.METHOD]
+    np.testing.assert_allclose(found.refined, np.eye(4), atol=1e-3)
+    assert list(found.stages) == ["voxel grid", "normals", "features", "RANSAC", "ICP"]
 
 
 def test_page_and_json_hold_every_row() -> None:
@@ -206,10 +207,17 @@ def test_page_and_json_hold_every_row() -> None:
         assert json.loads(json.dumps(asdict(one)))["spread"]
 
 
-def test_service_and_library_do_the_same_work(tmp_path: Path) -> None:
-    """`measure` compares every answer with the library's; here on a room of the demo."""
-    assert len(list(write_building(tmp_path / "building", 1))) == 1
-    with service.frames_of(tmp_path / "building", 12) as frames:
+@pytest.fixture(scope="module")
+def building(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A room of the demo."""
+    folder = tmp_path_factory.mktemp("rows") / "building"
+    assert len(list(write_building(folder, 1))) == 1
+    return folder
+
+
+def test_service_and_library_do_the_same_work(building: Path) -> None:
+    """`measure` compares every answer with the library's."""
+    with service.frames_of(building, 12) as frames:
         found = service.measure(frames, 2, seconds=1.0)
     assert (found.frames, found.queries) == (10, 2)
     assert list(found.stages) == [
@@ -261,9 +269,8 @@ def test_a_search_from_a_shortlist_is_compared_with_the_scan_of_all() -> None:
     assert 0 < found.spread[0] <= found.ratio <= found.spread[1]
 
 
-def test_a_start_is_measured_with_and_without_the_index(tmp_path: Path) -> None:
-    assert len(list(write_building(tmp_path / "building", 2))) == 2
-    with service.frames_of(tmp_path / "building", 40) as frames:
+def test_a_start_is_measured_with_and_without_the_index(building: Path) -> None:
+    with service.frames_of(building, 40) as frames:
         found = readiness.measure(frames[0], list(frames[1:40]), 60, "compact")
     assert (found.frames, found.signature_bytes) == (60, 12_800)
     assert 0 < found.ready < found.first

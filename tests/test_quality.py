@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.retrieval import measure
-from benchmarks.roll import shares_of_d0, view
+from benchmarks.roll import RolledView, shares_of_d0, view
 from sceneprint.datasets import FrameReference, find_sequences
 from sceneprint.signing import (
     Signer,
@@ -30,6 +30,12 @@ def signer(request: pytest.FixtureRequest) -> Signer:
 @pytest.fixture(scope="module")
 def paper() -> Signer:
     return open_signer("paper")
+
+
+@pytest.fixture(scope="module")
+def views() -> list[RolledView]:
+    """Rendered once for both models."""
+    return [view(i) for i in range(12)]
 
 
 def every(path: Path, step: int) -> list[FrameReference]:
@@ -66,19 +72,22 @@ def test_the_table_keeps_the_distances_of_the_exact_path(data_root: Path, signer
 
 
 @pytest.mark.parametrize(
-    ("split", "mean_overlap", "top1"), [("forward", 0.585, 0.67), ("reverse", 0.61, 0.70)]
+    ("split", "oracle", "mean_overlap", "top1"),
+    [("forward", 0.636, 0.59, 0.79), ("reverse", 0.633, 0.595, 0.68)],
 )
 def test_retrieval(
-    data_root: Path, paper: Signer, split: str, mean_overlap: float, top1: float
+    data_root: Path, paper: Signer, split: str, oracle: float, mean_overlap: float, top1: float
 ) -> None:
+    """Every second frame of the splits of docs/performance.md: .604 and .610, .82 and .71.
+
+    `python -m benchmarks.retrieval` takes all of them.
+    """
     (sequence,) = find_sequences(data_root / "7scenes/redkitchen")
-    frames = [reference.read() for reference in sequence.frames]
-    figures = measure(split, frames, paper)
-    # the splits are those of docs/performance.md: their oracle is known
-    assert figures.oracle_mean_overlap == pytest.approx(0.636, abs=0.002)
+    figures = measure(split, sequence, paper, every=2)
+    assert figures.oracle_mean_overlap == pytest.approx(oracle, abs=0.002)
     assert figures.mean_overlap >= mean_overlap
     assert figures.top1_overlap_50 >= top1
-    assert figures.top1_overlap_30 >= 0.99
+    assert figures.top1_overlap_30 >= 0.98
     assert figures.recall_at_10_of_float >= 0.99
 
 
@@ -90,18 +99,20 @@ def test_another_rooms_frame_is_farther(signer: Signer, room_frames: tuple[Frame
     assert np.median(across) / signer.model.unrelated_distance == pytest.approx(1.0, abs=0.25)
 
 
-def test_a_roll_of_the_camera_changes_little(signer: Signer) -> None:
+def test_a_roll_of_the_camera_changes_little(signer: Signer, views: list[RolledView]) -> None:
     """The same content at every angle: what is left is the segmentation's own noise.
 
     A third of d0 is what we want; one of the 84 measurements misses it, as docs/performance.md
     says, and a rectangular sensor, whose content changes, is not held to it.
     """
-    shares = np.array([shares_of_d0(view(i), signer, round_lens=True) for i in range(12)])
+    shares = np.array([shares_of_d0(one, signer, round_lens=True) for one in views])
     assert np.median(shares) <= 0.2
     assert (shares <= 1 / 3).mean() >= 0.98
     assert shares.max() <= 0.35
 
 
-def test_a_rectangular_sensor_turned_upside_down_sees_the_same(signer: Signer) -> None:
-    shares = [shares_of_d0(view(i), signer, False, angles=(180,))[0] for i in range(4)]
+def test_a_rectangular_sensor_turned_upside_down_sees_the_same(
+    signer: Signer, views: list[RolledView]
+) -> None:
+    shares = [shares_of_d0(one, signer, False, angles=(180,))[0] for one in views[:4]]
     assert max(shares) <= 1 / 3

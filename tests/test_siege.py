@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.pages import put_between
-from benchmarks.siege.__main__ import BEGIN, END, besieged, known_of, table
+from benchmarks.siege.__main__ import ASKED_OF, BEGIN, END, besieged, known_of, table
 from benchmarks.siege.contract import ContractFigures, try_contract
 from benchmarks.siege.mutations import MutationFigures, besiege, mutated
 from benchmarks.siege.overload import OverloadFigures, overload
@@ -61,7 +61,7 @@ def test_the_page_tells_what_was_measured(tmp_path: Path) -> None:
     overloaded = OverloadFigures(
         50.0, 500.0, 4.0, {200: 3, 503: 9}, 1, (10.0, 20.0), (1.0, 2.0), 5, 1, 0.5
     )
-    lines = table(mutations, [contract] * 4, overloaded)
+    lines = table(mutations, [contract] * len(ASKED_OF), overloaded)
     page = tmp_path / "page.md"
     page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
     put_between(page, BEGIN, END, lines)

@@ -96,11 +96,14 @@ def test_frames_go_into_a_map(outputs: dict[str, list[str]]) -> None:
 
 
 def test_there_are_other_ways_in(outputs: dict[str, list[str]]) -> None:
-    raw, put, once, batch, archive = outputs["More ways in"]
+    raw, put, cloud, once, batch, archive = outputs["More ways in"]
     assert documents(raw)[1]["state"] == "received"
     added, frame = documents(put)
     assert added["frame_id"] == frame["frame_id"] == "r3-000007"
     assert frame["T_base_sensor"]["translation"] == {"x": 0.1, "y": 0.0, "z": 0.4}
+    [answer] = documents(cloud)
+    assert (answer["kind"], answer["status"]) == ("cloud", "found")
+    assert answer["matches"][0]["transform"]["child_frame"] == "query.sensor"
     assert [a["frame_id"] for a in documents(once)] == [documents(once)[0]["frame_id"]] * 2
     assert once.lower().count("idempotent-replayed: true") == 1
     assert [i["status"] for i in documents(batch)[0]["items"]] == [202, 202, 422]

@@ -74,7 +74,7 @@ def _signed(shots: list[Shot]) -> Bytes:
     from sceneprint.engine.frames import read_upload
 
     signer = open_signer(MODEL)
-    return np.stack([sign(read_upload(one.png, one.meta), signer).vector for one in shots])
+    return np.stack([sign(read_upload(one.png, one.meta).frame, signer).vector for one in shots])
 
 
 def faults(

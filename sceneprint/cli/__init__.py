@@ -23,6 +23,7 @@ def parser() -> argparse.ArgumentParser:
         demo,
         doctor,
         evaluate,
+        evaluate_pairs,
         events,
         frames,
         fsck,
@@ -79,6 +80,7 @@ def parser() -> argparse.ArgumentParser:
         sign,
         picture,
         evaluate,
+        evaluate_pairs,
         synth,
         train,
     ):

@@ -81,10 +81,10 @@ def _kernels() -> Finding:
 
 
 def _tables(cache_dir: Path) -> Iterator[Finding]:
-    from sceneprint.models import read_model
+    from sceneprint.models import PRESETS, read_model
     from sceneprint.models.tables import CACHE_VERSION
 
-    for preset in ("paper", "compact"):
+    for preset in PRESETS:
         subject, model = f"table {preset}", read_model(preset)
         path = cache_dir / f"table-v{CACHE_VERSION}-{model.id}.bin"
         if path.is_file():

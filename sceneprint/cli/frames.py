@@ -67,7 +67,7 @@ def _add_files(group: Any) -> None:
     group.add_argument("--cloud", type=Path, metavar="FILE", help="write its surface as PLY")
     group.add_argument(
         "--within", choices=CLOUD_FRAMES, default="optical",
-        help="coordinates of the cloud: of the camera, the parent frame of its pose, or the "
+        help="coordinates of the cloud: of the sensor, the parent frame of its pose, or the "
         "robot's base (default: optical)",
     )  # fmt: skip
     group.add_argument("--preview", type=Path, metavar="FILE", help="write a picture as PNG")

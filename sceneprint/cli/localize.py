@@ -19,11 +19,13 @@ def add_to(commands: Any) -> None:
     command = commands.add_parser(
         "localize",
         help="ask a service where a frame was taken, for its pose",
-        description="Find where in a map a depth frame was taken. The frame is not added to the "
-        "map. Exit code 0: found; 1: ambiguous or not found.",
+        description="Find where in a map a depth frame or a cloud was taken. The frame is not "
+        "added to the map. Exit code 0: found; 1: ambiguous or not found.",
     )
     command.add_argument("map", metavar="MAP")
-    command.add_argument("path", type=Path, metavar="FRAME", help="a depth image, or a folder")
+    command.add_argument(
+        "path", type=Path, metavar="FRAME", help="a depth image, a cloud or a folder"
+    )
     command.add_argument(
         "--frame", metavar="N|FILE", help="of a folder: its place from 0, or name (default: 0)"
     )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from sceneprint.cli.connection import add_service_options, one_line, open_client
 from sceneprint.errors import InvalidRequest
+from sceneprint.models import PRESETS
 
 if TYPE_CHECKING:
     from sceneprint.client import Client
@@ -25,7 +26,7 @@ def add_to(commands: Any) -> None:
     choice.add_argument("--delete", metavar="NAME", help="remove a map with all its frames")
     command.add_argument("--title", help="of the map to make, for people")
     command.add_argument(
-        "--model", choices=("paper", "compact"), help="of the map to make (default: paper)"
+        "--model", choices=PRESETS, help=f"of the map to make (default: {PRESETS[0]})"
     )
     command.add_argument("--yes", action="store_true", help="do delete")
     command.add_argument("--json", action="store_true", help="print JSON")
@@ -41,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
         if options.delete is not None:
             _delete(client, options.delete, sure=options.yes)
         elif options.create is not None:
-            made = client.create_map(options.create, options.title, options.model or "paper")
+            made = client.create_map(options.create, options.title, options.model or PRESETS[0])
             print(made.model_dump_json() if options.json else f"map {made.name}, {made.model}")
         else:
             _list(client.maps(), as_json=options.json)

@@ -24,9 +24,9 @@ def add_to(commands: Any) -> None:
     command = commands.add_parser(
         "query",
         help="ask a service where frames were taken",
-        description="Look depth frames up in a map: one file, or the frames of a folder (7-Scenes, "
-        "TUM RGB-D or plain depth images, with an intrinsics.json beside them or above). They "
-        "are not kept.",
+        description="Look depth frames or point clouds up in a map: one file, or the frames of a "
+        "folder (7-Scenes, TUM RGB-D or plain depth images, with an intrinsics.json beside them or "
+        "above; or clouds). They are not kept.",
     )
     command.add_argument("map", metavar="MAP")
     command.add_argument("path", type=Path, metavar="PATH")

@@ -25,9 +25,9 @@ def add_to(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "sign",
-        help="sign depth frames",
+        help="sign depth frames and point clouds",
         description="Sign every frame of the given files and folders (7-Scenes, TUM RGB-D or "
-        "plain depth images, with an intrinsics.json beside them or above).",
+        "plain depth images, with an intrinsics.json beside them or above; or point clouds).",
     )
     command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
     add_model_options(command)

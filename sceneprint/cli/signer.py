@@ -24,9 +24,9 @@ def add_model_options(command: argparse.ArgumentParser) -> None:
     choice = command.add_mutually_exclusive_group()
     choice.add_argument(
         "--preset",
-        choices=("paper", "compact"),
-        default="paper",
-        help="model that ships with sceneprint (default: paper)",
+        choices=PRESETS,
+        default=PRESETS[0],
+        help=f"model that ships with sceneprint (default: {PRESETS[0]})",
     )
     choice.add_argument("--model", type=Path, metavar="FILE", help="a model of your own")
 
@@ -60,7 +60,7 @@ def prepare_presets(settings: Settings, say: Callable[[str], None] | None = None
     from sceneprint.engine.warming import warm
 
     if _announce(say):
-        warm(_opened("paper", settings))
+        warm(_opened(PRESETS[0], settings), clouds=True)
     for preset in PRESETS:
         _opened(preset, settings)
 

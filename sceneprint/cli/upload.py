@@ -28,6 +28,7 @@ from sceneprint.errors import (
     Refused,
     UnknownMap,
 )
+from sceneprint.models import PRESETS
 from sceneprint.schemas.novelty import NOVEL
 
 if TYPE_CHECKING:
@@ -42,11 +43,11 @@ def add_to(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "upload",
-        help="upload depth frames to a map of a service",
+        help="upload depth frames and point clouds to a map of a service",
         description="Upload every frame of the given files and folders (7-Scenes, TUM RGB-D or "
-        "plain depth images, with an intrinsics.json beside them or above), and wait until they "
-        "are signed. A zip or tar of them is sent whole, and unpacked by the service. A frame that "
-        "is in the map already is not stored twice.",
+        "plain depth images, with an intrinsics.json beside them or above; or point clouds), and "
+        "wait until they are signed. A zip or tar of them is sent whole, and unpacked by the "
+        "service. A frame that is in the map already is not stored twice.",
     )
     command.add_argument("map", metavar="MAP", help="made where missing")
     command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
@@ -70,7 +71,7 @@ def add_to(commands: Any) -> None:
         "--base",
         type=base_of,
         metavar="TX,TY,TZ,QX,QY,QZ,QW",
-        help="where the camera sits on the robot: metres and a unit quaternion, camera to base",
+        help="where the sensor sits on the robot: metres and a unit quaternion, sensor to base",
     )
     command.add_argument(
         "--base-frame", metavar="NAME", help="what the robot calls its base (default: base_link)"
@@ -82,7 +83,7 @@ def add_to(commands: Any) -> None:
         help="make the map where it is missing (default)",
     )
     command.add_argument(
-        "--model", choices=("paper", "compact"), help="of a map that is made (default: paper)"
+        "--model", choices=PRESETS, help=f"of a map that is made (default: {PRESETS[0]})"
     )
     command.add_argument(
         "--every", type=positive, default=1, metavar="N", help="take every Nth frame"
@@ -175,7 +176,7 @@ def _see_to_map(client: Client, options: argparse.Namespace) -> None:
     except UnknownMap:
         if not options.create:
             raise
-        made = client.create_map(options.map, model=options.model or "paper")
+        made = client.create_map(options.map, model=options.model or PRESETS[0])
         print(f"map {made.name} is made, with model {made.model}")
         return
     if options.model is not None and model.rpartition("-")[0] != options.model:

@@ -87,6 +87,8 @@ class RemoteAsking(Sender):
 
     def compare(self, a: Side, b: Side, how: Comparison) -> Similarity:
         """How alike two frames are."""
+        from sceneprint.client.messages import said_of
+
         body = how.model_dump(mode="json", exclude_defaults=True, by_alias=True)
         files = {}
         for name, side in (("a", a), ("b", b)):
@@ -94,7 +96,7 @@ class RemoteAsking(Sender):
                 body[f"frame_{name}"] = side.model_dump()
             else:
                 files[name] = (name, side[0], "application/octet-stream")
-                body[f"meta_{name}"] = side[1].model_dump(mode="json", exclude_none=True)
+                body[f"meta_{name}"] = said_of(side[1])
         if not files:
             return self._ask(Similarity, "POST", "/v1/similarity", json=body)
         fields = {name: text_of(value) for name, value in body.items()}

@@ -114,7 +114,7 @@ class Browsing:
         received_after, received_before : uploaded then or later, then or earlier
         parent_frame : its pose leads there
         has_pose : whether it has one
-        content_id : of its samples and camera
+        content_id : of its samples and camera, or points and viewpoint
         order : "desc" for the newest first
 
         Raises

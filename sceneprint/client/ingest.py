@@ -85,9 +85,9 @@ class RemoteIngest(Sender):
         if_novel: float | None,
     ) -> Batch:  # fmt: skip
         """Take frames into a map in one commit."""
-        from sceneprint.client.messages import map_path
+        from sceneprint.client.messages import map_path, said_of
 
-        metas = [meta.model_dump(mode="json", exclude_none=True) for _, meta in frames]
+        metas = [said_of(meta) for _, meta in frames]
         files = [("frame", ("frame", data, "application/octet-stream")) for data, _ in frames]
         data = {"metas": json.dumps(metas), **_said(priority, if_novel)}
         path = f"{map_path(map_name)}/frames/batch"

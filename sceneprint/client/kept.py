@@ -124,7 +124,7 @@ class Kept:
         return self._backend.answer(query_id)
 
     def query_cloud(self, query_id: str) -> bytes:
-        """The surface that a query saw, points and normals as PLY, in its optical frame.
+        """The surface that a query saw, points and normals as PLY, in its sensor's frame.
 
         Raises
         ------
@@ -175,7 +175,7 @@ class Kept:
         self, query_id: str, frame_id: str, map_name: str | None = None,
         color: OverlayColour = "source", transform: OverlayTransform = "aligned",
     ) -> bytes:  # fmt: skip
-        """A query's points and a match's in the match's optical frame, coloured, as PLY.
+        """A query's points and a match's in the match's sensor's frame, coloured, as PLY.
 
         Parameters
         ----------

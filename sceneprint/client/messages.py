@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 from typing import Any, TypeVar
@@ -48,8 +49,13 @@ def form(data: bytes, meta: FrameMeta) -> dict[str, Any]:
     """Arguments of a request that sends a frame."""
     return {
         "files": {"frame": ("frame", data, "application/octet-stream")},
-        "data": {"meta": meta.model_dump_json(exclude_none=True)},
+        "data": {"meta": json.dumps(said_of(meta))},
     }
+
+
+def said_of(meta: FrameMeta) -> dict[str, Any]:
+    """What is known of a frame as it is sent: a viewpoint of null says that there is none."""
+    return meta.model_dump(mode="json", exclude_defaults=True)
 
 
 def map_path(name: str) -> str:

@@ -109,7 +109,7 @@ class Outputs(Browsing, Edits):
         Parameters
         ----------
         map_name, frame_id : of an indexed frame
-        within : its coordinates: "optical" of the camera, "parent" of its pose, "base" of the
+        within : its coordinates: "optical" of the sensor, "parent" of its pose, "base" of the
             robot
 
         Raises

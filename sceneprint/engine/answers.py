@@ -18,7 +18,7 @@ from sceneprint.engine.searching import Place, Searched, search_maps
 from sceneprint.engine.telling import Found, tell_location, tell_matches
 from sceneprint.engine.validating import Validated, validated, wanted_of
 from sceneprint.engine.why import Asking, why
-from sceneprint.engine.wire import query_camera
+from sceneprint.engine.wire import query_sensor
 from sceneprint.geometry.diversity import DiversityParameters, diversify
 from sceneprint.geometry.retrieval import pairwise_distances
 from sceneprint.matches import Match
@@ -73,17 +73,16 @@ def answer(
         selection = diversify(ranking.distances, among, wanted, scales)
     clock.stage("diversify")
     chosen = range(min(wanted, len(ranking))) if selection is None else selection.indices.tolist()
-    tried = validated(store, searched, chosen, asked.geometry, query, deadline)
+    p = model.parameters.validation
+    tried = validated(store, searched, chosen, asked.geometry, query, deadline, p)
     clock.stage("validate")
     shown = range(len(ranking)) if query.explain else chosen
     with store.database.read() as connection:
         rows = frames_of(connection, ranking.indices[list(shown)].tolist())
     matches = [one for one in tried.matches if one.index in rows]  # the rest was deleted meanwhile
     names = {place.row.number: place.row.name for place in places}
-    optical = query_camera(_name(asked), list(names.values()))
-    found = Found(
-        names, ranking, selection, rows, tried.unreadable, tried.untried, optical, asked.base
-    )
+    own = query_sensor(_name(asked), asked.kind, list(names.values()))
+    found = Found(names, ranking, selection, rows, tried.unreadable, tried.untried, own, asked.base)
     explanations = explained = None
     if query.explain:
         explanations = explain(found, tried, among, scales)
@@ -111,6 +110,7 @@ def answer(
         milliseconds=clock.spent,
         maps=[place.row.name for place in places],
         frame=_name(asked),
+        kind=asked.kind,
         per_map=per_map if len(places) > 1 else None,
         deadline_reached=tried.late,
         explanations=explanations,

@@ -13,7 +13,6 @@ import numpy as np
 from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.engine.frames import read_upload
 from sceneprint.engine.healing import sign_again
-from sceneprint.engine.transforms import pose_matrix
 from sceneprint.errors import (
     DamagedBlob,
     DamagedSignature,
@@ -23,6 +22,7 @@ from sceneprint.errors import (
 )
 from sceneprint.pipeline import Signer, prepare, sign
 from sceneprint.schemas import FrameMeta, Query
+from sceneprint.schemas.frames import Kind
 from sceneprint.store import Store
 from sceneprint.store.filters import Taken
 from sceneprint.store.frames import find_frame, refers_to
@@ -47,6 +47,7 @@ class Asked:
     home : the map that frame is in
     base : what the robot's base is called, and T_base_query (4, 4); None where it is not known
     artifact : `geometry` as bytes
+    kind : of the frame
     """
 
     model_id: str
@@ -58,6 +59,7 @@ class Asked:
     home: MapRow | None = None
     base: tuple[str, Floats] | None = None
     artifact: bytes | None = None
+    kind: Kind = "depth"
 
 
 def ask_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -> Asked:
@@ -67,24 +69,25 @@ def ask_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -> As
     ------
     FrameError : see `read_upload`; UselessFrame where nothing in it can be signed; InvalidPose
         where T_base_sensor is none.
-    InvalidRequest : the filter asks for distance from its session, and `meta` lacks it or a time.
+    InvalidRequest : the filter asks for distance from its session, and `meta` lacks it or a time;
+        or see `read_upload`.
     """
     start = time.perf_counter()
     at = None if meta.captured_at is None else meta.captured_at.timestamp()
     taken = _checked(Taken(meta.robot, meta.session, at), query)
-    given, base = meta.T_base_sensor, None
-    if given is not None:
-        base = given.base_frame, pose_matrix(given, "T_base_sensor")
-    frame = read_upload(data, meta)
+    read = read_upload(data, meta)
+    kind, base = read.kind, read.base
     if "validate" not in query.stages:
-        vector = sign(frame, signer).vector
-        return Asked(signer.model.id, vector, None, taken, None, _since(start), base=base)
-    signature, seen = prepare(frame, signer)
+        vector = sign(read.frame, signer).vector
+        return Asked(
+            signer.model.id, vector, None, taken, None, _since(start), base=base, kind=kind
+        )
+    signature, seen = prepare(read.frame, signer)
     # as it would be read back: the same answer as when the frame is in the map
     artifact = write_geometry(seen)
     return Asked(
         signature.model_id, signature.vector, read_geometry(artifact), taken, None, _since(start),
-        base=base, artifact=artifact,
+        base=base, artifact=artifact, kind=kind,
     )  # fmt: skip
 
 
@@ -133,7 +136,9 @@ def ask_stored(store: Store, map_name: str, frame_id: str, query: Query) -> Aske
             raise
     own = (frame.number, frame.id)
     asked = np.frombuffer(vector, np.uint8)
-    return Asked(row.model_id, asked, geometry, taken, own, _since(start), row, base, artifact)
+    return Asked(
+        row.model_id, asked, geometry, taken, own, _since(start), row, base, artifact, frame.kind
+    )
 
 
 def _checked(taken: Taken, query: Query) -> Taken:

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.associating import runs_of
-from sceneprint.engine.cursors import row_of
+from sceneprint.engine.cursors import opened, row_of
 from sceneprint.engine.posegraphs import pose_graph, tell_graph
+from sceneprint.engine.sides import runs_of
 from sceneprint.engine.tasks import Tasks
 from sceneprint.engine.transforms import transform
 from sceneprint.engine.uploads import sweep_deleted
-from sceneprint.engine.wire import camera_frame, when
+from sceneprint.engine.wire import sensor_frame, when
 from sceneprint.errors import NotIndexed, UnknownJob
 from sceneprint.graphs import information_of
 from sceneprint.schemas import JobState, Page, Progress
@@ -75,12 +75,13 @@ class Associations:
         UnknownMap : no such map.
         InvalidRequest : a cursor that was not given out.
         """
-        before = row_of(cursor)
+        seals = self._store.seals
+        before = opened(seals, "job", cursor)
         with self._store.database.read() as connection:
             find_map(connection, map_name)
             found = list_jobs(connection, before, limit + 1, None, ASSOCIATE, [map_name])
         items = [_told(one.job, map_name) for one in found[:limit]]
-        more = str(found[limit - 1].job.number) if len(found) > limit else None
+        more = seals.seal("job", found[limit - 1].job.number) if len(found) > limit else None
         return Page[Association](items=items, next_cursor=more)
 
     def get(self, map_name: str, job_id: str) -> Association:
@@ -143,20 +144,14 @@ class Associations:
         self, map_name: str, job_id: str, kind: GraphFormat = "g2o", min_overlap: float = 0.0,
         *, odometry: bool = False, consistent: bool = False,
     ) -> str:  # fmt: skip
-        """The pose graph of an association that is over, as a file.
+        """The pose graph of an association that is over, as a file of a kind.
 
-        Parameters
-        ----------
-        map_name, job_id : of the association
-        kind : g2o, tum or json
-        min_overlap : least overlap of an edge
-        odometry : add an edge between each two consecutive frames, from their poses
-        consistent : only edges that loops confirm; else all that were not outvoted
+        It has the edges of at least `min_overlap` that were not outvoted, or those alone that
+        loops confirm (`consistent`); and with `odometry` one between each two consecutive frames.
 
         Raises
         ------
-        UnknownMap, UnknownJob : there is none.
-        NotIndexed : it is not over, or did not succeed.
+        UnknownMap, UnknownJob, NotIndexed : there is none, or it did not succeed.
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
@@ -245,6 +240,8 @@ def _edge(item: dict[str, Any], stops: dict[int, Stop]) -> Edge:
         number=item["number"], from_frame=here.id, to_frame=there.id,
         from_session=here.session, to_session=there.session,
         from_robot=here.robot, to_robot=there.robot,
-        transform=transform(T, camera_frame(there.id), camera_frame(here.id)),
+        transform=transform(
+            T, sensor_frame(there.id, there.kind), sensor_frame(here.id, here.kind)
+        ),
         information=information, **{name: item[name] for name in same},
     )  # fmt: skip

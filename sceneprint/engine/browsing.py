@@ -12,7 +12,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from sceneprint.datasets import trajectory_row, trajectory_text
-from sceneprint.engine.cursors import row_of
+from sceneprint.engine.cursors import opened
 from sceneprint.engine.wire import tell_frames, when
 from sceneprint.errors import InvalidRequest
 from sceneprint.schemas import Frame, Page
@@ -37,13 +37,13 @@ def list_frames(
     UnknownMap : no such map.
     InvalidRequest : a cursor that was not given out.
     """
-    beyond = row_of(cursor)
+    beyond = opened(store.seals, "frame", cursor)
     with store.database.read() as connection:
         row = find_map(connection, map_name)
         found = browsing.list_frames(connection, row.number, beyond, limit + 1, wanted)
         items = tell_frames(connection, row, found[:limit])
-    more = len(found) > limit
-    return Page[Frame](items=items, next_cursor=str(found[limit - 1].number) if more else None)
+    more = store.seals.seal("frame", found[limit - 1].number) if len(found) > limit else None
+    return Page[Frame](items=items, next_cursor=more)
 
 
 def list_sessions(store: Store, map_name: str, cursor: str | None, limit: int) -> Page[Session]:
@@ -104,7 +104,7 @@ def trajectory_file(told: Trajectory) -> str:
     robot = "" if told.robot is None else f", robot {told.robot}"
     comments = [
         f"map {told.map}, session {told.session}{robot}",
-        f"poses of the cameras' optical frames in {told.parent_frame or 'no frame'}, metres",
+        f"poses of the sensors' frames in {told.parent_frame or 'no frame'}, metres",
         f"poses: {len(told.poses)}; frames left out: {told.left_out}",
         "t tx ty tz qx qy qz qw",
     ]

@@ -14,7 +14,7 @@ from sceneprint.engine.switches import check_model, steadily
 from sceneprint.engine.telling import tell_uncertainty, tell_validation
 from sceneprint.engine.transforms import transform
 from sceneprint.engine.validating import thresholds
-from sceneprint.engine.wire import camera_frame, model_label
+from sceneprint.engine.wire import model_label, sensor_frame
 from sceneprint.errors import InvalidRequest
 from sceneprint.geometry.covariance import PAIR_METHOD
 from sceneprint.geometry.retrieval import distances, similarity
@@ -68,7 +68,8 @@ def _compared(a: Asked, b: Asked, signer: Signer, how: Comparison) -> Similarity
     distance = distances(a.vector, b.vector[None])
     made, T = None, None
     if a.geometry is not None and b.geometry is not None:
-        found = validate(b.geometry, a.geometry, how.seed, *thresholds(how.validation))
+        p = signer.model.parameters.validation
+        found = validate(b.geometry, a.geometry, how.seed, *thresholds(how.validation, p))
         made, T = found, found.T_match_query
     spent = {
         "prepare": round(a.prepare_ms + b.prepare_ms, 2),
@@ -117,9 +118,8 @@ def _name(asked: Asked) -> FrameName | None:
 
 
 def _cameras(a: Asked, b: Asked) -> tuple[str, str]:
-    """What both camera frames are called; of one id in two maps, a and b."""
-    names = [camera_frame(x if one.frame is None else one.frame[1])
-             for x, one in (("a", a), ("b", b))]  # fmt: skip
-    if names[0] == names[1]:
-        return camera_frame("a"), camera_frame("b")
-    return names[0], names[1]
+    """What the coordinates of both sensors are called; of one id in two maps, a and b."""
+    ids = [x if one.frame is None else one.frame[1] for x, one in (("a", a), ("b", b))]
+    if ids[0] == ids[1]:
+        ids = ["a", "b"]
+    return sensor_frame(ids[0], a.kind), sensor_frame(ids[1], b.kind)

@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.engine.transforms import transform
-from sceneprint.geometry.cycles import Edges, Run, Verdicts, run_of, verdicts
-from sceneprint.geometry.joining import join, votes_of
+from sceneprint.geometry.cycles import Edges, Verdicts, verdicts
+from sceneprint.geometry.joining import join
+from sceneprint.geometry.runs import Run, run_of
+from sceneprint.geometry.votes import votes_of
 from sceneprint.schemas.associations import Join, NewAssociation
 from sceneprint.store.associations import Stop
 from sceneprint.types import Floats

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from sceneprint.engine.frames import columns
+from sceneprint.engine.frames import base_of, columns, viewpoint_of
 from sceneprint.engine.tags import frame_tag, map_tag
 from sceneprint.engine.transforms import pose_matrix, transform
 from sceneprint.engine.wire import tell_frames, tell_map, when
@@ -23,8 +23,6 @@ from sceneprint.store.editing import write_frame, write_title
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.records import FrameRow
-from sceneprint.types import Frame as Samples
-from sceneprint.types import Intrinsics
 
 #: Columns of each field that can be edited.
 _COLUMNS = {
@@ -35,7 +33,9 @@ _COLUMNS = {
     "pose": ("pose_parent", "pose"),
     "T_base_sensor": ("base_frame", "base"),
 }
-_CONTENT = ("intrinsics", "depth_scale", "depth_along_ray")
+_CONTENT = (
+    "intrinsics", "depth_scale", "depth_along_ray", "viewpoint", "units_per_metre", "format",
+)  # fmt: skip
 #: Ways to give a transform.
 _WAYS = ("translation", "rotation", "matrix")
 
@@ -96,8 +96,7 @@ def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
     """
     meta = _merged(frame, patch)
     pose = None if meta.pose is None else pose_matrix(meta.pose)
-    known = columns(meta, Samples(np.empty((0, 0), np.float32), Intrinsics(1, 1, 1, 1, 0, 0),
-                                  pose=pose))  # fmt: skip
+    known = columns(meta, pose, base_of(meta.T_base_sensor, viewpoint_of(frame)))
     found = {name: known[name] for field in patch for name in _COLUMNS[field]}
     for field, column in (("pose", "pose"), ("T_base_sensor", "base")):
         given = patch.get(field)

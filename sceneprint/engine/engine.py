@@ -12,7 +12,7 @@ from sceneprint.engine.administration import Administration
 from sceneprint.engine.browsing import list_frames
 from sceneprint.engine.endings import Work, put_back
 from sceneprint.engine.readers import View
-from sceneprint.engine.tasks import Task
+from sceneprint.engine.slices import Task
 from sceneprint.engine.uploads import Upload, sweep_deleted
 from sceneprint.engine.wire import tell_frames
 from sceneprint.errors import BusyIndex
@@ -29,8 +29,8 @@ from sceneprint.schemas import (
     Query,
 )
 from sceneprint.schemas.browsing import FrameListing
+from sceneprint.store import cancelling, listing, queue
 from sceneprint.store import frames as stored_frames
-from sceneprint.store import listing, queue
 from sceneprint.store import maps as stored_maps
 from sceneprint.store.records import MapRow
 
@@ -107,7 +107,7 @@ class Engine(Administration):
         with self.store.database.write() as connection:
             row = stored_maps.find_map(connection, map_name)
             frame = stored_frames.find_frame(connection, row, frame_id)
-            queue.cancel_of(connection, frame.number)
+            cancelling.cancel_of(connection, frame.number)
             blobs = stored_frames.delete_frame(connection, row, frame)
         sweep_deleted(self.store, blobs)
 

@@ -44,9 +44,13 @@ def figures(v: Validation) -> str:
     return (
         f"{v.status}: {v.reason} (the directions disagree by {v.residual.translation_m:.3g} m, "
         f"{v.residual.rotation_deg:.3g} deg; overlap {v.overlap:.3g}, by planes "
-        f"{v.plane_overlap:.3g}; violations {v.free_space_violations:.3g}; ambiguity "
+        f"{v.plane_overlap:.3g}; violations {_or_unknown(v.free_space_violations)}; ambiguity "
         f"{v.ambiguity:.3g})"
     )
+
+
+def _or_unknown(share: float | None) -> str:
+    return "unknown" if share is None else f"{share:.3g}"
 
 
 def _each(

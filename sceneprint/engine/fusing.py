@@ -38,7 +38,7 @@ from sceneprint.store import Store
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import geometry_blobs
-from sceneprint.types import Floats, Frame, Geometry, Intrinsics
+from sceneprint.types import Cloud, Floats, Frame, Geometry, Intrinsics
 
 Source = Literal["upload", "geometry"]
 Strength = Literal["strong", "weak"]
@@ -104,7 +104,8 @@ def fused(
     open3d()  # before all the reading: where it is missing, that is what is to be told
     p = FusionParameters(voxel_m=wanted.voxel_m)
     frames, told, left_out = list[Frame](), list[FusedView](), list[LeftOut]()
-    if query is not None and wanted.include_query:
+    # points of a cloud have no image that voxels could be carved with: it is explained, not fused
+    if query is not None and wanted.include_query and isinstance(query.surface.camera, Intrinsics):
         frame, source = _own(store, query, own, model_id, asked_at)
         frames.append(within(frame, p))
         told.append(_told(None, frames[-1], source))
@@ -119,8 +120,8 @@ def fused(
     others = [frame for frame, one in zip(frames, told, strict=True) if one.frame_id is not None]
     if not others:
         raise UselessFrame(
-            f"None of the {len(views)} matches can be fused: {left_out[0].reason} Ask again, and "
-            "reconstruct from the new answer."
+            f"None of the {len(views)} matches can be fused: {left_out[0].reason} Reconstruct from "
+            "another answer."
         )
     mesh, voxel = fuse(frames, p)
     first = of_views(mesh, frames, BAND * voxel)
@@ -180,6 +181,8 @@ def _read(store: Store, view: View, model_id: str, asked_at: float) -> tuple[Fra
     T = np.array(view.transform)
     try:
         found = read_stored(store.blobs.get(frame.blob), frame)
+        if isinstance(found, Cloud):
+            raise _no_image(view.frame_id)
         return Frame(found.depth, found.intrinsics, view.frame_id, T), "upload"
     except DamagedBlob:
         if blob is None:
@@ -190,9 +193,17 @@ def _read(store: Store, view: View, model_id: str, asked_at: float) -> tuple[Fra
 def _frame(geometry: Geometry, name: str, T: Floats) -> Frame:
     """The depth that an artifact keeps, with a pose."""
     surface = geometry.surface
+    if not isinstance(surface.camera, Intrinsics):
+        raise _no_image(name)
     depth = np.where(surface.valid, surface.points[..., 2], np.float32(0))
-    assert isinstance(surface.camera, Intrinsics)
     return Frame(np.ascontiguousarray(depth, np.float32), surface.camera, name, T)
+
+
+def _no_image(name: str) -> UselessFrame:
+    return UselessFrame(
+        f"{name} is a point cloud, and reconstructions fuse depth images alone. Lay its points "
+        "over the others with overlay.ply."
+    )
 
 
 def _points(geometry: Geometry) -> Floats:

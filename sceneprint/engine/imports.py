@@ -26,15 +26,16 @@ from sceneprint.engine.cursors import row_of
 from sceneprint.engine.jobs import get_job
 from sceneprint.engine.replaying import Outcome as Taken
 from sceneprint.engine.replaying import item_of
-from sceneprint.engine.tasks import Outcome, Swept, Task, Tasks
+from sceneprint.engine.slices import Outcome, Swept, Task
+from sceneprint.engine.tasks import Tasks
 from sceneprint.engine.uploads import Upload, Uploads, sweep_deleted
 from sceneprint.errors import SceneprintError, StoreError, UnreadableArchive, UnusableStore
 from sceneprint.schemas import Job, Page
 from sceneprint.schemas.ingest import ImportItem, ImportOptions
 from sceneprint.store import Store, queue
-from sceneprint.store.blobs import IncomingBlob
 from sceneprint.store.faults import unusable
 from sceneprint.store.idempotency import Once
+from sceneprint.store.incoming import IncomingBlob
 from sceneprint.store.listing import find_job, unknown_job
 from sceneprint.store.maps import find_map
 from sceneprint.store.parts import JobFile, files_of, given_up, items_of, remove_parts

@@ -17,7 +17,7 @@ from sceneprint.engine.signers import Signers
 from sceneprint.engine.telling import tell_uncertainty, tell_validation
 from sceneprint.engine.transforms import transform
 from sceneprint.engine.validating import thresholds
-from sceneprint.engine.wire import camera_frame, query_camera
+from sceneprint.engine.wire import query_sensor, sensor_of
 from sceneprint.errors import (
     DamagedBlob,
     InvalidRequest,
@@ -29,7 +29,7 @@ from sceneprint.geometry.covariance import PAIR_METHOD
 from sceneprint.geometry.overlays import overlay
 from sceneprint.geometry.retrieval import pairwise_distances, similarity
 from sceneprint.geometry.traces import AGREES, VIOLATES, Traces, Verdicts, trace
-from sceneprint.geometry.validation import Validation
+from sceneprint.geometry.validation import Validation, ValidationParameters
 from sceneprint.pipeline import validate
 from sceneprint.schemas import Answer, FrameState
 from sceneprint.schemas import Match as ToldMatch
@@ -68,7 +68,7 @@ class Inspection:
         return self._kept.find(query_id).answer
 
     def cloud(self, query_id: str) -> bytes:
-        """The query's points and normals as PLY, in its optical frame.
+        """The query's points and normals as PLY, in the coordinates of its sensor.
 
         Raises
         ------
@@ -78,7 +78,7 @@ class Inspection:
         kept = self._kept.find(query_id)
         points, normals = points_of(_geometry(kept).surface)
         comments = [
-            f"frame {_optical(kept)}", f"points of query {query_id}, metres",
+            f"frame {_sensor(kept)}", f"points of query {query_id}, metres",
             f"model {kept.answer.model}",
         ]  # fmt: skip
         return write_ply(points, normals, comments=comments)
@@ -125,11 +125,12 @@ class Inspection:
         """
         kept = self._kept.find(query_id)
         match = _match_of(kept, frame_id, map_name)
-        query, other = _geometry(kept), self._geometry(kept, match)
-        v = _validated(kept, query, other)
-        names = camera_frame(match.frame_id), _optical(kept)
+        query, (name, other) = _geometry(kept), self._geometry(kept, match)
+        p = self._signers(kept.model_id).model.parameters.validation
+        v = _validated(kept, query, other, p)
+        names = name, _sensor(kept)
         T, rival = v.T_match_query, v.T_rival
-        traces = None if T is None else trace(query, other, T)
+        traces = None if T is None else trace(query, other, T, p.agreement, p.alignment.consensus)
         return MatchDetails(
             query_id=query_id,
             frame_id=match.frame_id,
@@ -148,7 +149,8 @@ class Inspection:
         self, query_id: str, frame_id: str, map_name: str | None = None,
         colour: OverlayColour = "source", by: OverlayTransform = "aligned",
     ) -> bytes:  # fmt: skip
-        """The query's points and a match's as PLY, in the match's optical frame; see `match`.
+        """The query's points and a match's as PLY, in the coordinates of the match's sensor; see
+        `match`.
 
         Parameters
         ----------
@@ -164,10 +166,11 @@ class Inspection:
         """
         kept = self._kept.find(query_id)
         match = _match_of(kept, frame_id, map_name)
-        query, other = _geometry(kept), self._geometry(kept, match)
+        query, (name, other) = _geometry(kept), self._geometry(kept, match)
         T = np.eye(4)
+        p = self._signers(kept.model_id).model.parameters.validation
         if by != "none":
-            v = _validated(kept, query, other)
+            v = _validated(kept, query, other, p)
             found = v.T_match_query if by == "aligned" else v.T_rival
             if found is None:
                 what = "no transform" if by == "aligned" else "no rival"
@@ -177,16 +180,18 @@ class Inspection:
                     (("transform", f"there is {what}"),),
                 )
             T = found
-        points, normals, colours = overlay(query.surface, other.surface, T, colour)
+        points, normals, colours = overlay(query.surface, other.surface, T, colour, p.agreement)
         comments = [
-            f"frame {camera_frame(match.frame_id)}",
+            f"frame {name}",
             f"query {query_id} and frame {match.frame_id} of map {match.map}, metres",
             f"transform {by}, colours by {colour}", f"model {kept.answer.model}",
         ]  # fmt: skip
         return write_ply(points, normals, colours, comments=comments)
 
-    def _geometry(self, kept: Kept, match: ToldMatch) -> Geometry:
-        """A match's artifact, if it is still the frame that was matched."""
+    def _geometry(self, kept: Kept, match: ToldMatch) -> tuple[str, Geometry]:
+        """What the coordinates of a match are called, and its artifact, if it is still the frame
+        that was matched.
+        """
         with self._store.database.read() as connection:
             row = find_map(connection, match.map)
             frame = find_frame(connection, row, match.frame_id)
@@ -199,7 +204,8 @@ class Inspection:
                 "model cannot be compared with one of another. Ask again."
             )
         try:
-            return read_geometry(self._store.blobs.get(blobs[frame.number]))
+            artifact = read_geometry(self._store.blobs.get(blobs[frame.number]))
+            return sensor_of(frame), artifact
         except (DamagedBlob, UnreadableGeometry):
             with self._store.database.read() as connection:
                 if not refers_to(connection, blobs[frame.number]):
@@ -209,8 +215,8 @@ class Inspection:
             raise
 
 
-def _optical(kept: Kept) -> str:
-    return query_camera(kept.answer.frame, kept.answer.maps)
+def _sensor(kept: Kept) -> str:
+    return query_sensor(kept.answer.frame, kept.answer.kind, kept.answer.maps)
 
 
 def _geometry(kept: Kept) -> Geometry:
@@ -238,9 +244,8 @@ def _match_of(kept: Kept, frame_id: str, map_name: str | None) -> ToldMatch:
     )
 
 
-def _validated(kept: Kept, query: Geometry, match: Geometry) -> Validation:
-    p, mode = thresholds(kept.query.validation)
-    return validate(query, match, kept.query.seed, p, mode)
+def _validated(kept: Kept, query: Geometry, match: Geometry, p: ValidationParameters) -> Validation:
+    return validate(query, match, kept.query.seed, *thresholds(kept.query.validation, p))
 
 
 def _coincidences(traces: Traces, query: Geometry, match: Geometry) -> Coincidences:

@@ -7,11 +7,11 @@ from collections.abc import Collection
 
 from sqlalchemy import Connection
 
-from sceneprint.engine.cursors import row_of
+from sceneprint.engine.cursors import opened
 from sceneprint.engine.wire import tell_job
 from sceneprint.errors import CannotRetry
 from sceneprint.schemas import FrameState, Job, JobState, Page
-from sceneprint.store import Store, listing, queue
+from sceneprint.store import Store, cancelling, listing, queue
 from sceneprint.store.deaths import fail_of_dead
 from sceneprint.store.events import tell
 from sceneprint.store.frames import frame_of, set_state
@@ -44,11 +44,11 @@ def list_jobs(
     ------
     InvalidRequest : a cursor that was not given out.
     """
-    before = row_of(cursor)
+    before = opened(store.seals, "job", cursor)
     with store.database.read() as connection:
         found = list_stored(connection, before, limit + 1, state, kind, map_names)
     items = [tell_job(one.job, one.frame_id, one.map_name) for one in found[:limit]]
-    more = str(found[limit - 1].job.number) if len(found) > limit else None
+    more = store.seals.seal("job", found[limit - 1].job.number) if len(found) > limit else None
     return Page[Job](items=items, next_cursor=more)
 
 
@@ -71,7 +71,7 @@ def cancel(store: Store, job_id: str) -> Job:
     with store.database.write() as connection:
         job = listing.find_job(connection, job_id)
         if job.state != JobState.CANCELLED:
-            queue.cancel(connection, job)
+            cancelling.cancel(connection, job)
             _fail_frame(connection, job, CANCELLED)
         return _told(connection, listing.find_job(connection, job_id))
 
@@ -171,7 +171,7 @@ def _retry_task(connection: Connection, job: JobRow) -> tuple[Job, bool]:
         return _told(connection, job), False
     if job.state == JobState.SUCCEEDED:
         raise CannotRetry(f"Job {job.id} is {job.state}: nothing was given up.")
-    queue.revive(connection, job)
+    cancelling.revive(connection, job)
     return _told(connection, listing.find_job(connection, job.id)), True
 
 

@@ -21,7 +21,11 @@ PLY, PNG, NPY, BYTES, JSON = (
     "application/ply", "image/png", "application/x-npy", "application/octet-stream",
     "application/json",
 )  # fmt: skip
-_MAGIC_PNG = b"\x89PNG"
+#: How uploads begin, their media types, and what their names end with.
+_UPLOADS = (
+    (b"\x89PNG", PNG, "png"), (b"\x93NUMPY", NPY, "npy"), (b"ply", PLY, "ply"),
+    (b"# .PCD", BYTES, "pcd"), (b"VERSION", BYTES, "pcd"), (b"LASF", BYTES, "las"),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +44,12 @@ class Output(Generic[T]):
     blob: str | None = None
 
 
-def upload_type(data: bytes) -> str:
-    """Media type of an upload."""
-    return PNG if data.startswith(_MAGIC_PNG) else NPY
+def upload_type(data: bytes) -> tuple[str, str]:
+    """Media type of an upload, and what its name ends with."""
+    for magic, media_type, suffix in _UPLOADS:
+        if data.startswith(magic):
+            return media_type, suffix
+    return BYTES, "bin"
 
 
 def level_of(patches: Patches) -> PatchLevel:

@@ -22,7 +22,7 @@ from sceneprint.engine.indexed import (
 from sceneprint.engine.made import BYTES, Output, level_of, npy_of
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.tags import tag_of
-from sceneprint.engine.wire import camera_frame
+from sceneprint.engine.wire import sensor_of
 from sceneprint.errors import (
     DamagedSignature,
     InvalidRequest,
@@ -37,7 +37,8 @@ from sceneprint.store import Store
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import Sizes, signature_sizes, stored_vector
-from sceneprint.types import Hierarchy
+from sceneprint.types import Hierarchy, Intrinsics, Ints32, Surface
+from sceneprint.vistas import onto, vista_of
 
 
 class Outputs:
@@ -68,7 +69,7 @@ class Outputs:
         InvalidRequest : its pose, or where the sensor sits on its base, is not known.
         """
         found = find_indexed(self._store, map_name, frame_id)
-        frame, optical = found.frame, camera_frame(found.frame.id)
+        frame, optical = found.frame, sensor_of(found.frame)
         name, matrix = {
             "optical": (optical, np.eye(4).tolist()),
             "parent": (frame.pose_parent, frame.pose),
@@ -107,11 +108,11 @@ class Outputs:
 
         def make() -> bytes:
             if view == "patches":
-                colours, text = patches_view(self._hierarchy(found).labels[0])
+                colours, text = patches_view(self._labels(found))
             else:
                 surface = geometry_of(self._store, found).surface
                 colours, text = (depth_view if view == "depth" else normals_view)(surface)
-            told = {"view": view, "frame": camera_frame(found.frame.id), "model": found.label}
+            told = {"view": view, "frame": sensor_of(found.frame), "model": found.label}
             return picture(colours, width, {**told, **text})
 
         return Output(found.tag("preview", found.frame.id, view, width), make)
@@ -124,9 +125,9 @@ class Outputs:
             return FramePatches(
                 frame_id=found.frame.id,
                 map=found.row.name,
-                frame=camera_frame(found.frame.id),
+                frame=sensor_of(found.frame),
                 model=found.label,
-                levels=[level_of(one) for one in self._hierarchy(found).levels],
+                levels=[level_of(one) for one in self._hierarchy(found)[1].levels],
                 validation=level_of(geometry_of(self._store, found).patches),
             )
 
@@ -186,11 +187,21 @@ class Outputs:
         blob = frame.blob
         return Output(tag_of("upload", blob), lambda: self._store.blobs.get(blob), blob)
 
-    def _hierarchy(self, found: IndexedFrame) -> Hierarchy:
+    def _hierarchy(self, found: IndexedFrame) -> tuple[Surface, Hierarchy]:
         """As it was signed: of the upload, as the artifact's points are rounded."""
         p = self._signers(found.row.model_id).model.parameters
         frame = read_stored(self._store.blobs.get(found.frame.blob), found.frame)
-        return hierarchy_of(see(frame, p), p, found.frame.id)
+        seen = see(frame, p)
+        return seen, hierarchy_of(seen, p, found.frame.id)
+
+    def _labels(self, found: IndexedFrame) -> Ints32:
+        """The finest patches as an image; those of a cloud are of points in no order."""
+        seen, hierarchy = self._hierarchy(found)
+        labels = hierarchy.labels[0]
+        if isinstance(seen.camera, Intrinsics):
+            return labels
+        drawn = geometry_of(self._store, found).surface
+        return onto(vista_of(drawn), drawn, seen.points.reshape(-1, 3), labels.ravel())
 
     def _signature(self, found: IndexedFrame) -> tuple[bytes, Sizes]:
         number, model_id = found.frame.number, found.row.model_id

@@ -16,7 +16,7 @@ import numpy as np
 
 from sceneprint.datasets import trajectory_row, trajectory_text
 from sceneprint.engine.transforms import transform
-from sceneprint.engine.wire import camera_frame, when
+from sceneprint.engine.wire import sensor_frame, when
 from sceneprint.geometry.rigid import inverse, rotation_angle
 from sceneprint.graphs import GraphEdge, g2o, information_of
 from sceneprint.schemas.associations import Graph, GraphFormat, Vertex
@@ -185,7 +185,7 @@ def _tum(graph: PoseGraph) -> str:
         if stop.captured_at is not None and pose is not None and frame == main:
             rows.append(trajectory_row(stop.captured_at, pose))
     comments = [
-        f"poses of the cameras' optical frames in {main or 'no frame'}, metres",
+        f"poses of the sensors' frames in {main or 'no frame'}, metres",
         f"{len(rows)} poses; {len(graph.stops) - len(rows)} frames without a time, or not joined "
         "to it, left out",
         "t tx ty tz qx qy qz qw",
@@ -198,7 +198,10 @@ def _json(graph: PoseGraph) -> Graph:
         Vertex(
             vertex=i, frame_id=stop.id, robot=stop.robot, session=stop.session,
             captured_at=when(stop.captured_at),
-            pose=None if pose is None else transform(pose, frame or "", camera_frame(stop.id)),
+            pose=(
+                None if pose is None
+                else transform(pose, frame or "", sensor_frame(stop.id, stop.kind))
+            ),
         )
         for i, (stop, pose, frame) in enumerate(
             zip(graph.stops, graph.poses, graph.frames, strict=True)

@@ -12,7 +12,10 @@ from sceneprint.store.frames import frames_of_content, living_frame
 from sceneprint.store.records import FrameRow, MapRow
 
 #: What to call a column when it differs.
-_FIELDS = {"pose_parent": "pose.parent_frame", "base": "T_base_sensor", "content_id": "content"}
+_FIELDS = {
+    "pose_parent": "pose.parent_frame", "base": "T_base_sensor", "content_id": "content",
+    "cloud": "units_per_metre",
+}  # fmt: skip
 
 
 def standing(
@@ -59,8 +62,18 @@ def standing(
 
 def _differing(frame: FrameRow, known: dict[str, Any]) -> list[str]:
     return [
-        _FIELDS.get(name, name) for name, value in known.items() if getattr(frame, name) != value
+        _FIELDS.get(name, name)
+        for name, value in known.items()
+        if _said(name, getattr(frame, name)) != _said(name, value)
     ]
+
+
+def _said(name: str, value: Any) -> Any:
+    """What of a column the caller has said: not how a cloud was packed, nor what was found in it.
+
+    Its viewpoint is part of its content.
+    """
+    return value["units_per_metre"] if name == "cloud" and value is not None else value
 
 
 def being_signed(state: FrameState) -> bool:

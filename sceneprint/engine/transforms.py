@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sceneprint.datasets import rigid_transform
-from sceneprint.datasets.files import naming
-from sceneprint.errors import InvalidPose
+from sceneprint.errors import InvalidPose, naming
 from sceneprint.geometry.quaternions import quaternion_of, rotation_of
 from sceneprint.schemas import Quaternion, Transform, Vector
 from sceneprint.schemas.frames import GivenTransform

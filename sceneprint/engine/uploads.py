@@ -47,7 +47,7 @@ class Upload:
 
     Parameters
     ----------
-    data : a PNG or NPY file
+    data : a depth image as PNG or NPY, or a point cloud: see `sceneprint.scans`
     meta : what is known of it
     priority : frames of a greater one are signed first; of one that is there it changes nothing
     if_novel : keep it only if the nearest frame of the map is farther, as a share of the distance
@@ -103,7 +103,7 @@ class Uploads:
         Raises
         ------
         UnknownMap : no such map.
-        InvalidRequest : a frame id that is none.
+        InvalidRequest : a frame id that is none; or see `read_upload`.
         FrameError : see `read_upload`.
         FrameConflict : the frame is there with other content or metadata.
         IdempotencyConflict : see `Once`.
@@ -161,10 +161,11 @@ class Uploads:
         if upload.frame_id is not None:
             check_frame_id(upload.frame_id)
         with self._decoding:
-            frame = read_upload(upload.data, upload.meta)
-            content = content_id(frame)
+            read = read_upload(upload.data, upload.meta)
+            content = content_id(read)
         blob = hashlib.sha256(upload.data).hexdigest()
-        return _Prepared(upload, blob, content, columns(upload.meta, frame))
+        known = {**columns(upload.meta, read.frame.pose, read.base), "cloud": read.cloud}
+        return _Prepared(upload, blob, content, known)
 
     def _settled(self, map_name: str, ready: _Prepared) -> Outcome | None:
         """What comes of an upload for which nothing has to be written; None: it has to be."""

@@ -12,15 +12,17 @@ from sceneprint.errors import FrameError
 from sceneprint.geometry.retrieval import distances, pairwise_distances
 from sceneprint.index import Tail, search
 from sceneprint.pipeline import Signer, prepare, validate
-from sceneprint.types import Frame, Intrinsics
+from sceneprint.types import Cloud, Frame, Intrinsics
 
 
-def warm(signer: Signer) -> bool:
+def warm(signer: Signer, *, clouds: bool = False) -> bool:
     """Sign, search and validate a corner of a room, so that kernels are compiled or loaded.
 
     Parameters
     ----------
     signer : whose table is touched
+    clouds : do it with clouds too, with and without a viewpoint: their kernels take longest to
+        compile, and little to load once they are compiled
 
     Returns
     -------
@@ -28,15 +30,19 @@ def warm(signer: Signer) -> bool:
         range sees nothing there
     """
     unfilter(np.frombuffer(bytes(5), np.uint8).reshape(1, 5))  # of a PNG
+    corner, p = _corner(), signer.model.parameters.validation
     with suppress(FrameError):
-        signature, seen = prepare(_corner(), signer)
+        signature, seen = prepare(corner, signer)
         rows = signature.vector[None].copy()
         search(signature.vector, None, Tail(np.zeros(1, np.int64), rows), 1)
         pairwise_distances(rows)
         rows.flags.writeable = False  # as a mapped segment is: another compilation
         distances(signature.vector.copy(), rows)
         geometry = read_geometry(write_geometry(seen))
-        return validate(geometry, geometry).status == "accepted"
+        for has_viewpoint in (True, False) if clouds else ():
+            _, points = prepare(_cloud(corner, has_viewpoint=has_viewpoint), signer)
+            validate(geometry, read_geometry(write_geometry(points)), p=p)
+        return validate(geometry, geometry, p=p).status == "accepted"
     return False
 
 
@@ -48,3 +54,12 @@ def _corner() -> Frame:
     wall, floor = 2.4 / np.maximum(1 + right, 0.1), 1.2 / np.maximum(down, 0.01)
     box = np.where((abs(right - 0.1) < 0.2) & (down > 0.1), 1.5, np.inf)
     return Frame(np.minimum.reduce([wall, floor, box]).astype(np.float32), camera)
+
+
+def _cloud(frame: Frame, *, has_viewpoint: bool) -> Cloud:
+    """What a depth image shows, as points."""
+    k = frame.intrinsics
+    v, u = np.nonzero(frame.depth)
+    z = frame.depth[v, u]
+    points = np.stack([(u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z], axis=1)
+    return Cloud(points.astype(np.float32), has_viewpoint)

@@ -17,7 +17,7 @@ from sceneprint.engine.searching import Part, Searched, is_shortlisted, rank_amo
 from sceneprint.engine.telling import Found, tell_validation
 from sceneprint.engine.transforms import transform
 from sceneprint.engine.validating import Validated, thresholds
-from sceneprint.engine.wire import camera_frame
+from sceneprint.engine.wire import sensor_of
 from sceneprint.errors import DamagedBlob, UnknownFrame, UnreadableGeometry
 from sceneprint.geometry.retrieval import distances, similarity
 from sceneprint.geometry.validation import Validation
@@ -99,7 +99,7 @@ def why(asking: Asking, frame_id: str) -> ExplainedFrame:
         validation=validation,
         transform=(
             None if T is None
-            else transform(T, camera_frame(row.id), asking.found.query_frame)
+            else transform(T, sensor_of(row), asking.found.query_frame)
         ),
         lost_at=lost,
         reason=reason,
@@ -199,5 +199,6 @@ def _aligned(
         except (DamagedBlob, UnreadableGeometry) as error:
             return ToldValidation(status="skipped", reason=str(error)), None
         query = asking.query
-        made = validate(geometry, own, query.seed, *thresholds(query.validation))
+        p = asking.model.parameters.validation
+        made = validate(geometry, own, query.seed, *thresholds(query.validation, p))
     return tell_validation(made), made.T_match_query

@@ -20,7 +20,9 @@ from sceneprint.schemas import (
     Map,
     Progress,
     Reencoding,
+    Vector,
 )
+from sceneprint.schemas.frames import Kind
 from sceneprint.store.listing import jobs_of
 from sceneprint.store.maps import count_frames, model_names
 from sceneprint.store.records import FrameRow, JobRow, MapRow
@@ -37,13 +39,21 @@ def model_label(name: str, model_id: str) -> str:
     return f"{name}-{model_id[:12]}"
 
 
-def camera_frame(frame_id: str) -> str:
-    """What the optical frame of a frame's camera is called in transforms."""
-    return f"{frame_id}.optical"
+def sensor_frame(frame_id: str, kind: Kind) -> str:
+    """What the coordinates of a frame's sensor are called in transforms.
+
+    The optical ones of a camera; a cloud keeps the axes that its sensor has.
+    """
+    return f"{frame_id}.optical" if kind == "depth" else f"{frame_id}.sensor"
 
 
-def query_camera(frame: FrameName | None, maps: Sequence[str]) -> str:
-    """What a query's optical frame is called.
+def sensor_of(frame: FrameRow) -> str:
+    """What the coordinates of a stored frame's sensor are called in transforms."""
+    return sensor_frame(frame.id, frame.kind)
+
+
+def query_sensor(frame: FrameName | None, kind: Kind, maps: Sequence[str]) -> str:
+    """What the coordinates of a query's sensor are called.
 
     By its id where it is a stored frame, asked of its own map alone: another map may have a frame
     of the same id, and a transform leads from one frame to another.
@@ -51,10 +61,11 @@ def query_camera(frame: FrameName | None, maps: Sequence[str]) -> str:
     Parameters
     ----------
     frame : that was asked for; None for an upload
+    kind : of it
     maps : that were asked
     """
     alone = frame is not None and list(maps) == [frame.map]
-    return camera_frame(frame.frame_id if frame is not None and alone else "query")
+    return sensor_frame(frame.frame_id if frame is not None and alone else "query", kind)
 
 
 def tell_map(connection: Connection, row: MapRow) -> Map:
@@ -109,10 +120,10 @@ def tell_job(job: JobRow, frame_id: str | None, map_name: str | None) -> Job:
 def _frame(row: MapRow, frame: FrameRow, job: JobRow) -> Frame:
     pose = None
     if frame.pose is not None and frame.pose_parent is not None:
-        pose = transform(np.array(frame.pose), frame.pose_parent, camera_frame(frame.id))
+        pose = transform(np.array(frame.pose), frame.pose_parent, sensor_of(frame))
     base = None
     if frame.base is not None and frame.base_frame is not None:
-        base = transform(np.array(frame.base), frame.base_frame, camera_frame(frame.id))
+        base = transform(np.array(frame.base), frame.base_frame, sensor_of(frame))
     return Frame(
         frame_id=frame.id,
         map=row.name,
@@ -121,9 +132,7 @@ def _frame(row: MapRow, frame: FrameRow, job: JobRow) -> Frame:
         job_id=job.id,
         content_id=frame.content_id,
         bytes=frame.bytes,
-        intrinsics=CameraIntrinsics(**frame.intrinsics),
-        depth_scale=frame.depth_scale,
-        depth_along_ray=frame.depth_along_ray,
+        **_seen(frame),
         robot=frame.robot,
         session=frame.session,
         captured_at=when(frame.captured_at),
@@ -135,3 +144,25 @@ def _frame(row: MapRow, frame: FrameRow, job: JobRow) -> Frame:
         tags=frame.tags,
         etag=frame_tag(frame),
     )
+
+
+def _seen(frame: FrameRow) -> dict[str, Any]:
+    """How the samples or the points of a frame are read."""
+    if frame.cloud is None:
+        return {
+            "kind": "depth",
+            "intrinsics": CameraIntrinsics.model_validate(frame.intrinsics),
+            "depth_scale": frame.depth_scale,
+            "depth_along_ray": frame.depth_along_ray,
+        }
+    at = frame.cloud["viewpoint"]
+    return {
+        "kind": "cloud",
+        "intrinsics": None,
+        "depth_scale": None,
+        "depth_along_ray": None,
+        "points": frame.cloud["points"],
+        "viewpoint": None if at is None else Vector(**dict(zip("xyz", at, strict=True))),
+        "units_per_metre": frame.cloud["units_per_metre"],
+        "note": frame.cloud["note"],
+    }

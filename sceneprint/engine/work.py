@@ -23,12 +23,12 @@ from sceneprint.engine.leases import renewed
 from sceneprint.engine.novelty import Stale, judge, look
 from sceneprint.engine.readers import Readers
 from sceneprint.engine.signers import Signers
-from sceneprint.engine.tasks import Task
+from sceneprint.engine.slices import Task
 from sceneprint.engine.uploads import sweep
 from sceneprint.errors import DamagedBlob, FrameError, LostLease, SceneprintError, UnusableStore
 from sceneprint.pipeline import prepare
 from sceneprint.schemas import FrameState, JobState
-from sceneprint.store import Store, queue
+from sceneprint.store import Store, deaths, queue
 from sceneprint.store.events import tell
 from sceneprint.store.frames import frame_of, set_state
 from sceneprint.store.maps import map_of
@@ -58,7 +58,7 @@ def claim(store: Store, worker: str, lease_s: float) -> Work | Task | None:
         if not queue.has_due(connection):
             return None
     with store.database.write() as connection:
-        for job in queue.bury(connection):
+        for job in deaths.bury(connection):
             if job.kind == REENCODE or job.frame_number is None:
                 continue
             frame = frame_of(connection, job.frame)

@@ -13,8 +13,8 @@ from sceneprint.maintenance.findings import Finding, Folder, each
 from sceneprint.maintenance.repairs import GONE, quarantine_blob, sign_while_indexed
 from sceneprint.schemas import FrameState, JobState
 from sceneprint.store.blobs import Condition
+from sceneprint.store.cancelling import cancel_of
 from sceneprint.store.events import tell
-from sceneprint.store.queue import cancel_of
 from sceneprint.store.reencoding import REENCODE
 from sceneprint.store.tables import frames, jobs, maps, signatures
 

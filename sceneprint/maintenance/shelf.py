@@ -18,7 +18,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from sceneprint.engine.tasks import Outcome, Task
+from sceneprint.engine.slices import Outcome, Task
 from sceneprint.errors import SnapshotError, UnknownSnapshot, UnusableStore
 from sceneprint.maintenance.snapshots import take_snapshot
 from sceneprint.schemas.snapshots import SnapshotFile

@@ -89,7 +89,7 @@ class Edge(Told):
     to_session: str | None
     from_robot: str | None
     to_robot: str | None
-    transform: Transform = Field(description="x_to = matrix @ x_from, between optical frames.")
+    transform: Transform = Field(description="x_to = matrix @ x_from, between the sensors' frames.")
     information: list[float] | None = Field(
         description="36 numbers, row by row in the order x y z rx ry rz, metres and radians: the "
         "inverse of the covariance of an error that comes after the transform, along the axes of "

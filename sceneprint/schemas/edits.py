@@ -32,7 +32,7 @@ class FrameEdit(Given):
         "`rotation` alone leave the other; each of them is replaced as a whole.",
     )
     T_base_sensor: GivenBase | None = Field(
-        default=None, description="Where the camera sits on the robot; parts of it as of `pose`."
+        default=None, description="Where the sensor sits on the robot; parts of it as of `pose`."
     )
 
 

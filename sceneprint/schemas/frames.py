@@ -9,10 +9,15 @@ from pydantic import AwareDatetime, Field, field_validator, model_validator
 
 from sceneprint.schemas.base import Given, Label, Told
 from sceneprint.schemas.states import FrameState
-from sceneprint.schemas.transforms import Transform
+from sceneprint.schemas.transforms import Transform, Vector
 
 #: A frame's priority is a whole number from minus this to this.
 MOST_PRIORITY = 10
+
+#: What a frame is: a depth image or a point cloud.
+Kind = Literal["depth", "cloud"]
+#: How files of clouds are packed; all but KITTI's say so themselves.
+CloudFormat = Literal["ply", "pcd", "kitti", "npy", "las"]
 
 Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
 
@@ -70,7 +75,7 @@ class GivenPose(GivenTransform):
 
 
 class GivenBase(GivenTransform):
-    """T_base_sensor: where the camera sits on the robot; x_base = T_base_sensor @ x_sensor."""
+    """T_base_sensor: where the sensor sits on the robot; x_base = T_base_sensor @ x_sensor."""
 
     base_frame: Label = Field(
         default="base_link", description="What the robot calls the frame of its base."
@@ -80,7 +85,9 @@ class GivenBase(GivenTransform):
 class FrameMeta(Given):
     """What is known of a frame beside its samples."""
 
-    intrinsics: CameraIntrinsics
+    intrinsics: CameraIntrinsics | None = Field(
+        default=None, description="Of a depth image, which needs them; a point cloud has none."
+    )
     depth_scale: float = Field(
         default=1000.0,
         gt=0,
@@ -88,6 +95,20 @@ class FrameMeta(Given):
     )
     depth_along_ray: bool = Field(
         default=False, description="Samples are ranges along the pixel's ray."
+    )
+    viewpoint: GivenVector | Literal["file"] | None = Field(
+        default="file",
+        description="Of a point cloud: where it was seen from, along its own axes, metres; null "
+        "where there is no such place, as of a cloud that is fused of many views. `file`: as the "
+        "file says (a PCD's VIEWPOINT), else the origin of its coordinates.",
+    )
+    units_per_metre: float = Field(
+        default=1.0, gt=0, description="Of a point cloud: 1000 where it is in millimetres."
+    )
+    format: CloudFormat | None = Field(
+        default=None,
+        description="Of a point cloud: how it is packed. KITTI's files alone do not say so "
+        "themselves; `kitti` has to be given.",
     )
     robot: Label | None = Field(default=None, description="Who took the frame.")
     session: Label | None = Field(default=None, description="In which run.")
@@ -98,7 +119,9 @@ class FrameMeta(Given):
     pose: GivenPose | None = None
     T_base_sensor: GivenBase | None = Field(
         default=None,
-        description="Where the camera sits on the robot: answers then also say where its base is.",
+        description="Where the sensor sits on the robot: answers then also say where its base is. "
+        "A cloud with a `viewpoint` that is not its origin has the base frame `cloud` without it: "
+        "the coordinates as they were sent.",
     )
     tags: list[Label] = Field(default=[], max_length=32)
 
@@ -138,12 +161,22 @@ class Frame(Told):
     state: FrameState
     reason: str | None = Field(description="Why it was rejected, or failed, or was not kept.")
     job_id: str
-    content_id: str | None = Field(description="Hash of samples and camera; null when deleted.")
-    kind: Literal["depth"] = "depth"
+    content_id: str | None = Field(
+        description="Hash of samples and camera, or of points and viewpoint; null when deleted."
+    )
+    kind: Kind = "depth"
     bytes: int = Field(description="Size of the upload.")
-    intrinsics: CameraIntrinsics
-    depth_scale: float
-    depth_along_ray: bool
+    intrinsics: CameraIntrinsics | None = Field(description="Null of a cloud.")
+    depth_scale: float | None = Field(description="Null of a cloud.")
+    depth_along_ray: bool | None = Field(description="Null of a cloud.")
+    points: int | None = Field(default=None, description="Of a cloud, as it was read.")
+    viewpoint: Vector | None = Field(
+        default=None, description="Of a cloud, in its own coordinates; null where it has none."
+    )
+    units_per_metre: float | None = Field(default=None, description="Null of a depth image.")
+    note: str | None = Field(
+        default=None, description="What was done to the points of a cloud on the way, or null."
+    )
     robot: str | None
     session: str | None
     captured_at: datetime | None
@@ -152,7 +185,7 @@ class Frame(Told):
     pose: Transform | None
     base_frame: str | None = Field(default=None, description="Frame of the robot's base.")
     T_base_sensor: Transform | None = Field(
-        default=None, description="Where the camera sits on the robot, as it was sent."
+        default=None, description="Where the sensor sits on the robot, as it was sent."
     )
     tags: list[str]
     etag: str | None = Field(

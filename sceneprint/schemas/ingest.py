@@ -64,7 +64,7 @@ class ImportOptions(Given):
     with_poses: bool = Field(default=True, description="Take the poses that are in the archive.")
     every: int = Field(default=1, ge=1, description="Take every Nth frame of a sequence.")
     T_base_sensor: GivenBase | None = Field(
-        default=None, description="Where the camera sits on the robot."
+        default=None, description="Where the sensor sits on the robot."
     )
     priority: int = Field(
         default=0, ge=-MOST_PRIORITY, le=MOST_PRIORITY, description="Of the frames' jobs."

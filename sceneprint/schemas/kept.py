@@ -42,15 +42,15 @@ class Coincidences(Told):
 
     query: list[int] = Field(description="Index among the query's validation patches.")
     match: list[int] = Field(description="Index among the match's: see its `/patches`.")
-    query_mean: list[Triple] = Field(description="Metres, in the query's optical frame.")
+    query_mean: list[Triple] = Field(description="Metres, in the query's sensor's frame.")
     query_normal: list[Triple]
-    match_mean: list[Triple] = Field(description="Metres, in the match's optical frame.")
+    match_mean: list[Triple] = Field(description="Metres, in the match's sensor's frame.")
     match_normal: list[Triple]
     distance_m: list[float] = Field(description="Between the means under the transform, rising.")
 
 
 class Points(Told):
-    """Points of one frame, in its own optical frame, that evidence is counted on."""
+    """Points of one frame, in its own sensor's frame, that evidence is counted on."""
 
     sampled: int = Field(description="How many were looked up in the other frame.")
     inliers: list[Triple] = Field(

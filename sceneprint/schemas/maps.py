@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Literal
+from typing import Annotated
 
-from pydantic import Field, StringConstraints
+from pydantic import AfterValidator, Field, StringConstraints, WithJsonSchema
 
+from sceneprint.models import PRESETS
 from sceneprint.schemas.base import Given, Told
 
 #: A map's name: an immutable slug.
 Slug = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,62}$")]
 
-Preset = Literal["paper", "compact"]
+
+def _shipped(name: str) -> str:
+    if name not in PRESETS:
+        *most, last = map(repr, PRESETS)
+        raise ValueError(f"Input should be {', '.join(most)} or {last}")  # as pydantic says it
+    return name
+
+
+#: A model that ships with the package.
+Preset = Annotated[
+    str, AfterValidator(_shipped), WithJsonSchema({"type": "string", "enum": list(PRESETS)})
+]
 
 
 class NewMap(Given):
@@ -25,7 +37,9 @@ class NewMap(Given):
     title: str | None = Field(default=None, max_length=200, description="For people.")
     model: Preset = Field(
         default="paper",
-        description="The model that signs its frames, until `sceneprint reencode` changes it.",
+        description="The model that signs its frames, until `sceneprint reencode` changes it: "
+        "`paper` or, a tenth as large, `compact` for rooms; `lidar` for the "
+        "ranges of a LiDAR.",
     )
 
 

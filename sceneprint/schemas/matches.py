@@ -37,7 +37,9 @@ class Validation(Told):
         default=None, description="The same, every plane counting alike."
     )
     free_space_violations: float | None = Field(
-        default=None, description="Share that lies where the other frame saw through."
+        default=None,
+        description="Share that lies where the other frame saw through; null where neither frame "
+        "has a viewpoint, so that nothing is known of free space.",
     )
     inliers: int | None = Field(default=None, description="Points of both frames that agree.")
     ambiguity: float | None = Field(

@@ -23,6 +23,8 @@ _A, _D = AcceptanceParameters(), DiversityParameters()
 #: A map's name or a frame's id as it is asked for; whether there is such a one is found out later.
 Named = Annotated[str, StringConstraints(min_length=1, max_length=128)]
 
+#: A part of a whole.
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 #: An object in JSON; a form and a query string give it as text.
 JsonText = BeforeValidator(parsed)
@@ -61,7 +63,10 @@ class Diversity(Given):
 
 
 class ValidationOptions(Given):
-    """What a match must stand to be accepted."""
+    """What a match must stand to be accepted.
+
+    What is left out is as the map's model has it; the defaults told are those of `paper`.
+    """
 
     mode: Mode = Field(
         default="full",
@@ -74,33 +79,22 @@ class ValidationOptions(Given):
     residual_deg: float = Field(
         default=math.degrees(_A.residual_rad), gt=0, le=45.0, description="The same, of the turn."
     )
-    evidence: float = Field(
+    evidence: Share = Field(
         default=_A.evidence,
-        ge=0.0,
-        le=1.0,
         description="Least `overlap` - `violation_weight` x `free_space_violations`.",
     )
     violation_weight: float = Field(default=_A.violation_weight, ge=0.0, le=100.0)
-    plane_overlap: float = Field(
-        default=_A.plane_overlap, ge=0.0, le=1.0, description="Least, every plane counting alike."
+    plane_overlap: Share = Field(
+        default=_A.plane_overlap, description="Least, every plane counting alike."
     )
-    strong: float = Field(
-        default=_A.strong,
-        ge=0.0,
-        le=1.0,
-        description="Evidence below which an accepted match is weak.",
+    strong: Share = Field(
+        default=_A.strong, description="Evidence below which an accepted match is weak."
     )
-    weak: float = Field(
-        default=_A.weak,
-        ge=0.0,
-        le=1.0,
-        description="`ambiguity` from which on an accepted match is weak.",
+    weak: Share = Field(
+        default=_A.weak, description="`ambiguity` from which on an accepted match is weak."
     )
-    ambiguous: float = Field(
-        default=_A.ambiguous,
-        ge=0.0,
-        le=1.0,
-        description="`ambiguity` from which on nothing is accepted.",
+    ambiguous: Share = Field(
+        default=_A.ambiguous, description="`ambiguity` from which on nothing is accepted."
     )
     ambiguous_share: float = Field(
         default=_A.ambiguous_share,

@@ -40,7 +40,7 @@ class FramePatches(Told):
 
     frame_id: str
     map: str
-    frame: str = Field(description="Frame of the coordinates: the camera's optical one.")
+    frame: str = Field(description="Frame of the coordinates: the sensor's.")
     model: str
     levels: list[PatchLevel] = Field(
         description="The hierarchy that the signature describes, the finest first."

@@ -9,6 +9,7 @@ from pydantic import Field, field_validator
 from sceneprint.schemas.base import Given, Told
 from sceneprint.schemas.explanations import ExplainedFrame, Explanation
 from sceneprint.schemas.filters import Filter, parsed
+from sceneprint.schemas.frames import Kind
 from sceneprint.schemas.matches import Location, Match
 from sceneprint.schemas.options import (
     MOST_MAPS,
@@ -170,7 +171,13 @@ class Answer(Told):
     frame: FrameName | None = Field(
         default=None,
         description="The stored frame that was asked for; null for an upload. Transforms call its "
-        "camera by its id where its own map alone was asked, and `query.optical` else.",
+        "sensor by its id where its own map alone was asked, and `query` else.",
+    )
+    kind: Kind = Field(
+        default="depth",
+        description="Of the frame that was asked for. Transforms call the sensor of a depth image "
+        "`ID.optical` (x right, y down, z ahead), and that of a cloud, which keeps its axes, "
+        "`ID.sensor`.",
     )
     per_map: dict[str, OfMap] | None = Field(
         default=None, description="What each of several maps had; null where one was asked."

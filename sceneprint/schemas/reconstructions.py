@@ -29,7 +29,8 @@ class NewReconstruction(Given):
         default="any", description="`strong`: leave out matches whose acceptance is weak."
     )
     include_query: bool = Field(
-        default=True, description="Fuse what the query itself saw as well, as the first view."
+        default=True,
+        description="Fuse what the query itself saw as well, as the first view; but no cloud.",
     )
     voxel_m: float | None = Field(
         default=None,
@@ -61,7 +62,7 @@ class FusedView(Told):
 
 
 class LeftOut(Told):
-    """A match that could not be fused."""
+    """A match that could not be fused: point clouds are not, as only depth images carve space."""
 
     frame_id: str
     map: str
@@ -105,7 +106,8 @@ class Reconstruction(Told):
     finished_at: datetime | None
     request: NewReconstruction
     parent_frame: str = Field(
-        description="Coordinates of mesh.ply: the query's camera, x right, y down, z ahead, metres."
+        description="Coordinates of mesh.ply: those of the query's sensor, metres; of a camera "
+        "x right, y down, z ahead."
     )
     coverage: Coverage | None = Field(default=None, description="When it has succeeded.")
     files: list[ReconstructionFile] = Field(

@@ -35,7 +35,8 @@ class Comparison(Given):
     )
     model: Preset | None = Field(
         default=None,
-        description="That signs two uploads; default: `paper`. A stored frame brings its own.",
+        description="That signs two uploads; default: `paper`; of a LiDAR, `lidar`. A stored frame "
+        "brings its own.",
     )
 
 

@@ -25,7 +25,9 @@ class Quaternion(Told):
 
 
 class Transform(Told):
-    """x_parent = matrix @ x_child, in metres. Camera frames: x right, y down, z ahead."""
+    """x_parent = matrix @ x_child, in metres. Camera frames (`ID.optical`): x right, y down, z
+    ahead; a cloud (`ID.sensor`) keeps the axes of its sensor.
+    """
 
     parent_frame: str
     child_frame: str

@@ -7,11 +7,13 @@ that what belongs together is committed together; `Store` opens both parts.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from sceneprint.store.blobs import Blobs
 from sceneprint.store.database import Database, is_there, open_database
 from sceneprint.store.sealed import is_sealed
+from sceneprint.store.seals import Seals
 
 __all__ = ["Blobs", "Database", "Store", "open_database", "open_store"]
 
@@ -22,6 +24,11 @@ class Store:
 
     database: Database
     blobs: Blobs
+
+    @cached_property
+    def seals(self) -> Seals:
+        """What numbers of its rows look like from outside."""
+        return Seals(self.database)
 
 
 def open_store(url: str, blobs: Path) -> Store:

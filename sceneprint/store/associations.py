@@ -6,9 +6,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Select, delete, select
+from sqlalchemy import Connection, Select, delete, null, select
 
 from sceneprint.schemas import FrameState
+from sceneprint.schemas.frames import Kind
 from sceneprint.store.parts import remove_parts
 from sceneprint.store.records import JobRow
 from sceneprint.store.tables import frames, jobs
@@ -29,6 +30,7 @@ class Stop:
     robot, session, captured_at : as far as is known
     parent : that its pose leads to
     pose : T_parent_sensor, or None
+    is_cloud : whether it is a point cloud
     """
 
     number: int
@@ -38,6 +40,12 @@ class Stop:
     captured_at: float | None
     parent: str | None
     pose: list[list[float]] | None
+    is_cloud: bool
+
+    @property
+    def kind(self) -> Kind:
+        """A depth image or a point cloud."""
+        return "cloud" if self.is_cloud else "depth"
 
 
 def numbers_of_session(
@@ -89,4 +97,5 @@ def _asked() -> Select[Any]:
     return select(
         frames.c.number, frames.c.id, frames.c.robot, frames.c.session, frames.c.captured_at,
         frames.c.pose_parent.label("parent"), frames.c.pose,
+        frames.c.cloud.is_not(null()).label("is_cloud"),
     )  # fmt: skip

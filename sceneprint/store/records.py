@@ -8,6 +8,7 @@ from typing import Any
 from sqlalchemy import RowMapping
 
 from sceneprint.schemas import FrameState, JobState
+from sceneprint.schemas.frames import Kind
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class FrameRow:
     content_id: str | None
     blob: str
     bytes: int
-    intrinsics: dict[str, Any]
+    intrinsics: dict[str, Any] | None
     depth_scale: float
     depth_along_ray: bool
     robot: str | None
@@ -53,6 +54,12 @@ class FrameRow:
     received_at: float
     indexed_at: float | None
     revision: int | None
+    cloud: dict[str, Any] | None
+
+    @property
+    def kind(self) -> Kind:
+        """A depth image or a point cloud."""
+        return "depth" if self.cloud is None else "cloud"
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,9 @@ BODY: dict[str, Any] = {
                     "frame": {
                         "type": "string",
                         "format": "binary",
-                        "description": "16-bit greyscale PNG in stored units (0 and 65535 where "
-                        "missing), or a two-dimensional float NPY in metres.",
+                        "description": "A depth image: 16-bit greyscale PNG in stored units (0 and "
+                        "65535 where missing), or a two-dimensional float NPY in metres. Or a "
+                        "point cloud: PLY, PCD, LAS, LAZ, NPY of shape (N, 3), or KITTI's .bin.",
                     },
                     "meta": {"$ref": "#/components/schemas/FrameMeta"},
                 },

@@ -58,7 +58,7 @@ def get_answer(query_id: str, here: Here, asking: Asking) -> Answer:
 @router.get(
     "/cloud.ply",
     response_class=Response,
-    responses=_ply("Points and normals in the query's optical frame.", 404, 409, 422),
+    responses=_ply("Points and normals in the query's sensor's frame.", 404, 409, 422),
 )
 async def get_query_cloud(query_id: str, here: Here, asking: Asking) -> Response:
     """The surface that the query saw, as validation compares it: binary PLY, metres."""
@@ -103,7 +103,7 @@ async def get_match(
 @router.get(
     "/matches/{frame_id}/overlay.ply",
     response_class=Response,
-    responses=_ply("Both clouds in the match's optical frame, coloured.", 404, 409, 422),
+    responses=_ply("Both clouds in the match's sensor's frame, coloured.", 404, 409, 422),
 )
 async def get_overlay(
     query_id: str,

@@ -70,13 +70,14 @@ async def get_cloud(
     frame: Annotated[
         CloudFrame,
         Query(
-            description="Coordinates: `optical` of the camera, `parent` of its pose, or `base` of "
-            "the robot."
+            description="Coordinates: `optical` of the camera (of a cloud, its sensor), `parent` "
+            "of its pose, or `base` of the robot."
         ),
     ] = "optical",
 ) -> Response:
     """The surface that was seen, as a cloud of up to 160 x 120 points: smoothed, as validation
-    compares it. The samples themselves are in the upload.
+    compares it; of a point cloud, a range image's about its viewpoint. The samples themselves are
+    in the upload.
     """
     found = await _found(lambda: here.engine.outputs.cloud(map_name, frame_id, frame))
     return await _sent(request, here, found, PLY, name=f"{frame_id}-{frame}.ply")
@@ -101,7 +102,9 @@ async def get_preview(
         Query(
             description="`depth`: yellow near, violet far. `normals`: red, green, blue are "
             "127.5 (1 + n) of x right, y down, z ahead. `patches`: each of the finest level a "
-            "colour. Dark grey where nothing is known."
+            "colour. Dark grey where nothing is known. Of a cloud what is seen around its "
+            "viewpoint, normals along its own axes; of one without, the view from above, with "
+            "heights in place of depth."
         ),
     ] = "depth",
     width: Annotated[int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Columns.")] = WIDTH,
@@ -149,7 +152,7 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
 @router.get(
     "/upload",
     response_class=Response,
-    responses=files((PNG, NPY), "Byte for byte as it came.", 409),
+    responses=files((PNG, NPY, PLY, BYTES), "Byte for byte as it came.", 409),
 )
 async def get_upload(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """The frame's upload: what you sent in is yours to take out."""
@@ -171,8 +174,8 @@ def _upload(request: Request, here: Context, found: Output[bytes], frame_id: str
         with suppress(FileNotFoundError):
             path = blobs.path(blob)
             with path.open("rb") as file:
-                kind = upload_type(file.read(HEAD))
-            name = _safe(f"{frame_id}.{'png' if kind == PNG else 'npy'}")
+                kind, suffix = upload_type(file.read(HEAD))
+            name = _safe(f"{frame_id}.{suffix}")
             return send_file(request, path, kind, found.tag, name)
     found.make()  # says what is wrong with it
     raise DamagedBlob(f"The upload of frame {frame_id} was put back just now. Ask again.")

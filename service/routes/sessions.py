@@ -49,7 +49,7 @@ async def get_trajectory(
     here: Here,
     run: Annotated[Run, Query()],
 ) -> Response:
-    """The poses of a run in the order of time: of the cameras' optical frames, in metres.
+    """The poses of a run in the order of time: of the sensors' frames, in metres.
 
     At most 100,000 frames at once; ask for parts of a longer one by time.
     """

@@ -82,8 +82,9 @@ def test_demo_goes_the_whole_way_and_leaves_nothing(
     leaves_nothing(tmp_path / "tmp")
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("stage", ["building", "serving"])
+@pytest.mark.parametrize(
+    ("stage", "number"), [("building", signal.SIGHUP), ("serving", signal.SIGTERM)]
+)
 def test_demo_that_is_stopped_leaves_nothing(
     demo: Callable[..., subprocess.Popen[str]], tmp_path: Path, rooms: Path, stage: str,
     number: signal.Signals,

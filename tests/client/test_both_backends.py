@@ -212,7 +212,7 @@ def test_requests_that_make_no_sense(
     with pytest.raises(InvalidRequest, match="name: String should match") as told:
         client.create_map("Big Hall")
     assert [place for place, _ in told.value.fields] == ["name"]
-    with pytest.raises(InvalidRequest, match="model: Input should be 'paper' or 'compact'"):
+    with pytest.raises(InvalidRequest, match="model: Input should be 'paper', 'compact' or"):
         client.create_map(map_name, model="huge")
     client.create_map(map_name)
     with pytest.raises(InvalidRequest, match="less than or equal to 50") as told:

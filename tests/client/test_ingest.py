@@ -163,4 +163,4 @@ def test_what_is_no_archive_is_refused_at_the_door(
     notes.seek(0)
     job, items = done(client, map_name, notes)
     assert (job.state, items) == (JobState.FAILED, [])
-    assert "There is no depth image in the archive" in job.error
+    assert "There is no depth image or cloud in the archive" in job.error

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from sqlalchemy import select, update
 
-from sceneprint.engine import Engine, associating
+from sceneprint.engine import Engine, sides
 from sceneprint.engine.associating import Associating
-from sceneprint.engine.tasks import Task
+from sceneprint.engine.slices import Task
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.geometry.rigid import difference, inverse
 from sceneprint.schemas import Filter, JobState, NewMap
@@ -333,7 +333,7 @@ def test_a_session_of_two_robots_needs_a_name(
 def test_too_many_frames_are_refused_in_words(
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(associating, "MOST_FRAMES", 8)
+    monkeypatch.setattr(sides, "MOST_FRAMES", 8)
     with pytest.raises(InvalidRequest, match="have 12 frames, and an association takes at most 8"):
         engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
     late = Filter(captured_after=BEGIN + timedelta(seconds=4))

@@ -13,7 +13,7 @@ import pytest
 from sqlalchemy import update
 
 from sceneprint.engine import Engine, imports
-from sceneprint.engine.tasks import Task
+from sceneprint.engine.slices import Task
 from sceneprint.engine.uploads import sweep
 from sceneprint.errors import LostLease, UnknownMap, UnusableStore
 from sceneprint.schemas import Job, JobState, NewMap

@@ -99,8 +99,8 @@ FORMS = {
     "meta is no JSON": (X, FRAME + part("meta", b"{") + END, 400, "malformed-body", "`meta`"),
     "meta is no object": (X, FRAME + part("meta", b"[]") + END, 422, "invalid-request", "`meta`"),
     "meta is empty": (X, FRAME + part("meta", b"") + END, 400, "malformed-body", "`meta`"),
-    "meta lacks all": (X, FRAME + part("meta", b"{}") + END, 422, "invalid-request",
-                       "intrinsics: Field required"),
+    "meta lacks all": (X, FRAME + part("meta", b"{}") + END, 422, "unreadable-frame",
+                       "neither a depth image"),
     "cut in meta": (X, FRAME + part("meta", b'{"a', end=b""), 422, "invalid-request", "`meta`"),
     "cut in frame": (X, KNOWN + part("frame", b"ab", "a", b""), 422, "invalid-request", "`frame`"),
 }  # fmt: skip

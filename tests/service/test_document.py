@@ -86,10 +86,10 @@ def test_an_operation_declares_what_it_answers(document, method, path, statuses)
 
 def test_bodies_that_are_read_by_hand_are_described(document):
     schemas = document["components"]["schemas"]
-    assert "intrinsics" in schemas["FrameMeta"]["required"]
+    assert "required" not in schemas["FrameMeta"]  # a cloud needs no more than its points
     assert schemas["FrameMeta"]["additionalProperties"] is False
     upload = operations(document)["post", "/v1/maps/{map_name}/frames"]["requestBody"]
-    raw = ["image/png", "application/x-npy", "application/octet-stream"]
+    raw = ["image/png", "application/x-npy", "application/ply", "application/octet-stream"]
     assert list(upload["content"]) == ["multipart/form-data", *raw]
     form = upload["content"]["multipart/form-data"]["schema"]
     assert form["required"] == ["frame", "meta"]

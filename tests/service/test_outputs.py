@@ -215,7 +215,7 @@ def test_sessions_and_a_trajectory(served, shown, refused):
     assert [[float(word) for word in line.split()] for line in lines] == [
         [start + i, i, 0, 1, 0, 0, 0, 1] for i in range(3)
     ]
-    assert "# poses of the cameras' optical frames in hall, metres" in text.text
+    assert "# poses of the sensors' frames in hall, metres" in text.text
     url = f"{path}/trajectory?session=monday&captured_after=2026-11-16T09:30:01Z"
     told = served.client.get(url, headers={"Accept": "application/json"}).json()
     assert (told["frame_ids"], told["parent_frame"], told["left_out"]) == (ids[1:], "hall", 0)

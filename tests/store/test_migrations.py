@@ -22,8 +22,8 @@ POSE = [[1.0, 0.0, 0.0, 1.5], [0.0, 1.0, 0.0, -2.5], [0.0, 0.0, 1.0, 3.25], [0.0
 FRAMES = [(["door", "lit"], POSE), ([], None), (["door", "door"], None)]
 
 
-def an_old_database(path: Path) -> None:
-    """A database as migration 0001 left it."""
+def bring_to(path: Path, version: str) -> None:
+    """Let the migrations of a version and before it make or change a database."""
     from alembic import command
     from alembic.config import Config
     from sqlalchemy import create_engine
@@ -35,8 +35,13 @@ def an_old_database(path: Path) -> None:
     engine = create_engine(f"sqlite:///{path}")
     with engine.begin() as connection:
         config.attributes["connection"] = connection
-        command.upgrade(config, "0001")
+        command.upgrade(config, version)
     engine.dispose()
+
+
+def an_old_database(path: Path) -> None:
+    """A database as migration 0001 left it."""
+    bring_to(path, "0001")
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("INSERT INTO models VALUES ('m', 'compact', x'00', 1.0)")
         connection.execute(
@@ -95,4 +100,22 @@ def test_jobs_keys_and_numbers_go_on_where_they_were(tmp_path: Path) -> None:
         assert add_frame(connection, 1, values).number == 71
         checked = connection.execute(text("PRAGMA foreign_keys")).scalar()
     assert checked == 1
+    database.close()
+
+
+def test_frames_of_before_there_were_clouds_are_depth_images(tmp_path: Path) -> None:
+    an_old_database(tmp_path / "truth.db")
+    bring_to(tmp_path / "truth.db", "0003")
+    database = open_database(f"sqlite:///{tmp_path / 'truth.db'}")
+    with database.write() as connection:
+        rows = [frame_of(connection, number) for number in (1, 2, 3)]
+        assert [(row.tags, row.pose) for row in rows] == FRAMES
+        assert {(row.kind, row.cloud) for row in rows} == {("depth", None)}
+        seen = {"viewpoint": None, "units_per_metre": 1000.0, "points": 12, "note": None}
+        values = {
+            "blob": "b", "bytes": 1, "intrinsics": None, "depth_scale": 1.0, "tags": [],
+            "depth_along_ray": False, "pose": None, "cloud": seen,
+        }  # fmt: skip
+        added = add_frame(connection, 1, values)
+        assert (added.kind, added.cloud, added.intrinsics) == ("cloud", seen, None)
     database.close()

@@ -74,7 +74,7 @@ def at_work(url: str, uploads: list) -> Iterator[list[Robot]]:
 
 def test_it_holds_one_state_and_all_of_it(data, tmp_path, uploads, rows, answers, settings):
     asked = uploads[:6]
-    archives = [tmp_path / f"{i}.tar" for i in range(3)]
+    archives = [tmp_path / f"{i}.tar" for i in range(2)]
     with serving(data, 1) as url:
         with Client(url) as client:
             client.create_map("busy", model="compact")

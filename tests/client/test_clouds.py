@@ -1,0 +1,105 @@
+"""Point clouds through the client: over HTTP and in process alike."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sceneprint.client import Client
+from sceneprint.clouds import write_ply
+from sceneprint.datasets import find_sequences, write_pose
+from sceneprint.errors import InvalidRequest, UnreadableCloud
+from sceneprint.geometry.retrieval import distances
+from sceneprint.pipeline import open_signer, sign
+from sceneprint.scans import decode_cloud
+from sceneprint.schemas import FrameMeta
+from sceneprint.types import Floats, Frame
+
+
+@pytest.fixture(scope="module")
+def seen(room_frames: tuple[Frame, ...]) -> list[Floats]:
+    """What depth images of one room see, in their optical frames."""
+    found = []
+    for frame in room_frames[:2]:
+        k, depth = frame.intrinsics, frame.depth[::2, ::2].astype(float)
+        y, x = np.nonzero(depth)
+        z = depth[y, x]
+        found.append(np.stack([(2 * x - k.cx) / k.fx * z, (2 * y - k.cy) / k.fy * z, z], axis=1))
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(
+    seen: list[Floats], room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """Two scans in centimetres from a mast, with their poses."""
+    place = tmp_path_factory.mktemp("scans") / "run"
+    place.mkdir()
+    said = {"units_per_metre": 100, "viewpoint": {"x": 0, "y": 0, "z": 1.5}}
+    (place / "clouds.json").write_text(json.dumps(said))
+    for i, (points, frame) in enumerate(zip(seen, room_frames, strict=False)):
+        (place / f"{i}.ply").write_bytes(write_ply(100 * (points + np.array([0, 0, 1.5]))))
+        assert frame.pose is not None
+        write_pose(place / f"{i}.pose.txt", frame.pose)
+    return place
+
+
+def test_a_folder_of_scans(client: Client, map_name: str, folder: Path, seen: list[Floats]) -> None:
+    client.create_map(map_name, model="compact")
+    [sequence] = find_sequences(folder)
+    for reference in sequence.frames:
+        assert client.upload(map_name, reference, wait_s=60).state == "indexed"
+    first, second = client.frames(map_name)
+    assert (first.kind, first.points, first.units_per_metre) == ("cloud", len(seen[0]), 100)
+    assert first.viewpoint is not None
+    assert (first.viewpoint.z, first.base_frame) == (1.5, "cloud")
+    again = client.upload(map_name, folder / "0.ply", wait_s=60)
+    assert again.frame_id == first.frame_id
+
+    # asked by bytes alone: the same numbers as of the library
+    data = write_ply(seen[0])
+    answer = client.query(map_name, data, k=2)
+    signer = open_signer("compact")
+    own, two = (sign(decode_cloud(one), signer) for one in map(write_ply, seen))
+    told = {match.frame_id: match for match in answer.matches}
+    apart = int(distances(own.vector, two.vector[None])[0])
+    assert abs(told[second.frame_id].distance - apart) < 0.02 * apart  # centimetres are rounded
+    assert told[first.frame_id].validation.status == "accepted"
+    assert np.allclose(told[first.frame_id].transform.matrix, np.eye(4), atol=0.02)
+    assert answer.location is not None
+    itself = client.similarity((map_name, first.frame_id), data)
+    assert itself.distance == told[first.frame_id].distance
+
+
+def test_a_cloud_of_many_views_says_so_on_its_way(
+    client: Client, map_name: str, seen: list[Floats], room_frames: tuple[Frame, ...]
+) -> None:
+    client.create_map(map_name, model="compact")
+    T = room_frames[0].pose
+    assert T is not None
+    placed = write_ply(seen[0] @ T[:3, :3].T + T[:3, 3])
+    fused = FrameMeta(viewpoint=None)
+    [one] = client.upload_batch(map_name, [placed], [fused])
+    assert one.frame is not None
+    put = client.put_frame(map_name, "own", placed, fused, wait_s=60)
+    assert put.state == "indexed", put.reason
+    for frame in (client.frame(map_name, one.frame.frame_id), client.frame(map_name, "own")):
+        assert (frame.viewpoint, frame.base_frame, frame.kind) == (None, None, "cloud")
+    answer = client.query(map_name, placed, fused, k=1)
+    assert answer.matches[0].validation.free_space_violations is None
+    assert answer.matches[0].validation.strength != "strong"
+
+
+def test_what_is_none_is_refused_alike(client: Client, map_name: str, seen: list[Floats]) -> None:
+    client.create_map(map_name, model="compact")
+    with pytest.raises(UnreadableCloud, match="PLY"):
+        client.upload(map_name, write_ply(seen[0])[:-7], FrameMeta())
+    with pytest.raises(InvalidRequest, match="intrinsics") as caught:
+        client.query(map_name, b"\x89PNG\r\n\x1a\n", FrameMeta())
+    assert caught.value.fields[0][0] == "intrinsics"
+    with pytest.raises(TypeError, match="the bytes of a depth image need"):
+        client.upload(map_name, b"\x89PNG\r\n\x1a\n")
+    assert list(client.frames(map_name)) == []
