@@ -156,7 +156,7 @@ def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
     makes = [line for line in commands if line.startswith("make")]
     assert makes == ["make demo"]
     serve, *rest = [line for line in commands if line not in makes]
-    assert len(rest) == 19
+    assert len(rest) == 20
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -197,6 +197,8 @@ def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
     assert (tmp_path / "frame.png").stat().st_size > 10_000
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert figures["counts"]["queries"] == 3
+    pairs = json.loads((tmp_path / "pairs.json").read_text())
+    assert set(pairs["validation"]) >= {"precision", "recall", "accepted"}
     assert (tmp_path / "plots/contact.png").stat().st_size > 10_000
     client, library = blocks(README, "python")
     assert re.match(r"found x=\S+ y=\S+ z=\S+$", run_example(client, tmp_path).strip())
