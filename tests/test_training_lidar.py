@@ -38,8 +38,8 @@ def test_scenes_and_lengths_are_the_presets_own() -> None:
         ("rooms", 6), ("rooms", 6), ("sites", 3),
     ]  # fmt: skip
     lidar, mixture = preset_parameters("lidar")
-    assert (mixture.n_components, lidar.hierarchy.n_levels) == (256, 2)
-    assert lidar.properties.radius == 5 * ModelParameters().properties.radius
+    assert (mixture.n_components, lidar.hierarchy.n_levels) == (256, 4)
+    assert (lidar.properties.radius, lidar.weights.size_exponent) == (30.0, 0.0)
     assert lidar.surroundings.far_radius == 8.0
     assert (lidar.cloud.minimum_range, lidar.cloud.maximum_range) == (0.6, 60.0)
     assert preset_parameters("paper")[0] == ModelParameters()
@@ -61,7 +61,7 @@ def test_neighbours_in_a_hall_are_nearest(trained: Model) -> None:
 def test_the_preset_ships_as_its_recipe_says() -> None:
     model = read_model("lidar")
     assert model.name == "lidar"
-    assert model.signature_bytes == 25 * 256 * 2
+    assert model.signature_bytes == 25 * 256 * 4
     assert model.parameters == preset_parameters("lidar")[0]
     assert model.provenance["training"]["scenes"] == "sites"
     assert model.provenance["own_frames"] == 0

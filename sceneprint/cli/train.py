@@ -61,7 +61,7 @@ def add_to(commands: Any) -> None:
         "--radius",
         type=metres,
         metavar="R",
-        help="reach of a patch, metres (default: 3; of lidar 15)",
+        help="reach of a patch, metres (default: 3; of lidar 30)",
     )
     command.add_argument(
         "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help="processes"

@@ -125,7 +125,8 @@ class NewModel(Given):
     """Which model a map is to be signed with from now on."""
 
     model: Label = Field(
-        description="`paper`, `compact`, or the id or label of a model that GET /v1/models lists.",
+        description="`paper`, `compact`, `lidar`, or the id or label of a model that GET "
+        "/v1/models lists.",
         examples=["compact"],
     )
 

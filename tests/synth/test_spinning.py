@@ -28,7 +28,7 @@ def inside_out(mesh: Mesh) -> Mesh:
 
 @pytest.fixture(scope="module")
 def shell() -> Caster:
-    return Caster(inside_out(box(*(2 * HALF), (0.0, 0.0, -HALF[2]))))
+    return Caster(inside_out(box(2 * HALF[0], 2 * HALF[1], 2 * HALF[2], (0.0, 0.0, -HALF[2]))))
 
 
 def pose(yaw: float, at: tuple[float, float, float]) -> Floats:
@@ -51,7 +51,8 @@ def from_walls(points: Floats32, T: Floats) -> Floats:
 def test_every_point_lies_on_a_wall_within_noise(shell: Caster) -> None:
     T = pose(0.7, (1.0, -0.5, 0.3))
     points = scan(shell, T, SENSOR, np.random.default_rng(0))
-    assert (points.dtype, points.shape[1]) == (np.float32, 3)
+    assert points.dtype == np.float32
+    assert points.shape[1] == 3
     off = from_walls(points, T)
     # noise is along the ray, so off the wall it is no more: three sigmas hold 99.7 %
     assert (off < 3 * math.hypot(SENSOR.sigma, SENSOR.ring_sigma)).mean() > 0.99
