@@ -27,6 +27,7 @@ from tqdm import tqdm
 from sceneprint.evaluation.baselines.rings import ring_descriptor, ring_distances
 from sceneprint.geometry.retrieval import distances
 from sceneprint.geometry.rigid import inverse, rotation_angle
+from sceneprint.geometry.validation import ValidationParameters
 from sceneprint.pipeline import Signature, prepare, validate
 from sceneprint.scans import decode_cloud
 from sceneprint.signing import Signer, open_signer
@@ -112,12 +113,15 @@ def ring_rows(walk: Sequence[Cloud]) -> Floats:
 
 
 def believed(
-    walk: Sequence[Cloud], geometries: Sequence[Geometry], pairs: Sequence[tuple[int, int]]
+    walk: Sequence[Cloud],
+    geometries: Sequence[Geometry],
+    pairs: Sequence[tuple[int, int]],
+    p: ValidationParameters,
 ) -> tuple[Believed, list[dict[str, object]]]:
     """Pairs (query, match) validated, and each of them for those who want to see."""
     rows: list[dict[str, object]] = []
     for i, j in tqdm(pairs, desc="validate", unit="pair", disable=None):
-        v = validate(geometries[i], geometries[j])
+        v = validate(geometries[i], geometries[j], p=p)
         truth = inverse(_pose(walk[j])) @ _pose(walk[i])
         right, off, turn = False, math.inf, math.inf
         if v.T_match_query is not None:
@@ -194,7 +198,9 @@ def measure(walk: Sequence[Cloud], signer: Signer, *, pairs: bool) -> dict[str, 
         }
         for name, chosen in lists.items():
             spread = np.linspace(0, len(chosen) - 1, min(len(chosen), MOST_PAIRS)).astype(int)
-            figures, each = believed(walk, geometries, [chosen[k] for k in spread])
+            figures, each = believed(
+                walk, geometries, [chosen[k] for k in spread], signer.model.parameters.validation
+            )
             result[name] = {**asdict(figures), "each": each}
     return result
 
@@ -205,25 +211,26 @@ def milliseconds(walk: Sequence[Cloud], signer: Signer) -> dict[str, float]:
     stored = [prepare(one, signer) for one in walk[:20]]
     vectors = np.stack([one.vector for one, _ in stored])
     signature, geometry = prepare(cloud, signer)
+    p = signer.model.parameters.validation
     return {
         "points": float(len(cloud.points)),
         "prepare": timed(lambda: prepare(cloud, signer)),
         "search": timed(lambda: distances(signature.vector, vectors)),
-        "validate": timed(lambda: validate(geometry, stored[0][1])),
+        "validate": timed(lambda: validate(geometry, stored[0][1], p=p)),
     }
 
 
 def negatives(walk: Sequence[Cloud], signer: Signer, n: int) -> dict[str, int]:
     """Scans against scans of `n` synthetic sites each: how many pairs are believed."""
     ours = [prepare(cloud, signer)[1] for cloud in walk[:: max(1, len(walk) // 20)]]
-    accepted = pairs = 0
+    accepted, pairs, p = 0, 0, signer.model.parameters.validation
     for index in tqdm(range(n), desc="negatives", disable=None):
         kind = ("hall", "storey")[index % 2]
         for cloud in synthesise_survey(HELD_OUT + 1, index, 2, kind=kind).clouds:
             other = prepare(cloud, signer)[1]
             for one in ours:
                 pairs += 1
-                accepted += validate(one, other).status == "accepted"
+                accepted += validate(one, other, p=p).status == "accepted"
     return {"pairs": pairs, "accepted": accepted}
 
 

@@ -171,7 +171,8 @@ def validate(
     ----------
     query, match : geometry artifacts of one model
     seed : of the random choices; the answer echoes it
-    p : see ValidationParameters
+    p : of the model they were made with, `model.parameters.validation`; default: for depth
+        sensors indoors, as of `paper` and `compact`. The lidar model has others
     mode : "full", or "paper" for the paper's test alone
     matching : "histograms", or "sequence" for correspondences as the paper finds them: slower
 

@@ -80,7 +80,7 @@ def open_signer(
 
     Parameters
     ----------
-    model : "paper", "compact", the path of a model file, or a model
+    model : "paper", "compact", "lidar", the path of a model file, or a model
     cache_dir : folder of derived files; default: the user's cache folder
     progress : called with bins done and their total while the table is being built
     cached : False for a model that will not be seen again: nothing is read or written

@@ -64,6 +64,10 @@ class Archive:
         """The name of a frame's member, as the archive writes it."""
         return shown(self._members[reference.path].name)
 
+    def size_of(self, reference: FrameReference) -> int:
+        """Bytes of a frame of `sequences`, as the archive announces them."""
+        return self._members[reference.path].size
+
     def data_of(self, reference: FrameReference) -> bytes:
         """The bytes of a frame of `sequences`.
 

@@ -138,6 +138,11 @@ def _viewpoint(fields: dict[str, object]) -> Position | Unsaid | None:
 
 
 def _number(name: str, value: object) -> float:
-    if not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value):
-        return float(value)
+    if not isinstance(value, bool) and isinstance(value, int | float):
+        try:
+            number = float(value)
+        except OverflowError:  # JSON has whole numbers of any length
+            number = math.inf
+        if math.isfinite(number):
+            return number
     raise DatasetError(f"{name} is {value!r:.40}, no finite number. Write it as one.")

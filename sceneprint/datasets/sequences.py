@@ -125,7 +125,8 @@ def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
         layout = layout_of(files)
         # a scene may hold a picture or a mesh of itself beside its sequences
         scene = any(_SEQUENCE_FOLDER.fullmatch(name) for name in folders) or (
-            layout is Layout.CLOUDS and "depth" in folders
+            layout is Layout.CLOUDS
+            and ("depth" in folders or _is_above_images(folder, files, folders, depth))
         )
         if layout is not None and not (layout in (Layout.PLAIN, Layout.CLOUDS) and scene):
             yield folder, files, layout
@@ -133,6 +134,32 @@ def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
             waiting += [
                 (folder / name, depth + 1) for name in reversed(folders) if not is_of_colour(name)
             ]
+
+
+def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: int) -> bool:
+    """Whether points lie above folders of depth images whose camera is known, and nothing says
+    that they are frames: they are a mesh of what is below, and must not hide it.
+    """
+    if CLOUDS_FILE in files:
+        return False
+    waiting = [(folder / name, depth + 1) for name in folders]
+    looked = 0
+    while waiting and looked < _MAXIMUM_FOLDERS:
+        below, deep = waiting.pop()
+        looked += 1
+        if deep > _DEPTH or is_of_colour(below.name):
+            continue
+        try:
+            own, deeper = list_folder(below)
+            if layout_of(own) not in (None, Layout.CLOUDS):
+                find_camera(below)
+                return True
+        except DatasetError:  # colour images alone have no camera; others say why in their turn
+            continue
+        except SceneprintError:  # a camera that is none: whoever reads the images says why
+            return True
+        waiting += [(below / name, deep + 1) for name in deeper]
+    return False
 
 
 def is_of_colour(folder: str) -> bool:

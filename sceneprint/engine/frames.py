@@ -19,10 +19,11 @@ from sceneprint.errors import (
     InvalidRequest,
     MissingDependency,
     SceneprintError,
+    UnreadableCloud,
     UnreadableFrame,
     UnsupportedType,
 )
-from sceneprint.scans import UNSAID, decode_cloud, decode_scan, format_of
+from sceneprint.scans import UNSAID, CloudFormat, decode_cloud, decode_scan, format_of
 from sceneprint.schemas import CameraIntrinsics, FrameMeta
 from sceneprint.schemas.frames import GivenBase, Kind
 from sceneprint.store.records import FrameRow
@@ -87,7 +88,7 @@ def read_stored(data: bytes, row: FrameRow) -> AnyFrame:
         # a lost upload may have come again, packed otherwise
         return decode_cloud(
             data,
-            file_format=format_of(data) or "kitti",
+            file_format=_packing(data),
             viewpoint=viewpoint_of(row),
             units_per_metre=row.cloud["units_per_metre"],
             name=row.id,
@@ -179,6 +180,11 @@ def base_of(
     return GIVEN_FRAME, T
 
 
+def _packing(data: bytes) -> CloudFormat:
+    """How a cloud is packed that was let in: what does not say so is a KITTI scan."""
+    return format_of(data) or "kitti"
+
+
 def _is_cloud(data: bytes, meta: FrameMeta) -> bool:
     """Whether an upload is a point cloud; an array may be either, and with a camera is an image."""
     if meta.format is not None:
@@ -203,7 +209,13 @@ def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None) -> Read:
         )
     except MissingDependency as error:  # of this machine, and yet it is the file that asks for it
         raise UnsupportedType(str(error)) from error
-    seen_from = None if scan.viewpoint is None else list(scan.viewpoint)
+    if scan.file_format != _packing(data):  # it could not be read again without what was said
+        raise UnreadableCloud(
+            f"This is read as {scan.file_format.upper()}, and does not begin as such files do. "
+            "Write the file again."
+        )
+    # nobody means -0.0 by another place
+    seen_from = None if scan.viewpoint is None else [value + 0.0 for value in scan.viewpoint]
     stored = {
         "format": scan.file_format,
         "viewpoint": seen_from,

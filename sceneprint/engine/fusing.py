@@ -38,7 +38,7 @@ from sceneprint.store import Store
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import geometry_blobs
-from sceneprint.types import Cloud, Floats, Frame, Geometry, Intrinsics
+from sceneprint.types import Floats, Frame, Geometry, Intrinsics
 
 Source = Literal["upload", "geometry"]
 Strength = Literal["strong", "weak"]
@@ -138,7 +138,9 @@ def fused(
         points=len(mesh.points),
         triangles=len(mesh.triangles) if as_mesh else 0,
     )
-    comment = f"frame {parent_frame}: x right, y down, z ahead, metres"
+    # a cloud keeps the axes of its sensor, whichever they are
+    axes = ": x right, y down, z ahead" if parent_frame.endswith(".optical") else ""
+    comment = f"frame {parent_frame}{axes}, metres"
     colours = PALETTE[first % len(PALETTE)]
     ply = write_ply(
         mesh.points, mesh.normals, colours, mesh.triangles if as_mesh else None,
@@ -178,11 +180,12 @@ def _read(store: Store, view: View, model_id: str, asked_at: float) -> tuple[Fra
                 f"Frame {frame.id} of map {row.name!r} was deleted, and another has its id since."
             )
         blob = geometry_blobs(connection, [frame.number], model_id).get(frame.number)
+    if frame.kind == "cloud":  # before five million points are unpacked, if they can be here
+        raise _no_image(view.frame_id)
     T = np.array(view.transform)
     try:
         found = read_stored(store.blobs.get(frame.blob), frame)
-        if isinstance(found, Cloud):
-            raise _no_image(view.frame_id)
+        assert isinstance(found, Frame)
         return Frame(found.depth, found.intrinsics, view.frame_id, T), "upload"
     except DamagedBlob:
         if blob is None:

@@ -44,8 +44,9 @@ KIND, FILE = "import", "archive"
 #: Seconds for which the archive of an import that was given up is kept for another try, and
 #: between two looks for those.
 KEPT_S, TIDY_S = 86_400.0, 60.0
-#: Frames that are taken in one commit.
-_AT_ONCE = 16
+#: Frames that are taken in one commit, and bytes of more than one: a cloud may have 512 MiB, and
+#: what is taken at once is in memory.
+_AT_ONCE, _BYTES_AT_ONCE = 16, 128 << 20
 #: How much more a compressed tar may hold than the largest archive that is taken.
 _UNPACKED = 4
 
@@ -243,7 +244,7 @@ class Imports:
         progress["total"] = len(steps)
         items: list[dict[str, Any]] = []
         while progress["done"] < len(steps) and (not items or time.monotonic() < until):
-            some = steps[progress["done"] :][:_AT_ONCE]
+            some = _next(archive, steps, progress["done"])
             for item in self._taken(task, archive, some, options):
                 items.append(item.model_dump(mode="json"))
                 what = {202: "received", 200: "there"}.get(item.status, "refused")
@@ -290,6 +291,17 @@ def _steps(archive: Archive, every: int) -> Iterator[_Step]:
     for sequence in archive.sequences:
         for reference in sequence.frames[::every]:
             yield _Step(archive.name_of(reference), sequence, reference)
+
+
+def _next(archive: Archive, steps: Sequence[_Step], done: int) -> Sequence[_Step]:
+    """The steps that are taken at once, at least one."""
+    count = size = 0
+    for step in steps[done : done + _AT_ONCE]:
+        size += 0 if step.reference is None else archive.size_of(step.reference)
+        if count and size > _BYTES_AT_ONCE:
+            break
+        count += 1
+    return steps[done : done + count]
 
 
 def _upload(archive: Archive, step: _Step, options: ImportOptions) -> Upload:

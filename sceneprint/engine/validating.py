@@ -24,6 +24,12 @@ from sceneprint.types import Geometry
 
 #: Candidates that are selected and validated, unless more matches are wanted: more cost time.
 CANDIDATES = 10
+#: What stands in the place of a limit where nothing is known of free space: what a caller says of
+#: the one is meant of the other too.
+_BLIND = {
+    "evidence": "blind_evidence", "plane_overlap": "blind_plane_overlap",
+    "ambiguous_share": "blind_ambiguous_share",
+}  # fmt: skip
 #: Why no candidate was tried where validation was not asked for.
 NOT_ASKED = "not asked for"
 
@@ -66,6 +72,7 @@ def thresholds(
     own = given.model_dump(exclude={"mode", "residual_deg"}, exclude_unset=True)
     if "residual_deg" in given.model_fields_set:
         own["residual_rad"] = math.radians(given.residual_deg)
+    own |= {blind: own[name] for name, blind in _BLIND.items() if name in own}
     return replace(p, acceptance=replace(p.acceptance, **own)), given.mode
 
 

@@ -42,6 +42,7 @@ class Evidence:
     residual_m, residual_rad, overlap, plane_overlap : as in Validation
     violations : as in Validation; None where there is no evidence of free space
     stiffness : the less of both directions', as in Alignment
+    one_sided : free space of one of the frames is not known
     """
 
     residual_m: float
@@ -50,6 +51,7 @@ class Evidence:
     plane_overlap: float
     violations: float | None
     stiffness: float
+    one_sided: bool = False
 
     def total(self, p: AcceptanceParameters) -> float:
         """For less against."""
@@ -100,4 +102,6 @@ def belief(
         return "accepted", "weak", "another transform is not ruled out"
     if e.total(p) < p.strong:
         return "accepted", "weak", f"{e.overlap:.0%} of the surfaces agree"
+    if e.one_sided:  # what one frame has and the other lacks may speak against it unheard
+        return "accepted", "weak", "surfaces agree, but free space is known of one frame only"
     return "accepted", "strong", "surfaces agree, and nothing speaks against it"

@@ -6,6 +6,7 @@ points (N, 3), axes  --thinned-->  means (V, 4), side of a cell
 from __future__ import annotations
 
 import math
+import secrets
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,9 +54,22 @@ def metric_cell(x: float, y: float, z: float, size: float) -> int:
 
 
 @kernel
+def mixed(key: int, secret: int) -> int:
+    """Where a key goes in a hash table whose size is a power of two.
+
+    Who knows the hash can make a cloud all of whose cells share a slot, so there is a secret;
+    what comes of it must not depend on it.
+    """
+    h = (key ^ secret) * 0x9E3779B97F4A7C1
+    h ^= h >> 31
+    h *= 0x1D8E4E27C47D124F
+    return h >> 20
+
+
+@kernel
 def _gather(
     points: Floats32, axes: Floats, centre: Floats, seen: bool, side: float, step: float,
-    unit: float, keys: Ints64, bins: Ints64, sums: Ints64,
+    unit: float, secret: int, keys: Ints64, bins: Ints64, sums: Ints64,
 ) -> int:  # fmt: skip
     """Sums of the points in each occupied cell; how many there are, or -1 for too many.
 
@@ -80,8 +94,7 @@ def _gather(
         else:
             key, shell = metric_cell(x, y, z, side), np.int64(0)
             scale, inverse = _STEPS / unit, 0.0
-        spread = (key * 1000003 + shell) * -7046029254386353131
-        at = ((spread >> 29) ^ spread) & mask
+        at = mixed(int(key * 1000003 + shell), secret) & mask
         while table[at] >= 0 and (keys[table[at]] != key or bins[table[at]] != shell):
             at = (at + 1) & mask
         k = table[at]
@@ -133,9 +146,9 @@ def thinned(
     room = min(_ROOM * p.maximum_pixels, len(points))
     keys, bins = np.empty(room, np.int64), np.empty(room, np.int64)
     sums, out = np.empty((room, 5), np.int64), np.empty((room, 5), np.int64)
-    step = math.log1p(p.same_surface)
+    step, secret = math.log1p(p.same_surface), secrets.randbits(62)
     while True:
-        n = _gather(points, axes, centre, seen, side, step, unit, keys, bins, sums)
+        n = _gather(points, axes, centre, seen, side, step, unit, secret, keys, bins, sums)
         if 0 <= n <= p.maximum_pixels:
             break
         wider = max(math.sqrt(n / p.maximum_pixels), 1.05) if n > 0 else math.sqrt(_ROOM)

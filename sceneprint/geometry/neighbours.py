@@ -9,11 +9,13 @@ the cells around it hold.
 
 from __future__ import annotations
 
+import secrets
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneprint.geometry.cells import mixed
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Floats, Ints32
 
@@ -62,7 +64,7 @@ class Links:
 
 
 @kernel
-def _grid(cells: Ints64, order: Ints64, table: Ints64, starts: Ints64) -> int:
+def _grid(cells: Ints64, order: Ints64, secret: int, table: Ints64, starts: Ints64) -> int:
     """Enter runs of points in one cell (cells sorted by `order`) into a hash table."""
     mask = len(table) - 1
     n = 0
@@ -71,7 +73,7 @@ def _grid(cells: Ints64, order: Ints64, table: Ints64, starts: Ints64) -> int:
         if i > 0 and cells[order[i - 1]] == key:
             continue
         starts[n] = i
-        at = _hash(key) & mask
+        at = mixed(key, secret) & mask
         while table[at] >= 0:
             at = (at + 1) & mask
         table[at] = n
@@ -81,15 +83,9 @@ def _grid(cells: Ints64, order: Ints64, table: Ints64, starts: Ints64) -> int:
 
 
 @kernel
-def _hash(key: int) -> int:
-    spread = key * -7046029254386353131
-    return (spread >> 29) ^ spread
-
-
-@kernel
 def _link(
-    places: Floats, heights: Floats, cells: Ints64, order: Ints64, table: Ints64, starts: Ints64,
-    n_cells: int, counts: Ints64, begins: Ints64,
+    places: Floats, heights: Floats, cells: Ints64, order: Ints64, secret: int, table: Ints64,
+    starts: Ints64, n_cells: int, counts: Ints64, begins: Ints64,
 ) -> Ints32:  # fmt: skip
     """Neighbours of each point, all in one array: where they begin, and how many they are."""
     mask = len(table) - 1
@@ -104,7 +100,7 @@ def _link(
             for dy in range(-1, 2):
                 for dz in range(-1, 2):
                     wanted = key + (dx * span + dy) * span + dz
-                    at = _hash(wanted) & mask
+                    at = mixed(wanted, secret) & mask
                     while table[at] >= 0:
                         if cells[order[starts[table[at]]]] == wanted:
                             around[found] = table[at]
@@ -154,11 +150,11 @@ def linked(places: Floats, heights: Floats) -> Links:
     cells = (cell[:, 0] * 2 * _REACH + cell[:, 1]) * 2 * _REACH + cell[:, 2]
     order = np.argsort(cells, kind="stable")
     table = np.full(1 << max((2 * n - 1).bit_length(), 1), -1, np.int64)
-    starts = np.empty(n + 1, np.int64)
-    n_cells = _grid(cells, order, table, starts)
+    starts, secret = np.empty(n + 1, np.int64), secrets.randbits(62)
+    n_cells = _grid(cells, order, secret, table, starts)
     counts, begins = np.zeros(n, np.int64), np.zeros(n, np.int64)
     offsets = np.zeros(n + 1, np.int64)
-    found = _link(places, heights, cells, order, table, starts, n_cells, counts, begins)
+    found = _link(places, heights, cells, order, secret, table, starts, n_cells, counts, begins)
     np.cumsum(counts, out=offsets[1:])
     indices = np.empty(int(offsets[-1]), np.int32)
     _reorder(found, begins, offsets, indices)

@@ -67,11 +67,11 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
     _fit(q, u, p.image_radius_px, camera.is_closed, flat, gates, limits, planes)
     rays = directions(camera)
     closed = planes.copy()
-    for view, target, ray in (
-        (planes, closed, rays),
-        (_turned(planes), _turned(closed), _turned(rays)),
+    for view, target, ray, shown in (
+        (planes, closed, rays, q),
+        (_turned(planes), _turned(closed), _turned(rays), q.T),
     ):
-        _close(view, target, ray, p.gap_px, gates, p.gap_cosine)
+        _close(view, target, ray, shown, p.gap_px, gates, p.gap_cosine)
     return _lifted(closed, rays, camera, p)
 
 
@@ -85,10 +85,12 @@ def _nearest(angles: Floats, frame: Floats, pixel: NDArray[np.int64], nearest: F
     height, width = nearest.shape
     step, left, top = frame[0], frame[1], frame[2]
     for i in range(len(angles)):
-        turn = (angles[i, 0] - left) / step + 0.5
+        turn, around = (angles[i, 0] - left) / step + 0.5, 2 * np.pi / step
         if turn < 0:
-            turn += 2 * np.pi / step
-        x = min(max(int(turn), 0), width - 1)
+            turn += around
+        x = int(turn)
+        if x >= width:  # by rounding: just behind the last column, or just before the first
+            x = 0 if turn > (width + around) / 2 else width - 1
         y = min(max(int((top - angles[i, 1]) / step + 0.5), 0), height - 1)
         pixel[i] = y * width + x
         nearest[y, x] = min(nearest[y, x], angles[i, 2])
@@ -193,9 +195,13 @@ def _fit(
 
 @kernel
 def _close(
-    planes: Floats, out: Floats, rays: Floats, longest: int, gates: Floats, cosine: float
-) -> None:
-    """Fill gaps of each column whose two sides are planes that agree across it."""
+    planes: Floats, out: Floats, rays: Floats, q: Floats, longest: int, gates: Floats,
+    cosine: float,
+) -> None:  # fmt: skip
+    """Fill gaps of each column whose two sides are planes that agree across it.
+
+    Not where something else was seen, as a wire before a wall: nobody saw through it.
+    """
     height, width = planes.shape[0], planes.shape[1]
     for x in range(width):
         last = -1
@@ -216,6 +222,9 @@ def _close(
                         below = b[0] * ray[0] + b[1] * ray[1] + b[2] * ray[2]
                         if abs(above - below) < gates[1] + gates[2] * max(above, below):
                             share = (k - last) / (y - last)
+                            there = (1.0 - share) * above + share * below
+                            if q[k, x] > 0 and abs(q[k, x] - there) >= gates[1] + gates[2] * there:
+                                continue
                             for d in range(3):
                                 out[k, x, d] = (1.0 - share) * a[d] + share * b[d]
             last = y

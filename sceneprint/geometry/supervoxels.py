@@ -19,6 +19,8 @@ from sceneprint.types import Floats, Floats32, Ints32
 
 #: Depth of a seed's cell, in its width: surfaces seen at a slant are one cell still.
 _DEPTH = 4.0
+#: Least size of a patch, as a share of its seed's cell: seeds set wider end with no patch.
+_LEAST = 1e-3
 #: Rounds of growth before centres move: a patch may grow by so many voxels.
 _GROWTH = 2
 
@@ -138,7 +140,7 @@ def supervoxels(seen: Voxels, spacing: float, most: int, p: SegmentationParamete
     if not len(seen.sides):
         return np.empty((1, 0), np.int32)
     while True:
-        least = max(p.minimum_pixels, p.minimum_size * spacing * spacing)
+        least = max(p.minimum_pixels, max(_LEAST, p.minimum_size) * spacing * spacing)
         seeds = _seeds(seen, spacing)
         n = int(np.count_nonzero(np.bincount(seeds) >= least))
         if n <= most:

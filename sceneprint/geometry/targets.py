@@ -8,10 +8,12 @@ a cube holds a bounded number of them, however many a cloud has in one place.
 
 from __future__ import annotations
 
+import secrets
 from dataclasses import dataclass
 
 import numpy as np
 
+from sceneprint.geometry.cells import mixed
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.projecting import camera_of
 from sceneprint.types import Floats, Floats32, Ints32, Surface
@@ -27,7 +29,8 @@ class Target:
     Parameters
     ----------
     points, normals : (h, w, 3); (1, N, 3) of a cloud in no order
-    camera : (7,) of `camera_of`; of a cloud in no order its third number is the reach
+    camera : (7,) of `camera_of`; of a cloud in no order its third number is the reach, and its
+        fourth the secret of the hash
     heads, chain : of the hash: the first point of each slot, the next of each point, -1 for none
     """
 
@@ -39,18 +42,18 @@ class Target:
 
 
 @kernel
-def _slot(i: int, j: int, k: int, slots: int) -> int:
+def _slot(i: int, j: int, k: int, slots: int, secret: int) -> int:
     """Of a cube: slots is a power of two."""
-    return ((i * 73856093) ^ (j * 19349669) ^ (k * 83492791)) & (slots - 1)
+    return mixed((((i << 21) + j) << 21) + k, secret) & (slots - 1)
 
 
 @kernel
-def _fill(points: Floats32, cube: float, heads: Ints32, chain: Ints32) -> None:
+def _fill(points: Floats32, cube: float, secret: int, heads: Ints32, chain: Ints32) -> None:
     """Every point in the slot of its cube, the last first."""
     for n in range(len(points)):
         slot = _slot(
             int(np.floor(points[n, 0] / cube)), int(np.floor(points[n, 1] / cube)),
-            int(np.floor(points[n, 2] / cube)), len(heads),
+            int(np.floor(points[n, 2] / cube)), len(heads), secret,
         )  # fmt: skip
         chain[n] = heads[slot]
         heads[slot] = n
@@ -62,7 +65,7 @@ def nearest_alike(
     at: Floats, facing: Floats, least_cosine: float,
 ) -> tuple[int, float]:  # fmt: skip
     """The nearest point within reach whose normal is alike: index, -1 for none, and squared."""
-    reach, slots = camera[2], len(heads)
+    reach, secret, slots = camera[2], int(camera[3]), len(heads)
     cube = 2.0 * reach
     # the eight cubes that a ball of this reach can touch
     i0 = int(np.floor(at[0] / cube - 0.5))
@@ -72,7 +75,7 @@ def nearest_alike(
     for i in range(i0, i0 + 2):
         for j in range(j0, j0 + 2):
             for k in range(k0, k0 + 2):
-                n = heads[_slot(i, j, k, slots)]
+                n = heads[_slot(i, j, k, slots, secret)]
                 while n >= 0:
                     ex, ey, ez = (
                         at[0] - points[0, n, 0], at[1] - points[0, n, 1], at[2] - points[0, n, 2]
@@ -113,13 +116,14 @@ def target_of(surface: Surface, nearest: float, reach: float) -> Target:
     camera, none = camera_of(surface.camera, nearest), np.zeros(0, np.int32)
     if surface.camera is not None:
         return Target(surface.points, surface.normals, camera, none, none)
-    camera[2] = reach
+    secret = secrets.randbits(52)  # what a float64 holds whole
+    camera[2:4] = reach, secret
     points, normals = surface.points[surface.valid], surface.normals[surface.valid]
     kept = one_of_each(points, reach / FINENESS)
     points, normals = points[kept], normals[kept]
     slots = 1 << max(int(2 * len(points) - 1).bit_length(), 1)
     heads, chain = np.full(slots, -1, np.int32), np.full(len(points), -1, np.int32)
-    _fill(points, 2.0 * reach, heads, chain)
+    _fill(points, 2.0 * reach, secret, heads, chain)
     return Target(points[None], normals[None], camera, heads, chain)
 
 

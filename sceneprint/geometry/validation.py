@@ -56,8 +56,8 @@ class Validation:
     ----------
     status : accepted, rejected, or ambiguous (a rival transform explains the frames as well, or
         what they share leaves a direction free)
-    strength : of an accepted match: strong, or weak where a rival comes near or little agrees;
-        else None
+    strength : of an accepted match: strong, or weak where a rival comes near, little agrees, or a
+        frame has no viewpoint; else None
     reason : a short sentence
     T_match_query : (4, 4) query coordinates to the match's, x_match = T @ x_query; the best there
         is, whatever the status: halfway between the two directions, or where these disagree, the
@@ -198,7 +198,7 @@ def _decided(
     if against is not None:
         status, reason = against
     elif mode == "paper":
-        strength = "weak" if e.violations is None else "strong"
+        strength = "weak" if e.violations is None or e.one_sided else "strong"
         status, reason = "accepted", "the two directions agree"
     else:
         voted = np.concatenate([there.others, inverses(back.others)])
@@ -230,5 +230,6 @@ def _evidence(
         plane_overlap=plane_overlap,
         violations=violated / max(agreeing + violated, 1) if seen else None,
         stiffness=min(there.stiffness, back.stiffness),
+        one_sided=len(seen) == 1,
     )
     return e, inliers

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from sceneprint.geometry.clouds import CloudParameters
 from sceneprint.models.model import ModelParameters
 
@@ -27,11 +25,16 @@ BOUNDS = {
     "patches of a cloud": (1, 10_000),
     "patches of a cloud for validation": (1, 2_000),
     "gap of a cloud": (0, 1000),
+    "neighbours in a cloud": (1, 1 << 27),
     "hypotheses": (1, 1000),
     "correspondences": (1, 10_000),
     "rivals": (0, 100),
     "iterations of a refinement": (0, 1000),
     "stride": (1, 1000),
+    "pixels about an edge": (0, 100),
+    "rounds of a hypothesis": (0, 1000),
+    "neighbours in a sequence": (1, 1000),
+    "correspondences of sequences": (1, 10_000),
 }
 
 
@@ -57,6 +60,7 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
         raise ValueError("every scale of the surroundings should have a radius and bins")
     _check_cloud(p.cloud)
     alignment, rivals = p.validation.alignment, p.validation.rivals
+    sequence = alignment.sequence
     refinements = (alignment.coarse, alignment.fine, rivals.first, rivals.then)
     strides = [p.validation.agreement.stride, *(one.stride for one in refinements)]
     counts = {
@@ -76,11 +80,16 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
         "patches of a cloud": p.cloud.maximum_patches,
         "patches of a cloud for validation": p.cloud.maximum_validation_patches,
         "gap of a cloud": p.cloud.gap_px,
+        "neighbours in a cloud": p.cloud.maximum_pixels * (2 * p.cloud.radius_px + 1) ** 2,
         "hypotheses": max(alignment.n_refined, alignment.consensus.n_seeds),
         "correspondences": alignment.matching.n_sources * alignment.matching.n_nearest,
         "rivals": max(rivals.n_axes, rivals.n_planes, rivals.n_shifts),
         "iterations of a refinement": max(one.iterations for one in refinements),
         "stride": min(strides),
+        "pixels about an edge": p.validation.agreement.edge_px,
+        "rounds of a hypothesis": alignment.consensus.rounds,
+        "neighbours in a sequence": sequence.n_neighbours,
+        "correspondences of sequences": sequence.n_sources * sequence.n_nearest,
     }
     for what, (least, most) in BOUNDS.items():
         if not least <= counts[what] <= most:
@@ -89,7 +98,7 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
 
 def _check_cloud(p: CloudParameters) -> None:
     """See that voxels and pixels have a size, and the range has points."""
-    if not 0 < p.minimum_range < p.maximum_range < math.inf:
+    if not 1e-4 <= p.minimum_range < p.maximum_range <= 1e6:
         raise ValueError("the range of a cloud should begin above 0 and before it ends")
     if not (p.voxel_size > 0 and min(p.voxel_angle, p.image_angle) >= 1e-4):
         raise ValueError("voxels and pixels of a cloud should have a size")
@@ -97,5 +106,5 @@ def _check_cloud(p: CloudParameters) -> None:
         raise ValueError("voxels and pixels of a cloud should be small, and not flat")
     if not min(p.seed_px, p.validation_seed_px) >= 1:
         raise ValueError("seeds of a cloud should be as far apart as voxels")
-    if not p.range_gate > 0:
+    if not 0 < p.range_gate <= 1:  # of 1, neighbours are as far as e times the range
         raise ValueError("neighbours in a cloud should be in some range of each other")

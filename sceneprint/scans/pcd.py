@@ -114,12 +114,14 @@ def read_pcd(data: bytes) -> RawPoints:
 
 
 def _written_out(data: bytes, start: int, count: int, fields: list[Field]) -> Iterator[Floats]:
-    text = np.frombuffer(data, np.uint8)
-    wanted = [_XYZ.index(f.name) if f.name in _XYZ else -1 for f in fields for _ in range(f.count)]
-    check_room(text, start, count, len(wanted))
-    return parse_blocks(
-        text, start, count, np.array(wanted, np.int8), np.zeros(len(wanted), np.bool_)
-    )
+    text, counts = np.frombuffer(data, np.uint8), [field.count for field in fields]
+    width = sum(counts)
+    if not count:  # a header alone must not ask for room for its columns
+        return iter(())
+    check_room(text, start, count, width)
+    column = [_XYZ.index(field.name) if field.name in _XYZ else -1 for field in fields]
+    wanted = np.repeat(np.array(column, np.int8), counts)
+    return parse_blocks(text, start, count, wanted, np.zeros(width, np.bool_))
 
 
 def _compressed(data: bytes, start: int, count: int, fields: list[Field]) -> Iterator[Floats]:

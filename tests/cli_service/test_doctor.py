@@ -33,8 +33,8 @@ def test_a_sound_machine(sceneprint: Run, data_folder: Path, service_url: str) -
     done = sceneprint("doctor", "--data", data_folder)
     found = verdicts(done.stdout)
     assert list(found) == [
-        "python", "sqlite", "kernels", "table paper", "table compact", "data folder", "disk",
-        "database", "embreex", "open3d libraries", "service", "workers",
+        "python", "sqlite", "kernels", "table paper", "table compact", "table lidar", "data folder",
+        "disk", "database", "embreex", "open3d libraries", "service", "workers",
     ]  # fmt: skip
     for needed in ("python", "sqlite", "data folder", "database", "service", "workers"):
         assert found[needed] == "ok"

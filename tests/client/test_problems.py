@@ -12,7 +12,9 @@ from service.problems import type_of
 KINDS = [
     kind
     for kind in vars(errors).values()
-    if isinstance(kind, type) and not issubclass(kind, errors.ServiceError)
+    if isinstance(kind, type)
+    and issubclass(kind, errors.SceneprintError)
+    and not issubclass(kind, errors.ServiceError)
 ]
 
 

@@ -115,6 +115,7 @@ def test_what_clouds_json_says(hall: Path) -> None:
         ('{"units_per_metre": 0}', "units_per_metre is 0"),
         ('{"units_per_metre": "mm"}', "units_per_metre is 'mm'"),
         ('{"units_per_metre": true}', "units_per_metre is True"),
+        (f'{{"units_per_metre": 1{400 * "0"}}}', "units_per_metre is 1000"),
         ('{"viewpoint": [0, 0, 1]}', r"viewpoint is \[0, 0, 1\]"),
         ('{"viewpoint": {"x": 0, "y": 0}}', "viewpoint is"),
         ('{"viewpoint": {"x": 0, "y": 0, "z": 1e999}}', "z is inf"),
@@ -139,6 +140,21 @@ def test_depth_and_clouds_together(hall: Path, tmp_path: Path) -> None:
     (scene / "mesh.ply").write_bytes(write_ply(POINTS))
     (scene / "depth" / "0.pcd").write_bytes(b"")
     assert [s.name for s in find_sequences(scene)] == ["depth"]
+
+
+def test_a_mesh_does_not_hide_the_images_below_it(hall: Path) -> None:
+    for run, deeper in (("a", ""), ("b", "night")):
+        folder = hall / run / deeper
+        folder.mkdir(parents=True)
+        write_depth_png(folder / "0.png", np.ones((3, 4), np.float32), 1000.0)
+    # pictures without a camera are no depth, and clouds may lie above them
+    assert [s.layout for s in find_sequences(hall)] == [Layout.CLOUDS]
+    camera = {"width": 4, "height": 3, "fx": 4, "fy": 4, "cx": 2, "cy": 1}
+    (hall / "b" / "intrinsics.json").write_text(json.dumps(camera))
+    (hall / "a" / "0.png").unlink()
+    assert [(s.name, s.layout) for s in find_sequences(hall)] == [("b/night", Layout.PLAIN)]
+    (hall / "clouds.json").write_text("{}")
+    assert [s.layout for s in find_sequences(hall)] == [Layout.CLOUDS]
 
 
 def test_damaged_clouds_and_names(hall: Path) -> None:

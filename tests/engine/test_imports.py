@@ -76,6 +76,20 @@ def test_a_slice_that_was_lost_is_done_again(
     assert len(empty.list_frames("hall").items) == 5
 
 
+def test_large_frames_are_not_in_memory_together(
+    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sixteen clouds of 512 MiB each would be more than a worker may take."""
+    sizes = [len(one.data) for one in uploads[:3]]
+    begun(empty, packed(uploads[:3]))
+    task, over = claimed(empty), time.monotonic() - 1
+    taken = []
+    for most in (max(sizes) - 1, sizes[0] + sizes[1], sum(sizes)):
+        monkeypatch.setattr(imports, "_BYTES_AT_ONCE", most)
+        taken.append(len(empty.imports.handle(task, over).items))
+    assert taken == [1, 2, 3]
+
+
 def test_an_archive_stays_until_its_import_is_over_and_no_longer(
     empty: Engine, uploads: Any
 ) -> None:

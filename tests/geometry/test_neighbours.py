@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sceneprint.geometry.cells import mixed
 from sceneprint.geometry.fitting import least_axis, plane_facing, plane_seen
 from sceneprint.geometry.neighbours import Links, linked
 from sceneprint.types import Floats
@@ -31,6 +32,24 @@ def test_links_are_all_pairs_that_are_near(spread: float) -> None:
     places = np.repeat(seeds, 20, axis=0) + rng.normal(size=(240, 3))
     heights = rng.uniform(0, 3, 240)
     assert of(linked(places, heights)) == naive(places, heights)
+
+
+def test_cells_that_share_a_slot_do_so_under_one_secret_only() -> None:
+    """Nobody can know which cells make a table slow; what is found does not depend on it."""
+    keys, mask = np.arange(200_000, dtype=np.int64) << 21, (1 << 20) - 1
+    same = [int(key) for key in keys if mixed(key, 5) & mask < 1 << 12]
+    assert len(same) > 500
+    assert len({mixed(key, 77) & mask for key in same}) > 0.98 * len(same)
+
+
+def test_links_do_not_depend_on_the_secret(monkeypatch: pytest.MonkeyPatch) -> None:
+    places = np.random.default_rng(5).uniform(-4, 4, (500, 3))
+    made = []
+    for secret in (0, 2**61 + 12345):
+        monkeypatch.setattr("secrets.randbits", lambda _, secret=secret: secret)
+        made.append(linked(places, np.zeros(500)))
+    assert made[0].offsets.tobytes() == made[1].offsets.tobytes()
+    assert made[0].indices.tobytes() == made[1].indices.tobytes()
 
 
 def test_no_points_no_links() -> None:

@@ -10,7 +10,8 @@ import pytest
 
 from sceneprint.errors import UselessFrame
 from sceneprint.geometry.clouds import CloudParameters
-from sceneprint.geometry.framing import directions
+from sceneprint.geometry.framing import directions, framed, to_angles
+from sceneprint.geometry.spheres import _averaged as averaged
 from sceneprint.geometry.spheres import range_image
 from sceneprint.types import Cloud, Floats, Frame, Sphere
 
@@ -117,6 +118,39 @@ def test_gaps_between_rings_are_closed_on_one_plane_only() -> None:
     assert len(empty) == 2  # the gap at the step
     x = two.points[two.valid][:, 0]
     assert (np.minimum(np.abs(x - 3), np.abs(x - 4)) < 1e-3).all()
+
+
+def test_points_where_the_image_begins_are_in_its_first_column() -> None:
+    """At azimuth 0, the left edge of column 0 but for rounding: half a wall, from y = 0 on."""
+    y, z = np.meshgrid(np.arange(0, 2, 0.01), np.arange(-0.6, 0.6, 0.01))
+    for x in 2 + 0.01 * np.arange(60):
+        points = np.stack([np.full(y.shape, x), y, z], axis=2).reshape(-1, 3).astype(np.float32)
+        angles = np.empty((len(points), 3))
+        to_angles(points, 2, angles)
+        camera = framed(angles, 2, replace(P, image_angle=0.0068 + 0.0089 * (x - 2)))
+        q, u = averaged(angles, camera, P)
+        u /= np.maximum(np.linalg.norm(u, axis=2, keepdims=True), 1e-9)
+        cosines = (u * directions(camera)).sum(axis=2)[q > 0]
+        assert cosines.min() > np.cos(camera.step)
+
+
+def test_nobody_sees_through_a_wire() -> None:
+    """It is too narrow for a plane of its own, and the wall behind it is not invented there."""
+    step = P.image_angle
+    azimuth, elevation = np.meshgrid(
+        np.arange(-0.5, 0.5, step / 2.5), np.arange(-0.3, 0.3, step / 2.5)
+    )
+    rays = np.stack([np.ones_like(azimuth), np.tan(azimuth), np.tan(elevation)], axis=2)
+    rays /= np.linalg.norm(rays, axis=2)[..., None]
+    reach = np.where(np.abs(azimuth) < 0.4 * step, 1.5, 4.0 / rays[..., 0])
+    surface = range_image(Cloud((rays * reach[..., None]).reshape(-1, 3).astype(np.float32)), P)
+    camera = surface.camera
+    assert isinstance(camera, Sphere)
+    wire = round(-camera.left / camera.step)
+    inner = surface.valid[3:-3]
+    assert not inner[:, wire].any()
+    assert inner[:, wire + 3 : -3].all()
+    assert inner[:, 3 : wire - 2].all()
 
 
 def test_any_order_gives_the_same_bytes(cloud_scenes: ModuleType) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import ModuleType
 
@@ -121,3 +122,14 @@ def test_voxels_grow_with_range(cloud_scenes: ModuleType) -> None:
     np.testing.assert_allclose(seen.sides, 0.03 * ranges, rtol=1e-5)
     plain = voxels(replace(cloud_scenes.room(30_000), has_viewpoint=False), P)
     np.testing.assert_allclose(plain.sides, 0.06)
+
+
+def test_parts_that_never_become_few_enough_come_to_an_end() -> None:
+    """Plates apart from each other, more than may be patches, and no size too small for one."""
+    side = np.linspace(0, 0.4, 14)
+    plate = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3)
+    corners = np.stack(np.meshgrid(np.arange(4), np.arange(3), [0]), axis=-1).reshape(-1, 3)
+    points = (plate[None] + corners[:, None]).reshape(-1, 3).astype(np.float32)
+    seen = voxels(Cloud(points, has_viewpoint=False), P)
+    for least in (0.0, -1.0, math.nan):
+        assert supervoxels(seen, 5.0, 8, replace(S, minimum_size=least)).max() < 8

@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.geometry.acceptance import AcceptanceParameters, Evidence, belief, objection
+from sceneprint.geometry.agreement import AgreementParameters, agreements, looked_up, sampled
+from sceneprint.geometry.registration import FINE, refine
 from sceneprint.geometry.rigid import difference, inverse, moved
 from sceneprint.geometry.scaling import scaled
 from sceneprint.geometry.validation import Validation, ValidationParameters, validate
@@ -193,9 +195,31 @@ def test_where_there_is_no_viewpoint_a_match_is_weak(
             metres, degrees = off(v, T)
             assert metres < 0.02
             assert degrees < 0.3
-            assert v.status == "accepted"
+            assert (v.status, v.strength) == ("accepted", "weak")
+            assert "one frame" in v.reason
             assert v.violations is not None
             assert v.violations < 0.02
+    one_sided = validate(rooms[0][1][0].scan, fused[0][1], mode="paper")
+    assert (one_sided.status, one_sided.strength) == ("accepted", "weak")
+
+
+def test_what_is_found_by_place_does_not_depend_on_a_secret(
+    fused: list[list[Geometry]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which points share a slot of the hash nobody can know: else a cloud could make it slow."""
+    query, match = fused[0]
+    points, made = sampled(query.surface, 5), []
+    for secret in (0, 2**51 + 12345):
+        monkeypatch.setattr("secrets.randbits", lambda _, secret=secret: secret)
+        p = AgreementParameters()
+        target = looked_up(match.surface, p)
+        refined = refine(points, match.surface, np.eye(4), FINE)
+        assert refined is not None
+        inliers = agreements(points, match.surface, refined.T[None], p)[0, 0]
+        assert inliers > 0.4 * len(points)
+        made.append((target.heads.tobytes(), inliers, refined.T.tobytes()))
+    assert made[0][0] != made[1][0]
+    assert made[0][1:] == made[1][1:]
 
 
 def test_an_empty_square_room_without_a_viewpoint_is_ambiguous(made: Make) -> None:
@@ -264,4 +288,8 @@ def test_without_evidence_of_free_space_more_must_agree() -> None:
         assert "free space" in reason
     assert belief(blind, 0.31, p)[:2] == ("ambiguous", None)
     assert belief(seen, 0.15, p)[:2] == ("ambiguous", None)
+    one_sided = replace(seen, one_sided=True)
+    assert objection(one_sided, p, "full") is None
+    assert belief(one_sided, 0.0, p)[:2] == ("accepted", "weak")
+    assert belief(one_sided, 0.15, p)[:2] == ("ambiguous", None)
     assert ValidationParameters().acceptance == AcceptanceParameters()

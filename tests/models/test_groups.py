@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -76,9 +77,35 @@ def test_what_is_not_known_is_refused(group: str, value: Any) -> None:
         CloudParameters(same_surface=0.0),
         CloudParameters(seed_px=0.0),
         CloudParameters(range_gate=0.0),
+        CloudParameters(range_gate=math.inf),
+        CloudParameters(maximum_range=math.inf),
+        CloudParameters(minimum_range=1e-200),
+        CloudParameters(maximum_pixels=1 << 20, radius_px=16),
     ],
 )
 def test_what_would_take_for_ever_is_refused(small_model: Model, cloud: CloudParameters) -> None:
     model = replace(small_model, parameters=replace(small_model.parameters, cloud=cloud))
     with pytest.raises(UnreadableModel):
         parse_model(write_model(model), "a file")
+
+
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [
+        ("agreement.edge_px", 1_000_000_000),
+        ("alignment.consensus.rounds", 1_000_000_000),
+        ("alignment.sequence.n_neighbours", 1_000_000_000),
+        ("alignment.sequence.n_sources", 1_000_000_000),
+        ("rivals.then.iterations", 1_000_000_000),
+    ],
+)
+def test_validation_that_would_take_for_ever_is_refused(
+    small_model: Model, where: str, value: int
+) -> None:
+    def changed(record: Any, names: list[str]) -> Any:
+        first, *rest = names
+        return replace(record, **{first: changed(getattr(record, first), rest) if rest else value})
+
+    parameters = changed(small_model.parameters, ["validation", *where.split(".")])
+    with pytest.raises(UnreadableModel, match="is not from"):
+        parse_model(write_model(replace(small_model, parameters=parameters)), "a file")

@@ -1,6 +1,7 @@
 """PCD: its header, its compression, its viewpoint."""
 
 import struct
+import tracemalloc
 from collections.abc import Callable
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.errors import UnreadableCloud
+from sceneprint.errors import FrameError, UnreadableCloud
 from sceneprint.scans import decode_cloud, decode_scan
 from sceneprint.scans.lzf import inflate
 
@@ -69,6 +70,22 @@ def test_lies(pcd: Write, case: str) -> None:
         decode_cloud(pcd().replace(old, new).replace(b"POINTS 12", b"POINTS " + (
             b"50000000" if case == "fifty million" else b"12"
         )))  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_header_alone_asks_for_nothing(count: int) -> None:
+    """Of a hundred fields, each of as many values as may be."""
+    header = (
+        f"VERSION 0.7\nFIELDS x y z{' a' * 100}\nSIZE{' 4' * 103}\nTYPE{' F' * 103}\n"
+        f"COUNT 1 1 1{' 65536' * 100}\nWIDTH {count}\nHEIGHT 1\nDATA ascii\n1 2 3\n"
+    )
+    tracemalloc.start()
+    try:
+        with pytest.raises(FrameError, match=r"6553603 values|0 of 0 points"):
+            decode_cloud(header.encode())
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
 
 
 def test_truncated(pcd: Write) -> None:

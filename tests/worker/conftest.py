@@ -23,7 +23,7 @@ from sceneprint.engine import Engine
 from sceneprint.schemas import Added, CameraIntrinsics, FrameMeta, NewMap
 from sceneprint.settings import Settings
 
-LEASE_S = 0.5
+LEASE_S = 1.5  # a busy machine renews one late at times
 
 
 def until(what: Callable[[], Any], seconds: float = 90) -> Any:

@@ -30,7 +30,8 @@ prepare = work.prepare
 def crashing(): ctypes.string_at(0)
 def hanging():
     logging.getLogger("spoilt").info("hanging")
-    ctypes.PyDLL(None).sleep(600)  # never gives the interpreter back
+    while True:  # a signal ends one sleep
+        ctypes.PyDLL(None).sleep(600)  # never gives the interpreter back
 def hungry(): return np.ones(1 << 30, np.uint8)
 def broken(): raise ZeroDivisionError("a bug")
 

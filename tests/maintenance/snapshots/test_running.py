@@ -62,7 +62,7 @@ class Robot(threading.Thread):
 
 @contextmanager
 def at_work(url: str, uploads: list) -> Iterator[list[Robot]]:
-    robots = [Robot(url, uploads[i::2]) for i in range(2)]
+    robots = [Robot(url, uploads[i::2]) for i in range(3)]
     for robot in robots:
         robot.start()
     yield robots
@@ -74,7 +74,7 @@ def at_work(url: str, uploads: list) -> Iterator[list[Robot]]:
 
 def test_it_holds_one_state_and_all_of_it(data, tmp_path, uploads, rows, answers, settings):
     asked = uploads[:6]
-    archives = [tmp_path / f"{i}.tar" for i in range(2)]
+    archives = [tmp_path / f"{i}.tar" for i in range(3)]
     with serving(data, 1) as url:
         with Client(url) as client:
             client.create_map("busy", model="compact")
