@@ -14,7 +14,6 @@ from sceneprint.evaluation.registration_baselines import (
     NORMALS,
     VOXEL,
     Clock,
-    open3d,
     points_of,
 )
 from sceneprint.geometry.counting import count_pairs
@@ -24,6 +23,7 @@ from sceneprint.geometry.hierarchy import hierarchy
 from sceneprint.geometry.normals import surface
 from sceneprint.geometry.segmentation import segment
 from sceneprint.geometry.weights import patch_weights
+from sceneprint.libraries import open3d
 from sceneprint.pipeline import Signer, geometry_of, sign
 from sceneprint.signing import float_signature, see
 from sceneprint.types import Floats, Frame
@@ -102,7 +102,7 @@ def measure(frames: list[Frame], signer: Signer, warm_up: int = 3) -> EncodeFigu
     """Sign every frame and, in turn, compute its FPFH, on the processor we are pinned to."""
     p, note, o3d = signer.model.parameters.depth, "", None
     try:
-        o3d = open3d()
+        o3d = open3d("FPFH")
     except MissingDependency as error:
         note = str(error)
     for frame in frames[:warm_up]:

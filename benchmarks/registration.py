@@ -14,11 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.encode import Clock, open3d, points_of
+from benchmarks.encode import Clock, points_of
 from benchmarks.pairs import FramePair
 from sceneprint.errors import MissingDependency
 from sceneprint.evaluation.registration_baselines import METHODS, register
 from sceneprint.geometry.rigid import difference
+from sceneprint.libraries import open3d
 from sceneprint.models import Model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
@@ -81,7 +82,7 @@ def measure(pairs: Sequence[FramePair], model: Model, warm_up: int = 1) -> Regis
     """
     p, note, o3d = model.parameters.depth, "", None
     try:
-        o3d = open3d()
+        o3d = open3d("FPFH")
     except MissingDependency as error:
         note = str(error)
     for pair in pairs[:warm_up]:

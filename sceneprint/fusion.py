@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.errors import InvalidRequest, MissingDependency, UselessFrame
+from sceneprint.errors import InvalidRequest, UselessFrame
 from sceneprint.geometry.coverage import Mesh
 from sceneprint.geometry.depth import halved
 from sceneprint.geometry.rigid import inverse, moved
+from sceneprint.libraries import open3d
 from sceneprint.types import Floats, Floats32, Frame
 
-#: Debian packages with the system libraries that Open3D loads.
-PACKAGES = "libgl1 libegl1 libx11-6 libusb-1.0-0 libgomp1"
 #: Voxels along the edge of a block: space is kept in blocks, where a surface is.
 _SIDE = 8
 #: Voxels before and behind a surface, along the ray, in which its distance is kept: where a ray
@@ -62,7 +61,7 @@ def fuse(views: Sequence[Frame], p: FusionParameters | None = None) -> tuple[Mes
     InvalidRequest : voxels of the wanted size take more blocks than there may be.
     """
     p = p or FusionParameters()
-    o3d = open3d()
+    o3d = open3d("A reconstruction")
     kept = [within(view, p) for view in views]
     points = [_points(view) for view in kept]
     if not sum(map(len, points)):
@@ -89,24 +88,6 @@ def within(view: Frame, p: FusionParameters) -> Frame:
         good = (depth >= p.nearest_m) & (depth <= p.farthest_m)  # false for NaN as well
     kept: Floats32 = np.ascontiguousarray(np.where(good, depth, np.float32(0)))
     return replace(view, depth=kept, intrinsics=camera)
-
-
-def open3d() -> Any:
-    """The open3d module, to work in one thread.
-
-    Raises
-    ------
-    MissingDependency : it, or a system library it needs, is absent.
-    """
-    try:
-        import open3d as module
-    except (ImportError, OSError) as error:
-        raise MissingDependency(
-            f"A reconstruction needs Open3D, which cannot be imported here ({error}). Install it "
-            f"(pip install open3d), and on Debian or Ubuntu: apt-get install {PACKAGES}"
-        ) from error
-    module.utility.set_max_threads(1)  # one process, one processor; and one order of sums
-    return module
 
 
 def _points(view: Frame) -> Floats:

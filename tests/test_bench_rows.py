@@ -18,7 +18,7 @@ import pytest
 
 from benchmarks import dpp, readiness, registration, scan, search, service
 from benchmarks.__main__ import BEGIN, END, Rows, page
-from benchmarks.encode import EncodeFigures, open3d, points_of
+from benchmarks.encode import EncodeFigures, points_of
 from benchmarks.machine import Machine
 from benchmarks.pairs import FramePair, pairs_among, real_pairs, synthetic_pairs
 from sceneprint.cli.demo_building import write_building
@@ -27,6 +27,7 @@ from sceneprint.errors import MissingDependency
 from sceneprint.evaluation.registration_baselines import register
 from sceneprint.geometry.diversity import diversify
 from sceneprint.geometry.retrieval import distances, pairwise_distances, rank
+from sceneprint.libraries import open3d
 from sceneprint.models import Model
 from sceneprint.types import Floats, Frame, Intrinsics
 
@@ -147,7 +148,7 @@ def test_without_open3d_the_row_says_so(
 
 def test_open3d_finds_a_frame_in_itself(room_frames: tuple[Frame, ...]) -> None:
     try:
-        o3d = open3d()
+        o3d = open3d("FPFH")
     except MissingDependency as error:
         pytest.skip(str(error))
     points = points_of(room_frames[0], 0.3, 9.0)

@@ -208,9 +208,10 @@ class Without:
             raise ImportError("libX11.so.6: cannot open shared object file")
 sys.meta_path.insert(0, Without())
 import sceneprint.cli, sceneprint.client, sceneprint.fusion, service.app, worker.loop
+from sceneprint.libraries import open3d
 from sceneprint.errors import MissingDependency
 try:
-    sceneprint.fusion.open3d()
+    open3d("A reconstruction")
 except MissingDependency as error:
     print(error)
 """

@@ -24,7 +24,7 @@ from sceneprint.errors import (
     UnreadableGeometry,
     UselessFrame,
 )
-from sceneprint.fusion import BAND, FusionParameters, fuse, open3d, within
+from sceneprint.fusion import BAND, FusionParameters, fuse, within
 from sceneprint.geometry.coverage import (
     added_areas,
     observed_volume,
@@ -32,6 +32,7 @@ from sceneprint.geometry.coverage import (
     share_seen,
 )
 from sceneprint.geometry.enlarging import doubled
+from sceneprint.libraries import open3d
 from sceneprint.rendering import PALETTE, reconstruction_picture
 from sceneprint.schemas.reconstructions import Coverage, FusedView, LeftOut, NewReconstruction
 from sceneprint.store import Store
@@ -101,7 +102,8 @@ def fused(
     UselessFrame : no match is left, or their depth makes no surface.
     InvalidRequest : voxels too small for memory.
     """
-    open3d()  # before all the reading: where it is missing, that is what is to be told
+    # before all the reading: where it is missing, that is what is to be told
+    open3d("A reconstruction")
     p = FusionParameters(voxel_m=wanted.voxel_m)
     frames, told, left_out = list[Frame](), list[FusedView](), list[LeftOut]()
     # points of a cloud have no image that voxels could be carved with: it is explained, not fused

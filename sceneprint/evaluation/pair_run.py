@@ -21,11 +21,11 @@ from sceneprint.evaluation.pair_trying import Tried, attempt, open_bench, scale_
 from sceneprint.evaluation.planarity import OFF_PLANE, PLANAR, plane_share
 from sceneprint.evaluation.protocol import Chosen, every_frame
 from sceneprint.evaluation.records import RIGHT, Member
-from sceneprint.evaluation.registration_baselines import open3d
 from sceneprint.evaluation.run import overlaps_of
 from sceneprint.evaluation.workers import Watch, map_over, unwatched
 from sceneprint.geometry.acceptance import AcceptanceParameters, Mode
 from sceneprint.geometry.sequences import Matching
+from sceneprint.libraries import open3d
 from sceneprint.pipeline import Signer
 from sceneprint.types import Floats
 
@@ -104,7 +104,8 @@ def evaluate_pairs(
     MissingDependency : baselines were asked for, and Open3D cannot be imported.
     """
     if settings.baselines:
-        open3d()  # before all the reading: where it is missing, that is what is to be told
+        # before all the reading: where it is missing, that is what is to be told
+        open3d("A baseline of registration")
     placed = spread(every_frame(paths), settings.frames)
     chosen = tuple(one for one, _ in placed)
     prepared = prepare_all(

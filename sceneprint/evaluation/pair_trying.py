@@ -23,13 +23,14 @@ from sceneprint.evaluation.pairs import (
     validated,
 )
 from sceneprint.evaluation.records import Error, Member, Pair, pose_error
-from sceneprint.evaluation.registration_baselines import open3d, points_of, register
+from sceneprint.evaluation.registration_baselines import points_of, register
 from sceneprint.geometry.acceptance import Mode
 from sceneprint.geometry.alignment import AlignmentParameters
 from sceneprint.geometry.properties import PropertyParameters
 from sceneprint.geometry.registration import refined_all
 from sceneprint.geometry.sequences import Matching
 from sceneprint.geometry.validation import refined_at
+from sceneprint.libraries import open3d
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
@@ -102,7 +103,7 @@ def open_bench(
     matching: Matching = "histograms",
 ) -> Bench:
     """Make ready to try pairs of the frames of a store."""
-    o3d = open3d() if baselines else None
+    o3d = open3d("A baseline of registration") if baselines else None
     judging = open_judge(store, mode, seed, model.parameters.validation, matching)
     return Bench(judging, store, model, limits, o3d)
 

@@ -15,13 +15,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sceneprint.errors import MissingDependency
 from sceneprint.types import Floats, Frame
 
 T = TypeVar("T")
 
-#: Debian packages with the system libraries that Open3D loads.
-PACKAGES = "libgl1 libegl1 libx11-6 libusb-1.0-0 libgomp1"
 #: FPFH as its users run it: voxel, then normals (radius, neighbours), features (the same).
 VOXEL, NORMALS, FEATURES = 0.05, (0.10, 30), (0.25, 100)
 #: RANSAC: farthest correspondence (metres), points a hypothesis, least ratio of edge lengths, ...
@@ -71,25 +68,6 @@ class Attempt:
     def milliseconds(self) -> float:
         """Of all stages."""
         return sum(self.stages.values())
-
-
-def open3d() -> Any:
-    """The open3d module, to work in one thread.
-
-    Raises
-    ------
-    MissingDependency : it, or a system library it needs, is absent.
-    """
-    try:
-        import open3d as module
-    except (ImportError, OSError) as error:
-        raise MissingDependency(
-            f"The baselines need Open3D, which cannot be imported here ({error}). Install it "
-            f"(pip install open3d), and on Debian or Ubuntu: apt-get install {PACKAGES}"
-        ) from error
-    module.utility.set_max_threads(1)  # one process, one processor: as ours
-    module.utility.set_verbosity_level(module.utility.VerbosityLevel.Error)
-    return module
 
 
 def points_of(frame: Frame, minimum: float, maximum: float) -> Floats:

@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import MissingDependency, UnreadableCloud
-from sceneprint.scans.raw import MAXIMUM_INFLATED, steps
+from sceneprint.scans.raw import steps
 
 _AGAIN = "Copy or write the file again."
 _VLR = 54  #: bytes of a record's own header
 _MAXIMUM_VLRS = 10_000
 _VARIABLE = 0xFFFFFFFF  #: chunk size that says each chunk has its own
+_MOST = 2 << 30  #: bytes of records, which are inflated block by block
 _MOST_RATIO, _FREE = 250, 64 << 20  #: how much more records are than their file, once beyond bytes
 
 #: Bytes of a value by its kind, where that is fixed; kinds from 10 are in layers, so many each.
@@ -64,7 +65,7 @@ def inflated_records(
             f"The LAZ file packs records of {length} bytes of format {form} as {kinds[:20]} by "
             f"compressor {compressor}, which does not fit. {_AGAIN}"
         )
-    if count * length > min(MAXIMUM_INFLATED * 2, _FREE + _MOST_RATIO * len(data)):
+    if count * length > min(_MOST, _FREE + _MOST_RATIO * len(data)):
         raise UnreadableCloud(
             f"The LAZ file announces {count} points of {length} bytes in {len(data)} bytes, more "
             f"than {_MOST_RATIO} times as much. {_AGAIN}"

@@ -17,8 +17,9 @@ MAXIMUM_POINTS = 20_000_000
 #: Longest file of points that is read, bytes.
 MAXIMUM_BYTES = 512 << 20
 
-#: Most bytes that a compressed file is inflated to.
-MAXIMUM_INFLATED = 1 << 30
+#: Most bytes that a compressed file is inflated to at once: 20 million points of x, y, z and one
+#: more, and what several uploads at a time may hold together.
+MAXIMUM_INFLATED = 400 << 20
 
 #: Points that are parsed at a time: what they take beside the file stays in the cache.
 BLOCK = 1 << 16

@@ -15,8 +15,9 @@ from sceneprint.cli import main
 from sceneprint.clouds import write_ply
 from sceneprint.evaluation.pair_drawing import BINS
 from sceneprint.evaluation.protocol import every_frame
-from sceneprint.evaluation.registration_baselines import METHODS, open3d, points_of, register
+from sceneprint.evaluation.registration_baselines import METHODS, points_of, register
 from sceneprint.geometry.rigid import difference
+from sceneprint.libraries import open3d
 from sceneprint.models import Model, save_model
 from sceneprint.types import Floats
 
@@ -128,14 +129,14 @@ def test_baselines_find_a_cloud_again() -> None:
     for scale in (1.0, 5.0):
         apart = truth.copy()
         apart[:3, 3] *= scale
-        found = register(scale * points, scale * moved, open3d(), scale=scale)
+        found = register(scale * points, scale * moved, open3d("A test"), scale=scale)
         assert tuple(found) == METHODS
         for one in found.values():
             metres, radians = difference(one.refined, apart)
             assert metres < 0.01 * scale
             assert radians < 0.01
             assert {"normals", "features", "ICP"} < set(one.stages)
-    assert register(points[:5], moved, open3d()) == {}
+    assert register(points[:5], moved, open3d("A test")) == {}
 
 
 def test_baselines_without_open3d_are_refused(

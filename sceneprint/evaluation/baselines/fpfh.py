@@ -10,39 +10,19 @@ the model it is held against has never seen a frame of it. Open3D is loaded here
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
-from sceneprint.errors import MissingDependency, UselessFrame
+from sceneprint.errors import UselessFrame
+from sceneprint.libraries import open3d
 from sceneprint.types import AnyFrame, Cloud, Floats, Floats32
 
 #: Voxel of the points, reach of normals and of features, metres, for a sensor of RANGE metres;
 #: for others in proportion.
 VOXEL, NORMALS, FEATURES, RANGE = 0.05, 0.10, 0.25, 9.0
+_WHAT = "The baseline fpfh_vlad"  #: needs Open3D
 #: Words of the vocabulary, and features that it is learnt from.
 WORDS, LEARNT_FROM = 64, 20_000
-#: Debian packages with the system libraries that Open3D loads.
-PACKAGES = "libgl1 libegl1 libx11-6 libusb-1.0-0 libgomp1"
-
-
-def open3d() -> Any:
-    """The open3d module, to work in one thread.
-
-    Raises
-    ------
-    MissingDependency : it, or a system library it needs, is absent.
-    """
-    try:
-        import open3d as module
-    except (ImportError, OSError) as error:
-        raise MissingDependency(
-            f"FPFH features need Open3D, which cannot be imported here ({error}). Install it "
-            f"(pip install open3d), and on Debian or Ubuntu: apt-get install {PACKAGES}; or leave "
-            "fpfh_vlad out of --baselines."
-        ) from error
-    module.utility.set_max_threads(1)
-    return module
 
 
 def features(points: Floats, scale: float = 1.0) -> Floats32:
@@ -58,7 +38,7 @@ def features(points: Floats, scale: float = 1.0) -> Floats32:
     (n, 33) float32, of each of the three histograms the root of its shares, so that L2 between
     two is Hellinger's distance
     """
-    o3d = open3d()
+    o3d = open3d(_WHAT)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, np.float64)))
     cloud = cloud.voxel_down_sample(VOXEL * scale)
     search = o3d.geometry.KDTreeSearchParamHybrid
@@ -114,7 +94,7 @@ class FpfhVlad:
 
     def check(self) -> None:
         """See `open3d`."""
-        open3d()
+        open3d(_WHAT)
 
     def takes(self, frame: AnyFrame) -> bool:  # noqa: ARG002
         """Whether the baseline is made for such a frame: always."""
