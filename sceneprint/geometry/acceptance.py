@@ -68,8 +68,8 @@ def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status,
     mode : "paper" asks for the residual alone
     """
     if e.residual_m > p.residual_m or e.residual_rad > p.residual_rad:
-        degrees = math.degrees(e.residual_rad)
-        return "rejected", f"the two directions disagree by {e.residual_m:.2g} m, {degrees:.2g} deg"
+        metres, degrees = _two_digits(e.residual_m), _two_digits(math.degrees(e.residual_rad))
+        return "rejected", f"the two directions disagree by {metres} m, {degrees} deg"
     if mode == "paper":
         return None
     blind = e.violations is None
@@ -105,3 +105,8 @@ def belief(
     if e.one_sided:  # what one frame has and the other lacks may speak against it unheard
         return "accepted", "weak", "surfaces agree, but free space is known of one frame only"
     return "accepted", "strong", "surfaces agree, and nothing speaks against it"
+
+
+def _two_digits(value: float) -> str:
+    """As people write it: 130, and never 1.3e+02."""
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"

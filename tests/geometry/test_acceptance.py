@@ -53,6 +53,11 @@ def test_each_objection_has_its_threshold(
     assert (alone is not None) == ("disagree" in found[1])
 
 
+def test_a_large_residual_is_told_as_people_write_it() -> None:
+    told = objection(replace(GOOD, residual_m=2.84, residual_rad=2.27), P, "full")
+    assert told == ("rejected", "the two directions disagree by 2.8 m, 130 deg")
+
+
 @pytest.mark.parametrize(
     ("ambiguity", "changed", "status", "strength"),
     [
