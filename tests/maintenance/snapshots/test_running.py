@@ -62,7 +62,7 @@ class Robot(threading.Thread):
 
 @contextmanager
 def at_work(url: str, uploads: list) -> Iterator[list[Robot]]:
-    robots = [Robot(url, uploads[i::2]) for i in range(3)]
+    robots = [Robot(url, uploads[i::2]) for i in range(2)]
     for robot in robots:
         robot.start()
     yield robots
