@@ -143,7 +143,7 @@ def test_without_open3d_the_row_says_so(
     assert list(figures.stages) == ["geometry of both frames", "validation"]
     assert figures.ours == pytest.approx(sum(figures.stages.values()))
     text = "\n".join(registration.table(figures))
-    assert "Open3D | not measured: The baselines need Open3D, which cannot be imported" in text
+    assert "Open3D | not measured: FPFH needs Open3D, which cannot be imported" in text
 
 
 def test_open3d_finds_a_frame_in_itself(room_frames: tuple[Frame, ...]) -> None:
