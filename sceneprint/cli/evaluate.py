@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
+from sceneprint.cli.judging import add_judging_options
 from sceneprint.cli.numbers import positive, whole
 from sceneprint.cli.signer import add_model_options, open_for
 from sceneprint.errors import DatasetError
@@ -110,19 +111,7 @@ def _add_method(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--levels", type=positive, metavar="H", help="levels of the signature to use (default: all)"
     )
-    command.add_argument(
-        "--mode",
-        choices=("full", "paper"),
-        default="full",
-        help="accept on all evidence, or as the paper on the residual alone (default: full)",
-    )
-    command.add_argument(
-        "--matching",
-        choices=("histograms", "sequence"),
-        default="histograms",
-        help="find correspondences by histograms, or as the paper by aligned sequences of "
-        "neighbours, which is slower (default: histograms)",
-    )
+    add_judging_options(command)
     command.add_argument(
         "--baselines",
         nargs="*",

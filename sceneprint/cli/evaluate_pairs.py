@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
+from sceneprint.cli.judging import add_judging_options
 from sceneprint.cli.numbers import positive, whole
 from sceneprint.cli.signer import add_model_options, open_for
 from sceneprint.settings import Settings
@@ -43,19 +44,7 @@ def add_to(commands: Any) -> None:
     command.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="of sequences")
     add_model_options(command)
     _add_drawing(command)
-    command.add_argument(
-        "--mode",
-        choices=("full", "paper"),
-        default="full",
-        help="accept on all evidence, or as the paper on the residual alone (default: full)",
-    )
-    command.add_argument(
-        "--matching",
-        choices=("histograms", "sequence"),
-        default="histograms",
-        help="find correspondences by histograms, or as the paper by aligned sequences of "
-        "neighbours, which is slower (default: histograms)",
-    )
+    add_judging_options(command)
     command.add_argument(
         "--right",
         nargs=2,
