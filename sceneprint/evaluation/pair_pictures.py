@@ -5,6 +5,7 @@ PairEvaluation, figures  --save_pair_pictures-->  PNG files
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,14 +29,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: Failures that are drawn, and points of a cloud at the most.
-DRAWN, POINTS = 12, 50_000
+DRAWN, POINTS = 8, 50_000
 _COLOURS = ("#2b6cb0", "#d9772b", "#2f9e63", "#c8372d", "#111111", "#a050aa", "#8a8f98")
 
 
 def save_pair_pictures(
     folder: Path, evaluation: PairEvaluation, figures: dict[str, Any], store: Store
 ) -> list[Path]:
-    """Draw curves, bars of success, and the first failures, the worst kind first.
+    """Draw curves, bars of success, and some failures of each kind, the worst kind first.
 
     Parameters
     ----------
@@ -50,7 +51,9 @@ def save_pair_pictures(
     """
     drawn = {"roc.png": curves_figure(figures), "success.png": success_figure(figures)}
     if figures["failures"]:
-        drawn["failures.png"] = failures_figure(evaluation, figures["failures"][:DRAWN], store)
+        drawn["failures.png"] = failures_figure(
+            evaluation, some_of_each(figures["failures"]), store
+        )
     for name, figure in drawn.items():
         save_figure(figure, folder / name)
     return [folder / name for name in drawn]
@@ -104,6 +107,30 @@ def success_figure(figures: dict[str, Any]) -> Figure:
     return figure
 
 
+def some_of_each(failures: Sequence[dict[str, Any]], most: int = DRAWN) -> list[dict[str, Any]]:
+    """Failures of every kind, as many of each as there are and places for, evenly spread.
+
+    Neighbours in the list are of neighbouring frames, and the first of it all alike.
+
+    Parameters
+    ----------
+    failures : of `pair_figures`, by kind
+    most : of them
+    """
+    kinds: dict[str, list[dict[str, Any]]] = {}
+    for failure in failures:
+        kinds.setdefault(failure["what"], []).append(failure)
+    taken = dict.fromkeys(kinds, 0)
+    for _ in range(min(most, len(failures))):
+        fewest = min(
+            (what for what in kinds if taken[what] < len(kinds[what])), key=taken.__getitem__
+        )
+        taken[fewest] += 1
+    return [
+        own[i * len(own) // taken[what]] for what, own in kinds.items() for i in range(taken[what])
+    ]
+
+
 def failures_figure(
     evaluation: PairEvaluation, failures: list[dict[str, Any]], store: Store
 ) -> Figure:
@@ -123,6 +150,9 @@ def failures_figure(
             cell.spines[:].set(color=_colour(failure["what"]), linewidth=2)
             if picture is not None:
                 cell.imshow(picture)
+            else:
+                why = "no transform" if name == "as found" else "they are of two scenes"
+                cell.text(0.5, 0.5, why, ha="center", va="center", fontsize=8)
     return figure
 
 

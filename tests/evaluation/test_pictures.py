@@ -11,6 +11,7 @@ import pytest
 
 from sceneprint.evaluation.clouds import cloud_figure, merged
 from sceneprint.evaluation.contact import contact_sheet
+from sceneprint.evaluation.pair_pictures import some_of_each
 from sceneprint.evaluation.plots import save_figure
 from sceneprint.evaluation.records import Outcome, Pair
 from sceneprint.types import Frame, Intrinsics
@@ -35,3 +36,13 @@ def test_a_name_is_no_formula(
     cloud = merged(wall(2.0), pairs, lambda _: wall(2.0))
     save_figure(cloud_figure(name, cloud, cloud, 1.0), tmp_path / "cloud.png", 30)
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_failures_of_every_kind_are_drawn_evenly_spread() -> None:
+    """Two wrong ones, ten that were not believed, five not found: of eight places 2, 3 and 3."""
+    kinds = ["wrong"] * 2 + ["not believed"] * 10 + ["not found"] * 5
+    listed = [{"number": i, "what": what} for i, what in enumerate(kinds)]
+    drawn = [one["number"] for one in some_of_each(listed, 8)]
+    assert drawn == [0, 1, 2, 5, 8, 12, 13, 15]
+    assert some_of_each(listed[:3], 8) == listed[:3]
+    assert some_of_each([], 8) == []
