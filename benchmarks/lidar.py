@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from benchmarks.lidar_answers import first_answers
 from sceneprint.evaluation.baselines.rings import ring_descriptor, ring_distances
 from sceneprint.geometry.retrieval import distances
 from sceneprint.geometry.rigid import inverse, rotation_angle
@@ -189,6 +190,12 @@ def measure(walk: Sequence[Cloud], signer: Signer, *, pairs: bool) -> dict[str, 
         result[name] = asdict(Found(queries, ours, first_right(rings, at, allowed)[1]))
     if pairs:
         geometries = [g for _, g in made]
+        p = signer.model.parameters.validation
+        near = np.linalg.norm(at[:, None] - at[None, :], axis=2) < WITHIN_M
+        for name, both_ways in (("earlier", False), ("any", True)):
+            allowed = apart(at, both_ways=both_ways)
+            answered = first_answers(geometries, rows, near, allowed, p)
+            result[f"first match, {name}"] = asdict(answered)
         allowed = apart(at, both_ways=True)
         everything = np.ones((len(at), len(at)), bool)
         lists = {
@@ -198,9 +205,7 @@ def measure(walk: Sequence[Cloud], signer: Signer, *, pairs: bool) -> dict[str, 
         }
         for name, chosen in lists.items():
             spread = np.linspace(0, len(chosen) - 1, min(len(chosen), MOST_PAIRS)).astype(int)
-            figures, each = believed(
-                walk, geometries, [chosen[k] for k in spread], signer.model.parameters.validation
-            )
+            figures, each = believed(walk, geometries, [chosen[k] for k in spread], p)
             result[name] = {**asdict(figures), "each": each}
     return result
 
