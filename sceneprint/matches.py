@@ -75,7 +75,7 @@ def associate(
     among : positions in R to try, rising: C, or the first of R
     open_geometry : artifact of a row of the database; a row without one is passed over
     k : accepted ones after which to stop, at least 1
-    seed, p, mode, matching : see `validate`
+    seed, p, mode, matching : see `validate`, by default with the numbers of the model
     go_on : asked before each; where it says no, the rest is left
 
     Returns

@@ -27,7 +27,7 @@ from sceneprint.geometry.surroundings import compress, surroundings
 from sceneprint.geometry.validation import Validation, ValidationParameters
 from sceneprint.geometry.validation import validate as validate_geometry
 from sceneprint.geometry.voxels import Voxels
-from sceneprint.models import Model
+from sceneprint.models import PRESETS, Model, read_model
 from sceneprint.signing import (
     Signature,
     Signer,
@@ -91,6 +91,7 @@ def geometry_of(seen: Surface, model: Model) -> Geometry:
     model : whose parameters and compression are used
     """
     p = model.parameters
+    _NUMBERS[model.id] = p.validation
     shown = seen
     if isinstance(seen, Voxels):
         shown = range_image(seen.cloud, p.cloud) if seen.cloud.has_viewpoint else seen.plain
@@ -171,17 +172,34 @@ def validate(
     ----------
     query, match : geometry artifacts of one model
     seed : of the random choices; the answer echoes it
-    p : of the model they were made with, `model.parameters.validation`; default: for depth
-        sensors indoors, as of `paper` and `compact`. The lidar model has others
+    p : default: those of the model that made them, `model.parameters.validation`
     mode : "full", or "paper" for the paper's test alone
     matching : "histograms", or "sequence" for correspondences as the paper finds them: slower
 
     Raises
     ------
-    ModelMismatch : the artifacts are of two models.
+    ModelMismatch : the artifacts are of two models; or of one that this process has not used,
+        and `p` was not given.
     """
     _same_model(query, match)
-    return validate_geometry(query, match, seed, p, mode, matching)
+    return validate_geometry(query, match, seed, p or _numbers_of(query), mode, matching)
+
+
+#: Of models that this process has used, by id: an artifact names its model, and holds no more.
+_NUMBERS: dict[str, ValidationParameters] = {}
+
+
+def _numbers_of(made: Geometry) -> ValidationParameters:
+    """What its own model validates with: rooms and halls are not judged by one number."""
+    if made.model_id not in _NUMBERS:
+        for model in map(read_model, PRESETS):
+            _NUMBERS[model.id] = model.parameters.validation
+    if made.model_id not in _NUMBERS:
+        raise ModelMismatch(
+            f"The artifacts are of model {made.model_id[:12]}, which ships with no preset and has "
+            "not been used by this process. Give `p`, its `model.parameters.validation`."
+        )
+    return _NUMBERS[made.model_id]
 
 
 def _stacked(signatures: Sequence[Signature]) -> Bytes:

@@ -82,7 +82,10 @@ def answer(
     matches = [one for one in tried.matches if one.index in rows]  # the rest was deleted meanwhile
     names = {place.row.number: place.row.name for place in places}
     own = query_sensor(_name(asked), asked.kind, list(names.values()))
-    found = Found(names, ranking, selection, rows, tried.unreadable, tried.untried, own, asked.base)
+    found = Found(
+        names, ranking, selection, rows, tried.unreadable, tried.untried, own, p.covariance,
+        asked.base,
+    )  # fmt: skip
     explanations = explained = None
     if query.explain:
         explanations = explain(found, tried, among, scales)

@@ -66,9 +66,8 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
 def _compared(a: Asked, b: Asked, signer: Signer, how: Comparison) -> Similarity:
     start = time.perf_counter()
     distance = distances(a.vector, b.vector[None])
-    made, T = None, None
+    made, T, p = None, None, signer.model.parameters.validation
     if a.geometry is not None and b.geometry is not None:
-        p = signer.model.parameters.validation
         found = validate(b.geometry, a.geometry, how.seed, *thresholds(how.validation, p))
         made, T = found, found.T_match_query
     spent = {
@@ -82,7 +81,9 @@ def _compared(a: Asked, b: Asked, signer: Signer, how: Comparison) -> Similarity
         a=_name(a),
         b=_name(b),
         validation=None if made is None else tell_validation(made),
-        uncertainty=None if made is None else tell_uncertainty(made.covariance, PAIR_METHOD),
+        uncertainty=(
+            None if made is None else tell_uncertainty(made.covariance, PAIR_METHOD, p.covariance)
+        ),
         transform=None if T is None else transform(T, *_cameras(a, b)),
         seed=how.seed,
         milliseconds={**spent, "total": round(sum(spent.values()), 2)},

@@ -10,7 +10,13 @@ import numpy as np
 
 from sceneprint.engine.transforms import transform
 from sceneprint.engine.wire import sensor_of
-from sceneprint.geometry.covariance import PAIR_METHOD, PLACE_METHOD, Method, free_directions
+from sceneprint.geometry.covariance import (
+    PAIR_METHOD,
+    PLACE_METHOD,
+    CovarianceParameters,
+    Method,
+    free_directions,
+)
 from sceneprint.geometry.diversity import Selection
 from sceneprint.geometry.retrieval import Ranking
 from sceneprint.geometry.rigid import inverse
@@ -39,6 +45,7 @@ class Found:
     unreadable : numbers of frames whose artifact cannot be read, and why
     untried : why the other candidates were not tried
     query_frame : what the coordinates of the query's sensor are called
+    covariance : of the model, by which a direction is told to be free
     base : what the robot's base is called, and T_base_query (4, 4); None where it is not known
     """
 
@@ -49,6 +56,7 @@ class Found:
     unreadable: dict[int, str]
     untried: str
     query_frame: str
+    covariance: CovarianceParameters
     base: tuple[str, Floats] | None = None
 
     def base_of(self, T_parent_query: Floats | None, parent: str) -> Transform | None:
@@ -106,7 +114,7 @@ def tell_location(found: Found, matches: Sequence[Match]) -> ToldLocation | None
         votes=average.votes,
         spread_m=average.spread_m,
         spread_deg=math.degrees(average.spread_rad),
-        uncertainty=tell_uncertainty(location.covariance, PLACE_METHOD),
+        uncertainty=tell_uncertainty(location.covariance, PLACE_METHOD, found.covariance),
         base=found.base_of(average.T, parent),
     )
 
@@ -136,13 +144,19 @@ def _match(
         pose_in_map=(
             None if in_map is None else transform(in_map, str(row.pose_parent), found.query_frame)
         ),
-        uncertainty=None if tried is None else tell_uncertainty(tried.covariance, PAIR_METHOD),
+        uncertainty=(
+            None
+            if tried is None
+            else tell_uncertainty(tried.covariance, PAIR_METHOD, found.covariance)
+        ),
         base_in_map=found.base_of(in_map, str(row.pose_parent)),
     )
 
 
-def tell_uncertainty(covariance: Floats | None, method: Method) -> Uncertainty | None:
-    """A covariance (6, 6) with the directions that it leaves free."""
+def tell_uncertainty(
+    covariance: Floats | None, method: Method, p: CovarianceParameters
+) -> Uncertainty | None:
+    """A covariance (6, 6) with the directions that it leaves free by the model's numbers."""
     if covariance is None:
         return None
     free = [
@@ -151,7 +165,7 @@ def tell_uncertainty(covariance: Floats | None, method: Method) -> Uncertainty |
             rotation=_vector(one.rotation),
             deviation=one.deviation,
         )
-        for one in free_directions(covariance)
+        for one in free_directions(covariance, p)
     ]
     return Uncertainty(covariance=covariance.ravel().tolist(), method=method, degenerate=free)
 

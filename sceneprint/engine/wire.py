@@ -94,7 +94,9 @@ def tell_frames(connection: Connection, row: MapRow, found: list[FrameRow]) -> l
     return [_frame(row, frame, jobs[frame.number]) for frame in found]
 
 
-def tell_job(job: JobRow, frame_id: str | None, map_name: str | None) -> Job:
+def tell_job(
+    job: JobRow, frame_id: str | None, map_name: str | None, followed_by: str | None = None
+) -> Job:
     """A job, and the names of what it is about."""
     progress = None
     if job.progress is not None:
@@ -114,6 +116,7 @@ def tell_job(job: JobRow, frame_id: str | None, map_name: str | None) -> Job:
         traceback=job.traceback,
         progress=progress,
         result=job.result,
+        followed_by=followed_by,
     )
 
 

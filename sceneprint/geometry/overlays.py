@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 
 from sceneprint.geometry.agreement import AgreementParameters, sampled
 from sceneprint.geometry.rigid import inverse, moved
-from sceneprint.geometry.traces import residual_steps
+from sceneprint.geometry.traces import OUTSIDE, TOLERANCE, residuals
 from sceneprint.types import Bytes, Floats, Surface
 
 Colour = Literal["source", "normal", "residual"]
 
 #: Of the source's points, and of the target's.
 SOURCE, TARGET = (217, 119, 43), (43, 108, 176)
-#: Distances from the other's surface, metres at up to 2.2 m, and the colours of the points that
-#: keep them; then of those that lie beside it or where it did not look, and of violations.
-STEPS = (0.01, 0.02, 0.05)
+#: Distances from the other's surface, of `TOLERANCE` of what validation allows, and the colours of
+#: the points that keep them; then of those that lie beside it or where it did not look, and of
+#: violations.
+STEPS = (50, 100, TOLERANCE)
 STEP_COLOURS = np.array(
     [(38, 130, 60), (140, 190, 70), (240, 200, 60), (150, 155, 160), (200, 40, 40)], np.uint8
 )
@@ -59,10 +60,8 @@ def overlay(
         of = np.repeat(np.array([SOURCE, TARGET], np.uint8), [len(ours), len(theirs)], axis=0)
         return points, normals, of
     p = p or AgreementParameters()
-    steps: NDArray[np.intp] = np.concatenate(
-        [
-            residual_steps(ours, target, T, STEPS, p),
-            residual_steps(theirs, source, inverse(T), STEPS, p),
-        ]
+    steps: NDArray[np.intp] = np.searchsorted(
+        (*STEPS, OUTSIDE),
+        np.concatenate([residuals(ours, target, T, p), residuals(theirs, source, inverse(T), p)]),
     )
     return points, normals, STEP_COLOURS[steps]

@@ -2,13 +2,14 @@
 
     Geometry, Geometry, T  --trace-->  Traces: corresponding patches, inliers, violations
     points, Surface, T  --judged-->  which agree, which violate free space
+    points, Surface, T  --residuals-->  and how far those that agree are from the surface
 
 Nothing here decides: the points are judged by `agreement.py`, one at a time.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ from sceneprint.types import Floats, Floats32, Geometry, Ints32, Patches, Surfac
 
 #: What becomes of a point: nothing to compare it with, or beside the surface; on it; before it.
 NEITHER, AGREES, VIOLATES = 0, 1, 2
+#: And how far it is from the surface, as `sceneprint.points` tells it.
+TOLERANCE, OUTSIDE, VIOLATION = 250, 253, 254
 
 Verdicts = NDArray[np.uint8]
 
@@ -80,28 +83,55 @@ def judged(
     return out
 
 
-def residual_steps(
-    source: Floats32, target: Surface, T_target_source: Floats, steps: tuple[float, ...],
-    p: AgreementParameters,
-) -> NDArray[np.intp]:  # fmt: skip
-    """How well each point lies on the target's surface: (N,) the first of the steps it keeps.
+@kernel
+def _measure(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats,
+    heads: Ints32, chain: Ints32, T: Floats, numbers: Floats, out: Verdicts,
+) -> None:  # fmt: skip
+    one, narrower = np.ones(1, np.float32), numbers.copy()
+    for i in range(len(source)):
+        inliers, violations = weigh_agreement(
+            source[i : i + 1], one, points, normals, camera, heads, chain, T, numbers
+        )
+        if inliers == 0:
+            out[i] = VIOLATION if violations > 0 else OUTSIDE
+            continue
+        below, least = 0, TOLERANCE
+        while least - below > 1:
+            step = (below + least) // 2
+            narrower[0] = numbers[0] * step / TOLERANCE
+            inliers, _ = weigh_agreement(
+                source[i : i + 1], one, points, normals, camera, heads, chain, T, narrower
+            )
+            if inliers > 0:
+                least = step
+            else:
+                below = step
+        out[i] = least
+
+
+def residuals(
+    source: Floats32, target: Surface, T_target_source: Floats, p: AgreementParameters
+) -> Verdicts:
+    """How far each of a source's points is from the target's surface, in steps of what agrees.
 
     Parameters
     ----------
     source, target, T_target_source, p : see `agreements`
-    steps : distances from the target's plane, metres, rising; as there they grow with z^2
 
     Returns
     -------
-    (N,) index of a step; len(steps) where it keeps none, len(steps) + 1 where it violates free
-    space
+    (N,) the least k of 1 to TOLERANCE such that it agrees within k / TOLERANCE of
+    `surface_tolerance`, which grows with distance; VIOLATION where it violates free space, OUTSIDE
+    where it does neither: it is seen by no pixel, or lies beside or behind the surface
     """
-    found = np.full(len(source), len(steps), np.intp)
-    found[judged(source, target, T_target_source, p) == VIOLATES] += 1
-    for i in reversed(range(len(steps))):
-        within = replace(p, surface_tolerance=steps[i])
-        found[judged(source, target, T_target_source, within) == AGREES] = i
-    return found
+    out = np.zeros(len(source), np.uint8)
+    t = looked_up(target, p)
+    _measure(
+        source, t.points, t.normals, t.camera, t.heads, t.chain,
+        np.ascontiguousarray(T_target_source), tolerances(p), out,
+    )  # fmt: skip
+    return out
 
 
 def trace(

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
 import pytest
 
 from sceneprint.geometry.agreement import AgreementParameters, agreement, sampled
-from sceneprint.geometry.overlays import SOURCE, STEP_COLOURS, STEPS, TARGET, overlay
+from sceneprint.geometry.overlays import SOURCE, STEP_COLOURS, TARGET, overlay
 from sceneprint.geometry.rigid import inverse
-from sceneprint.geometry.traces import AGREES, NEITHER, VIOLATES, judged, residual_steps, trace
+from sceneprint.geometry.traces import (
+    AGREES,
+    NEITHER,
+    OUTSIDE,
+    TOLERANCE,
+    VIOLATES,
+    VIOLATION,
+    judged,
+    residuals,
+    trace,
+)
 from sceneprint.types import Floats, Geometry, Patches, Surface
 
 P = AgreementParameters(stride=3)
@@ -59,13 +70,29 @@ def test_a_wall_before_a_wall(scenes: ModuleType) -> None:
     assert set(judged(sampled(far, 3), near, shifted(), P).tolist()) == {NEITHER}
 
 
-def test_steps_by_hand(scenes: ModuleType) -> None:
-    seen = wall(scenes, 2.0)
+@pytest.mark.parametrize("tolerance", [0.05, 0.12])
+def test_residuals_by_hand(scenes: ModuleType, tolerance: float) -> None:
+    seen, p = wall(scenes, 2.0), AgreementParameters(stride=3, surface_tolerance=tolerance)
     points = sampled(seen, 3)
     ahead = int(np.hypot(points[:, 0], points[:, 1]).argmin())
-    for z, step in ((0.0, 0), (0.009, 0), (0.011, 1), (-0.019, 1), (0.021, 2), (0.049, 2),
-                    (0.051, 3), (0.4, 3), (-0.09, 3), (-0.2, 4)):  # fmt: skip
-        assert residual_steps(points, seen, shifted(z=z), STEPS, P)[ahead] == step, z
+    # half a step off a whole one, as a share of the tolerance, and where nothing agrees
+    for share, step in ((0.0, 1), (0.5, 1), (1.5, 2), (49.5, 50), (-50.5, 51), (249.5, 250)):
+        T = shifted(z=share / 250 * tolerance)
+        assert residuals(points, seen, T, p)[ahead] == step, share
+    for z, byte in ((1.01 * tolerance, OUTSIDE), (0.4, OUTSIDE), (-0.2, VIOLATION)):
+        assert residuals(points, seen, shifted(z=z), p)[ahead] == byte, z
+
+
+def test_residuals_agree_with_verdicts(scenes: ModuleType) -> None:
+    seen, _ = scenes.corner()
+    points, T = sampled(seen, 2), shifted(0.04, 0.03)
+    told, verdicts = residuals(points, seen, T, P), judged(points, seen, T, P)
+    assert ((told <= TOLERANCE) == (verdicts == AGREES)).all()
+    assert ((told == VIOLATION) == (verdicts == VIOLATES)).all()
+    assert ((told == OUTSIDE) == (verdicts == NEITHER)).all()
+    for step in (3, 77, 200):  # as if that were all that is allowed
+        less = replace(P, surface_tolerance=P.surface_tolerance * step / TOLERANCE)
+        assert ((told <= step) == (judged(points, seen, T, less) == AGREES)).all()
 
 
 def test_patches_coincide_with_each_others_nearest(scenes: ModuleType) -> None:
@@ -104,3 +131,15 @@ def test_overlays_are_coloured(scenes: ModuleType) -> None:
     _, _, colours = overlay(near, far, shifted(), "residual")
     assert (colours[:n] == STEP_COLOURS[-1]).all()  # before what the other saw
     assert (colours[n:] == STEP_COLOURS[-2]).all()  # behind it
+
+
+def test_an_overlays_steps_are_of_the_models_tolerance(scenes: ModuleType) -> None:
+    seen = wall(scenes, 2.0)
+    wide = AgreementParameters(surface_tolerance=0.12)
+    for share, step in ((0.19, 0), (0.21, 1), (0.39, 1), (0.41, 2), (0.99, 2), (1.01, 3)):
+        for p in (AgreementParameters(), wide):
+            T = shifted(z=share * p.surface_tolerance)
+            _, _, colours = overlay(seen, seen, T, "residual", p)
+            middle = colours[: len(colours) // 2].tolist()
+            most = max(middle, key=middle.count)
+            assert most == STEP_COLOURS[step].tolist(), (share, p.surface_tolerance)
