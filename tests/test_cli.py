@@ -7,12 +7,14 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from sceneprint import cli
 from sceneprint.models import Model, save_model
 from sceneprint.pipeline import Signer, sign
 
@@ -246,3 +248,29 @@ def test_errors_are_one_line_and_exit_code_2(
 def test_wrong_usage(arguments: list[str]) -> None:
     done = run(*arguments, expect=2)
     assert done.stderr.startswith("usage: sceneprint")
+
+
+def test_every_command_is_known() -> None:
+    modules = [path.stem for path in Path(cli.__file__).parent.glob("*.py")]
+    commands = [one for one in modules if hasattr(import_module(f"sceneprint.cli.{one}"), "add_to")]
+    assert sorted(commands) == sorted(name.replace("-", "_") for name in cli.COMMANDS)
+
+
+def test_a_command_waits_for_no_other() -> None:
+    """Its own module is loaded, and not what only evaluation or a service needs."""
+    code = (
+        "import sys; from sceneprint.cli import main\n"
+        "try: main([*sys.argv[1:], '--help'])\n"
+        "except SystemExit: print(*sorted(sys.modules))"
+    )
+
+    def loaded(*arguments: str) -> set[str]:
+        done = subprocess.run(
+            [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
+        )
+        return set(done.stdout.splitlines()[-1].split())
+
+    of_serve = loaded("serve")
+    assert "sceneprint.cli.serve" in of_serve
+    assert {"sceneprint.cli.evaluate", "sceneprint.client", "sceneprint.engine"} & of_serve == set()
+    assert {"numpy", "sceneprint.cli.serve"} & loaded("--version") == set()

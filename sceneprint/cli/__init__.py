@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 from concurrent.futures.process import BrokenProcessPool
+from importlib import import_module
 
 from sceneprint import __version__
 from sceneprint.errors import SceneprintError
@@ -15,77 +16,42 @@ from sceneprint.errors import SceneprintError
 USAGE = 2
 
 
-def parser() -> argparse.ArgumentParser:
-    """All commands with their options."""
-    from sceneprint.cli import (
-        associate,
-        audit,
-        demo,
-        doctor,
-        evaluate,
-        evaluate_pairs,
-        events,
-        frames,
-        fsck,
-        index,
-        jobs,
-        keys,
-        localize,
-        maps,
-        picture,
-        query,
-        reconstruct,
-        reencode,
-        restore,
-        serve,
-        sign,
-        similarity,
-        snapshot,
-        synth,
-        thin,
-        train,
-        upload,
-        work,
-    )
+#: In the order in which the help lists them; each is a module of this package.
+COMMANDS = (
+    "demo", "serve", "work", "keys", "audit", "maps", "upload", "query", "localize", "similarity",
+    "associate", "frames", "reconstruct", "jobs", "events", "doctor", "fsck", "reencode", "thin",
+    "index", "snapshot", "restore", "sign", "picture", "evaluate", "evaluate-pairs", "synth",
+    "train",
+)  # fmt: skip
 
+
+def parser(names: Sequence[str] = COMMANDS) -> argparse.ArgumentParser:
+    """Commands with their options.
+
+    Parameters
+    ----------
+    names : of the commands it knows; only their modules are loaded
+    """
     top = argparse.ArgumentParser(
         prog="sceneprint",
         description="Place recognition from pure geometry: depth frames in, places and poses out.",
     )
     top.add_argument("--version", action="version", version=f"sceneprint {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (
-        demo,
-        serve,
-        work,
-        keys,
-        audit,
-        maps,
-        upload,
-        query,
-        localize,
-        similarity,
-        associate,
-        frames,
-        reconstruct,
-        jobs,
-        events,
-        doctor,
-        fsck,
-        reencode,
-        thin,
-        index,
-        snapshot,
-        restore,
-        sign,
-        picture,
-        evaluate,
-        evaluate_pairs,
-        synth,
-        train,
-    ):
-        module.add_to(commands)
+    for name in names:
+        import_module(f"sceneprint.cli.{name.replace('-', '_')}").add_to(commands)
     return top
+
+
+def _asked(arguments: Sequence[str]) -> Sequence[str]:
+    """Names of the commands that have to be known to read these arguments.
+
+    To load them all takes a second, which is most of what a small command needs.
+    """
+    first = arguments[0] if arguments else ""
+    if first == "--version":
+        return ()
+    return (first,) if first in COMMANDS else COMMANDS
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -94,8 +60,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     command = "sceneprint"
+    given = sys.argv[1:] if arguments is None else arguments
     try:  # from the first import on, which takes a second
-        options = parser().parse_args(arguments)
+        options = parser(_asked(given)).parse_args(given)
         command = f"sceneprint {options.command}"
         return int(options.run(options))
     except SceneprintError as error:

@@ -72,10 +72,10 @@ def _kernels() -> Finding:
     if folder and any(Path(folder).glob(pattern)):
         return Finding("ok", "kernels", f"compiled, in {folder}")
     if folder and _may_write(Path(folder)):
-        return Finding("note", "kernels", "not compiled yet; the first use does it, in 10 seconds")
+        return Finding("note", "kernels", "not compiled yet; the first use does it, in a minute")
     text = (
-        f"{folder or 'no folder'} cannot be written, so that every process compiles for 10 "
-        "seconds. Set NUMBA_CACHE_DIR to a folder that can."
+        f"{folder or 'no folder'} cannot be written, so that every process compiles for a "
+        "minute. Set NUMBA_CACHE_DIR to a folder that can."
     )
     return Finding("note", "kernels", text)
 

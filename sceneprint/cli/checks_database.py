@@ -100,14 +100,12 @@ def _path_of(url: URL) -> Path | None:
 
 def _schema(engine: Engine) -> Finding:
     """Compare the schema with the one of this version; the database is not touched."""
-    from alembic.migration import MigrationContext
-
-    from sceneprint.store.revisions import known_revisions
+    from sceneprint.store.revisions import known_revisions, revision_of
 
     head, known = known_revisions()
     try:
         with engine.connect() as connection:
-            found = MigrationContext.configure(connection).get_current_revision()
+            found = revision_of(connection)
     finally:
         engine.dispose()
     place = f"{engine.url!r}, schema {found}"

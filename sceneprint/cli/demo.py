@@ -63,7 +63,8 @@ def run(options: argparse.Namespace) -> int:
         draw(known, asked, options.model, options.out)
     print(
         "next: `sceneprint serve`; then, in another terminal, `sceneprint upload MAP PATH` and "
-        "`sceneprint query MAP PATH` with frames of your own; http://127.0.0.1:8008/docs is the API"
+        "`sceneprint query MAP PATH` with frames of your own, and http://127.0.0.1:8008/dashboard "
+        "to look at them"
     )
     return 0
 

@@ -13,7 +13,7 @@ from sceneprint.cli.asking import add_asking_options, explained_lines, options_o
 from sceneprint.cli.connection import add_service_options, one_line, open_client
 from sceneprint.cli.overlaying import add_overlay_options, check_overlay, save_overlay
 from sceneprint.datasets import FrameReference, find_sequences
-from sceneprint.errors import DatasetError, FrameError
+from sceneprint.errors import DatasetError, FrameError, MissingDependency, TooLarge
 
 if TYPE_CHECKING:
     from sceneprint.schemas import Answer, Match, Transform
@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
         for reference in references:
             try:
                 answer = client.query(None if several else options.map, reference, **how)
-            except FrameError as error:  # says nothing of the next frame
+            except (FrameError, MissingDependency, TooLarge) as error:  # of this file alone
                 failed += 1
                 print(f"{one_line(reference.name)}: {one_line(str(error))}", file=sys.stderr)
                 continue

@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
         if not read_only:  # there would be nothing for workers to do
             supervisor.start()  # after the service has brought the database to its schema
             watching.start()
-        print(f"sceneprint: serving {url}", flush=True)
+        print(f"sceneprint: serving {url}\nsceneprint: dashboard {url}/dashboard", flush=True)
 
     # uvicorn handles both signals while it runs; before and after, leave by the same way out
     signal.signal(signal.SIGTERM, signal.default_int_handler)

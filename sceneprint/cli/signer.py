@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -40,7 +41,8 @@ def open_for(options: argparse.Namespace, settings: Settings) -> Signer:
     ------
     UnreadableModel : no such model.
     """
-    _announce()
+    if _is_new():
+        _print("first use of this installation: compiling (once, about half a minute)")
     signer = _opened(options.model or options.preset, settings)
     with suppress(FrameError):  # a model of another range may see nothing there
         sign(_wall(), signer)  # so that the first frame's time is that of signing, not of loading
@@ -55,23 +57,27 @@ def prepare_presets(settings: Settings, say: Callable[[str], None] | None = None
     Parameters
     ----------
     settings : see Settings
-    say : what tells that it takes a while (default: a line on standard error)
+    say : what tells of each step, as it takes a while (default: lines on standard error)
     """
     from sceneprint.engine.warming import warm
 
-    if _announce(say):
-        warm(_opened(PRESETS[0], settings), clouds=True)
+    if _is_new():
+        tell, begun = say or _print, time.monotonic()
+        tell("first use of this installation: compiling for depth images (about 40 seconds)")
+        signer = _opened(PRESETS[0], settings)
+        warm(signer)
+        spent = time.monotonic() - begun
+        tell(f"compiled for depth images in {spent:.0f} s; now for clouds (about 15 seconds)")
+        warm(signer, clouds=True)
+        tell(f"compiled, once for all, in {time.monotonic() - begun:.0f} s")
     for preset in PRESETS:
         _opened(preset, settings)
 
 
-def _announce(say: Callable[[str], None] | None = None) -> bool:
-    """Whether the code is yet to be compiled; says so."""
+def _is_new() -> bool:
+    """Whether the code is yet to be compiled."""
     folder, pattern = compiled_at()
-    new = not any(Path(folder).glob(pattern))
-    if new:
-        (say or _print)("first use of this installation; compiling (once, about 10 seconds)")
-    return new
+    return not any(Path(folder).glob(pattern))
 
 
 def _print(text: str) -> None:

@@ -25,6 +25,7 @@ from sceneprint.errors import (
     FrameError,
     InvalidRequest,
     MapExists,
+    MissingDependency,
     Refused,
     UnknownMap,
 )
@@ -36,7 +37,9 @@ if TYPE_CHECKING:
     from sceneprint.schemas import Added
 
 #: What is wrong with one frame, and says nothing of the next.
-_OF_FRAME = (FrameError, DatasetError, FrameConflict, InvalidRequest, Refused)
+_OF_FRAME = (
+    FrameError, DatasetError, FrameConflict, InvalidRequest, MissingDependency, Refused,
+)  # fmt: skip
 
 
 def add_to(commands: Any) -> None:

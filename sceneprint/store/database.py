@@ -11,13 +11,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from alembic.migration import MigrationContext
 from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, event, make_url
 from sqlalchemy.exc import ArgumentError
 
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
 from sceneprint.store.faults import explained
-from sceneprint.store.revisions import known_revisions, migration_config
+from sceneprint.store.revisions import known_revisions, migration_config, revision_of
 from sceneprint.store.sealed import Sealed, sealed_file
 from sceneprint.store.sqlite import (
     BUSY_S,
@@ -218,7 +217,7 @@ def _require_whole(connection: Connection, engine: Engine) -> None:
 
 
 def _current(connection: Connection, known: frozenset[str], engine: Engine) -> str | None:
-    current = MigrationContext.configure(connection).get_current_revision()
+    current = revision_of(connection)
     if current is not None and current not in known:
         raise NewerSchema(
             f"{engine.url!r} has schema {current}, which this version of sceneprint does not "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -13,8 +14,9 @@ import pytest
 from pydantic import SecretStr
 
 from sceneprint import __version__
-from sceneprint.cli import checks, connection, doctor
+from sceneprint.cli import checks, connection, doctor, signer
 from sceneprint.cli.findings import Finding
+from sceneprint.cli.signer import prepare_presets
 from sceneprint.client import Client, Status
 from sceneprint.datasets import find_sequences
 from sceneprint.geometry import counting
@@ -212,3 +214,19 @@ def test_a_service_of_another_version() -> None:
     finding = doctor._version("http://x", status)
     assert finding.verdict == "note"
     assert f"version 99.1, 3 frames; this is version {__version__}" in finding.text
+
+
+def test_the_first_use_says_what_it_waits_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    prepare_presets(Settings(data_dir=tmp_path), said.append)
+    said.clear()  # of a checkout in which nothing was compiled
+    prepare_presets(Settings(data_dir=tmp_path), said.append)
+    assert said == []
+    monkeypatch.setattr(signer, "compiled_at", lambda: (str(tmp_path / "numba"), "*.nbi"))
+    prepare_presets(Settings(data_dir=tmp_path), said.append)
+    first, second, last = said
+    assert first.endswith("compiling for depth images (about 40 seconds)")
+    assert re.fullmatch(r"compiled for depth images in \d+ s; now for clouds \(.+\)", second)
+    assert re.fullmatch(r"compiled, once for all, in \d+ s", last)

@@ -19,6 +19,7 @@ import pytest
 
 from sceneprint.client import Client, retrying
 from sceneprint.datasets import read_pose, write_depth_png
+from sceneprint.errors import MissingDependency, TooLarge
 from sceneprint.schemas import Answer, FrameState, Map
 
 Run = Callable[..., Any]
@@ -268,3 +269,22 @@ def test_an_archive_is_uploaded_as_its_folder_is(
     bad.write_bytes(b"PK\x03\x04" + bytes(600))
     done = sceneprint("upload", house, bad, expect=2)
     assert "has no directory" in done.stderr
+
+
+@pytest.mark.parametrize("error", [TooLarge("too many bytes"), MissingDependency("no lazrs")])
+def test_a_query_goes_on_after_a_file_that_is_not_taken(
+    sceneprint: Run, house: str, rooms: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    ask = Client.query
+
+    def query(client: Client, name: Any, frame: Any, *more: Any, **how: Any) -> Any:
+        if frame.name.endswith("1"):
+            raise error
+        return ask(client, name, frame, *more, **how)
+
+    monkeypatch.setattr(Client, "query", query)
+    folder = rooms / "room-0" / "seq-01"
+    done = sceneprint("query", house, folder, "--stages", "retrieve", "--json", expect=2)
+    assert [json.loads(line)["name"] for line in done.stdout.splitlines()] \
+        == ["seq-01/frame-000000", "seq-01/frame-000002"]  # fmt: skip
+    assert done.stderr == f"seq-01/frame-000001: {error}\n"

@@ -16,12 +16,14 @@ from typing import Any
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from sqlalchemy import create_engine
 
 from sceneprint.errors import NewerSchema, UnusableStore
 from sceneprint.store import Store, open_database
 from sceneprint.store.maps import find_map
 from sceneprint.store.records import MapRow
+from sceneprint.store.revisions import known_revisions, migration_config, revision_of
 from sceneprint.store.tables import metadata
 
 TABLES = [
@@ -186,3 +188,22 @@ def test_a_damaged_page_is_said(url: str, store: Store, tmp_path: Path) -> None:
     path.write_bytes(data)
     with pytest.raises(UnusableStore, match=r"malformed\. Restore the data folder from a copy"):
         open_database(url)
+
+
+def test_the_revisions_are_those_that_alembic_sees(store: Store) -> None:
+    scripts = ScriptDirectory.from_config(migration_config())
+    every = {one.revision for one in scripts.walk_revisions()}
+    assert known_revisions() == (scripts.get_current_head(), every)
+    with store.database.read() as connection:
+        context = MigrationContext.configure(connection)
+        assert revision_of(connection) == context.get_current_revision() == known_revisions()[0]
+
+
+def test_a_store_that_is_there_is_opened_without_alembic(url: str, store: Store) -> None:
+    """It takes longer to load than the rest of the store, in each process anew."""
+    code = (
+        "import sys; from sceneprint.store import open_database; "
+        f"open_database({url!r}).close(); print('alembic' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
