@@ -5,13 +5,12 @@ folder  --find_cloud_source-->  CloudSource  --read_cloud-->  Cloud
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import get_args
 
-from sceneprint.datasets.files import read_bytes, read_text
+from sceneprint.datasets.files import read_bytes, read_object
 from sceneprint.errors import DatasetError, UnreadableCloud, naming
 from sceneprint.scans import (
     MAXIMUM_BYTES,
@@ -98,16 +97,8 @@ def find_cloud_source(folder: Path) -> CloudSource:
 
 
 def _read(path: Path) -> CloudSource:
-    text = read_text(path, _MAXIMUM_BYTES, DatasetError)
+    fields = read_object(path, _MAXIMUM_BYTES, DatasetError, _EXAMPLE)
     with naming(str(path)):
-        try:
-            fields = json.loads(text)
-        except (ValueError, RecursionError) as cause:
-            raise DatasetError(
-                f"This is not JSON ({cause}). Write it such as {_EXAMPLE}."
-            ) from cause
-        if not isinstance(fields, dict):
-            raise DatasetError(f"This is no JSON object. Write it such as {_EXAMPLE}.")
         unknown = sorted(set(fields) - {*_FIELDS})
         if unknown:
             raise DatasetError(

@@ -1,12 +1,13 @@
-"""What every reader here needs: bytes and text of files, up to a limit."""
+"""What every reader here needs: bytes, text and JSON of files, up to a limit."""
 
 from __future__ import annotations
 
+import json
 import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from sceneprint.errors import SceneprintError
+from sceneprint.errors import SceneprintError, naming
 
 
 def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
@@ -51,6 +52,31 @@ def read_text(path: Path, limit: int, error: type[SceneprintError]) -> str:
             f"{path}: The file is no text ({cause.reason} at byte {cause.start}). "
             "Check that it is the file you meant."
         ) from cause
+
+
+def read_object(
+    path: Path, limit: int, error: type[SceneprintError], example: str
+) -> dict[str, object]:
+    """Return the object of a JSON file.
+
+    Parameters
+    ----------
+    path, limit, error : see `read_text`
+    example : what such a file looks like, for errors
+
+    Raises
+    ------
+    SceneprintError : as `read_text`; or it is no JSON, or no object. It names the file.
+    """
+    text = read_text(path, limit, error)
+    with naming(str(path)):
+        try:
+            fields = json.loads(text)
+        except (ValueError, RecursionError) as cause:
+            raise error(f"This is not JSON ({cause}). Write it such as {example}.") from cause
+        if not isinstance(fields, dict):
+            raise error(f"This is no JSON object. Write it such as {example}.")
+    return fields
 
 
 def data_lines(text: str) -> Iterator[tuple[int, str]]:

@@ -5,12 +5,11 @@ folder  --find_camera-->  Camera
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from sceneprint.datasets.files import read_text
+from sceneprint.datasets.files import read_object
 from sceneprint.errors import DatasetError, InvalidIntrinsics, naming
 from sceneprint.types import Intrinsics
 
@@ -83,16 +82,8 @@ def read_camera(path: Path) -> Camera:
     InvalidIntrinsics : the file cannot be read, is no JSON object, lacks a field, has one
         too many, or a value that no camera has; names the file.
     """
-    text = read_text(path, _MAXIMUM_BYTES, InvalidIntrinsics)
+    fields = read_object(path, _MAXIMUM_BYTES, InvalidIntrinsics, _EXAMPLE)
     with naming(str(path)):
-        try:
-            fields = json.loads(text)
-        except (ValueError, RecursionError) as cause:
-            raise InvalidIntrinsics(
-                f"This is not JSON ({cause}). Write it such as {_EXAMPLE}."
-            ) from cause
-        if not isinstance(fields, dict):
-            raise InvalidIntrinsics(f"This is no JSON object. Write it such as {_EXAMPLE}.")
         return _camera(fields)
 
 

@@ -2,37 +2,30 @@
 
     chunks  --Receiver-->  a blob that can be sought in  --begin-->  job  --handler-->  items
 
-A frame goes the way of every upload, so that what is done again after a crash finds it there.
+What is taken of one at once: members.py.
 """
 
 from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection
-
-from sceneprint.datasets import FrameReference
 from sceneprint.datasets.archives import Archive, open_archive
 from sceneprint.datasets.inflating import Inflater
-from sceneprint.datasets.metas import meta_of, parent_frame_of, session_of
-from sceneprint.datasets.records import Sequence as FrameSequence
 from sceneprint.engine.cursors import row_of
 from sceneprint.engine.jobs import get_job
-from sceneprint.engine.replaying import Outcome as Taken
-from sceneprint.engine.replaying import item_of
+from sceneprint.engine.members import next_of, steps_of, take
 from sceneprint.engine.slices import Outcome, Swept, Task
 from sceneprint.engine.tasks import Tasks
-from sceneprint.engine.uploads import Upload, Uploads, sweep_deleted
-from sceneprint.errors import SceneprintError, StoreError, UnreadableArchive, UnusableStore
+from sceneprint.engine.uploads import Uploads, sweep_deleted
+from sceneprint.errors import SceneprintError, UnreadableArchive, UnusableStore
 from sceneprint.schemas import Job, Page
 from sceneprint.schemas.ingest import ImportItem, ImportOptions
-from sceneprint.store import Store, queue
+from sceneprint.store import Store
 from sceneprint.store.faults import unusable
 from sceneprint.store.idempotency import Once
 from sceneprint.store.incoming import IncomingBlob
@@ -44,9 +37,6 @@ KIND, FILE = "import", "archive"
 #: Seconds for which the archive of an import that was given up is kept for another try, and
 #: between two looks for those.
 KEPT_S, TIDY_S = 86_400.0, 60.0
-#: Frames that are taken in one commit, and bytes of more than one: a cloud may have 512 MiB, and
-#: what is taken at once is in memory.
-_AT_ONCE, _BYTES_AT_ONCE = 16, 128 << 20
 #: How much more a compressed tar may hold than the largest archive that is taken.
 _UNPACKED = 4
 
@@ -79,16 +69,6 @@ class Receiver:
         for piece in self._inflater.end():
             self._blob.write(piece)
         return JobFile(FILE, self._blob.keep(), self._blob.size, "application/octet-stream")
-
-
-@dataclass(frozen=True, eq=False)
-class _Step:
-    """A frame of an archive, or why there is none."""
-
-    name: str
-    sequence: FrameSequence | None = None
-    reference: FrameReference | None = None
-    refused: SceneprintError | None = None
 
 
 class Imports:
@@ -239,13 +219,13 @@ class Imports:
             raise unusable("The archive cannot be unpacked", error) from error
 
     def _slice(self, task: Task, archive: Archive, options: ImportOptions, until: float) -> Outcome:
-        steps = list(_steps(archive, options.every))
+        steps = list(steps_of(archive, options.every))
         progress = {"done": 0, "received": 0, "there": 0, "refused": 0} | task.progress
         progress["total"] = len(steps)
         items: list[dict[str, Any]] = []
         while progress["done"] < len(steps) and (not items or time.monotonic() < until):
-            some = _next(archive, steps, progress["done"])
-            for item in self._taken(task, archive, some, options):
+            some = next_of(archive, steps, progress["done"])
+            for item in take(self._uploads, task, archive, some, options):
                 items.append(item.model_dump(mode="json"))
                 what = {202: "received", 200: "there"}.get(item.status, "refused")
                 progress[what] += 1
@@ -257,75 +237,3 @@ class Imports:
             over, progress, items, drop=[FILE] if over else (), result=result if over else None,
             event="import.done" if over else None,
         )  # fmt: skip
-
-    def _taken(
-        self, task: Task, archive: Archive, steps: Sequence[_Step], options: ImportOptions
-    ) -> list[ImportItem]:
-        """Take some frames in one commit, as long as the job is this worker's."""
-
-        def fence(connection: Connection) -> None:  # cancelled, or of a map that was made anew
-            queue.check_held(connection, task.claim)
-
-        outcomes: list[Taken | None] = []
-        uploads = []
-        for step in steps:
-            try:
-                uploads.append(_upload(archive, step, options))
-                outcomes.append(None)
-            except StoreError:
-                raise
-            except SceneprintError as error:
-                outcomes.append(Taken(None, error=type(error)(archive.told(error))))
-        name = task.of_map.name
-        rest = iter(self._uploads.add_all(name, uploads, fence=fence)[0] if uploads else [])
-        return [
-            _item(step.name, outcome or next(rest))
-            for step, outcome in zip(steps, outcomes, strict=True)
-        ]
-
-
-def _steps(archive: Archive, every: int) -> Iterator[_Step]:
-    """All there is to tell of an archive, in the same order each time."""
-    for name, reason in archive.refused:
-        yield _Step(name, refused=UnreadableArchive(reason))
-    for sequence in archive.sequences:
-        for reference in sequence.frames[::every]:
-            yield _Step(archive.name_of(reference), sequence, reference)
-
-
-def _next(archive: Archive, steps: Sequence[_Step], done: int) -> Sequence[_Step]:
-    """The steps that are taken at once, at least one."""
-    count = size = 0
-    for step in steps[done : done + _AT_ONCE]:
-        size += 0 if step.reference is None else archive.size_of(step.reference)
-        if count and size > _BYTES_AT_ONCE:
-            break
-        count += 1
-    return steps[done : done + count]
-
-
-def _upload(archive: Archive, step: _Step, options: ImportOptions) -> Upload:
-    if step.sequence is None or step.reference is None:
-        raise step.refused or ValueError("neither a frame nor refused")
-    meta = meta_of(
-        step.reference,
-        robot=options.robot,
-        session=options.session or session_of(step.sequence),
-        tags=options.tags,
-        with_pose=options.with_poses,
-        parent_frame=options.parent_frame or parent_frame_of(step.sequence, options.robot),
-        base=options.T_base_sensor,
-    )
-    data = archive.data_of(step.reference)
-    return Upload(data, meta, options.priority, options.if_novel)
-
-
-def _item(name: str, outcome: Taken) -> ImportItem:
-    item = item_of(outcome)
-    return ImportItem(
-        name=name,
-        status=item.status,
-        frame_id=None if item.frame is None else item.frame.frame_id,
-        job_id=None if item.frame is None else item.frame.job_id,
-        problem=item.problem,
-    )

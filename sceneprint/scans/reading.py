@@ -145,6 +145,11 @@ def decode_scan(
             points, edge = thinned(points, MOST_POINTS)
             told = f"thinned from {before} points to {len(points)}, one to {100 * edge:.1f} cm"
             note = f"{note}; {told}" if note else told
+            if len(points) < FEWEST_POINTS:
+                raise UselessFrame(
+                    f"{before} points lie in {len(points)} places {100 * edge:.1f} cm apart or "
+                    f"more, fewer than {FEWEST_POINTS}. Check that the sensor saw something."
+                )
         cloud = Cloud(
             points,
             has_viewpoint=place is not None,

@@ -12,7 +12,9 @@ from typing import Any
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine, imports
+from sceneprint.datasets.archives import Archive
+from sceneprint.engine import Engine, imports, members
+from sceneprint.engine import uploads as uploading
 from sceneprint.engine.slices import Task
 from sceneprint.engine.uploads import sweep
 from sceneprint.errors import LostLease, UnknownMap, UnusableStore
@@ -53,7 +55,7 @@ def claimed(engine: Engine) -> Task:
 def test_a_slice_that_was_lost_is_done_again(
     empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(imports, "_AT_ONCE", 2)
+    monkeypatch.setattr(members, "_AT_ONCE", 2)
     job = begun(empty, packed(uploads[:5]))
     task = claimed(empty)
     over = time.monotonic() - 1  # at least some are taken, so that it comes to an end
@@ -85,7 +87,7 @@ def test_large_frames_are_not_in_memory_together(
     task, over = claimed(empty), time.monotonic() - 1
     taken = []
     for most in (max(sizes) - 1, sizes[0] + sizes[1], sum(sizes)):
-        monkeypatch.setattr(imports, "_BYTES_AT_ONCE", most)
+        monkeypatch.setattr(members, "_BYTES_AT_ONCE", most)
         taken.append(len(empty.imports.handle(task, over).items))
     assert taken == [1, 2, 3]
 
@@ -135,7 +137,7 @@ class Between:
 def test_a_cancelled_import_takes_no_frame_more(
     empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(imports, "_AT_ONCE", 2)
+    monkeypatch.setattr(members, "_AT_ONCE", 2)
     job = begun(empty, packed(uploads[:4]))
     until: Any = Between(lambda: empty.cancel_job(job.job_id))
     with pytest.raises(LostLease):
@@ -147,7 +149,7 @@ def test_a_cancelled_import_takes_no_frame_more(
 def test_a_map_that_is_made_anew_takes_nothing_of_an_import_into_the_one_before(
     empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(imports, "_AT_ONCE", 2)
+    monkeypatch.setattr(members, "_AT_ONCE", 2)
     begun(empty, packed(uploads[:4]))
 
     def make_anew() -> None:
@@ -195,3 +197,33 @@ def test_an_archive_that_was_swept_before_its_job_was_there_is_not_acknowledged(
     with pytest.raises(UnusableStore, match="Send the archive once more"):
         empty.imports.begin("hall", archive, ImportOptions())
     assert list(empty.list_jobs().items) == []
+
+
+def test_a_frame_that_memory_does_not_do_for_costs_no_other(
+    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that cannot be read out of the archive, and one that cannot be decoded beside others."""
+    read, decode, asked = Archive.data_of, uploading.read_upload, []
+
+    def data_of(archive: Archive, reference: Any) -> bytes:
+        if archive.name_of(reference) == "run/0.png":
+            raise MemoryError
+        return read(archive, reference)
+
+    def decoded(data: bytes, meta: Any) -> Any:
+        asked.append(data)
+        if data == uploads[2].data:
+            raise MemoryError
+        return decode(data, meta)
+
+    monkeypatch.setattr(Archive, "data_of", data_of)
+    monkeypatch.setattr(uploading, "read_upload", decoded)
+    job = begun(empty, packed(uploads[:4]))
+    assert empty.run(claimed(empty)) == JobState.SUCCEEDED
+    items = empty.imports.items("hall", job.job_id).items
+    assert [one.status for one in items] == [422, 202, 422, 202]
+    assert len(asked) == 5  # two of three together, then each alone
+    for refused in (items[0], items[2]):
+        assert refused.problem is not None
+        assert "takes more memory than a worker may have" in refused.problem.detail
+    assert len(empty.list_frames("hall").items) == 2

@@ -10,7 +10,10 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.engine.localizing import check_localizes, localization_of
+from sceneprint.engine.telling import tell_uncertainty
 from sceneprint.errors import InvalidRequest, UnknownFrame
+from sceneprint.geometry.covariance import PAIR_METHOD
+from sceneprint.models import read_model
 from sceneprint.pipeline import Signature, distance, validate
 from sceneprint.schemas import Comparison, NamedFrame, NewMap, Query, Similarity
 from sceneprint.types import Geometry
@@ -140,3 +143,16 @@ def test_frames_that_cannot_be_compared(
         full.queries.compare(other, sent, Comparison())
     with pytest.raises(UnknownFrame):
         full.queries.compare(NamedFrame(map="hall", frame_id="x"), sent, Comparison())
+
+
+def test_what_is_free_is_told_by_the_numbers_of_the_model() -> None:
+    """A radian counts five metres in a hall, and one in a room."""
+    S = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 300.0]) * 1e-6
+    room, hall = (read_model(one).parameters.validation.covariance for one in ("paper", "lidar"))
+    held = tell_uncertainty(S, PAIR_METHOD, room)
+    free = tell_uncertainty(S, PAIR_METHOD, hall)
+    assert held is not None
+    assert free is not None
+    assert (held.degenerate, held.covariance) == ([], free.covariance)
+    [one] = free.degenerate
+    assert (one.rotation.z, one.translation.z) == (1.0, 0.0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import InvalidPose, UnreadableCloud, UselessFrame
-from sceneprint.scans import decode_cloud, decode_scan
+from sceneprint.scans import decode_cloud, decode_scan, reading
 from sceneprint.scans.thinning import thinned
 
 Write = Callable[..., bytes]
@@ -124,3 +124,12 @@ def test_more_than_five_million() -> None:
     assert scan.given == 2240**2
     assert len(scan.cloud.points) == side**2
     assert scan.cloud.note == f"thinned from {2240**2} points to {side**2}, one to 1.0 cm"
+
+
+def test_nothing_of_more_than_five_million_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All in one place: as useless as so few points that were sent."""
+    rows = np.full((100, 4), 2.0, "<f4")
+    assert len(decode_scan(rows.tobytes(), file_format="kitti").cloud.points) == 100
+    monkeypatch.setattr(reading, "MOST_POINTS", 99)
+    with pytest.raises(UselessFrame, match="100 points lie in 1 places"):
+        decode_scan(rows.tobytes(), file_format="kitti")
