@@ -47,7 +47,9 @@ def list_jobs(
     before = opened(store.seals, "job", cursor)
     with store.database.read() as connection:
         found = list_stored(connection, before, limit + 1, state, kind, map_names)
-    items = [tell_job(one.job, one.frame_id, one.map_name) for one in found[:limit]]
+    items = [
+        tell_job(one.job, one.frame_id, one.map_name, one.followed_by) for one in found[:limit]
+    ]
     more = store.seals.seal("job", found[limit - 1].job.number) if len(found) > limit else None
     return Page[Job](items=items, next_cursor=more)
 
@@ -176,6 +178,10 @@ def _retry_task(connection: Connection, job: JobRow) -> tuple[Job, bool]:
 
 
 def _told(connection: Connection, job: JobRow) -> Job:
-    frame_id = None if job.frame_number is None else frame_of(connection, job.frame).id
+    frame_id = followed_by = None
+    if job.frame_number is not None:
+        frame_id = frame_of(connection, job.frame).id
+        last = listing.last_of(connection, job.kind, job.frame_number, job.model_id)
+        followed_by = None if last is None or last.number == job.number else last.id
     name = None if job.map_number is None else map_of(connection, job.map_number).name
-    return tell_job(job, frame_id, name)
+    return tell_job(job, frame_id, name, followed_by)

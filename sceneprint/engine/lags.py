@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 from sqlalchemy import Connection
@@ -9,7 +10,7 @@ from sqlalchemy import Connection
 from sceneprint.engine.readers import index_folder, is_index_folder
 from sceneprint.errors import DamagedIndex
 from sceneprint.index.manifests import Manifest, manifests, read_manifest
-from sceneprint.schemas.operations import IndexState
+from sceneprint.schemas.operations import IndexRecall, IndexState
 from sceneprint.store.events import anchor_number
 from sceneprint.store.maps import list_maps
 from sceneprint.store.records import MapRow
@@ -25,8 +26,10 @@ def index_state(connection: Connection, indexes: Path, row: MapRow) -> IndexStat
         found = _read(path)
         if found is not None and found.revision <= row.revision:
             tail = count_indexed(connection, row.number, found.revision)
-            return IndexState(map=row.name, generation=found.number, tail=tail)
-    return IndexState(map=row.name, generation=None, tail=count_indexed(connection, row.number, 0))
+            recall = None if found.recall is None else IndexRecall(**asdict(found.recall))
+            return IndexState(map=row.name, generation=found.number, tail=tail, recall=recall)
+    tail = count_indexed(connection, row.number, 0)
+    return IndexState(map=row.name, generation=None, tail=tail, recall=None)
 
 
 def index_states(connection: Connection, indexes: Path) -> list[IndexState]:

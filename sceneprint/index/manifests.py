@@ -24,6 +24,27 @@ _NAME = re.compile(r"(\d{10})-([0-9a-f]{32})\.json")
 
 
 @dataclass(frozen=True)
+class Recall:
+    """What the shortlist finds of the nearest frames.
+
+    Parameters
+    ----------
+    share : of the `near` nearest by the exact scan that the shortlist finds too
+    near : neighbours that were looked for
+    sample : frames that were looked up, each without itself; 0 where a search compares every
+        frame, so that there is nothing to miss
+    shortlist : frames that the codes propose
+    frames : of the generation that was measured, which may be an earlier one
+    """
+
+    share: float
+    near: int
+    sample: int
+    shortlist: int
+    frames: int
+
+
+@dataclass(frozen=True)
 class Manifest:
     """What a generation consists of.
 
@@ -37,6 +58,8 @@ class Manifest:
     fitted_on : frames that the map had when the code was fitted
     anchor : what whoever published it will know the state of the database by
     files : (name, bytes) of every file, segments in the order of their rows; a name is a checksum
+    recall : as measured when it, or one before it that had about as many frames, was published;
+        None where an earlier version published it
     """
 
     number: int
@@ -47,6 +70,7 @@ class Manifest:
     fitted_on: int
     anchor: str
     files: tuple[tuple[str, int], ...]
+    recall: Recall | None = None
 
     def of_kind(self, kind: str) -> list[tuple[str, int]]:
         """The files of one kind."""
@@ -95,6 +119,8 @@ def read_manifest(path: Path) -> Manifest:
         if record.pop("schema_version") != SCHEMA_VERSION:
             raise DamagedIndex(f"{path}: of another schema than {SCHEMA_VERSION}.")
         record["files"] = tuple((str(name), int(size)) for name, size in record["files"])
+        if record.get("recall") is not None:
+            record["recall"] = Recall(**record["recall"])
         manifest = Manifest(**record)
     except (ValueError, TypeError, KeyError) as error:  # of another version, if of any
         raise DamagedIndex(f"{path}: no manifest ({error}).") from error

@@ -18,7 +18,8 @@ from sceneprint.index.codes import SAMPLE, Code, draw, fit_code, write_code
 from sceneprint.index.drafts import Draft, append, remaining
 from sceneprint.index.files import building, is_ours, put
 from sceneprint.index.generations import Generation, newest
-from sceneprint.index.manifests import Manifest, manifests, read_manifest, write_manifest
+from sceneprint.index.manifests import Manifest, Recall, manifests, read_manifest, write_manifest
+from sceneprint.index.recall import measure_recall, still_holds
 from sceneprint.index.segments import BLOCK_BYTES, Block, blocks_of, gather
 from sceneprint.types import Floats32
 
@@ -52,7 +53,7 @@ def publish(
     previous : the newest generation of the folder, or None to build from nothing
     drop : keys of frames that are no longer in the map
     anchor : of the database's state; kept as it is, for whoever opens the generation to check
-    seed : of the rows that the code is fitted on
+    seed : of the rows that the code is fitted on, and of the frames that recall is measured by
 
     Returns
     -------
@@ -85,7 +86,7 @@ def publish(
             keys=draft.keys,
             coarse=coarse,
         )
-        own = _write(folder, generation)
+        own = _write(folder, generation, _recall(listed, previous, generation, seed))
         if previous is not None:  # known to be sound, whatever lies between
             listed = [each for each in listed if each[0] == previous.number]
         _clean(folder, {own, *(path for _, path in listed[:1])})
@@ -114,12 +115,23 @@ def _codes(draft: Draft, previous: Generation | None, seed: int) -> tuple[Code, 
     return code, coarse.appended(draft.kept[:0], _encoded(code, draft, draft.rows)), n
 
 
+def _recall(
+    listed: list[tuple[int, Path]], previous: Generation | None, generation: Generation, seed: int
+) -> Recall:
+    """As measured of the generation before, while that stands for this one; else measured."""
+    if previous is not None and previous.code is generation.code:
+        known = [read_manifest(path).recall for number, path in listed if number == previous.number]
+        if known and known[0] is not None and still_holds(known[0], len(generation)):
+            return known[0]
+    return measure_recall(generation, seed)
+
+
 def _encoded(code: Code, draft: Draft, rows: NDArray[np.int64]) -> Iterator[Floats32]:
     for some in blocks_of(rows, len(code.mean), BLOCK_BYTES):
         yield code.encode(gather(draft.segments, some))
 
 
-def _write(folder: Path, generation: Generation) -> Path:
+def _write(folder: Path, generation: Generation, recall: Recall) -> Path:
     """Write all but the segments, which are there, and the manifest last."""
     others = {
         "rows": generation.rows.astype("<i8").tobytes(),
@@ -135,6 +147,7 @@ def _write(folder: Path, generation: Generation) -> Path:
         code_id=generation.code.id,
         fitted_on=generation.fitted_on,
         anchor=generation.anchor,
+        recall=recall,
         files=(*((each.name, each.size) for each in generation.segments), *written),
     )
     return write_manifest(folder, manifest)

@@ -43,3 +43,8 @@ class Job(Told):
     result: dict[str, Any] | None = Field(
         default=None, description="What a long job came to, in short, when it has succeeded."
     )
+    followed_by: str | None = Field(
+        default=None,
+        description="The latest job of the same frame that does the same; null: it is this one. "
+        "What was tried again is followed by the try.",
+    )

@@ -20,6 +20,7 @@ class Listed:
     job: JobRow
     frame_id: str | None
     map_name: str | None
+    followed_by: str | None  # id of the latest job of the same frame and kind, if it is another
 
 
 def list_jobs(
@@ -35,13 +36,28 @@ def list_jobs(
     state, kind : of those that are wanted
     map_names : of those that are wanted; jobs of no map are not among them
     """
+    later = jobs.alias()
+    last = (
+        select(later.c.id)
+        .where(
+            later.c.frame_number == jobs.c.frame_number, later.c.kind == jobs.c.kind,
+            later.c.model_id.is_not_distinct_from(jobs.c.model_id), later.c.number > jobs.c.number,
+        )
+        .order_by(later.c.number.desc())
+        .limit(1)
+        .correlate(jobs)
+        .scalar_subquery()
+    )  # fmt: skip
     asked = (
-        select(jobs, frames.c.id.label("frame_id"), maps.c.name.label("map_name"))
+        select(
+            jobs, frames.c.id.label("frame_id"), maps.c.name.label("map_name"),
+            last.label("followed_by"),
+        )
         .join(frames, frames.c.number == jobs.c.frame_number, isouter=True)
         .join(maps, maps.c.number == jobs.c.map_number, isouter=True)
         .order_by(jobs.c.number.desc())
         .limit(limit)
-    )
+    )  # fmt: skip
     if kind is not None:
         asked = asked.where(jobs.c.kind == kind)
     if map_names is not None:
@@ -54,7 +70,7 @@ def list_jobs(
     for row in connection.execute(asked).mappings():
         own = {column.name: row[column.name] for column in jobs.columns}
         found.append(Listed(JobRow(**{**own, "state": JobState(own["state"])}),
-                            row["frame_id"], row["map_name"]))  # fmt: skip
+                            row["frame_id"], row["map_name"], row["followed_by"]))  # fmt: skip
     return found
 
 

@@ -17,6 +17,7 @@ from sqlalchemy.exc import ArgumentError
 
 from sceneprint.errors import NewerSchema, UnusableStore
 from sceneprint.store.database import Database
+from sceneprint.store.revisions import known_revisions, revision_of
 
 
 @contextmanager
@@ -88,13 +89,9 @@ def _begin(connection: Any) -> None:
 
 
 def _check_schema(database: Database, engine: Engine) -> None:
-    from alembic.migration import MigrationContext
-
-    from sceneprint.store.revisions import known_revisions
-
     head, known = known_revisions()
     with database.read() as connection:
-        found = MigrationContext.configure(connection).get_current_revision()
+        found = revision_of(connection)
     if found is not None and found not in known:
         raise NewerSchema(
             f"{engine.url!r} has schema {found}, which this version of sceneprint does not know: "

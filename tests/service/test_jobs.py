@@ -76,6 +76,11 @@ def test_dead_jobs_are_listed_with_their_tracebacks(idle, make_map, small_shots,
     for wrong in ({"state": "asleep"}, {"limit": 0}, {"cursor": "x"}):
         refused(client.get("/v1/jobs", params=wrong), 422, "invalid-request")
     again = client.post(f"/v1/jobs/{ids[0]}/retry").json()
+    dead = client.get("/v1/jobs", params={"state": "dead"}).json()["items"]
+    assert [job["followed_by"] for job in dead] == [None, None, again["job_id"]]
+    for job in (*dead, again):
+        told = client.get(f"/v1/jobs/{job['job_id']}").json()["followed_by"]
+        assert told == job["followed_by"]
     refused(client.post(f"/v1/jobs/{again['job_id']}/retry"), 409, "cannot-retry")
 
 
