@@ -123,5 +123,5 @@ class Metrics:
         self._disk.labels("database").set(sizes.database or 0)
         self._disk.labels("blobs").set(sizes.blobs)
         self._disk.labels("index").set(sizes.index)
-        self._free.set(sizes.free)
+        self._free.set(sizes.free or 0)  # of the whole it is known
         return generate_latest(self.registry)

@@ -14,6 +14,7 @@ from sceneprint.client.messages import map_path
 from sceneprint.client.sending import PAGE, Sender, given
 from sceneprint.schemas import Frame, FrameState, Page
 from sceneprint.schemas.browsing import FrameListing, Run, Session, Trajectory
+from sceneprint.schemas.growth import By, Growth, GrowthOf
 
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
@@ -33,6 +34,9 @@ class BrowsingBackend(Protocol):
 
     def trajectory_text(self, map_name: str, run: Run) -> str:
         """The same as a TUM file."""
+
+    def growth(self, map_name: str, asked: GrowthOf) -> Growth:
+        """How a map grew."""
 
 
 class RemoteBrowsing(Sender):
@@ -56,6 +60,11 @@ class RemoteBrowsing(Sender):
     def trajectory_text(self, map_name: str, run: Run) -> str:
         """The same as a TUM file."""
         return self._bytes("GET", **_of_run(map_name, run, "text/plain")).decode()
+
+    def growth(self, map_name: str, asked: GrowthOf) -> Growth:
+        """How a map grew."""
+        path = f"{map_path(map_name)}/growth"
+        return self._ask(Growth, "GET", path, params=asked.model_dump())
 
 
 class EmbeddedBrowsing:
@@ -84,6 +93,12 @@ class EmbeddedBrowsing:
         from sceneprint.engine.browsing import trajectory_file
 
         return trajectory_file(self.trajectory(map_name, run))
+
+    def growth(self, map_name: str, asked: GrowthOf) -> Growth:
+        """How a map grew."""
+        from sceneprint.engine.growth import growth
+
+        return growth(self._engine.store, map_name, asked.by, asked.last)
 
 
 class Browsing:
@@ -146,7 +161,8 @@ class Browsing:
     def trajectory(
         self, map_name: str, session: str, *, robot: str | None = None,
         parent_frame: str | None = None, captured_after: datetime | None = None,
-        captured_before: datetime | None = None,
+        captured_before: datetime | None = None, most: int | None = None,
+        clock: Literal["captured", "received"] = "captured",
     ) -> Trajectory:  # fmt: skip
         """The poses of a run in the order of time.
 
@@ -157,23 +173,42 @@ class Browsing:
         robot : needed where several called a run so
         parent_frame : needed where the poses lead to several
         captured_after, captured_before : a part of it; with a time zone
+        clock : `received` has frames too that do not say when they were taken, as they came
+        most : poses, evenly taken along it, at most so many; `posed` tells how many there are
 
         Raises
         ------
         UnknownMap : no such map.
         InvalidRequest : it is not clear which run is meant, or it is too long for one answer.
         """
-        run = _run(session, robot, parent_frame, captured_after, captured_before)
+        run = _run(session, robot, parent_frame, captured_after, captured_before, most, clock)
         return self._backend.trajectory(map_name, run)
 
     def trajectory_text(
         self, map_name: str, session: str, *, robot: str | None = None,
         parent_frame: str | None = None, captured_after: datetime | None = None,
-        captured_before: datetime | None = None,
+        captured_before: datetime | None = None, most: int | None = None,
+        clock: Literal["captured", "received"] = "captured",
     ) -> str:  # fmt: skip
         """As `trajectory`, as text of a TUM file."""
-        run = _run(session, robot, parent_frame, captured_after, captured_before)
+        run = _run(session, robot, parent_frame, captured_after, captured_before, most, clock)
         return self._backend.trajectory_text(map_name, run)
+
+    def growth(self, map_name: str, by: By = "day", last: int = 30) -> Growth:
+        """How many frames a map has by the hour or the day (UTC) in which they were indexed.
+
+        Parameters
+        ----------
+        map_name : of the map
+        by : what is counted by
+        last : hours or days, with the one that is not over; at most 400
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : neither hours nor days, or too many.
+        """
+        return self._backend.growth(map_name, checked(GrowthOf, "The growth", by=by, last=last))
 
     def _rest(self, map_name: str, wanted: FrameListing, page: Page[Frame]) -> Iterator[Frame]:
         yield from page.items
@@ -188,11 +223,12 @@ def _names(given: str | Iterable[str]) -> list[str]:
 
 def _run(
     session: str, robot: str | None, parent_frame: str | None, after: datetime | None,
-    before: datetime | None,
+    before: datetime | None, most: int | None, clock: Literal["captured", "received"],
 ) -> Run:  # fmt: skip
     return checked(
         Run, "The run", session=session, robot=robot, parent_frame=parent_frame,
-        captured_after=after, captured_before=before,
+        captured_after=after, captured_before=before, most=most,
+        clock=clock,
     )  # fmt: skip
 
 

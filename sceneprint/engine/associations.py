@@ -24,6 +24,7 @@ from sceneprint.schemas.associations import (
     GraphFormat,
     NewAssociation,
 )
+from sceneprint.schemas.transforms import Transform
 from sceneprint.store import Store
 from sceneprint.store.associations import ASSOCIATE, Stop, remove_job, stops_of
 from sceneprint.store.listing import find_job, list_jobs
@@ -226,6 +227,12 @@ def _items(connection: Connection, job: JobRow, first: int, limit: int) -> list[
     ]
 
 
+def _pose(stop: Stop) -> Transform | None:
+    if stop.pose is None or stop.parent is None:
+        return None
+    return transform(np.array(stop.pose), stop.parent, sensor_frame(stop.id, stop.kind))
+
+
 def _edge(item: dict[str, Any], stops: dict[int, Stop]) -> Edge:
     here, there = stops[item["from"]], stops[item["to"]]
     T, information = np.array(item["T"]).reshape(4, 4), None
@@ -237,6 +244,7 @@ def _edge(item: dict[str, Any], stops: dict[int, Stop]) -> Edge:
         "similarity", "consistent", "loops", "closed",
     )  # fmt: skip
     return Edge(
+        from_pose=_pose(here), to_pose=_pose(there),
         number=item["number"], from_frame=here.id, to_frame=there.id,
         from_session=here.session, to_session=there.session,
         from_robot=here.robot, to_robot=there.robot,

@@ -79,22 +79,23 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
         parents = {one.parent for one in counted if one.parent is not None}
         parent = _only("parent_frame", run.parent_frame, parents, run.session)
         total = sum(one.count for one in counted)
-        if total > MOST_POSES:
+        if run.most is None and total > MOST_POSES:
             raise InvalidRequest(
                 f"Session {run.session!r:.140} has {total} frames, and a trajectory at most "
-                f"{MOST_POSES}. Ask for parts of it with `captured_after` and `captured_before`.",
+                f"{MOST_POSES}. Ask for `most` of them, or for parts of it with `captured_after` "
+                "and `captured_before`.",
                 (("session", "too long for one answer"),),
             )
         only = run.model_copy(update={"robot": robot, "parent_frame": parent})
-        found = [] if parent is None else poses_of_run(connection, row.number, only)
-    kept = list({one.captured_at: one for one in reversed(found)}.values())[::-1]
+        kept, posed = ([], 0) if parent is None else poses_of_run(connection, row.number, only)
     return Trajectory(
         map=row.name,
         session=run.session,
         robot=robot,
         parent_frame=parent,
         frame_ids=[one.frame_id for one in kept],
-        poses=[trajectory_row(one.captured_at, np.array(one.pose)) for one in kept],
+        poses=[trajectory_row(one.at, np.array(one.pose)) for one in kept],
+        posed=posed,
         left_out=total - len(kept),
     )
 
@@ -102,10 +103,13 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
 def trajectory_file(told: Trajectory) -> str:
     """A trajectory as a TUM file, which says in comments what its poses are of."""
     robot = "" if told.robot is None else f", robot {told.robot}"
+    told_of = f"{len(told.poses)}"
+    if told.posed > len(told.poses):
+        told_of += f" of {told.posed}, evenly taken"
     comments = [
         f"map {told.map}, session {told.session}{robot}",
         f"poses of the sensors' frames in {told.parent_frame or 'no frame'}, metres",
-        f"poses: {len(told.poses)}; frames left out: {told.left_out}",
+        f"poses: {told_of}; frames left out: {told.left_out}",
         "t tx ty tz qx qy qz qw",
     ]
     return trajectory_text(told.poses, comments)

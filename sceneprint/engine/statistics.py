@@ -18,7 +18,7 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.lags import index_state, index_states
 from sceneprint.engine.latencies import merged, quantile
-from sceneprint.engine.sizes import sizes
+from sceneprint.engine.sizes import sizes, sizes_of_map
 from sceneprint.engine.wire import when
 from sceneprint.errors import SceneprintError
 from sceneprint.schemas import JobState
@@ -46,6 +46,7 @@ from sceneprint.store.figures import (
 from sceneprint.store.frames import count_states
 from sceneprint.store.listing import count_jobs
 from sceneprint.store.maps import count_frames, find_map
+from sceneprint.store.records import MapRow
 from sceneprint.store.samples import Sample, add_sample, count_samples, samples_since
 
 MINUTE_S, HOUR_S = 60.0, 3600.0
@@ -93,6 +94,7 @@ class Statistics:
     def __init__(self, store: Store, settings: Settings, bell: Bell) -> None:
         self._store, self._settings, self._bell = store, settings, bell
         self._sizes: tuple[float, Sizes] | None = None
+        self._sizes_of: dict[int, tuple[float, Sizes]] = {}
         self._figures: tuple[float, Figures] | None = None
         self._lock = threading.Lock()
 
@@ -126,6 +128,7 @@ class Statistics:
                 jobs = count_jobs_of(connection, row.number)
                 maps, indexes = 1, [index_state(connection, self._indexes, row)]
                 oldest, workers = oldest_waiting(connection, row.number), None
+            taken = self.sizes() if row is None else self._sizes_of_map(connection, row)
         return Stats(
             at=when(now),
             map=map_name,
@@ -136,7 +139,7 @@ class Statistics:
             oldest_waiting_s=None if oldest is None else max(now - oldest, 0.0),
             indexes=indexes,
             workers=workers,
-            bytes=self.sizes() if row is None else None,
+            bytes=taken,
             total=Counted(**_counted(happened, range(minutes), samples)),
             minutes=_minutes(happened, samples, start, minutes),
         )
@@ -186,6 +189,15 @@ class Statistics:
         if self._sizes is None or now - self._sizes[0] > MEASURED_S:
             self._sizes = now, sizes(self._settings)
         return self._sizes[1]
+
+    def _sizes_of_map(self, connection: Connection, row: MapRow) -> Sizes:
+        now = time.monotonic()
+        kept = {n: one for n, one in list(self._sizes_of.items()) if now - one[0] <= MEASURED_S}
+        if row.number not in kept:  # two that ask at once measure twice, and tell the same
+            found = sizes_of_map(connection, self._store, self._indexes, row)
+            kept[row.number] = now, found
+            self._sizes_of = kept
+        return kept[row.number][1]
 
 
 def _minutes(

@@ -102,6 +102,10 @@ class Edge(Told):
     inliers: int = Field(description="Points of both frames that agree.")
     ambiguity: float = Field(description="Share that the best other transform explains.")
     similarity: float = Field(description="Of the signatures, 0 to 1.")
+    from_pose: Transform | None = Field(
+        default=None, description="Of `from_frame`, in the parent frame that it was sent with."
+    )
+    to_pose: Transform | None = Field(default=None, description="Of `to_frame`.")
     consistent: bool | None = Field(
         description="Whether loops with edges near by close. `false`: it was outvoted, and is "
         "left out of graphs and joins. null: there is nothing near by to compare it with, or no "

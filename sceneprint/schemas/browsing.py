@@ -84,6 +84,16 @@ class Run(Given):
         default=None, description="A part of it: taken then, or later; with a time zone."
     )
     captured_before: AwareDatetime | None = Field(default=None, description="Then, or earlier.")
+    most: Annotated[int, Field(ge=2, le=10_000)] | None = Field(
+        default=None,
+        description="At most so many poses, evenly taken along the run, the first and the last "
+        "among them. A run may then be of any length.",
+    )
+    clock: Literal["captured", "received"] = Field(
+        default="captured",
+        description="By which time: `received`, in the order in which frames came, has those too "
+        "that do not say when they were taken.",
+    )
 
 
 class Trajectory(Told):
@@ -102,9 +112,12 @@ class Trajectory(Told):
     frame_ids: list[str]
     poses: list[list[float]] = Field(
         description="A row for each frame, as in a TUM file: t tx ty tz qx qy qz qw, seconds "
-        "since 1970, metres, unit quaternion."
+        "since 1970 by the clock that was asked for, metres, unit quaternion."
+    )
+    posed: int = Field(
+        description="Poses that there are: as many as are told, or more where `most` was given."
     )
     left_out: int = Field(
         description="Frames of the run that are not in it: without pose or time, with a pose that "
-        "leads elsewhere, or of a time that is there already."
+        "leads elsewhere, of a time that is there already, or one too many for `most`."
     )

@@ -13,13 +13,38 @@ from sceneprint.schemas.base import Given, Label, Told
 class Sizes(Told):
     """Disk space, bytes."""
 
-    database: int | None = Field(description="With its log; null where it is no file.")
+    database: int | None = Field(
+        description="With its log; null where it is no file. Of one map: its signatures."
+    )
     blobs: int = Field(
         description="Uploads and what was made of them. Of many files some are measured, and the "
-        "rest is taken to be like them."
+        "rest is taken to be like them. Of one map: of its frames, without archives and meshes."
     )
     index: int = Field(description="Search indexes of this machine; a cache.")
-    free: int = Field(description="Left on the disk of the data folder.")
+    free: int | None = Field(
+        description="Left on the disk of the data folder; null where a map was asked for."
+    )
+    disk: int | None = Field(
+        default=None,
+        description="Size of the disk of the data folder, whoever uses it; null as `free`.",
+    )
+
+
+class IndexRecall(Told):
+    """What the shortlist of an index finds, by which a large map is searched without `exact`."""
+
+    share: float = Field(
+        description="Of the `near` nearest frames by the exact scan that the shortlist finds too, "
+        "measured before filters when the generation was published, or one before it that had "
+        "about as many frames."
+    )
+    near: int
+    sample: int = Field(
+        description="Frames of the map that were looked up for this, each without itself; 0 where "
+        "the shortlist leaves nothing out, so that every frame is compared."
+    )
+    shortlist: int = Field(description="Frames that the codes propose.")
+    frames: int = Field(description="Frames that the index had when this was measured.")
 
 
 class IndexState(Told):
@@ -32,6 +57,11 @@ class IndexState(Told):
     tail: int = Field(
         description="Indexed frames that the generation lacks. Above the setting `tail_frames`, "
         "and not going down: see that workers run."
+    )
+    recall: IndexRecall | None = Field(
+        default=None,
+        description="Null where the map has no index, so that every frame is compared, or where an "
+        "earlier version published it and measured nothing.",
     )
 
 
@@ -96,7 +126,7 @@ class Stats(Told):
     workers: list[WorkerSeen] | None = Field(
         description="On this machine, and elsewhere where at a job. Null where a map was asked for."
     )
-    bytes: Sizes | None = Field(description="Null where a map was asked for.")
+    bytes: Sizes = Field(description="On the disk; measured at most twice a minute.")
     total: Counted = Field(description="All minutes together.")
     minutes: list[Minute] = Field(description="The oldest first; the last is not over yet.")
 

@@ -48,10 +48,10 @@ class Counted:
 
 @dataclass(frozen=True)
 class Posed:
-    """A frame of a run; `pose` is T_parent_sensor."""
+    """A frame of a run; `at` is by the clock of the run, `pose` is T_parent_sensor."""
 
     frame_id: str
-    captured_at: float
+    at: float
     pose: list[list[float]]
 
 
@@ -109,19 +109,48 @@ def count_run(connection: Connection, map_number: int, run: Run) -> list[Counted
     return [Counted(*row) for row in found]
 
 
-def poses_of_run(connection: Connection, map_number: int, run: Run) -> list[Posed]:
-    """Frames of a session with time and pose, in the order of time and as they came."""
+def poses_of_run(connection: Connection, map_number: int, run: Run) -> tuple[list[Posed], int]:
+    """Frames of a session with time and pose in the order of time, of one time the first that came;
+    by the clock `received` all with a pose, as they came.
+
+    Parameters
+    ----------
+    connection : of the database
+    map_number : of the map
+    run : whose; with `most`, so many of them at most, evenly taken. Only their rows are read: an
+        index holds what the choice needs.
+
+    Returns
+    -------
+    poses, count : how many there are of all of them
+    """
+    taken = run.clock == "captured"
+    at = frames.c.captured_at if taken else frames.c.received_at
+    posed = [
+        *_of_session(map_number, run),
+        frames.c.pose_parent == run.parent_frame,
+        frames.c.pose_x.is_not(None),
+    ]
+    if taken:
+        least = func.min(frames.c.number).label("number")
+        timed = select(least, at.label("order")).where(*posed, at.is_not(None)).group_by(at)
+    else:
+        timed = select(frames.c.number, frames.c.number.label("order")).where(*posed)
+    first = timed.subquery()
+    chosen = select(first.c.number)
+    count = int(connection.execute(select(func.count()).select_from(first)).scalar_one())
+    if run.most is not None and run.most < count:
+        place = (func.row_number().over(order_by=first.c.order) - 1).label("place")
+        placed = select(first.c.number, place).subquery()
+        # the multiples of (count - 1) / (most - 1), rounded up: with 0 and count - 1, `most`
+        even = (placed.c.place * (run.most - 1)) % (count - 1) < run.most - 1
+        chosen = select(placed.c.number).where(even)
     found = connection.execute(
-        select(frames.c.id, frames.c.captured_at, frames.c.pose)
-        .where(
-            *_of_session(map_number, run),
-            frames.c.pose_parent == run.parent_frame,
-            frames.c.captured_at.is_not(None),
-            frames.c.pose_x.is_not(None),
-        )
-        .order_by(frames.c.captured_at, frames.c.number)
+        select(frames.c.id, at, frames.c.pose)
+        .where(frames.c.number.in_(chosen))
+        .order_by(at if taken else frames.c.number, frames.c.number)
     )
-    return [Posed(*row) for row in found]
+    return [Posed(*row) for row in found], count
 
 
 def _of_session(map_number: int, run: Run) -> list[ColumnElement[bool]]:

@@ -1,4 +1,4 @@
-"""What was taken in one run: sessions of a map, and the trajectory of one."""
+"""What was taken in one run, and when: sessions of a map, a trajectory, and how the map grew."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from sceneprint.engine.browsing import list_sessions, trajectory, trajectory_file
+from sceneprint.engine.growth import growth
 from sceneprint.schemas import Page
 from sceneprint.schemas.browsing import Run, Session, Trajectory
+from sceneprint.schemas.growth import Growth, GrowthOf
 from service.access import may_read
 from service.conditions import chosen
 from service.context import Here
@@ -51,7 +53,8 @@ async def get_trajectory(
 ) -> Response:
     """The poses of a run in the order of time: of the sensors' frames, in metres.
 
-    At most 100,000 frames at once; ask for parts of a longer one by time.
+    At most 100,000 frames at once; ask for parts of a longer one by time, or for `most` of them,
+    which are evenly taken along it.
     """
     kind = chosen(request, (_TEXT, _JSON))
 
@@ -62,3 +65,9 @@ async def get_trajectory(
     async with here.gate.place():
         data = await here.gate.run(make)
     return Response(data, 200, {"Vary": "Accept"}, kind)
+
+
+@router.get("/growth", responses=declared(404, 422))
+def get_growth(map_name: str, here: Here, asked: Annotated[GrowthOf, Query()]) -> Growth:
+    """How many frames a map has, by the hour or the day (UTC) in which they were indexed."""
+    return growth(here.engine.store, map_name, asked.by, asked.last)

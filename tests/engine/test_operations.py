@@ -20,6 +20,7 @@ from sceneprint.engine.latencies import Latencies, bin_of
 from sceneprint.errors import Conflict, InvalidRequest, UnknownMap
 from sceneprint.models import PRESETS, read_model
 from sceneprint.schemas import NewMap, Query
+from sceneprint.schemas.operations import IndexRecall
 from sceneprint.store.events import Wanted, tell
 from sceneprint.store.samples import add_sample, samples_since
 from sceneprint.store.tables import events, jobs, samples
@@ -88,7 +89,7 @@ def test_history_is_that_of_all_processes(make_engine, noon):
     assert bin_of(last.latency.p99) == bin_of(0.1)  # the 198th of 200; the 199th took 3 s
     own = engine.operations.statistics.tell(3, "hall")
     assert [one.indexed for one in own.minutes] == [0, 1, 1]
-    assert (own.total.queries, own.total.latency, own.workers, own.bytes) == (None,) * 4
+    assert (own.total.queries, own.total.latency, own.workers, own.bytes.free) == (None,) * 4
     with pytest.raises(UnknownMap):
         engine.operations.statistics.tell(3, "shop")
 
@@ -130,15 +131,18 @@ def test_indexes_and_sizes_are_told(data, make_engine):
     indexed = engine.get_map("hall").frames["indexed"]
     (index,) = engine.operations.statistics.tell(1).indexes
     assert (index.map, index.generation, index.tail) == ("hall", None, indexed)
+    assert index.recall is None
     engine.rebuild_index("hall")
     (index,) = engine.operations.statistics.tell(1).indexes
     assert (index.generation, index.tail) == (1, 0)
+    assert index.recall == IndexRecall(share=1, near=10, sample=0, shortlist=500)  # compared whole
     told = measuring.sizes(engine.settings)
     assert told.index == sum(p.stat().st_size for p in (data / "index").rglob("*") if p.is_file())
     assert told.blobs == sum(p.stat().st_size for p in (data / "blobs").rglob("*") if p.is_file())
     assert told.database is not None
     assert told.database >= (data / "sceneprint.db").stat().st_size
     assert told.free == pytest.approx(shutil.disk_usage(data).free, rel=0.2)
+    assert told.disk == shutil.disk_usage(data).total
 
 
 def test_many_blobs_are_measured_by_a_part_of_them(make_engine, monkeypatch):

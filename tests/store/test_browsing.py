@@ -177,17 +177,41 @@ def test_poses_of_a_run_are_those_of_plain_python(
             for one in own
             if one.pose_parent == run.parent_frame and one.captured_at is not None
         ]
-        expected.sort(key=lambda one: (one.captured_at, one.number))
+        expected.sort(key=lambda one: (one.captured_at, -one.number))
+        expected = list({one.captured_at: one for one in expected}.values())  # the least number
         with store.database.read() as connection:
-            found = poses_of_run(connection, hall.number, run)
+            found, count = poses_of_run(connection, hall.number, run)
             counted = count_run(connection, hall.number, run)
         assert expected
-        assert [(one.frame_id, one.captured_at, one.pose) for one in found] == [
+        assert [(one.frame_id, one.at, one.pose) for one in found] == [
             (one.id, one.captured_at, one.pose) for one in expected
         ]
+        assert count == len(found)
         assert {(one.robot, one.parent): one.count for one in counted} == Counter(
             (one.robot, one.pose_parent) for one in own
         )
+
+
+def test_poses_are_taken_evenly(store: Store, hall: MapRow, received: Received) -> None:
+    """At the multiples of 10 / (most - 1), rounded up, of the eleven times."""
+    rows = [
+        received(
+            f"{i:064d}", session="s", pose_parent="p", pose=np.eye(4).tolist(),
+            captured_at=START.timestamp() + (i * 7) % 11,
+        )
+        for i in range(11)
+    ] + [received(f"{99:064d}", session="s", pose_parent="p", pose=np.eye(4).tolist(),
+                  captured_at=START.timestamp())]  # fmt: skip
+    for most, places in (
+        (2, [0, 10]), (3, [0, 5, 10]), (4, [0, 4, 7, 10]), (6, [0, 2, 4, 6, 8, 10]),
+        (10, [0, 2, 3, 4, 5, 6, 7, 8, 9, 10]), (11, range(11)), (12, range(11)),
+    ):  # fmt: skip
+        with store.database.read() as connection:
+            run = Run(session="s", parent_frame="p", most=most)
+            found, count = poses_of_run(connection, hall.number, run)
+        assert count == 11
+        assert [one.at - START.timestamp() for one in found] == list(places), most
+        assert found[0].frame_id == rows[0].id  # of two of one time, the first that came
 
 
 SEARCHED = "USING COVERING INDEX ix_frames_searched"

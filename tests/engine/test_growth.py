@@ -1,0 +1,146 @@
+"""How a map grew, and what it takes on the disk: against counts by hand and the files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import func, select, update
+
+from sceneprint.datasets import read_trajectory
+from sceneprint.engine import Engine
+from sceneprint.engine import growth as growing
+from sceneprint.engine import sizes as measuring
+from sceneprint.engine.browsing import trajectory, trajectory_file
+from sceneprint.engine.edits import edit_frame
+from sceneprint.engine.growth import growth
+from sceneprint.errors import UnknownMap
+from sceneprint.schemas import NewMap
+from sceneprint.schemas.browsing import Run
+from sceneprint.store.maps import find_map
+from sceneprint.store.tables import frames, signatures
+
+Ids = Callable[[Engine], list[str]]
+HOUR_S = 3600.0
+#: Twenty past the hour, two hours into a day of UTC.
+NOW = 20_000 * 24 * HOUR_S + 2 * HOUR_S + 1200
+
+
+@pytest.fixture
+def grown(full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch) -> Engine:
+    """Twelve frames, of which the third was deleted and the fourth failed later."""
+    monkeypatch.setattr(growing.time, "time", lambda: NOW)
+    hours_ago = (0, 0.3, 0.3, 0.3, 0.34, 1, 1.5, 2.4, 26, 26, 40, 2000)
+    names = ids(full)
+    with full.store.database.write() as connection:
+        for name, ago in zip(names, hours_ago, strict=True):
+            at = NOW - ago * HOUR_S
+            connection.execute(update(frames).where(frames.c.id == name).values(indexed_at=at))
+        failed = update(frames).where(frames.c.id == names[3])
+        connection.execute(failed.values(state="failed"))
+    full.delete_frame("hall", names[2])
+    full.create_map(NewMap(name="shop", model="compact"))
+    return full
+
+
+def test_frames_are_counted_by_hour_and_day(grown: Engine) -> None:
+    told = growth(grown.store, "hall", "hour", 4)
+    assert [one.at.timestamp() - NOW for one in told.buckets] == [
+        -3 * HOUR_S - 1200, -2 * HOUR_S - 1200, -HOUR_S - 1200, -1200
+    ]  # fmt: skip
+    # 0.34 h ago is before the full hour, 20 minutes ago, and 0.3 h ago is not
+    assert [one.indexed for one in told.buckets] == [1, 1, 2, 2]
+    assert [one.total for one in told.buckets] == [5, 6, 8, 10]
+    assert (told.map, told.by, told.indexed, told.before) == ("hall", "hour", 10, 4)
+    told = growth(grown.store, "hall", "day", 2)
+    assert [one.at.timestamp() for one in told.buckets] == [19_999 * 86400, 20_000 * 86400]
+    assert [(one.indexed, one.total) for one in told.buckets] == [(3, 5), (5, 10)]
+    assert told.before == 2
+    empty = growth(grown.store, "shop", "day", 1)
+    assert (empty.indexed, empty.before, empty.buckets[0].total) == (0, 0, 0)
+    with pytest.raises(UnknownMap):
+        growth(grown.store, "nowhere")
+
+
+def test_a_clock_that_was_set_back_loses_no_frame(grown: Engine, ids: Ids) -> None:
+    with grown.store.database.write() as connection:
+        later = update(frames).where(frames.c.id == ids(grown)[0])
+        connection.execute(later.values(indexed_at=NOW + 5 * HOUR_S))
+    told = growth(grown.store, "hall", "hour", 4)
+    assert [one.indexed for one in told.buckets] == [1, 1, 2, 2]
+
+
+def test_a_map_is_weighed(full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch) -> None:
+    full.create_map(NewMap(name="shop", model="compact"))
+    full.rebuild_index("hall")
+    names = ids(full)
+    with full.store.database.read() as connection:
+        held = connection.execute(
+            select(frames.c.bytes, func.length(signatures.c.vector), signatures.c.geometry)
+            .join(signatures, signatures.c.frame_number == frames.c.number)
+            .order_by(frames.c.number)
+        ).all()
+    folder = full.settings.data_dir
+    on_disk = sum(p.stat().st_size for p in (folder / "blobs").rglob("*") if p.is_file())
+    told = full.operations.statistics.tell(1, "hall").bytes
+    assert told.blobs == on_disk
+    assert told.database == sum(one[1] for one in held)
+    assert told.index == sum(p.stat().st_size for p in _files(folder / "index"))
+    assert (told.free, told.disk) == (None, None)
+    shop = full.operations.statistics.tell(1, "shop").bytes
+    assert (shop.database, shop.blobs, shop.index) == (0, 0, 0)
+
+    monkeypatch.setattr(measuring, "WEIGHED", 4)  # the 1st, 4th, 7th and 10th stand for all
+    some = [one for i, one in enumerate(held) if i % 3 == 0]
+    artifacts = sum(full.store.blobs.path(one[2]).stat().st_size for one in some)
+    with full.store.database.read() as connection:
+        row = find_map(connection, "hall")
+        told = measuring.sizes_of_map(connection, full.store, full.settings.indexes, row)
+    assert told.blobs == (sum(one[0] for one in some) + artifacts) * 3
+    assert told.database == sum(one[1] for one in some) * 3
+    # what is deleted takes nothing
+    full.delete_frame("hall", names[0])
+    monkeypatch.setattr(measuring, "WEIGHED", 1000)
+    with full.store.database.read() as connection:
+        told = measuring.sizes_of_map(connection, full.store, full.settings.indexes, row)
+    assert told.database == sum(one[1] for one in held[1:])
+
+
+def test_a_long_trajectory_is_thinned(
+    full: Engine, ids: Ids, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sceneprint.engine import browsing
+
+    names = ids(full)
+    for i, name in enumerate(names[:7]):
+        at = None if i == 6 else f"2026-11-16T09:30:0{i}Z"
+        pose: dict[str, Any] = {"parent_frame": "hall"}
+        edit_frame(full.store, "hall", name, {"session": "s", "captured_at": at, "pose": pose})
+    whole = trajectory(full.store, "hall", Run(session="s"))
+    monkeypatch.setattr(browsing, "MOST_POSES", 3)  # a part of a run may be one of any length
+    told = trajectory(full.store, "hall", Run(session="s", most=3))
+    assert told.frame_ids == [names[i] for i in (0, 3, 5)]
+    assert told.poses == [whole.poses[i] for i in (0, 3, 5)]
+    assert (told.posed, told.left_out) == (6, 4)
+    assert (whole.posed, whole.left_out) == (6, 1)
+    text = trajectory_file(told)
+    assert "# poses: 3 of 6, evenly taken; frames left out: 4" in text
+    (tmp_path / "a.tum").write_text(text)
+    assert len(read_trajectory(tmp_path / "a.tum").stamps) == 3
+    monkeypatch.undo()
+    came = trajectory(full.store, "hall", Run(session="s", clock="received"))
+    assert came.frame_ids == names[:7]  # the one without a time too
+    uploaded = [full.get_frame("hall", name).received_at.timestamp() for name in names[:7]]
+    assert [row[0] for row in came.poses] == pytest.approx(uploaded, abs=1e-6)
+    assert (came.posed, came.left_out) == (7, 0)
+    came = trajectory(full.store, "hall", Run(session="s", clock="received", most=2))
+    assert came.frame_ids == [names[0], names[6]]
+    whole = trajectory(full.store, "hall", Run(session="s", most=6))
+    assert (len(whole.poses), whole.posed, whole.left_out) == (6, 6, 1)
+    assert "# poses: 6; frames left out: 1" in trajectory_file(whole)
+
+
+def _files(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.is_file()]
