@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, FastAPI
 from sceneprint import __version__
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
-from service import problems
+from service import dashboard, problems
 from service.access import caller
 from service.context import Context, Gate
 from service.cors import origins_of
@@ -21,6 +21,7 @@ from service.limits import Limits
 from service.metrics import Metrics
 from service.middleware import Around
 from service.routes import (
+    again,
     associations,
     edits,
     events,
@@ -33,6 +34,7 @@ from service.routes import (
     maps,
     operations,
     outputs,
+    points,
     queries,
     reconstructions,
     sessions,
@@ -44,8 +46,8 @@ from service.sampling import housekeeping
 
 #: In the order in which the document lists them.
 ROUTES = (
-    maps, frames, uploads, outputs, edits, sessions, imports, queries, kept, similarity,
-    associations, reconstructions, jobs, events, operations, snapshots, keys,
+    maps, frames, uploads, outputs, points, edits, sessions, imports, queries, kept, again,
+    similarity, associations, reconstructions, jobs, events, operations, snapshots, keys,
 )  # fmt: skip
 #: Uploads that are in hand at once, so that one wait for the disk is enough for all of them.
 UPLOADS = 12
@@ -98,6 +100,7 @@ def create_app(settings: Settings) -> FastAPI:
         v1.include_router(part.router)
     app.include_router(v1)
     app.include_router(health.router)
+    app.include_router(dashboard.routes(dashboard.files_in(dashboard.PAGES)))
     problems.install(app)
     app.add_middleware(Around, settings=settings, origins=origins_of(settings), metrics=figures)
     app.openapi = lambda: openapi_of(app)  # type: ignore[method-assign]

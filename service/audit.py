@@ -18,8 +18,9 @@ _READING = frozenset(("GET", "HEAD", "OPTIONS"))
 #: What is asked much and changes no map, and uploads, which are many: frames and events tell of
 #: them.
 UNNOTED = frozenset(
-    ("add_frame", "put_frame", "add_batch", "ask", "ask_several", "localize", "compare")
-)
+    ("add_frame", "put_frame", "add_batch", "ask", "ask_several", "ask_again", "localize",
+     "compare")
+)  # fmt: skip
 
 
 async def note(scope: Scope, status: int, headers: list[tuple[bytes, bytes]]) -> None:

@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 
 from sceneprint.engine import jobs, keys, maps, reencoding
+from sceneprint.engine.again import Again
 from sceneprint.engine.associating import Associating
 from sceneprint.engine.associations import Associations
 from sceneprint.engine.audit import Audit
@@ -16,6 +17,7 @@ from sceneprint.engine.inspecting import Inspection
 from sceneprint.engine.kept import KeptQueries
 from sceneprint.engine.operations import Operations
 from sceneprint.engine.outputs import Outputs
+from sceneprint.engine.points import PointClouds
 from sceneprint.engine.querying import Queries
 from sceneprint.engine.readers import Readers
 from sceneprint.engine.reconstructions import Reconstructions
@@ -67,6 +69,7 @@ class Administration:
         self.kept = KeptQueries(settings.query_dir, settings.query_s, settings.query_bytes)
         self.inspection = Inspection(self.store, self.signers, self.kept)
         self.queries = Queries(self.store, self.signers, self._readers, self.kept)
+        self.again = Again(self.store, self.kept, self.queries)
         # threads of the service work side by side, and sums have one order: the same bytes always
         self._limits = threadpool_limits(1)
         self.bell = Bell(settings.bell_dir)
@@ -78,6 +81,7 @@ class Administration:
         self.tasks.register(ASSOCIATE, associating)
         self.audit = Audit(self.store)
         self.outputs = Outputs(self.store, self.signers)
+        self.points = PointClouds(self.store, self.inspection.pairs, self.kept)
         self.reconstructions = Reconstructions(self.store, self.tasks)
         self.operations = Operations(self.store, settings, self.bell)
 

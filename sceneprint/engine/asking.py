@@ -74,7 +74,7 @@ def ask_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -> As
     """
     start = time.perf_counter()
     at = None if meta.captured_at is None else meta.captured_at.timestamp()
-    taken = _checked(Taken(meta.robot, meta.session, at), query)
+    taken = check_taken(Taken(meta.robot, meta.session, at), query)
     read = read_upload(data, meta)
     kind, base = read.kind, read.base
     if "validate" not in query.stages:
@@ -118,7 +118,7 @@ def ask_stored(store: Store, map_name: str, frame_id: str, query: Query) -> Aske
             "while it is indexed.",
             (("frame_id", f"is {frame.state}"),),
         )
-    taken = _checked(Taken(frame.robot, frame.session, frame.captured_at), query)
+    taken = check_taken(Taken(frame.robot, frame.session, frame.captured_at), query)
     geometry = artifact = base = None
     if frame.base is not None:
         base = str(frame.base_frame), np.array(frame.base)
@@ -141,7 +141,7 @@ def ask_stored(store: Store, map_name: str, frame_id: str, query: Query) -> Aske
     )
 
 
-def _checked(taken: Taken, query: Query) -> Taken:
+def check_taken(taken: Taken, query: Query) -> Taken:
     """What is known of a query, if it is enough for the filter."""
     if query.filter is not None and query.filter.not_within_s is not None:
         missing = [name for name in ("session", "captured_at") if getattr(taken, name) is None]

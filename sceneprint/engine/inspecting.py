@@ -2,37 +2,28 @@
 
 query id  --Inspection-->  Answer | PLY | Similarities | MatchDetails
 
-A match is validated once more, with the seed and the options of the query: the same answer.
+A match is validated once more, with the seed and the options of the query: see `pairs.py`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from sceneprint.artifacts import read_geometry
 from sceneprint.clouds import points_of, write_ply
-from sceneprint.engine.healing import sign_again
 from sceneprint.engine.kept import Kept, KeptQueries
+from sceneprint.engine.pairs import Pairs, geometry_of_query
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.telling import tell_uncertainty, tell_validation
 from sceneprint.engine.transforms import transform
-from sceneprint.engine.validating import thresholds
-from sceneprint.engine.wire import query_sensor, sensor_of
+from sceneprint.engine.wire import query_sensor
 from sceneprint.errors import (
-    DamagedBlob,
     InvalidRequest,
-    NotIndexed,
-    UnknownFrame,
-    UnreadableGeometry,
 )
 from sceneprint.geometry.covariance import PAIR_METHOD
 from sceneprint.geometry.overlays import overlay
 from sceneprint.geometry.retrieval import pairwise_distances, similarity
 from sceneprint.geometry.traces import AGREES, VIOLATES, Traces, Verdicts, trace
-from sceneprint.geometry.validation import Validation, ValidationParameters
-from sceneprint.pipeline import validate
-from sceneprint.schemas import Answer, FrameState
-from sceneprint.schemas import Match as ToldMatch
+from sceneprint.schemas import Answer
 from sceneprint.schemas.kept import (
     MOST_POINTS,
     Coincidences,
@@ -45,9 +36,9 @@ from sceneprint.schemas.kept import (
 from sceneprint.schemas.options import FrameName
 from sceneprint.schemas.outputs import Triple
 from sceneprint.store import Store
-from sceneprint.store.frames import find_frame, frames_of, refers_to
-from sceneprint.store.maps import find_map, list_maps
-from sceneprint.store.signatures import geometry_blobs, stored_signatures
+from sceneprint.store.frames import frames_of
+from sceneprint.store.maps import list_maps
+from sceneprint.store.signatures import stored_signatures
 from sceneprint.types import Bytes, Floats, Floats32, Geometry
 
 
@@ -62,6 +53,7 @@ class Inspection:
 
     def __init__(self, store: Store, signers: Signers, kept: KeptQueries) -> None:
         self._store, self._signers, self._kept = store, signers, kept
+        self.pairs = Pairs(store, signers, kept)
 
     def answer(self, query_id: str) -> Answer:
         """The answer again; UnknownQuery where it is not kept, or no longer."""
@@ -76,7 +68,7 @@ class Inspection:
         NotIndexed : it was asked without validation, for which alone its points are made.
         """
         kept = self._kept.find(query_id)
-        points, normals = points_of(_geometry(kept).surface)
+        points, normals = points_of(geometry_of_query(kept).surface)
         comments = [
             f"frame {_sensor(kept)}", f"points of query {query_id}, metres",
             f"model {kept.answer.model}",
@@ -123,12 +115,11 @@ class Inspection:
             validation, or the map has changed its model since.
         DamagedBlob, UnreadableGeometry : the match's artifact is damaged; it is made again.
         """
-        kept = self._kept.find(query_id)
-        match = _match_of(kept, frame_id, map_name)
-        query, (name, other) = _geometry(kept), self._geometry(kept, match)
-        p = self._signers(kept.model_id).model.parameters.validation
-        v = _validated(kept, query, other, p)
-        names = name, _sensor(kept)
+        pair = self.pairs.find(query_id, frame_id, map_name)
+        kept, match, p = pair.kept, pair.match, self.pairs.parameters(pair)
+        query, other = self.pairs.opened(pair)
+        v = self.pairs.validated(pair, query, other)
+        names = pair.sensor, _sensor(kept)
         T, rival = v.T_match_query, v.T_rival
         traces = None if T is None else trace(query, other, T, p.agreement, p.alignment.consensus)
         return MatchDetails(
@@ -137,7 +128,7 @@ class Inspection:
             map=match.map,
             validation=tell_validation(v),
             transform=None if T is None else transform(T, *names),
-            uncertainty=tell_uncertainty(v.covariance, PAIR_METHOD),
+            uncertainty=tell_uncertainty(v.covariance, PAIR_METHOD, p.covariance),
             rival=None if rival is None else transform(rival, *names),
             patches=None if traces is None else _coincidences(traces, query, other),
             query=None if traces is None else _points(traces.query, traces.of_query),
@@ -164,13 +155,11 @@ class Inspection:
         UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : see `match`.
         InvalidRequest : there is no such transform.
         """
-        kept = self._kept.find(query_id)
-        match = _match_of(kept, frame_id, map_name)
-        query, (name, other) = _geometry(kept), self._geometry(kept, match)
+        pair = self.pairs.find(query_id, frame_id, map_name)
+        query, other = self.pairs.opened(pair)
         T = np.eye(4)
-        p = self._signers(kept.model_id).model.parameters.validation
         if by != "none":
-            v = _validated(kept, query, other, p)
+            v = self.pairs.validated(pair, query, other)
             found = v.T_match_query if by == "aligned" else v.T_rival
             if found is None:
                 what = "no transform" if by == "aligned" else "no rival"
@@ -180,72 +169,18 @@ class Inspection:
                     (("transform", f"there is {what}"),),
                 )
             T = found
-        points, normals, colours = overlay(query.surface, other.surface, T, colour, p.agreement)
+        p = self.pairs.parameters(pair).agreement
+        points, normals, colours = overlay(query.surface, other.surface, T, colour, p)
         comments = [
-            f"frame {name}",
-            f"query {query_id} and frame {match.frame_id} of map {match.map}, metres",
-            f"transform {by}, colours by {colour}", f"model {kept.answer.model}",
+            f"frame {pair.sensor}",
+            f"query {query_id} and frame {pair.match.frame_id} of map {pair.match.map}, metres",
+            f"transform {by}, colours by {colour}", f"model {pair.kept.answer.model}",
         ]  # fmt: skip
         return write_ply(points, normals, colours, comments=comments)
-
-    def _geometry(self, kept: Kept, match: ToldMatch) -> tuple[str, Geometry]:
-        """What the coordinates of a match are called, and its artifact, if it is still the frame
-        that was matched.
-        """
-        with self._store.database.read() as connection:
-            row = find_map(connection, match.map)
-            frame = find_frame(connection, row, match.frame_id)
-            blobs = geometry_blobs(connection, [frame.number], kept.model_id)
-        if frame.state == FrameState.DELETED or frame.number not in kept.ranked:
-            raise _deleted(match)
-        if frame.number not in blobs:
-            raise NotIndexed(
-                f"Map {match.map!r} has changed its model since the query, and a frame of one "
-                "model cannot be compared with one of another. Ask again."
-            )
-        try:
-            artifact = read_geometry(self._store.blobs.get(blobs[frame.number]))
-            return sensor_of(frame), artifact
-        except (DamagedBlob, UnreadableGeometry):
-            with self._store.database.read() as connection:
-                if not refers_to(connection, blobs[frame.number]):
-                    raise _deleted(match) from None
-            if row.model_id == kept.model_id:
-                sign_again(self._store, row, [frame.number], row.model_id)
-            raise
 
 
 def _sensor(kept: Kept) -> str:
     return query_sensor(kept.answer.frame, kept.answer.kind, kept.answer.maps)
-
-
-def _geometry(kept: Kept) -> Geometry:
-    if kept.geometry is None:
-        raise NotIndexed(
-            f"Query {kept.answer.query_id} was asked without validation, so its points were not "
-            "kept. Ask again with the stage `validate`."
-        )
-    return read_geometry(kept.geometry)
-
-
-def _deleted(match: ToldMatch) -> UnknownFrame:
-    return UnknownFrame(
-        f"Frame {match.frame_id} of map {match.map!r} was deleted since it was matched."
-    )
-
-
-def _match_of(kept: Kept, frame_id: str, map_name: str | None) -> ToldMatch:
-    for one in kept.answer.matches:
-        if one.frame_id == frame_id and map_name in (None, one.map):
-            return one
-    raise UnknownFrame(
-        f"Query {kept.answer.query_id} has no match {frame_id!r:.80}"
-        f"{'' if map_name is None else f' in map {map_name!r:.80}'}. Its answer lists them."
-    )
-
-
-def _validated(kept: Kept, query: Geometry, match: Geometry, p: ValidationParameters) -> Validation:
-    return validate(query, match, kept.query.seed, *thresholds(kept.query.validation, p))
 
 
 def _coincidences(traces: Traces, query: Geometry, match: Geometry) -> Coincidences:

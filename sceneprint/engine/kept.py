@@ -17,7 +17,7 @@ import struct
 import threading
 import time
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,8 @@ from pydantic import ValidationError
 
 from sceneprint.errors import UnknownQuery
 from sceneprint.schemas import Answer, Query
-from sceneprint.types import Bytes
+from sceneprint.store.filters import Taken
+from sceneprint.types import Bytes, Floats
 from sceneprint.writing import write_whole
 
 log = logging.getLogger(__name__)
@@ -33,7 +34,7 @@ log = logging.getLogger(__name__)
 #: Most answers that are kept, however small: a folder is read again for every few.
 MOST_QUERIES = 10_000
 #: Of the bytes and of what they mean. Raise it when either changes.
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 _MAGIC = b"SPQRY"
 #: magic, schema, CRC-32 of all that follows | bytes of head, signature and geometry artifact
 _FILE, _PARTS = struct.Struct("<5sHI"), struct.Struct("<III")
@@ -60,6 +61,8 @@ class Kept:
     geometry : its artifact as bytes; None where the query was not validated
     ranked : numbers of the frames of R, in its order
     at : when, seconds since 1970
+    taken : who took an uploaded query, in which run and when
+    base : what its robot's base is called, and T_base_query (4, 4); None where it is not known
     """
 
     answer: Answer
@@ -69,6 +72,8 @@ class Kept:
     geometry: bytes | None
     ranked: tuple[int, ...] = ()
     at: float = field(default_factory=time.time)
+    taken: Taken = field(default_factory=lambda: Taken(None, None, None))
+    base: tuple[str, Floats] | None = None
 
 
 class KeptQueries:
@@ -173,11 +178,16 @@ def _written(kept: Kept) -> bytes:
         {
             "answer": kept.answer.model_dump(mode="json"),
             # of a query to several maps without their names: the answer has them
-            "query": kept.query.model_dump(mode="json", include=set(Query.model_fields)),
+            # as given: what was left out of `validation` is as the model has it
+            "query": kept.query.model_dump(
+                mode="json", include=set(Query.model_fields), exclude_unset=True
+            ),
             "model_id": kept.model_id,
             "geometry": kept.geometry is not None,
             "ranked": kept.ranked,
             "at": kept.at,
+            "taken": asdict(kept.taken),
+            "base": None if kept.base is None else [kept.base[0], kept.base[1].tolist()],
         }
     ).encode()
     parts = [head, kept.vector.tobytes(), kept.geometry or b""]
@@ -201,4 +211,6 @@ def _read(data: bytes) -> Kept:
         geometry=body[ends[2] : ends[3]] if head["geometry"] else None,
         ranked=tuple(head["ranked"]),
         at=head["at"],
+        taken=Taken(**head["taken"]),
+        base=None if head["base"] is None else (head["base"][0], np.array(head["base"][1])),
     )

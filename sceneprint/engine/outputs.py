@@ -36,6 +36,7 @@ from sceneprint.signing import hierarchy_of, see
 from sceneprint.store import Store
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
+from sceneprint.store.records import FrameRow
 from sceneprint.store.signatures import Sizes, signature_sizes, stored_vector
 from sceneprint.types import Hierarchy, Intrinsics, Ints32, Surface
 from sceneprint.vistas import onto, vista_of
@@ -70,18 +71,7 @@ class Outputs:
         """
         found = find_indexed(self._store, map_name, frame_id)
         frame, optical = found.frame, sensor_of(found.frame)
-        name, matrix = {
-            "optical": (optical, np.eye(4).tolist()),
-            "parent": (frame.pose_parent, frame.pose),
-            "base": (frame.base_frame, frame.base),
-        }[within]
-        if matrix is None or name is None:
-            lacking = "pose" if within == "parent" else "T_base_sensor"
-            raise InvalidRequest(
-                f"Frame {frame_id} has no {lacking}, so its points are known in {optical} alone. "
-                f"Ask for frame=optical, or give it one with PATCH.",
-                (("frame", f"it has no {lacking}"),),
-            )
+        name, matrix = placed(frame, within)
         comments = [f"frame {name}", f"points of {optical} of map {found.row.name}, metres",
                     f"model {found.label}"]  # fmt: skip
 
@@ -218,3 +208,27 @@ class Outputs:
                 f"The signature of frame {found.frame.id} is missing. `sceneprint fsck` says why."
             )
         return vector, sizes
+
+
+def placed(frame: FrameRow, within: CloudFrame) -> tuple[str, list[list[float]]]:
+    """What some coordinates of a frame are called, and the (4, 4) that leads there from its
+    sensor's.
+
+    Raises
+    ------
+    InvalidRequest : its pose, or where the sensor sits on its base, is not known.
+    """
+    optical = sensor_of(frame)
+    name, matrix = {
+        "optical": (optical, np.eye(4).tolist()),
+        "parent": (frame.pose_parent, frame.pose),
+        "base": (frame.base_frame, frame.base),
+    }[within]
+    if matrix is None or name is None:
+        lacking = "pose" if within == "parent" else "T_base_sensor"
+        raise InvalidRequest(
+            f"Frame {frame.id} has no {lacking}, so its points are known in {optical} alone. "
+            f"Ask for frame=optical, or give it one with PATCH.",
+            (("frame", f"it has no {lacking}"),),
+        )
+    return name, matrix

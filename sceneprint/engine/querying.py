@@ -107,7 +107,10 @@ class Queries:
         model = self._signers(asked.model_id).model
         told, ranked = answer(self._store, places, model, asked, query, deadline)
         if query.keep:
-            kept = Kept(told, query, asked.model_id, asked.vector, asked.artifact, ranked)
+            kept = Kept(
+                told, query, asked.model_id, asked.vector, asked.artifact, ranked,
+                taken=asked.taken, base=asked.base,
+            )  # fmt: skip
             self._kept.keep(kept)
         return told
 

@@ -9,7 +9,10 @@ import numpy as np
 from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.datasets.unfiltering import unfilter
 from sceneprint.errors import FrameError
+from sceneprint.geometry.agreement import sampled
+from sceneprint.geometry.belonging import patches_at
 from sceneprint.geometry.retrieval import distances, pairwise_distances
+from sceneprint.geometry.traces import residuals
 from sceneprint.index import Tail, search
 from sceneprint.pipeline import Signer, prepare, validate
 from sceneprint.types import Cloud, Frame, Intrinsics
@@ -39,6 +42,9 @@ def warm(signer: Signer, *, clouds: bool = False) -> bool:
         rows.flags.writeable = False  # as a mapped segment is: another compilation
         distances(signature.vector.copy(), rows)
         geometry = read_geometry(write_geometry(seen))
+        drawn = sampled(geometry.surface, 1)  # as a page asks for them
+        patches_at(drawn, geometry.patches)
+        residuals(drawn, geometry.surface, np.eye(4), p.agreement)
         for has_viewpoint in (True, False) if clouds else ():
             _, points = prepare(_cloud(corner, has_viewpoint=has_viewpoint), signer)
             validate(geometry, read_geometry(write_geometry(points)), p=p)

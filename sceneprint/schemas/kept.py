@@ -16,6 +16,8 @@ from sceneprint.schemas.transforms import Transform
 OverlayColour = Literal["source", "normal", "residual"]
 #: By which transform an overlay's clouds are laid on each other.
 OverlayTransform = Literal["aligned", "rival", "none"]
+#: Whose points.
+PointsSide = Literal["query", "match"]
 COLOURS: tuple[OverlayColour, ...] = ("source", "normal", "residual")
 TRANSFORMS: tuple[OverlayTransform, ...] = ("aligned", "rival", "none")
 

@@ -32,7 +32,7 @@ def _ply(description: str, *statuses: int) -> dict[int | str, dict[str, Any]]:
     return {200: {"description": description, "content": content}, **declared(*statuses)}
 
 
-def _seen(query_id: str, here: Context, asking: Caller) -> Answer:
+def seen(query_id: str, here: Context, asking: Caller) -> Answer:
     """The answer, where the caller may read all that was asked.
 
     Raises
@@ -52,7 +52,7 @@ def get_answer(query_id: str, here: Here, asking: Asking) -> Answer:
 
     Answers are kept for an hour by default, and while there is room; not with `keep` false.
     """
-    return _seen(query_id, here, asking)
+    return seen(query_id, here, asking)
 
 
 @router.get(
@@ -63,7 +63,7 @@ def get_answer(query_id: str, here: Here, asking: Asking) -> Answer:
 async def get_query_cloud(query_id: str, here: Here, asking: Asking) -> Response:
     """The surface that the query saw, as validation compares it: binary PLY, metres."""
     inspection = here.engine.inspection
-    await to_thread.run_sync(_seen, query_id, here, asking)
+    await to_thread.run_sync(seen, query_id, here, asking)
     async with here.gate.place():
         data = await here.gate.run(lambda: inspection.cloud(query_id))
     return Response(data, media_type=PLY)
@@ -80,7 +80,7 @@ async def get_similarities(
 ) -> Similarities:
     """How alike the query and its nearest frames are, each to each: what the selection sees."""
     inspection = here.engine.inspection
-    await to_thread.run_sync(_seen, query_id, here, asking)
+    await to_thread.run_sync(seen, query_id, here, asking)
     async with here.gate.place():
         return await here.gate.run(lambda: inspection.similarities(query_id, limit))
 
@@ -95,7 +95,7 @@ async def get_match(
     passed over is validated now.
     """
     inspection = here.engine.inspection
-    await to_thread.run_sync(_seen, query_id, here, asking)
+    await to_thread.run_sync(seen, query_id, here, asking)
     async with here.gate.place():
         return await here.gate.run(lambda: inspection.match(query_id, frame_id, map_name))
 
@@ -115,9 +115,10 @@ async def get_overlay(
         OverlayColour,
         Query(
             description="`source`: the query orange, the match blue. `normal`: directions. "
-            "`residual`: green within 1 cm of the other's surface, yellow within 5 cm (at up to "
-            "2.2 m; more beyond), grey where there is nothing to compare with or it is farther, "
-            "red where the other saw through."
+            "`residual`: dark green within a fifth of what the model's validation allows between "
+            "surfaces (1 cm of 5 cm of rooms near by; more with distance), light green within two "
+            "fifths, yellow within all of it, grey where there is nothing to compare with or it "
+            "is farther, red where the other saw through."
         ),
     ] = "source",
     transform: Annotated[
@@ -130,7 +131,7 @@ async def get_overlay(
 ) -> Response:
     """The query laid on a match, to see how well they fit: binary PLY, metres."""
     inspection = here.engine.inspection
-    await to_thread.run_sync(_seen, query_id, here, asking)
+    await to_thread.run_sync(seen, query_id, here, asking)
     async with here.gate.place():
         data = await here.gate.run(
             lambda: inspection.overlay(query_id, frame_id, map_name, color, transform)

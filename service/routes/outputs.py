@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
-from typing import Annotated, Any, TypeVar
+from typing import Annotated
 
-from anyio import to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from sceneprint.datasets.sizes import HEAD
@@ -24,38 +22,17 @@ from service.access import may_read
 from service.conditions import chosen, is_known
 from service.context import Context, Here
 from service.files import files, send_file
-from service.problems import declared
-
-T = TypeVar("T")
+from service.made import look, made_files, safe, sent, tagged
 
 router = APIRouter(
     prefix="/maps/{map_name}/frames/{frame_id}", tags=["frames"], dependencies=[Depends(may_read)]
 )
 
 
-def _files(
-    *kinds: str, model: Any = None, description: str, statuses: tuple[int, ...] = (404, 409)
-) -> dict[int | str, dict[str, Any]]:
-    """Responses of a route that sends files, for the OpenAPI document."""
-    headers = {
-        "ETag": {
-            "description": "Stands for these bytes: sent in If-None-Match, it saves them.",
-            "schema": {"type": "string"},
-        }
-    }
-    schema = {"schema": {"type": "string", "format": "binary"}}
-    content = dict.fromkeys(kinds, schema)
-    done: dict[str, Any] = {"description": description, "headers": headers, "content": content}
-    if model is not None:
-        done["model"] = model
-    known = {"description": "As the caller has it: its If-None-Match names this ETag."}
-    return {200: done, 304: known, **declared(*statuses)}
-
-
 @router.get(
     "/cloud.ply",
     response_class=Response,
-    responses=_files(
+    responses=made_files(
         PLY,
         description="Points and normals, binary little-endian, 32-bit; a comment names the frame "
         "of the coordinates.",
@@ -79,14 +56,14 @@ async def get_cloud(
     compares it; of a point cloud, a range image's about its viewpoint. The samples themselves are
     in the upload.
     """
-    found = await _found(lambda: here.engine.outputs.cloud(map_name, frame_id, frame))
-    return await _sent(request, here, found, PLY, name=f"{frame_id}-{frame}.ply")
+    found = await look(lambda: here.engine.outputs.cloud(map_name, frame_id, frame))
+    return await sent(request, here, found, PLY, name=f"{frame_id}-{frame}.ply")
 
 
 @router.get(
     "/preview.png",
     response_class=Response,
-    responses=_files(
+    responses=made_files(
         PNG,
         description="What its colours mean is in the tEXt chunks.",
         statuses=(404, 409, 422),
@@ -110,26 +87,26 @@ async def get_preview(
     width: Annotated[int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Columns.")] = WIDTH,
 ) -> Response:
     """A picture of a frame, for people."""
-    found = await _found(lambda: here.engine.outputs.preview(map_name, frame_id, view, width))
-    return await _sent(request, here, found, PNG, name=f"{frame_id}-{view}.png")
+    found = await look(lambda: here.engine.outputs.preview(map_name, frame_id, view, width))
+    return await sent(request, here, found, PNG, name=f"{frame_id}-{view}.png")
 
 
 @router.get(
     "/patches",
     response_class=Response,
-    responses=_files(model=FramePatches, description="The same, as lists of numbers."),
+    responses=made_files(model=FramePatches, description="The same, as lists of numbers."),
 )
 async def get_patches(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """The surface patches of a frame, by level, and those that validation compares."""
-    found = await _found(lambda: here.engine.outputs.patches(map_name, frame_id))
+    found = await look(lambda: here.engine.outputs.patches(map_name, frame_id))
     told = Output(found.tag, lambda: found.make().model_dump_json().encode())
-    return await _sent(request, here, told, JSON)
+    return await sent(request, here, told, JSON)
 
 
 @router.get(
     "/signature",
     response_class=Response,
-    responses=_files(
+    responses=made_files(
         BYTES,
         NPY,
         model=FrameSignature,
@@ -142,11 +119,11 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
     """
     outputs, kind = here.engine.outputs, chosen(request, (JSON, BYTES, NPY))
     if kind == JSON:
-        made = await _found(lambda: outputs.signature(map_name, frame_id))
+        made = await look(lambda: outputs.signature(map_name, frame_id))
         told = Output(made.tag, lambda: made.make().model_dump_json().encode())
     else:
-        told = await _found(lambda: outputs.vector(map_name, frame_id, kind))
-    return await _sent(request, here, told, kind, Vary="Accept")
+        told = await look(lambda: outputs.vector(map_name, frame_id, kind))
+    return await sent(request, here, told, kind, Vary="Accept")
 
 
 @router.get(
@@ -156,15 +133,11 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
 )
 async def get_upload(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """The frame's upload: what you sent in is yours to take out."""
-    found = await _found(lambda: here.engine.outputs.upload(map_name, frame_id))
+    found = await look(lambda: here.engine.outputs.upload(map_name, frame_id))
     if is_known(request, found.tag):
-        return Response(None, 304, _tagged(found))
+        return Response(None, 304, tagged(found))
     async with here.gate.place():
         return await here.gate.run(lambda: _upload(request, here, found, frame_id))
-
-
-async def _found(find: Callable[[], Output[T]]) -> Output[T]:
-    return await to_thread.run_sync(find)
 
 
 def _upload(request: Request, here: Context, found: Output[bytes], frame_id: str) -> Response:
@@ -175,32 +148,7 @@ def _upload(request: Request, here: Context, found: Output[bytes], frame_id: str
             path = blobs.path(blob)
             with path.open("rb") as file:
                 kind, suffix = upload_type(file.read(HEAD))
-            name = _safe(f"{frame_id}.{suffix}")
+            name = safe(f"{frame_id}.{suffix}")
             return send_file(request, path, kind, found.tag, name)
     found.make()  # says what is wrong with it
     raise DamagedBlob(f"The upload of frame {frame_id} was put back just now. Ask again.")
-
-
-def _tagged(output: Output[Any]) -> dict[str, str]:
-    return {"ETag": f'"{output.tag}"', "Cache-Control": "private, no-cache"}
-
-
-async def _sent(
-    request: Request, here: Context, output: Output[bytes], kind: str,
-    name: str | None = None, **headers: str,
-) -> Response:  # fmt: skip
-    """An output; made only where the caller does not have it yet, and when it is its turn."""
-    headers |= _tagged(output)
-    if is_known(request, output.tag):
-        return Response(None, 304, headers)
-    async with here.gate.place():
-        data = await here.gate.run(output.make)
-    if name is not None:
-        headers["Content-Disposition"] = f'inline; filename="{_safe(name)}"'
-    return Response(data, 200, headers, kind)
-
-
-def _safe(name: str) -> str:
-    """An id as a header may hold it."""
-    return "".join(one if one.isascii() and one.isprintable() and one not in '"\\/' else "_"
-                   for one in name)  # fmt: skip

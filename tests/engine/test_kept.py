@@ -14,6 +14,7 @@ from sceneprint.engine import kept as module
 from sceneprint.engine.kept import Kept, KeptQueries
 from sceneprint.errors import UnknownQuery
 from sceneprint.schemas import Answer, Counts, Query, SeveralQuery
+from sceneprint.store.filters import Taken
 
 COUNTS = Counts(map=0, passed=0, compared=0, ranked=0, selected=0, validated=0, accepted=0)
 
@@ -27,6 +28,11 @@ def made(size: int = 1000, query: Query | None = None) -> Kept:
     )  # fmt: skip
     vector = np.frombuffer(os.urandom(64), np.uint8)
     return Kept(answer, query or Query(), "ab" * 32, vector, os.urandom(size), (7, 3))
+
+
+def _kept(queries: KeptQueries, one: Kept) -> str:
+    assert queries.keep(one)
+    return one.answer.query_id
 
 
 def aged(folder: Path, query_id: str, seconds: float) -> None:
@@ -49,6 +55,18 @@ def test_an_answer_comes_back_as_it_was(tmp_path: Path) -> None:
         assert again.query == one.query
         assert (again.model_id, again.geometry, again.at) == (one.model_id, one.geometry, one.at)
         assert (again.ranked, again.vector.tobytes()) == ((7, 3), one.vector.tobytes())
+        assert (again.taken, again.base) == (one.taken, None)
+    # what was left out is as the map's model has it, and not as `paper`
+    again = queries.find(_kept(queries, made(query=asked)))
+    assert again.query.validation is not None
+    assert again.query.validation.model_fields_set == {"evidence"}
+    base = ("base_link", np.arange(16.0).reshape(4, 4))
+    robot = replace(made(), taken=Taken("r1", "run", 12.5), base=base)
+    again = queries.find(_kept(queries, robot))
+    assert again.taken == Taken("r1", "run", 12.5)
+    assert again.base is not None
+    assert again.base[0] == "base_link"
+    assert (again.base[1] == base[1]).all()
     several = made(query=SeveralQuery(maps=["hall", "attic"], k=4))
     assert queries.keep(several)
     assert queries.find(several.answer.query_id).query == Query(k=4)

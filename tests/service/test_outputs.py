@@ -200,6 +200,27 @@ def test_lists_by_metadata(served, shown, refused):
         assert bad.partition("=")[0] in problem["errors"][0]["field"]
 
 
+def test_a_map_tells_how_it_grew(served, shown, refused):
+    path, ids = shown
+    told = served.client.get(f"{path}/growth?by=hour&last=2").json()
+    assert (told["map"], told["by"], told["indexed"], told["before"]) == (
+        path.rpartition("/")[2], "hour", 3, 0
+    )  # fmt: skip
+    first, last = (datetime.fromisoformat(one["at"]) for one in told["buckets"])
+    assert (last - first).total_seconds() == 3600
+    counted = [0, 0]
+    for one in ids:
+        at = served.client.get(f"{path}/frames/{one}").json()["indexed_at"]
+        counted[datetime.fromisoformat(at) >= last] += 1
+    assert [one["indexed"] for one in told["buckets"]] == counted
+    assert told["buckets"][-1]["total"] == 3
+    assert len(served.client.get(f"{path}/growth").json()["buckets"]) == 30
+    for bad in ("by=week", "last=0", "last=401", "lst=3"):
+        name = bad.partition("=")[0]
+        refused(served.client.get(f"{path}/growth?{bad}"), 422, "invalid-request", f"{name}: ")
+    refused(served.client.get("/v1/maps/nowhere/growth"), 404, "unknown-map")
+
+
 def test_sessions_and_a_trajectory(served, shown, refused):
     path, ids = shown
     (session,) = served.client.get(f"{path}/sessions").json()["items"]
@@ -220,7 +241,14 @@ def test_sessions_and_a_trajectory(served, shown, refused):
     told = served.client.get(url, headers={"Accept": "application/json"}).json()
     assert (told["frame_ids"], told["parent_frame"], told["left_out"]) == (ids[1:], "hall", 0)
     assert told["poses"] == [[start + i, i, 0, 1, 0, 0, 0, 1] for i in (1, 2)]
+    thin = served.client.get(f"{path}/trajectory?session=monday&most=2")
+    lines = [line for line in thin.text.splitlines() if not line.startswith("#")]
+    assert [float(line.split()[0]) - start for line in lines] == [0, 2]
+    assert "# poses: 2 of 3, evenly taken; frames left out: 1" in thin.text
     refused(served.client.get(f"{path}/trajectory"), 422, "invalid-request", "session: ")
+    for most in (1, 10_001):
+        bad = served.client.get(f"{path}/trajectory?session=monday&most={most}")
+        refused(bad, 422, "invalid-request", "most: ")
     refused(served.client.get(f"{path}/sessions?cursor=x"), 422, "invalid-request", "given out")
 
 

@@ -1,0 +1,126 @@
+"""Points that pages draw: those of the artifacts, judged as an overlay's are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.clouds import points_of
+from sceneprint.engine import Engine
+from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
+from sceneprint.geometry.belonging import patches_at
+from sceneprint.geometry.overlays import STEP_COLOURS
+from sceneprint.geometry.rigid import moved
+from sceneprint.pipeline import Signature
+from sceneprint.points import HEADER, POINT
+from sceneprint.schemas import Answer, Query
+from sceneprint.types import Geometry
+
+Prepared = list[tuple[Signature, Geometry]]
+Ids = Callable[[Engine], list[str]]
+Rows = np.ndarray[Any, Any]
+
+
+def rows_of(data: bytes) -> tuple[tuple[Any, ...], Rows, Any]:
+    """Header, rows, and their positions in metres."""
+    head = HEADER.unpack_from(data)
+    rows = np.frombuffer(data, POINT, offset=HEADER.size)
+    return head, rows, np.array(head[5:8]) + rows["position"] / 65535 * np.array(head[8:11])
+
+
+@pytest.fixture
+def asked(full: Engine, ids: Ids) -> Answer:
+    return full.query_frame("hall", ids(full)[3], Query(k=2, seed=5))
+
+
+def test_the_points_of_a_frame(full: Engine, prepared: Prepared, ids: Ids) -> None:
+    geometry = prepared[3][1]
+    points, normals = points_of(geometry.surface)
+    whole = full.points.frame("hall", ids(full)[3])
+    head, rows, at = rows_of(whole.make())
+    assert (head[2], head[3], head[11], head[12]) == (3, len(points), len(points), 0)
+    assert at == pytest.approx(points, abs=1e-4)
+    assert rows["normal"] / 127 == pytest.approx(normals, abs=0.5 / 127 + 1e-6)
+    found = patches_at(np.hstack([points, normals]), geometry.patches)
+    assert (rows["patch"] == np.where(found < 0, 65535, found)).all()
+    assert len(set(found.tolist())) > 0.9 * len(geometry.patches)
+    assert (rows["residual"] == 255).all()
+    fewer = full.points.frame("hall", ids(full)[3], limit=100)
+    assert rows_of(fewer.make())[0][3] == 100
+    assert rows_of(fewer.make())[0][11] == len(points)
+    assert fewer.tag != whole.tag
+    with pytest.raises(InvalidRequest, match="no T_base_sensor"):
+        full.points.frame("hall", ids(full)[3], "base")
+    pose = np.array(full.get_frame("hall", ids(full)[3]).pose.matrix)  # type: ignore[union-attr]
+    _, _, there = rows_of(full.points.frame("hall", ids(full)[3], "parent").make())
+    assert there == pytest.approx(moved(pose, points.astype(float)), abs=1e-4)
+
+
+@pytest.mark.parametrize("by", ["aligned", "none"])
+def test_residuals_are_those_of_the_overlay(full: Engine, asked: Answer, by: Any) -> None:
+    best = asked.matches[0]
+    ply = full.inspection.overlay(asked.query_id, best.frame_id, colour="residual", by=by)
+    body = ply.split(b"end_header\n", 1)[1]
+    kinds = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+    colours = np.frombuffer(body, [*kinds, ("rgb", "u1", 3)])["rgb"]
+    told = []
+    for side in ("query", "match"):
+        head, rows, _ = rows_of(
+            full.points.match(asked.query_id, best.frame_id, "hall", side, by).make()  # type: ignore[arg-type]
+        )
+        assert head[2] == 7
+        assert head[12] == pytest.approx(0.05)
+        told.append(rows["residual"])
+    steps = np.searchsorted((50, 100, 250, 253), np.concatenate(told))
+    assert (colours == STEP_COLOURS[steps]).all()
+    assert len(set(steps.tolist())) > 2
+    if by == "aligned":  # looked up on every 25th point, evidence finds about as much
+        inside = float((np.concatenate(told) <= 250).mean())
+        assert inside == pytest.approx(best.validation.overlap, abs=0.05)
+
+
+def test_points_of_a_query_are_those_of_its_side(full: Engine, asked: Answer) -> None:
+    best = asked.matches[0].frame_id
+    head, rows, at = rows_of(full.points.query(asked.query_id).make())
+    _, compared, there = rows_of(full.points.match(asked.query_id, best).make())
+    assert (at == there).all()
+    assert (rows["patch"] == compared["patch"]).all()
+    assert (rows["residual"] == 255).all()
+    assert head[12] == 0
+
+
+def test_what_cannot_be_drawn(full: Engine, asked: Answer, ids: Ids) -> None:
+    best = asked.matches[0].frame_id
+    with pytest.raises(InvalidRequest, match="no rival"):
+        full.points.match(asked.query_id, best, by="rival").make()
+    with pytest.raises(UnknownQuery):
+        full.points.query("0" * 32)
+    with pytest.raises(UnknownFrame, match="no match"):
+        full.points.match(asked.query_id, "nobody")
+    bare = full.query_frame("hall", ids(full)[3], Query(k=1, stages=("retrieve",)))
+    with pytest.raises(NotIndexed, match="without validation"):
+        full.points.query(bare.query_id)
+    found = full.points.match(asked.query_id, best)
+    full.delete_frame("hall", best)
+    with pytest.raises(UnknownFrame, match="was deleted"):
+        full.points.match(asked.query_id, best)
+    with pytest.raises(UnknownFrame, match="was deleted"):  # and between being found and made
+        found.make()
+
+
+def test_one_match_is_validated_once(
+    full: Engine, asked: Answer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    best, made = asked.matches[0].frame_id, []
+    from sceneprint.engine import pairs
+
+    whole = pairs.validate
+    monkeypatch.setattr(pairs, "validate", lambda *a: made.append(1) or whole(*a))
+    told = full.inspection.match(asked.query_id, best)
+    for side in ("query", "match"):
+        full.points.match(asked.query_id, best, side=side).make()  # type: ignore[arg-type]
+    assert full.inspection.match(asked.query_id, best) == told
+    assert len(made) == 1

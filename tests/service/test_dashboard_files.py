@@ -1,0 +1,117 @@
+"""The dashboard's files on the wire; tests/dashboard has what they make of a browser."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import pytest
+
+from service import dashboard
+
+POLICY = "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+HTML = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
+
+
+def names() -> list[str]:
+    return [p.relative_to(dashboard.PAGES).as_posix() for p in dashboard.PAGES.rglob("*.*")]
+
+
+def test_every_file_is_served_packed_guarded_and_not_sent_twice(served) -> None:
+    assert "main.js" in names()
+    assert "lib/api.js" in names()
+    for name in names():
+        on_disk = (dashboard.PAGES / name).read_bytes()
+        with served.client.stream(
+            "GET", f"/dashboard/{name}", headers={"Accept-Encoding": "gzip"}
+        ) as got:
+            packed = b"".join(got.iter_raw())
+        assert got.status_code == 200, name
+        assert gzip.decompress(packed) == on_disk
+        assert got.headers["content-encoding"] == "gzip"
+        assert got.headers["content-length"] == str(len(packed))
+        assert got.headers["content-security-policy"] == POLICY
+        assert got.headers["cache-control"] == "no-cache"
+        assert got.headers["x-content-type-options"] == "nosniff"
+        known = {"If-None-Match": got.headers["etag"], "Accept-Encoding": "gzip"}
+        again = served.client.get(f"/dashboard/{name}", headers=known)
+        assert (again.status_code, again.content) == (304, b"")
+        assert again.headers["content-security-policy"] == POLICY
+        plain = served.client.get(f"/dashboard/{name}", headers={"Accept-Encoding": "identity"})
+        assert plain.content == on_disk
+        assert "content-encoding" not in plain.headers
+        assert plain.headers["etag"] != got.headers["etag"]  # other bytes, another tag
+
+
+def test_the_page_is_at_the_address_without_a_slash(served) -> None:
+    index = (dashboard.PAGES / "index.html").read_bytes()
+    got = served.client.get("/dashboard")
+    assert got.content == index
+    assert got.headers["content-type"] == "text/html; charset=utf-8"
+    head = served.client.head("/dashboard")
+    assert (head.status_code, head.content) == (200, b"")
+    slash = served.client.get("/dashboard/")
+    assert (slash.status_code, slash.headers["location"]) == (307, "../dashboard")
+
+
+def test_a_browser_is_led_there_and_others_are_told_as_ever(served) -> None:
+    led = served.client.get("/", headers=HTML)
+    # relative: behind a proxy's prefix, and its TLS, it leads to the same place
+    assert (led.status_code, led.headers["location"]) == (307, "dashboard")
+    told = served.client.get("/", headers={"Accept": "application/json"})
+    assert told.status_code == 404
+    assert told.json()["type"] == "/problems/not-found"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/dashboard/nothing.js", "/dashboard/lib", "/dashboard/lib/", "/dashboard//main.js",
+        "/dashboard/../../app.py", "/dashboard/..%2f__init__.py", "/dashboard/%2e%2e/__init__.py",
+        "/dashboard/lib/..%2fmain.js", "/dashboard/%2fetc%2fpasswd", "/dashboard/main.js%00",
+    ],
+)  # fmt: skip
+def test_no_other_path_leads_to_a_file(served, path: str) -> None:
+    got = served.client.get(path, headers=HTML)
+    assert got.status_code == 404
+    assert got.headers["content-type"] == "application/problem+json"
+    assert got.json()["type"] == "/problems/not-found"
+    assert "default-src 'none'" in got.headers["content-security-policy"]
+
+
+def test_only_what_a_browser_needs_is_found(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    for name in ("a/page.js", "a/.js", "notes.txt", "page.js~", "style.css"):
+        (tmp_path / name).write_text("x")
+    assert sorted(dashboard.files_in(tmp_path)) == ["a/page.js", "style.css"]
+
+
+def test_nothing_is_taken(served) -> None:
+    for path in ("/", "/dashboard", "/dashboard/main.js"):
+        got = served.client.post(path, content=b"x")
+        assert got.status_code == 405
+        assert got.json()["type"] == "/problems/method-not-allowed"
+
+
+def test_no_file_asks_for_what_the_policy_forbids() -> None:
+    forbidden = (
+        "innerHTML",
+        "outerHTML",
+        "insertAdjacentHTML",
+        "document.write",
+        "eval(",
+        "new Function",
+    )
+    for name in names():
+        text = (dashboard.PAGES / name).read_text()
+        found = [one for one in forbidden if one in text]
+        assert found == [], name
+        assert "http://" not in text.replace("http://www.w3.org/", ""), name
+        assert "https://" not in text, name
+
+
+def test_it_is_for_whom_the_service_is_for(served, refused) -> None:
+    # a page of others that lets its name lead here gets nothing; a proxy's visitor needs no key yet
+    told = served.client.get("/dashboard", headers={**HTML, "Host": "evil.example"})
+    refused(told, 421, "misdirected")
+    assert served.client.get("/dashboard", headers={"X-Forwarded-For": "192.0.2.7"}).is_success

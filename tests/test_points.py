@@ -1,0 +1,94 @@
+"""Points as bytes, against a decoder that reads them as docs/reference.md says, one at a time."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.points import encode_points, thinned
+
+
+def decoded(data: bytes) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Header and points, by the words of the documentation alone."""
+    magic, version, flags, count, stride = struct.unpack_from("<4sHHII", data, 0)
+    assert (magic, version, stride) == (b"SPPT", 1, 12)
+    origin, extent = struct.unpack_from("<3f", data, 16), struct.unpack_from("<3f", data, 28)
+    total, scale = struct.unpack_from("<If", data, 40)
+    assert len(data) == 48 + 12 * count
+    points = []
+    for i in range(count):
+        x, y, z, patch, nx, ny, nz, residual = struct.unpack_from("<HHHHbbbB", data, 48 + 12 * i)
+        steps = zip(origin, (x, y, z), extent, strict=True)
+        points.append(
+            {
+                "at": [o + v / 65535 * e for o, v, e in steps],
+                "patch": patch,
+                "normal": [nx / 127, ny / 127, nz / 127],
+                "residual": residual,
+            }
+        )
+    head = {"flags": flags, "origin": origin, "extent": extent, "total": total, "scale": scale}
+    return head, points
+
+
+def test_points_are_read_back() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform((-4, -1, 0.5), (3, 2, 9), (300, 3))
+    normals = rng.normal(size=(300, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    patches = rng.integers(-1, 600, 300).astype(np.int32)
+    residuals = rng.integers(0, 256, 300).astype(np.uint8)
+    data = encode_points(points, normals, patches, residuals, total=777, scale=0.05)
+    head, told = decoded(data)
+    assert (head["flags"], head["total"]) == (7, 777)
+    assert head["scale"] == np.float32(0.05)
+    assert head["origin"] == pytest.approx(points.min(axis=0), abs=1e-6)
+    assert np.add(head["origin"], head["extent"]) == pytest.approx(points.max(axis=0), abs=1e-6)
+    half = np.array(head["extent"]) / 65535 / 2 + 1e-6
+    assert (abs(np.array([one["at"] for one in told]) - points) <= half).all()
+    assert (abs(np.array([one["normal"] for one in told]) - normals) <= 0.5 / 127 + 1e-9).all()
+    assert [one["patch"] for one in told] == [65535 if p < 0 else p for p in patches.tolist()]
+    assert [one["residual"] for one in told] == residuals.tolist()
+    assert data == encode_points(points, normals, patches, residuals, total=777, scale=0.05)
+
+
+def test_what_is_not_told_says_so() -> None:
+    head, told = decoded(encode_points(np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 3.5]])))
+    assert (head["flags"], head["total"], head["scale"]) == (0, 2, 0)
+    assert head["extent"] == (0, 0, 0.5)  # flat in two directions
+    assert [one["at"] for one in told] == [[1, 2, 3], [1, 2, 3.5]]
+    assert {(one["patch"], one["residual"]) for one in told} == {(65535, 255)}
+    assert told[0]["normal"] == [0, 0, 0]
+    assert decoded(encode_points(np.zeros((0, 3)))) == (
+        {"flags": 0, "origin": (0, 0, 0), "extent": (0, 0, 0), "total": 0, "scale": 0}, [],
+    )  # fmt: skip
+    for flags, more in ((1, {"normals": np.eye(3)}), (2, {"patches": np.array([0, 70000, -1])})):
+        head, told = decoded(encode_points(np.eye(3), **more))
+        assert head["flags"] == flags
+    assert [one["patch"] for one in told] == [0, 65535, 65535]
+
+
+def test_far_from_its_origin_a_cloud_keeps_its_shape() -> None:
+    points = 4e6 + np.array([[0.0, 0, 0], [1, 2, 0.25], [0.5, 1, 0.25]])
+    _, told = decoded(encode_points(points))
+    apart = np.array([one["at"] for one in told]) - told[0]["at"]
+    assert apart == pytest.approx(points - points[0], abs=1e-4)
+
+
+@pytest.mark.parametrize(("count", "limit"), [(5, 5), (5, 9), (1000, 1), (19200, 7000), (0, 3)])
+def test_thinning_takes_some_of_everywhere(count: int, limit: int) -> None:
+    kept = thinned(count, limit)
+    assert len(kept) == len(set(kept.tolist())) == min(count, limit)
+    assert (np.diff(kept) > 0).all()
+    assert (kept == thinned(count, limit)).all()
+    if count == 19200:
+        rows, columns = np.divmod(kept, 160)  # of an image
+        share = limit / count
+        assert np.bincount(rows, minlength=120).min() > 0.6 * share * 160
+        assert np.bincount(columns, minlength=160).min() > 0.6 * share * 120
+        assert np.bincount(columns, minlength=160).max() < 1.4 * share * 120
+        fewer = set(thinned(count, 2000).tolist())
+        assert fewer < set(kept.tolist())  # more of them add, and replace none
