@@ -8,13 +8,14 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint format bench soak siege models lock clean
+.PHONY: help demo test lint kernels format bench screenshots soak siege models lock clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
 	@echo "make test    lint, types, import contracts and all tests"
 	@echo "make lint    lint, types and import contracts only"
 	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
+	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
 	@echo "make soak    200 kills, and a crowd of writers and readers; rewrites its part of docs/reliability.md"
 	@echo "make siege   broken uploads, every operation fuzzed, ten times too many requests; likewise"
 	@echo "make models  train the presets that ship with the package (minutes)"
@@ -38,8 +39,15 @@ lint: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 
-test: lint
-	$(BIN)/python -m pytest -n auto --dist loadfile
+# Compiled once here, beside the linters, and not by each process of the tests for itself.
+kernels: $(STAMP)
+	@$(BIN)/python -c 'from sceneprint.cli.signer import prepare_presets; \
+		from sceneprint.settings import Settings; prepare_presets(Settings())'
+
+# Files stay whole, as their fixtures are dear, and in the order of tests/conftest.py.
+test: $(STAMP)
+	@$(MAKE) --no-print-directory -j2 lint kernels
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
@@ -47,6 +55,9 @@ format: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks --page docs/performance.md
+
+screenshots: $(STAMP)
+	$(BIN)/python -m benchmarks.screenshots --out out/screenshots
 
 soak: $(STAMP)
 	$(BIN)/python -m benchmarks.soak --page docs/reliability.md

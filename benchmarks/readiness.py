@@ -74,7 +74,7 @@ def measure(
         ready, first, _ = _start(data, frame)
         shutil.rmtree(data / "index")
         _, bare, exact = _start(data, frame)
-        signed = {n: _sign(Path(folder) / f"by-{n}", to_sign, n) for n in (1, 2)}
+        signed = {n: _sign(Path(folder) / f"by-{n}", to_sign, n, model) for n in (1, 2)}
     return ReadinessFigures(frames, length, ready, first, bare, exact, signed)
 
 
@@ -113,12 +113,12 @@ def _start(data: Path, frame: FrameReference) -> tuple[float, float, bool]:
         return ready, time.perf_counter() - begun, answer.exact
 
 
-def _sign(data: Path, frames: list[FrameReference], n: int) -> float:
+def _sign(data: Path, frames: list[FrameReference], n: int, model: Preset) -> float:
     """Frames that so many workers sign in a second, from the first that is signed to the last."""
     if len(frames) <= 16:
         raise ValueError(f"{len(frames)} frames are too few to time two workers with")
     with Client.embedded(data) as client:
-        client.create_map(MAP)
+        client.create_map(MAP, model=model)
         for frame in frames:
             client.upload(MAP, frame)
         command = [sys.executable, "-m", "sceneprint", "work", "--data", str(data)]

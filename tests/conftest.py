@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sceneprint.cli.demo_building import write_building
 from sceneprint.geometry.bins import TableLayout
 from sceneprint.geometry.hierarchy import HierarchyParameters
 from sceneprint.geometry.mixture import Mixture
@@ -24,17 +27,46 @@ from sceneprint.types import Frame
 
 #: Files that are begun first: no process is left alone with one of them in the end.
 LONG = (
-    "test_same_as_evaluate.py", "test_quality.py", "test_soak.py", "test_siege.py", "test_tour.py",
-    "test_bench_rows.py", "test_container.py", "test_kill.py", "test_docs.py", "test_survival.py",
+    "test_container.py", "test_bench_rows.py", "test_quality.py", "test_same_as_evaluate.py",
+    "test_soak.py", "test_siege.py", "test_tour.py", "test_kill.py", "test_docs.py",
+    "test_survival.py",
 )  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
+#: What makes a folder of that name by calling that function.
+Once = Callable[[str, Callable[[Path], object]], Path]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put long files first."""
     places = {name: place for place, name in enumerate(LONG)}
     items.sort(key=lambda item: places.get(item.path.name, len(LONG)))
+
+
+@pytest.fixture(scope="session")
+def once(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[str, Callable[[Path], object]], Path]:
+    """Makes a folder that all processes of this run read; the first that needs it makes it."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def folder(name: str, make: Callable[[Path], object]) -> Path:
+        with (shared / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            made, begun = shared / name, shared / f"{name}.begun"
+            if not made.exists():
+                make(begun)
+                begun.rename(made)
+        return made
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def building(once: Once) -> Path:
+    """A room of the demo: 30 frames of a walk for the map, 20 to look up. Only to be read."""
+    return once("building", lambda folder: list(write_building(folder, 1)))
 
 
 @pytest.fixture(scope="session")

@@ -21,7 +21,6 @@ from benchmarks.__main__ import BEGIN, END, Rows, page
 from benchmarks.encode import EncodeFigures, points_of
 from benchmarks.machine import Machine
 from benchmarks.pairs import FramePair, pairs_among, real_pairs, synthetic_pairs
-from sceneprint.cli.demo_building import write_building
 from sceneprint.datasets import Camera, write_depth_png, write_intrinsics
 from sceneprint.errors import MissingDependency
 from sceneprint.evaluation.registration_baselines import register
@@ -208,19 +207,18 @@ def test_page_and_json_hold_every_row() -> None:
         assert json.loads(json.dumps(asdict(one)))["spread"]
 
 
-@pytest.fixture(scope="module")
-def building(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A room of the demo."""
-    folder = tmp_path_factory.mktemp("rows") / "building"
-    assert len(list(write_building(folder, 1))) == 1
-    return folder
+@pytest.fixture
+def few_clients(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two processes query and not four."""
+    monkeypatch.setattr(service, "CLIENTS", 2)
 
 
+@pytest.mark.usefixtures("few_clients")
 def test_service_and_library_do_the_same_work(building: Path) -> None:
     """`measure` compares every answer with the library's."""
-    with service.frames_of(building, 12) as frames:
+    with service.frames_of(building, 8) as frames:
         found = service.measure(frames, 2, seconds=1.0)
-    assert (found.frames, found.queries) == (10, 2)
+    assert (found.frames, found.queries) == (6, 2)
     assert list(found.stages) == [
         "decode", "sign, with geometry", "retrieve", "diversify", "validate"
     ]  # fmt: skip
@@ -247,8 +245,9 @@ def test_a_building_of_its_own_is_gone_afterwards(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("few_clients")
 def test_a_load_that_dies_ends_the_measurement() -> None:
-    with pytest.raises(RuntimeError, match=r"of 5 processes of the load died: \[1"):
+    with pytest.raises(RuntimeError, match=r"of 3 processes of the load died: \[1"):
         service._loaded("no address", [], seconds=1.0)
     assert multiprocessing.active_children() == []
 
@@ -271,8 +270,8 @@ def test_a_search_from_a_shortlist_is_compared_with_the_scan_of_all() -> None:
 
 
 def test_a_start_is_measured_with_and_without_the_index(building: Path) -> None:
-    with service.frames_of(building, 40) as frames:
-        found = readiness.measure(frames[0], list(frames[1:40]), 60, "compact")
+    with service.frames_of(building, 25) as frames:
+        found = readiness.measure(frames[0], list(frames[1:]), 60, "compact")
     assert (found.frames, found.signature_bytes) == (60, 12_800)
     assert 0 < found.ready < found.first
     assert found.bare > 0

@@ -73,21 +73,21 @@ def test_the_table_keeps_the_distances_of_the_exact_path(data_root: Path, signer
 
 @pytest.mark.parametrize(
     ("split", "oracle", "mean_overlap", "top1"),
-    [("forward", 0.636, 0.59, 0.79), ("reverse", 0.633, 0.595, 0.68)],
+    [("forward", 0.630, 0.59, 0.81), ("reverse", 0.628, 0.59, 0.70)],
 )
 def test_retrieval(
     data_root: Path, paper: Signer, split: str, oracle: float, mean_overlap: float, top1: float
 ) -> None:
-    """Every second frame of the splits of docs/performance.md: .604 and .610, .82 and .71.
+    """Every fourth frame of the splits of docs/performance.md: .604 and .603, .84 and .73.
 
     `python -m benchmarks.retrieval` takes all of them.
     """
     (sequence,) = find_sequences(data_root / "7scenes/redkitchen")
-    figures = measure(split, sequence, paper, every=2)
+    figures = measure(split, sequence, paper, every=4)
     assert figures.oracle_mean_overlap == pytest.approx(oracle, abs=0.002)
     assert figures.mean_overlap >= mean_overlap
     assert figures.top1_overlap_50 >= top1
-    assert figures.top1_overlap_30 >= 0.98
+    assert figures.top1_overlap_30 >= 0.97
     assert figures.recall_at_10_of_float >= 0.99
 
 
