@@ -142,12 +142,13 @@ def served(line: str, folder: Path, environment: dict[str, str]) -> Iterator[Non
     )
     try:
         assert process.stdout is not None
-        assert process.stdout.readline().startswith("sceneprint: serving http://127.0.0.1:")
+        url = process.stdout.readline().removeprefix("sceneprint: serving ").strip()
+        assert url.startswith("http://127.0.0.1:")
         yield
     finally:
         process.terminate()
         out, _ = process.communicate()
-        assert (process.returncode, out) == (0, "")
+        assert (process.returncode, out) == (0, f"sceneprint: dashboard {url}/dashboard\n")
 
 
 def test_readme_commands_and_examples_run(tmp_path: Path) -> None:

@@ -1,0 +1,80 @@
+// Edit who took a frame: sent with If-Match, so that nobody's edit is overwritten unseen.
+import { at, get, send } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { sheet, toast } from "../lib/states.js";
+
+const NAMES = { robot: "Robot", session: "Session", tags: "Tags" };
+
+/**
+ * A dialog for robot, session and tags.
+ * @param {Object<string, any>} frame as it was read
+ * @param {(frame: Object<string, any>) => void} edited
+ */
+export function editFrame(frame, edited) {
+  const path = at("maps", frame.map, "frames", frame.frame_id);
+  const inputs = {};
+  const field = (name, hint) => {
+    inputs[name] = h("input", { type: "text", name, autocomplete: "off", placeholder: hint, value: textOf(frame, name) });
+    return h("label", { class: "field" }, h("span", {}, NAMES[name]), inputs[name]);
+  };
+  const said = h("div", { class: "edit-said", role: "alert" });
+  const save = h("button", { class: "button primary", type: "submit" }, "Save");
+  const dialog = sheet({
+    title: "Edit the frame",
+    children: [field("robot", "none"), field("session", "none"), field("tags", "with commas between"), said],
+    buttons: [save],
+  });
+  let base = frame;
+
+  dialog.querySelector("form").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const patch = changes();
+    if (!Object.keys(patch).length) { dialog.close(); return; }
+    save.disabled = true;
+    try {
+      const { data } = await send("PATCH", path, {
+        json: patch, type: "application/merge-patch+json", headers: { "If-Match": `"${base.etag}"` },
+      });
+      dialog.close();
+      toast("The frame was edited.");
+      edited(data);
+    } catch (error) {
+      if (error.status === 412) await meet();
+      else if (error.status === 401) throw error;
+      else put(said, h("p", { class: "field-error" }, error.message), (error.errors ?? []).map((one) => h("p", { class: "field-error" }, `${one.field}: ${one.reason}`)));
+    } finally {
+      save.disabled = false;
+    }
+  });
+
+  /** What was typed and is other than what the dialog began with. */
+  function changes() {
+    const patch = {};
+    for (const [name, input] of Object.entries(inputs)) {
+      if (input.value.trim() === textOf(frame, name)) continue;
+      patch[name] = name === "tags" ? input.value.split(",").map((one) => one.trim()).filter(Boolean) : input.value.trim() || null;
+    }
+    return patch;
+  }
+
+  /** Somebody else was first: say what it is now, and let choose. */
+  async function meet() {
+    base = await get(path);
+    const other = Object.keys(NAMES).filter((name) => textOf(base, name) !== textOf(frame, name));
+    const theirs = () => {
+      frame = base;
+      for (const [name, input] of Object.entries(inputs)) input.value = textOf(base, name);
+      put(said, h("p", { class: "muted" }, "These are the values of now."));
+      put(save, "Save");
+    };
+    put(said,
+      h("p", { class: "field-error" }, "Somebody edited this frame after you opened it. Nothing of yours was saved."),
+      h("ul", {}, other.map((name) => h("li", {}, `${NAMES[name]} is now `, h("strong", {}, textOf(base, name) || "none"))), !other.length && h("li", {}, "What they changed is none of these fields.")),
+      h("button", { class: "button", type: "button", onClick: theirs }, "Take what is there now"));
+    put(save, "Save mine over it");
+  }
+}
+
+function textOf(frame, name) {
+  return name === "tags" ? frame.tags.join(", ") : frame[name] ?? "";
+}

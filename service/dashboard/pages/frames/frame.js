@@ -1,0 +1,129 @@
+// One frame: what it looks like, what is known of it, which frames are near.
+import { at, bytes, get, save, send } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { shortId } from "../lib/format.js";
+import { link } from "../lib/router.js";
+import { may } from "../lib/session.js";
+import { confirm, toast } from "../lib/states.js";
+import { about } from "./about.js";
+import { editFrame } from "./edit.js";
+import { follow } from "./following.js";
+import { neighbours } from "./neighbours.js";
+import { preview } from "./tile.js";
+import { viewSwitch } from "./views.js";
+
+export const styles = ["frames/frames.css", "frames/frame.css"];
+
+const WIDTH = 640;
+
+/** The page: #/maps/NAME/frames/ID?view= */
+export async function render(root, { params, search, signal, go, title, actions }) {
+  const path = at("maps", params.map, "frames", params.frame);
+  let frame = await get(path, { signal });
+  let job = await jobOf(frame);
+  const canWrite = may("write", params.map);
+  const side = h("div", { class: "frame-side" });
+  const main = h("div", { class: "frame-main" });
+  let drawn = null; // the state that the main part shows
+  title(`Frame ${shortId(frame.frame_id)}`);
+  put(root, h("div", { class: "frame-page" }, main, side));
+
+  async function draw() {
+    put(side, about(frame, job, { edit: canWrite && frame.state !== "deleted" ? () => editFrame(frame, take) : null }));
+    if (drawn === frame.state) return;
+    drawn = frame.state;
+    actions(
+      frame.state === "indexed" && h("a", { class: "button primary", href: link("maps", params.map, "query", { frame: frame.frame_id }) }, "Ask where this is"),
+      canWrite && frame.state !== "deleted" && h("button", { class: "button danger", type: "button", onClick: remove }, "Delete"));
+    if (frame.state !== "indexed") { put(main, look()); return; }
+    const { scene } = await import("./scene.js");
+    const cards = await scene(frame, signal);
+    if (!signal.aborted) put(main, look(), cards, neighbours(frame, signal));
+  }
+
+  /** The picture, with what its colours mean, and the files. */
+  function look() {
+    const place = h("div", { class: "frame-look" });
+    const meaning = h("p", { class: "muted frame-meaning" });
+    const show = async (view) => {
+      put(place, preview(frame, { view, width: WIDTH, signal }));
+      put(meaning);
+      if (frame.state !== "indexed") return;
+      await place.querySelector("canvas").ready;
+      const png = await bytes(`${path}/preview.png`, { params: { view, width: WIDTH }, signal, accept: "image/png" });
+      put(meaning, textOf(png, "Description"));
+    };
+    const first = ["normals", "patches"].includes(search.get("view")) ? search.get("view") : "depth";
+    const views = viewSwitch(first, (view) => {
+      go(link("maps", params.map, "frames", params.frame, view === "depth" ? {} : { view }), { replace: true, quiet: true });
+      show(view);
+    });
+    show(first);
+    return h("section", { class: "card", "aria-labelledby": "look-title" },
+      h("div", { class: "card-head" }, h("h2", { id: "look-title" }, "What the sensor saw"), frame.state === "indexed" && views),
+      place, meaning, files());
+  }
+
+  function files() {
+    const button = (text, file, name) => h("button", { class: "button", type: "button", onClick: () => save(`${path}/${file}`, name ? { name } : {}) }, text);
+    if (frame.state === "deleted" || frame.state === "redundant") return null;
+    return h("div", { class: "toolbar", role: "group", "aria-label": "Download" },
+      button("Upload", "upload"),
+      frame.state === "indexed" && [button("Cloud (PLY)", "cloud.ply", `${frame.frame_id}.ply`),
+        button("Signature", "signature", `${frame.frame_id}.signature.json`), button("Patches", "patches", `${frame.frame_id}.patches.json`)]);
+  }
+
+  async function remove() {
+    const sure = await confirm({
+      title: "Delete this frame?", word: shortId(frame.frame_id), action: "Delete",
+      text: "No query finds it from then on, and its upload is removed from disk. This cannot be undone.",
+    });
+    if (!sure) return;
+    await send("DELETE", path);
+    toast(`Frame ${shortId(frame.frame_id)} was deleted.`);
+    go(link("maps", params.map));
+  }
+
+  function take(given) {
+    frame = { ...frame, ...given };
+    return draw();
+  }
+
+  // who may not see jobs sees the frame all the same
+  function jobOf(of) {
+    return get(at("jobs", of.job_id), { signal }).catch((error) => {
+      if (error.name === "AbortError" || error.status === 401 || error.status === 0) throw error;
+      return null;
+    });
+  }
+
+  await draw();
+  follow({
+    map: params.map, signal,
+    shown: (id) => id === frame.frame_id,
+    pending: () => [frame.frame_id],
+    changed: async (given) => {
+      if (given.etag === frame.etag && given.state === frame.state) return;
+      job = given.job_id ? await jobOf(given) : job;
+      await take(given);
+    },
+    missed: async () => take(await get(path, { signal })),
+  });
+}
+
+/** A tEXt chunk of a PNG; "" where it has none of that name. */
+function textOf(png, name) {
+  const view = new DataView(png);
+  const latin = new TextDecoder("latin1");
+  for (let from = 8; from + 12 <= png.byteLength;) {
+    const length = view.getUint32(from);
+    const type = latin.decode(new Uint8Array(png, from + 4, 4));
+    if (type === "IDAT" || from + 12 + length > png.byteLength) break;
+    if (type === "tEXt") {
+      const [key, ...text] = latin.decode(new Uint8Array(png, from + 8, length)).split("\0");
+      if (key === name) return text.join("");
+    }
+    from += 12 + length;
+  }
+  return "";
+}

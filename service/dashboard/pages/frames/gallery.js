@@ -1,0 +1,192 @@
+// Frames of a map, 24 at a time, by whatever the address says; their states change as they happen.
+import { at, get } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { count } from "../lib/format.js";
+import { link } from "../lib/router.js";
+import { may } from "../lib/session.js";
+import { empty, failed, toast } from "../lib/states.js";
+import { isPending } from "./badge.js";
+import { countOf, filterBar, FILTERS } from "./filters.js";
+import { follow } from "./following.js";
+import { before, remember } from "./pages.js";
+import { tile } from "./tile.js";
+import { viewSwitch } from "./views.js";
+
+export const styles = ["frames/frames.css"];
+
+const PAGE = 24;
+const FILL_MS = 300; // frames come in bursts
+const MOST_COME = 1000;
+
+/** The page: #/maps/NAME?view=&robot=&session=&state=&tag=&captured_after=&captured_before=&order=&cursor=&page= */
+export async function render(root, { params, search, signal, go, title, actions }) {
+  const path = at("maps", params.map);
+  title(params.map);
+  const canWrite = may("write", params.map);
+  actions(canWrite && h("a", { class: "button primary", href: link("maps", params.map, "upload") }, "Upload frames"));
+
+  let wanted = search;
+  let runs = null; // of the map's sessions: 100,000 frames are counted for them, and the list need not wait
+  let list = null;
+  let last = null; // the page that is shown
+  const tiles = new Map(); // by frame
+  const come = new Set(); // frames that came since the list was asked for
+  const grid = h("ul", { class: "gallery", id: "frames" });
+  const place = h("div", { class: "gallery-place" });
+  const news = h("div", { class: "gallery-news", role: "status" });
+  const [over, under] = [h("div", { class: "pager" }), h("nav", { class: "pager", "aria-label": "Pages" })];
+  const views = viewSwitch(viewOf(wanted), (view) => change({ view: view === "depth" ? null : view }, { sameList: true }));
+  const order = h("select", { id: "order", "aria-label": "Order", onChange: () => turn({ order: order.value || null }) },
+    h("option", { value: "" }, "Newest first"), h("option", { value: "asc" }, "Oldest first"));
+  let bar = filterBar(wanted, [], turn);
+  const clear = h("button", { class: "button quiet", type: "button", onClick: () => turn(Object.fromEntries(FILTERS.map((one) => [one, null]))) }, "Clear filters");
+  put(root, bar, h("div", { class: "gallery-head" }, views, order, clear, over), news, place, under);
+
+  /** Another list begins at its first page. */
+  function turn(asked) {
+    change({ ...asked, cursor: null, page: null });
+  }
+
+  function change(asked, { sameList = false } = {}) {
+    const next = new URLSearchParams(wanted);
+    for (const [name, value] of Object.entries(asked)) if (value === null) next.delete(name); else next.set(name, value);
+    wanted = next;
+    go(link("maps", params.map, wanted), { quiet: true });
+    show();
+    if (!sameList) return fetchList().catch(shownFault);
+    for (const one of tiles.values()) one.show(one.frame, viewOf(wanted));
+  }
+
+  function shownFault(error) {
+    if (error.name === "AbortError") return;
+    if (error.status === 401 || error.status === 0) throw error;
+    put(place, failed(error, () => fetchList().catch(shownFault)));
+    grid.removeAttribute("aria-busy");
+    put(over); put(under);
+  }
+
+  function show() {
+    bar.refill(wanted);
+    views.show(viewOf(wanted));
+    order.value = wanted.get("order") === "asc" ? "asc" : "";
+    clear.hidden = !FILTERS.some((one) => wanted.has(one));
+  }
+
+  async function fetchList() {
+    list?.abort();
+    const turnOf = list = new AbortController(); // of this list: what of the last one has not come is not wanted
+    const both = AbortSignal.any([signal, turnOf.signal]);
+    const asked = { limit: PAGE, order: wanted.get("order") === "asc" ? "asc" : "desc", cursor: wanted.get("cursor") };
+    for (const name of FILTERS) asked[name] = wanted.getAll(name);
+    grid.setAttribute("aria-busy", "true");
+    const page = await get(`${path}/frames`, { params: asked, signal: both });
+    remember(params.map, wanted, page.next_cursor);
+    put(news);
+    come.clear();
+    tiles.clear();
+    for (const frame of page.items) tiles.set(frame.frame_id, tile(frame, { view: viewOf(wanted), signal: both }));
+    put(grid, [...tiles.values()]);
+    put(place, page.items.length ? grid : nothing());
+    grid.removeAttribute("aria-busy");
+    last = page;
+    drawPager(page);
+  }
+
+  async function fetchRuns() {
+    runs = await get(`${path}/sessions`, { params: { limit: 1000 }, signal });
+    const before = bar;
+    const focused = before.contains(document.activeElement) ? document.activeElement.id : null;
+    bar = filterBar(wanted, runs.items, turn);
+    before.replaceWith(bar);
+    if (focused) document.getElementById(focused)?.focus();
+    if (last) drawPager(last);
+  }
+
+  function nothing() {
+    if (wanted.has("cursor")) return empty({ title: "No more frames", text: "This page is behind the last one.", actions: first("First page") });
+    if (!clear.hidden) return empty({ title: "No frame passes", text: "No frame of this map has all that the filters ask for.", actions: h("button", { class: "button", type: "button", onClick: () => clear.click() }, "Clear filters") });
+    return empty({
+      title: "No frames yet",
+      text: "What is uploaded here can be found a moment later, and its state changes before your eyes.",
+      actions: canWrite && h("a", { class: "button primary", href: link("maps", params.map, "upload") }, "Upload frames"),
+    });
+  }
+
+  function first(text) {
+    return h("button", { class: "button", type: "button", onClick: () => turn({}) }, text);
+  }
+
+  function drawPager(page) {
+    const number = Math.max(Number.parseInt(wanted.get("page") ?? "1", 10) || 1, 1);
+    const from = PAGE * (number - 1);
+    const total = countOf(wanted, runs && !runs.next_cursor ? runs.items : null);
+    const until = from + page.items.length;
+    const of = total !== null && total >= until ? ` of ${count(total)}` : page.next_cursor ? " and more" : ` of ${count(until)}`;
+    const words = page.items.length ? [h("strong", {}, `${count(from + 1)}–${count(until)}`), of] : [];
+    const previous = before(params.map, wanted);
+    const back = number > 1 && previous === undefined
+      ? first("First page")
+      : button("Previous", number > 1, () => change({ cursor: previous, page: number > 2 ? String(number - 1) : null }));
+    const forth = button("Next", Boolean(page.next_cursor), () => change({ cursor: page.next_cursor, page: String(number + 1) }));
+    put(over, h("span", { class: "pager-count" }, words));
+    put(under, page.items.length > 0 && (number > 1 || page.next_cursor) && [back, h("span", { class: "muted" }, `Page ${count(number)}`), forth]);
+  }
+
+  function button(text, enabled, step) {
+    const onClick = async () => {
+      await step();
+      window.scrollTo({ top: 0 });
+      document.getElementById("title").focus({ preventScroll: true });
+    };
+    return h("button", { class: "button", type: "button", disabled: !enabled, onClick }, text);
+  }
+
+  show();
+  const named = get(path, { signal }).then((map) => { if (map.title) title(map.title); });
+  const counted = fetchRuns(); // begun before 24 pictures queue up for the browser's few connections
+  counted.catch(() => {}); // told below, if the list is there to be filtered
+  await Promise.all([named, fetchList().catch((error) => {
+    // another list may have been asked for meanwhile
+    if (error.name !== "AbortError" || signal.aborted) throw error;
+  })]);
+  counted.catch((error) => { if (error.name !== "AbortError") toast(error.message, { kind: "bad" }); });
+  const isFirst = () => !wanted.has("cursor") && wanted.get("order") !== "asc";
+  let filling = null;
+  signal.addEventListener("abort", () => clearTimeout(filling), { once: true });
+  const look = () => {
+    filling = null;
+    Promise.all([fetchList(), fetchRuns()]).catch(shownFault);
+  };
+  const more = h("button", { class: "button", type: "button", onClick: look });
+
+  function arrived(id) {
+    if (!isFirst()) return;
+    // a page that is not full fills by itself; a full one is not pulled away under the reader
+    if (tiles.size < PAGE && clear.hidden) { filling ??= setTimeout(look, FILL_MS); return; }
+    if (come.size < MOST_COME) come.add(id);
+    put(more, `${count(come.size)}${come.size < MOST_COME ? "" : " or more"} new ${come.size === 1 ? "frame" : "frames"}: show`);
+    if (!more.isConnected) put(news, more);
+  }
+
+  follow({
+    map: params.map, signal,
+    shown: (id) => tiles.has(id),
+    pending: () => [...tiles.values()].filter((one) => isPending(one.frame.state)).map((one) => one.frame.frame_id),
+    changed: (frame) => {
+      const one = tiles.get(frame.frame_id);
+      one?.show({ ...one.frame, ...frame }, viewOf(wanted));
+    },
+    missed: () => fetchList().catch(shownFault),
+    arrived,
+    begins: async () => { // what came between the list and the stream was told to nobody
+      if (!isFirst() || !clear.hidden) return;
+      const { items: [newest] } = await get(`${path}/frames`, { params: { limit: 1, order: "desc" }, signal });
+      if (newest && !tiles.has(newest.frame_id)) arrived(newest.frame_id);
+    },
+  });
+}
+
+function viewOf(search) {
+  const view = search.get("view");
+  return view === "normals" || view === "patches" ? view : "depth";
+}

@@ -1,0 +1,48 @@
+// The frames nearest to one, by signature alone: what a query would begin with.
+import { at, send } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { count, percent, shortId } from "../lib/format.js";
+import { link } from "../lib/router.js";
+import { failed, loading } from "../lib/states.js";
+import { preview, who } from "./tile.js";
+
+const K = 8;
+
+/**
+ * A card with the nearest frames of the same map.
+ * @param {Object<string, any>} frame indexed
+ * @param {AbortSignal} signal
+ * @returns {HTMLElement} it fills itself
+ */
+export function neighbours(frame, signal) {
+  const place = h("div", {}, loading("Looking for its neighbours"));
+  const card = h("section", { class: "card", "aria-labelledby": "neighbours-title" },
+    h("h2", { id: "neighbours-title" }, "Neighbours"),
+    h("p", { class: "muted" }, "The nearest signatures of this map. Nothing is validated yet: that is what a query does."), place);
+  async function ask() {
+    try {
+      const { data } = await send("POST", `${at("maps", frame.map)}/queries`, {
+        json: { frame_id: frame.frame_id, k: K, stages: "retrieve", keep: false }, signal,
+      });
+      put(place, data.matches.length
+        ? h("ol", { class: "neighbours" }, data.matches.map((one) => tileOf(one, signal)))
+        : h("p", { class: "muted" }, "This is the only frame of the map that can be found."));
+    } catch (error) {
+      if (error.name === "AbortError") return;
+      if (error.status === 401) throw error;
+      put(place, failed(error, ask));
+    }
+  }
+  ask();
+  return card;
+}
+
+function tileOf(match, signal) {
+  const told = { frame_id: match.frame_id, map: match.map, state: "indexed" };
+  return h("li", { class: "tile", dataset: { frame: match.frame_id } }, h("div", { class: "tile-top" }, preview(told, { width: 192, signal })),
+    h("div", { class: "tile-words" },
+      h("div", { class: "tile-name" }, h("a", { class: "mono", href: link("maps", match.map, "frames", match.frame_id), title: match.frame_id }, shortId(match.frame_id)),
+        h("strong", { class: "number" }, percent(match.similarity))),
+      h("div", { class: "tile-who" }, who(match)),
+      h("div", { class: "tile-when muted number" }, `distance ${count(match.distance)}`)));
+}

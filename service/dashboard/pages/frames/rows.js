@@ -1,0 +1,158 @@
+// The files of a queue as rows: how far each one is, and why it was refused in the API's words.
+import { h, put } from "../lib/dom.js";
+import { bytes, count, seconds, shortId } from "../lib/format.js";
+import { link } from "../lib/router.js";
+import { badge, isPending } from "./badge.js";
+import { viewSwitch } from "./views.js";
+
+const GROUPS = [["all", "All"], ["ready", "Ready"], ["way", "Under way"], ["done", "Done"], ["refused", "Refused"]];
+const IN_GROUP = {
+  ready: "ready", waiting: "way", sending: "way", received: "way", signing: "way", importing: "way",
+  queued: "way", running: "way", indexed: "done", redundant: "done", imported: "done",
+};
+// as many rows as anybody reads; more are a click away, and 5,000 files cost no more than 100
+const STEP = 100;
+const KIND = { depth: "Depth image", cloud: "Point cloud", archive: "Archive" };
+
+/** Which of the groups an item is in. @param {string} state */
+export function groupOf(state) {
+  return IN_GROUP[state] ?? "refused";
+}
+
+/**
+ * The list of a queue; `update(item)` after one has changed, `update(null)` after many have.
+ * @param {import("./queue.js").Queue} queue
+ * @param {AbortSignal} signal
+ * @returns {HTMLElement & {update: (item: object | null) => void}}
+ */
+export function rowsOf(queue, signal) {
+  let group = "all";
+  let most = STEP;
+  let timer = null;
+  let all = false; // many have changed
+  const rows = new Map();
+  const dirty = new Set();
+  const list = h("ul", { class: "rows" });
+  const more = h("button", { class: "button", type: "button", onClick: () => { most += STEP; draw(); } });
+  const choose = viewSwitch(group, (one) => { group = one; most = STEP; draw(); }, GROUPS, "Show");
+  const element = h("section", { class: "rows-place", "aria-label": "Files" }, choose, list, more);
+
+  function draw() {
+    timer = null;
+    const counts = Object.fromEntries(GROUPS.map(([name]) => [name, 0]));
+    counts.all = queue.items.length;
+    for (const item of queue.items) counts[groupOf(item.state)] += 1;
+    for (const button of choose.querySelectorAll("button")) {
+      const [, text] = GROUPS.find(([name]) => name === button.dataset.value);
+      put(button, text, h("span", { class: "number muted" }, ` ${count(counts[button.dataset.value])}`));
+    }
+    const wanted = queue.items.filter((one) => group === "all" || groupOf(one.state) === group);
+    const shown = wanted.slice(0, most);
+    const ids = new Set(shown.map((one) => one.id));
+    for (const [id, row] of rows) if (!ids.has(id)) { row.remove(); rows.delete(id); }
+    shown.forEach((item, i) => {
+      let row = rows.get(item.id);
+      if (!row) { row = rowOf(queue, item); rows.set(item.id, row); } else if (all || dirty.has(item)) row.show();
+      if (list.children[i] !== row) list.insertBefore(row, list.children[i] ?? null);
+    });
+    dirty.clear();
+    all = false;
+    more.hidden = wanted.length <= most;
+    put(more, `Show ${count(Math.min(STEP, wanted.length - most))} more of ${count(wanted.length - most)}`);
+    element.hidden = queue.items.length === 0;
+  }
+
+  // a transfer tells of itself many times a second, and several are under way
+  element.update = (item) => {
+    if (item) dirty.add(item); else all = true;
+    timer ??= setTimeout(draw, 80);
+  };
+  signal.addEventListener("abort", () => clearTimeout(timer), { once: true });
+  draw();
+  return element;
+}
+
+function rowOf(queue, item) {
+  const state = h("div", { class: "row-state" });
+  const more = h("div", { class: "row-more" });
+  const action = h("div", { class: "row-action" });
+  const about = h("div", { class: "row-about muted" }, aboutOf(queue, item));
+  const row = h("li", { class: "row", dataset: { name: item.file.name } },
+    h("div", { class: "row-name" }, h("span", { title: item.path }, item.file.name), about), state, action, more);
+  let drawn = null;
+  row.show = () => {
+    if (item.state === "sending" && drawn === "sending") { row.querySelector("progress").value = item.share; return; }
+    if (item.state === drawn && item.state !== "importing" && item.state !== "waiting") return;
+    drawn = item.state;
+    row.dataset.state = item.state;
+    put(about, aboutOf(queue, item));
+    put(state, stateOf(item));
+    put(action, actionOf(queue, item));
+    put(more, reasonOf(item));
+    if (item.state === "waiting" && item.until) setTimeout(() => { if (item.state === "waiting") put(more, reasonOf(item)); }, 1000);
+  };
+  row.show();
+  return row;
+}
+
+function aboutOf(queue, item) {
+  const said = [KIND[item.source.kind], bytes(item.file.size)];
+  if (item.source.width) said.push(`${item.source.width} × ${item.source.height}`);
+  if (Object.keys(item.said).length) said.push(item.source.kind === "cloud" ? "clouds.json" : "intrinsics.json");
+  if (item.pose) said.push("pose");
+  return said.join(" · ");
+}
+
+function stateOf(item) {
+  const { state, share } = item;
+  if (state === "ready") return h("span", { class: "muted" }, "Ready");
+  if (state === "waiting") return h("span", { class: "badge", dataset: { kind: "neutral" } }, "in the queue");
+  if (state === "sending") return h("progress", { max: 1, value: share, "aria-label": `${item.file.name}, sent` });
+  if (state === "refused") return h("span", { class: "badge", dataset: { kind: "bad" } }, "refused");
+  if (state === "cancelled") return badge("cancelled");
+  if (state === "importing") {
+    const { done, total } = item.job.progress ?? {};
+    return [h("progress", { max: 1, value: total ? done / total : null, "aria-label": `${item.file.name}, taken` }),
+      h("span", { class: "muted number" }, total ? `${count(done)} of ${count(total)} frames` : "Waiting for a worker")];
+  }
+  if (state === "imported") return h("span", { class: "badge", dataset: { kind: "good" } }, "taken");
+  return badge(state);
+}
+
+function actionOf(queue, item) {
+  const name = item.file.name;
+  const button = (text, told) => h("button", { class: "button quiet", type: "button", "aria-label": `${text} ${name}`, onClick: told }, text);
+  const group = groupOf(item.state);
+  if (item.state === "ready") return button("Remove", () => queue.remove([item]));
+  if (["waiting", "sending", "importing"].includes(item.state)) return button("Cancel", () => queue.cancel(item));
+  if (item.frame_id) return h("a", { class: "mono", href: link("maps", queue.map, "frames", item.frame_id) }, shortId(item.frame_id));
+  if (group === "refused" && !item.job) return button("Retry", () => queue.again([item]));
+  return item.job ? h("a", { href: link("operations", "jobs", item.job.job_id) }, "Job") : null;
+}
+
+function reasonOf(item) {
+  const { problem, state } = item;
+  if (state === "imported") return importOf(item);
+  if (problem) {
+    const rest = Math.max(0, (item.until - Date.now()) / 1000);
+    return [
+      state === "waiting" && h("p", {}, `Again ${rest > 0.5 ? `in ${seconds(rest)}` : "now"}: `),
+      h("p", {}, problem.status ? h("strong", {}, `${problem.title}. `) : null, problem.detail ?? problem.message),
+      (problem.errors ?? []).length > 0 && h("ul", {}, problem.errors.map((one) => h("li", {}, `${one.field}: ${one.reason}`))),
+    ];
+  }
+  if (item.isThere && !isPending(state)) return h("p", {}, "The map has this frame already.", item.reason && ` ${item.reason}`);
+  return item.reason && h("p", {}, item.reason);
+}
+
+function importOf(item) {
+  const { received = 0, there = 0, refused = 0, ignored = 0 } = item.job.result ?? {};
+  const parts = [`${count(received)} taken`, there && `${count(there)} there already`, refused && `${count(refused)} refused`,
+    ignored && `${count(ignored)} files left out`].filter(Boolean);
+  const faults = item.refused ?? [];
+  return [
+    h("p", {}, `Frames: ${parts.join(", ")}.`),
+    faults.length > 0 && h("details", {}, h("summary", {}, `What was refused${faults.length < refused ? ", the first of them" : ""}`),
+      h("ul", {}, faults.slice(0, STEP).map((one) => h("li", {}, h("strong", {}, one.name), ` ${one.problem.detail}`)))),
+  ];
+}

@@ -1,0 +1,196 @@
+// From a dropped file to the form that uploads and queries send; and the fields that ask for what
+// the file does not say: camera, scale, viewpoint. Shared by upload and query.
+
+import { h } from "../lib/dom.js";
+import { kindOf } from "./kinds.js";
+
+const KEPT_AS = "sceneprint.source";
+const EMPTY = {
+  fx: "", fy: "", cx: "", cy: "", width: "", height: "", distortion: "", depth_scale: "1000",
+  depth_along_ray: false, viewpoint: "file", units_per_metre: "1",
+  robot: "", session: "", parent_frame: "", tags: "",
+};
+const PRESETS = {
+  "": { label: "Own values" },
+  kinect: {
+    label: "Kinect, 640 × 480, f 585", fx: "585", fy: "585", cx: "320", cy: "240",
+    width: "640", height: "480", distortion: "", depth_scale: "1000", depth_along_ray: false,
+  },
+};
+
+/**
+ * What was typed the last time, in this tab: all fields as text ("" where nothing is said).
+ * @returns {typeof EMPTY}
+ */
+export function settings() {
+  try {
+    return { ...EMPTY, ...JSON.parse(sessionStorage.getItem(KEPT_AS) ?? "{}") };
+  } catch {
+    return { ...EMPTY };
+  }
+}
+
+/** Keep settings for this tab. @param {typeof EMPTY} given */
+export function remember(given) {
+  sessionStorage.setItem(KEPT_AS, JSON.stringify(given));
+}
+
+/**
+ * What the API is told of a file as `meta`.
+ * @param {object} given settings, with what intrinsics.json or clouds.json say in place of theirs
+ * @param {import("./kinds.js").Source} source of the file
+ * @param {number[][] | null} [pose] T_parent_sensor
+ * @returns {object}
+ */
+export function metaOf(given, source, pose = null) {
+  const meta = {};
+  for (const name of ["robot", "session"]) if (said(given[name])) meta[name] = given[name].trim();
+  const tags = listOf(given.tags);
+  if (tags.length) meta.tags = tags;
+  if (pose) {
+    meta.pose = { matrix: pose };
+    if (said(given.parent_frame)) meta.pose.parent_frame = given.parent_frame.trim();
+  }
+  return Object.assign(meta, source.kind === "cloud" ? ofCloud(given, source) : ofDepth(given, source));
+}
+
+function ofDepth(given, source) {
+  const lens = {};
+  for (const name of ["fx", "fy", "cx", "cy", "width", "height"]) {
+    if (said(given[name])) lens[name] = numberOf(given[name]);
+  }
+  if (!Object.keys(lens).length) return {};
+  // a camera told without a size has that of the image
+  const size = source.width ? { width: source.width, height: source.height } : {};
+  const bent = listOf(given.distortion).map(numberOf);
+  if (bent.length) lens.distortion = bent;
+  const meta = { intrinsics: { ...size, ...lens } };
+  if (said(given.depth_scale)) meta.depth_scale = numberOf(given.depth_scale);
+  if (given.depth_along_ray) meta.depth_along_ray = true;
+  return meta;
+}
+
+function ofCloud(given, source) {
+  const meta = {}, format = source.format === "kitti" ? "kitti" : given.format;
+  if (format) meta.format = format;
+  if (said(given.units_per_metre)) meta.units_per_metre = numberOf(given.units_per_metre);
+  const seen = given.viewpoint;
+  if (seen === null || seen === "none") meta.viewpoint = null;
+  else if (typeof seen === "object") meta.viewpoint = seen;
+  else if (said(seen) && seen !== "file") {
+    const [x, y, z] = listOf(seen).map(numberOf);
+    meta.viewpoint = { x, y, z };
+  }
+  return meta;
+}
+
+/**
+ * The form that uploads and queries send: parts `frame` and `meta`.
+ * @param {File} file
+ * @param {object} given as of `metaOf`
+ * @param {{source?: import("./kinds.js").Source, pose?: number[][] | null}} [more]
+ * @returns {Promise<FormData>}
+ */
+export async function formOf(file, given, { source, pose = null } = {}) {
+  const form = new FormData();
+  form.append("meta", JSON.stringify(metaOf(given, source ?? await kindOf(file), pose)));
+  form.append("frame", file, file.name);
+  return form;
+}
+
+/** Whether a depth image could be sent with these settings. @param {object} given */
+export function hasCamera(given) {
+  return ["fx", "fy", "cx", "cy"].every((name) => said(given[name]));
+}
+
+function said(value) {
+  return value !== undefined && value !== null && String(value).trim() !== "";
+}
+
+function listOf(value) {
+  const parts = Array.isArray(value) ? value : String(value ?? "").split(",");
+  return parts.map((one) => String(one).trim()).filter((one) => one !== "");
+}
+
+/** A number where it is one; else the text, so that the API says what is wrong with it. */
+function numberOf(value) {
+  const number = Number(value);
+  return Number.isFinite(number) ? number : value;
+}
+
+/**
+ * Fields for the camera of depth images, and, folded, for how clouds are read. What is typed goes
+ * into `given` and is remembered; `element.refill()` shows `given` after others changed it.
+ * @param {object} given settings()
+ * @param {{onchange?: () => void}} [heard]
+ * @returns {HTMLElement & {refill: () => void}}
+ */
+export function cameraFields(given, { onchange = () => {} } = {}) {
+  const bound = [];
+  const preset = h("select", {
+    onchange: () => {
+      const { label, ...values } = PRESETS[preset.value];
+      Object.assign(given, values);
+      changed();
+      refill();
+    },
+  }, Object.entries(PRESETS).map(([value, { label }]) => h("option", { value }, label)));
+  const changed = () => { remember(given); onchange(); };
+
+  function input(name, label, { type = "text", hint = "", ...props } = {}) {
+    const box = type === "checkbox";
+    const field = h("input", {
+      type, name, autocomplete: "off", inputmode: box ? null : "decimal", ...props,
+      oninput: () => {
+        given[name] = box ? field.checked : field.value;
+        showPreset();
+        changed();
+      },
+    });
+    bound.push(() => {
+      if (box) field.checked = Boolean(given[name]);
+      else field.value = textOf(given[name]);
+    });
+    return box
+      ? h("label", { class: "field source-check" }, field, h("span", null, label))
+      : h("label", { class: "field"}, h("span", null, label, hint && h("small", { class: "muted"}, ` ${hint}`)), field);
+  }
+
+  function showPreset() {
+    const fits = Object.entries(PRESETS).find(([key, { label, ...values }]) => key
+      && Object.entries(values).every(([name, value]) => textOf(given[name]) === textOf(value)));
+    preset.value = fits?.[0] ?? "";
+  }
+
+  function refill() {
+    for (const show of bound) show();
+    showPreset();
+  }
+
+  const element = h("div", { class: "source-fields" },
+    h("fieldset", null,
+      h("legend", null, "Camera of depth images"),
+      h("label", { class: "field source-preset" }, h("span", null, "Preset"), preset),
+      h("div", { class: "source-row" },
+        input("fx", "fx", { hint: "px" }), input("fy", "fy", { hint: "px" }),
+        input("cx", "cx", { hint: "px" }), input("cy", "cy", { hint: "px" }),
+        input("width", "Width", { hint: "px", placeholder: "of the image" }),
+        input("height", "Height", { hint: "px", placeholder: "of the image" }),
+        input("depth_scale", "Depth scale", { hint: "per metre", placeholder: "1000" }),
+        input("distortion", "Distortion", { placeholder: "k1,k2,p1,p2" })),
+      input("depth_along_ray", "Samples are ranges along the pixel’s ray", { type: "checkbox" })),
+    h("details", null,
+      h("summary", null, "Point clouds"),
+      h("div", { class: "source-row" },
+        input("viewpoint", "Viewpoint", { hint: "x,y,z in metres, file or none", placeholder: "file" }),
+        input("units_per_metre", "Units per metre", { placeholder: "1" }))));
+  refill();
+  return Object.assign(element, { refill });
+}
+
+function textOf(value) {
+  if (value === null) return "none";
+  if (Array.isArray(value)) return value.join(", ");
+  if (typeof value === "object") return [value.x, value.y, value.z].join(", ");
+  return String(value ?? "");
+}

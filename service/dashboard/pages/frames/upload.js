@@ -1,0 +1,158 @@
+// Upload: files dropped or chosen, what is said of them, and what became of each.
+import { at, get } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { bytes, count } from "../lib/format.js";
+import { link } from "../lib/router.js";
+import { may, me } from "../lib/session.js";
+import { empty } from "../lib/states.js";
+import { follow } from "./following.js";
+import { chosen, dropped, taken } from "./intake.js";
+import { ACCEPT } from "./kinds.js";
+import { queueOf } from "./queue.js";
+import { groupOf, rowsOf } from "./rows.js";
+import { cameraFields, hasCamera, remember } from "./source.js";
+
+export const styles = ["frames/source.css", "frames/upload.css", "frames/frames.css"];
+
+/** The page: #/maps/NAME/upload */
+export async function render(root, { params, signal, title, actions }) {
+  const map = await get(at("maps", params.map), { signal });
+  title(`Upload to ${map.title ?? map.name}`);
+  if (!may("write", params.map)) {
+    put(root, empty({ title: "Your key may not upload here", text: `“${me()?.name}” may look at this map. To upload, a key needs the scope “write” for it.` }));
+    return;
+  }
+  const queue = queueOf(params.map);
+  const said = h("p", { class: "field-error", role: "alert" });
+  const note = h("p", { class: "muted" });
+  const summary = h("div", { class: "upload-sum" });
+  const status = h("strong", { role: "status" });
+  const rows = rowsOf(queue, signal);
+  const fields = cameraFields(queue.given);
+  const start = h("button", { class: "button primary", type: "button", onClick: begin });
+  const cancel = h("button", { class: "button", type: "button", onClick: () => queue.cancelAll() }, "Cancel all");
+  const tidy = h("button", { class: "button quiet", type: "button", onClick: () => queue.remove(queue.items.filter((one) => groupOf(one.state) === "done")) }, "Clear what is done");
+  const retry = h("button", { class: "button", type: "button", onClick: () => queue.again(queue.untaken()) });
+  const bar = h("div", { class: "upload-bar" }, summary, h("div", { class: "toolbar" }, tidy, retry, cancel, start));
+  const place = dropZone((files) => take(files));
+  put(root, h("div", { class: "upload" },
+    h("div", { class: "upload-main" }, place, note, bar, said, rows),
+    h("aside", { class: "card upload-said", "aria-label": "What is said of the files" }, whoFields(queue.given), fields)));
+  actions(h("a", { class: "button", href: link("maps", params.map) }, "To the frames"));
+
+  async function take(files) {
+    put(note, "Reading what was dropped…");
+    const { found, fields: told, left, faults } = await taken(files, signal);
+    if (signal.aborted) return;
+    for (const one of told) Object.assign(queue.given, one);
+    if (told.length) { remember(queue.given); fields.refill(); }
+    queue.add(found);
+    const words = [...faults];
+    if (told.length) words.push("The camera was read from what came along.");
+    const beside = found.filter((one) => Object.keys(one.said).length).length;
+    if (beside) words.push(`${count(beside)} of ${count(found.length)} are read as the intrinsics.json or clouds.json in their folder says.`);
+    if (left.length) words.push(`${count(left.length)} ${left.length === 1 ? "file is" : "files are"} no frame, and left out: ${left.slice(0, 3).join(", ")}${left.length > 3 ? ", …" : ""}`);
+    if (!found.length && !told.length && !left.length && !faults.length) words.push("Nothing in it can be read.");
+    put(note, words.join(" "));
+    put(said);
+  }
+
+  function begin() {
+    const ready = queue.items.filter((one) => one.state === "ready");
+    const blind = ready.find((one) => one.source.kind === "depth" && !hasCamera({ ...queue.given, ...one.said }));
+    const lost = ready.find((one) => one.pose && ![queue.given.session, queue.given.parent_frame].some((text) => text.trim()) && !one.path.includes("/"));
+    if (blind) return missing("fx", `${blind.file.name} is a depth image: give its camera (fx, fy, cx, cy), or drop an intrinsics.json along.`);
+    if (lost) return missing("session", `${lost.file.name} has a pose: name its session, or the parent frame that the pose leads to.`);
+    put(said);
+    queue.start();
+    return show(null);
+  }
+
+  function missing(name, text) {
+    put(said, text);
+    root.querySelector(`.upload-said [name="${name}"]`).focus();
+  }
+
+  let timer = null;
+  function show(item) {
+    if (item?.frame_id) following?.look(item.frame_id);
+    rows.update(item);
+    timer ??= setTimeout(() => { timer = null; sum(); }, 200);
+  }
+
+  function sum() {
+    const states = {};
+    let [size, sent] = [0, 0];
+    for (const { state, file, share } of queue.items) {
+      const named = state === "sending" || state === "waiting" ? state : groupOf(state) === "refused" && state !== "cancelled" ? "refused" : state;
+      states[named] = (states[named] ?? 0) + 1;
+      size += file.size;
+      sent += file.size * share;
+    }
+    const ready = states.ready ?? 0;
+    const busy = (states.sending ?? 0) + (states.waiting ?? 0);
+    put(start, ready ? `Upload ${count(ready)} ${ready === 1 ? "file" : "files"}` : "Upload");
+    start.hidden = ready === 0;
+    bar.hidden = queue.items.length === 0;
+    place.toggleAttribute("data-small", queue.items.length > 0);
+    const untaken = queue.untaken().length;
+    retry.hidden = untaken < 2;
+    put(retry, `Retry ${count(untaken)}`);
+    cancel.hidden = !(queue.running && busy);
+    tidy.hidden = !queue.items.some((one) => groupOf(one.state) === "done");
+    const words = { indexed: "indexed", redundant: "not needed", imported: "archives taken", received: "waiting for a worker", signing: "being signed",
+      importing: "archives being taken", sending: "being sent", waiting: "in the queue", ready: "ready", refused: "refused", cancelled: "cancelled" };
+    const parts = Object.keys(words).filter((one) => states[one]).map((one) => `${count(states[one])} ${words[one]}`);
+    const sending = busy > 0 && queue.running;
+    if (status.textContent !== parts.join(" · ")) put(status, parts.join(" · "));
+    put(summary, queue.items.length > 0 && [
+      status,
+      h("span", { class: "muted number" }, sending ? `${bytes(sent)} of ${bytes(size)} sent` : bytes(size)),
+      sending && h("progress", { max: size || 1, value: sent, "aria-label": "All files, sent" }),
+      queue.stopped && h("p", { class: "field-error", role: "alert" }, `It was stopped, as all others would be refused as well: ${queue.stopped.message}`),
+    ]);
+  }
+
+  queue.listeners.add(show);
+  signal.addEventListener("abort", () => { queue.listeners.delete(show); clearTimeout(timer); }, { once: true });
+  sum();
+  const following = follow({
+    map: params.map, signal,
+    shown: (id) => queue.byFrame.has(id),
+    pending: () => queue.pending(),
+    changed: (frame) => queue.became(frame),
+    missed: () => { for (const id of queue.pending()) get(at("maps", params.map, "frames", id), { signal }).then((frame) => queue.became(frame)); },
+  });
+}
+
+function dropZone(take) {
+  const pick = (props) => h("input", { type: "file", multiple: true, class: "visually-hidden", tabindex: "-1", "aria-hidden": "true", ...props,
+    onChange: (event) => { take(chosen(event.target.files)); event.target.value = ""; } });
+  const [files, folder] = [pick({ accept: ACCEPT, name: "files" }), pick({ webkitdirectory: true, name: "folder" })];
+  const zone = h("div", { class: "drop" }, files, folder,
+    h("strong", {}, "Drop frames, folders or archives here"),
+    h("p", { class: "muted" }, "Depth images (16-bit PNG, NPY), point clouds (PLY, PCD, NPY, LAS, KITTI .bin), zip and tar. An intrinsics.json, clouds.json or NAME.pose.txt beside them is read."),
+    h("div", { class: "toolbar" },
+      h("button", { class: "button", type: "button", onClick: () => files.click() }, "Choose files"),
+      h("button", { class: "button", type: "button", onClick: () => folder.click() }, "Choose a folder")));
+  let depth = 0; // of elements within that are dragged over: each of them tells
+  const over = (change) => (event) => {
+    event.preventDefault();
+    depth += change;
+    zone.toggleAttribute("data-over", depth > 0);
+  };
+  zone.addEventListener("dragenter", over(1));
+  zone.addEventListener("dragleave", over(-1));
+  zone.addEventListener("dragover", (event) => event.preventDefault());
+  zone.addEventListener("drop", (event) => { depth = 0; over(0)(event); take(dropped(event.dataTransfer)); });
+  return zone;
+}
+
+function whoFields(given) {
+  const field = (name, label, placeholder) => h("label", { class: "field" }, h("span", {}, label),
+    h("input", { type: "text", name, autocomplete: "off", placeholder, value: given[name], onInput: (event) => { given[name] = event.target.value; remember(given); } }));
+  return h("fieldset", {}, h("legend", {}, "Who took them"),
+    h("div", { class: "source-row" },
+      field("robot", "Robot", "none"), field("session", "Session", "as the folder"),
+      field("tags", "Tags", "door, north"), field("parent_frame", "Parent frame of poses", "as the session")));
+}

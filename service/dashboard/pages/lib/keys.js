@@ -1,0 +1,81 @@
+// Where a key is asked for, or the one of this tab is not enough.
+import { get } from "./api.js";
+import { h, put } from "./dom.js";
+import { forgetKey, identify, key, me, setKey } from "./session.js";
+
+const MAY = { read: "look and query", write: "upload and edit frames", admin: "change the map itself" };
+
+/**
+ * A field for a key, and why it is there.
+ * @param {Error} problem of status 401 or 403
+ * @param {() => void} taken what to do with a key that is good
+ * @returns {HTMLElement}
+ */
+export function keyPage(problem, taken) {
+  const refused = problem.status !== 401;
+  const input = h("input", {
+    id: "key", class: "mono", type: "password", autocomplete: "off", spellcheck: "false",
+    placeholder: "sp_…", "aria-describedby": "key-why key-note",
+  });
+  const why = h("p", { id: "key-why", class: "field-error", role: "alert" }, !refused && key() !== null && told(problem));
+  const button = h("button", { class: "button primary", type: "submit" }, "Use this key");
+  const show = h("button", { class: "button", type: "button", "aria-pressed": false, onClick: () => {
+    const hidden = input.type === "password";
+    input.type = hidden ? "text" : "password";
+    show.setAttribute("aria-pressed", String(hidden));
+  } }, "Show");
+  const form = h("form", { onSubmit: submit },
+    h("div", { class: "field" }, h("label", { for: "key" }, refused ? "Another key" : "Key"), h("div", { class: "joined" }, input, show)),
+    why, button);
+
+  async function submit(event) {
+    event.preventDefault();
+    const before = key();
+    const given = input.value.trim();
+    // a header can hold no other characters, and fetch would break down over them
+    if (!/^[\x21-\x7e]+$/.test(given)) { tell(given ? "That is no key: it has characters that no key has." : "Paste a key first."); return; }
+    setKey(given);
+    button.disabled = true;
+    try {
+      await identify(get);
+      taken();
+    } catch (error) {
+      if (before === null) forgetKey(); else setKey(before);
+      tell(error.status === 401 ? told(error) : error.message);
+    } finally {
+      button.disabled = false;
+    }
+  }
+
+  function tell(text) {
+    put(why, text);
+    input.setAttribute("aria-invalid", "true");
+    input.focus();
+    input.select();
+  }
+
+  return h("section", { class: "card key-page" },
+    h("h2", {}, heading(problem.status)),
+    refused ? h("p", {}, problem.detail)
+      : h("p", {}, "Whoever runs it makes one with ", h("code", {}, "sceneprint keys --create NAME"), "."),
+    refused && grants(),
+    form,
+    h("p", { id: "key-note", class: "muted" }, "It is kept in this tab until the tab is closed, and sent to this service alone."));
+}
+
+function heading(status) {
+  if (status === 401) return "This service asks for a key";
+  return status === 403 ? "Your key may not do this" : "It is not there, or your key may not see it";
+}
+
+// what the API says is for who writes requests by hand
+function told({ detail }) {
+  return detail.includes("has expired") ? detail : "This service does not know this key. See that all of it was copied, or ask for another.";
+}
+
+/** What the key of this tab may do. */
+function grants() {
+  const rows = Object.entries(me()?.grants ?? {}).map(([map, scope]) =>
+    h("li", {}, h("strong", {}, map === "*" ? "all maps" : map), `: ${scope} (${MAY[scope]})`));
+  return h("div", {}, h("p", {}, "The key ", h("strong", {}, me()?.name ?? ""), " may, by map:"), h("ul", {}, rows));
+}

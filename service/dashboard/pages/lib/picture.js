@@ -1,0 +1,52 @@
+// A picture of the API on a canvas: an <img> cannot show a key, and the policy forbids blob:.
+import { bytes } from "./api.js";
+import { h } from "./dom.js";
+
+/**
+ * A canvas that draws itself when the picture has come; where there is nothing to see it says why.
+ * @param {string} path
+ * @param {Object<string, any>} params
+ * @param {{alt: string, width: number, height: number, signal?: AbortSignal}} how size: in CSS
+ *   pixels, kept free until the picture is there
+ * @returns {HTMLCanvasElement} its property `ready` is a promise: whether it was drawn
+ */
+export function picture(path, params, { alt, width, height, signal }) {
+  const canvas = h("canvas", { role: "img", "aria-label": alt, width, height, class: "picture" });
+  canvas.ready = draw(canvas, path, params, alt, signal);
+  return canvas;
+}
+
+async function draw(canvas, path, params, alt, signal) {
+  try {
+    const data = await bytes(path, { params, signal, accept: "image/png" });
+    const bitmap = await createImageBitmap(new Blob([data], { type: "image/png" }));
+    canvas.width = bitmap.width;
+    canvas.height = bitmap.height;
+    canvas.getContext("2d").drawImage(bitmap, 0, 0);
+    bitmap.close();
+    return true;
+  } catch (error) {
+    if (error.name === "AbortError") return false;
+    const why = error.status === 409 ? "Nothing to see yet" : error.status === 0 ? "No answer" : "Cannot be shown";
+    canvas.setAttribute("aria-label", `${alt}. ${why}: ${error.message}`);
+    canvas.title = error.message;
+    write(canvas, why);
+    if (error.status === 401) throw error;
+    return false;
+  }
+}
+
+function write(canvas, text) {
+  const colours = getComputedStyle(document.documentElement);
+  const scale = window.devicePixelRatio || 1;
+  canvas.width *= scale;
+  canvas.height *= scale;
+  const pen = canvas.getContext("2d");
+  pen.fillStyle = colours.getPropertyValue("--sunken");
+  pen.fillRect(0, 0, canvas.width, canvas.height);
+  pen.fillStyle = colours.getPropertyValue("--muted");
+  pen.font = `${13 * scale}px system-ui, sans-serif`;
+  pen.textAlign = "center";
+  pen.textBaseline = "middle";
+  pen.fillText(text, canvas.width / 2, canvas.height / 2, canvas.width * 0.9);
+}

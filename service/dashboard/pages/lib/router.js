@@ -1,0 +1,74 @@
+// Addresses of the pages: everything behind `#`, so that they survive a reload and can be shared.
+
+/** Pages by the pattern of their address; `:name` is a segment. `section`: its place in the tabs
+ * of a map; `crumbs`: what leads there. */
+export const ROUTES = [
+  { path: "", page: "maps/maps.js", area: "maps", title: "Maps" },
+  { path: "maps/:map", page: "frames/gallery.js", area: "maps", section: "frames", title: "Frames" },
+  { path: "maps/:map/frames/:frame", page: "frames/frame.js", area: "maps", section: "frames", title: "Frame" },
+  { path: "maps/:map/upload", page: "frames/upload.js", area: "maps", section: "upload", title: "Upload" },
+  { path: "maps/:map/query", page: "query/ask.js", area: "maps", section: "query", title: "Query" },
+  { path: "maps/:map/paths", page: "paths/paths.js", area: "maps", section: "paths", title: "Map view" },
+  { path: "queries/:query", page: "query/answer.js", area: "maps", title: "Answer" },
+  { path: "queries/:query/matches/:frame", page: "overlay/overlay.js", area: "maps", title: "Overlay" },
+  { path: "operations", page: "operations/operations.js", area: "operations", title: "Operations" },
+  { path: "operations/jobs/:job", page: "operations/job.js", area: "operations", title: "Job" },
+];
+
+/**
+ * What an address stands for; `route` is null where it is none of ours.
+ * @param {string} hash with its `#`
+ * @returns {{route: Object<string, any> | null, params: Object<string, string>, search: URLSearchParams, path: string}}
+ */
+export function parse(hash) {
+  const [path, query] = hash.replace(/^#?\/?/, "").split(/\?(.*)/s, 2);
+  const search = new URLSearchParams(query ?? "");
+  const given = path.replace(/\/+$/, "").split("/");
+  for (const route of ROUTES) {
+    const wanted = route.path.split("/");
+    if (wanted.length !== given.length) continue;
+    const params = {};
+    const fits = wanted.every((one, i) => {
+      if (!one.startsWith(":")) return one === given[i];
+      params[one.slice(1)] = decoded(given[i]);
+      return given[i] !== "";
+    });
+    if (fits) return { route, params, search, path };
+  }
+  return { route: null, params: {}, search, path };
+}
+
+/**
+ * An address: `link("maps", name, "frames", id, {k: 5})`; a last object is its search.
+ * @param {...(string | Object<string, any> | URLSearchParams)} parts
+ * @returns {string}
+ */
+export function link(...parts) {
+  const last = parts.at(-1);
+  const search = typeof last === "object" ? parts.pop() : null;
+  const path = `#/${parts.map((one) => encodeURIComponent(one)).join("/")}`;
+  if (search === null) return path;
+  const query = new URLSearchParams();
+  const entries = search instanceof URLSearchParams ? [...search] : Object.entries(search);
+  for (const [name, value] of entries) {
+    for (const one of [value].flat()) if (one !== null && one !== undefined && one !== "") query.append(name, one);
+  }
+  return query.size ? `${path}?${query}` : path;
+}
+
+/**
+ * Go to a page. `replace`: Back leads past this one; `quiet`: the page that is shown has changed
+ * itself already, and only its address follows.
+ * @param {string} hash
+ * @param {{replace?: boolean, quiet?: boolean}} [how]
+ */
+export function go(hash, { replace = false, quiet = false } = {}) {
+  const same = hash === (location.hash || "#/");
+  if (replace || same) history.replaceState(null, "", hash); else history.pushState(null, "", hash);
+  if (!quiet) window.dispatchEvent(new CustomEvent("sceneprint:go"));
+}
+
+// what is no percent-encoding stands for itself
+function decoded(segment) {
+  try { return decodeURIComponent(segment); } catch { return segment; }
+}

@@ -1,0 +1,138 @@
+// What a page shows in place of what was asked for, and what asks or tells across pages.
+import { lives } from "./api.js";
+import { h, put, svg } from "./dom.js";
+
+const SHAPES = {
+  good: "M5 12.500l4.500 4.500L19 7.500",
+  bad: "M12 7v6.500M12 17v.1",
+  none: "M4 8l8-4 8 4v8l-8 4-8-4zM4 8l8 4 8-4M12 12v8",
+  wait: "M12 7v5l3 2",
+};
+const AGAIN_S = 2;
+const TOAST_S = 6;
+
+/** A skeleton, told to screen readers. @param {string} [text] @returns {HTMLElement} */
+export function loading(text = "Loading") {
+  const lines = [1, 2, 3].map(() => h("span", { class: "skeleton-line" }));
+  return h("div", { class: "skeleton", role: "status" }, h("span", { class: "visually-hidden" }, `${text}…`), lines);
+}
+
+/**
+ * There is nothing yet, and how to begin.
+ * @param {{title: string, text?: any, actions?: any}} what text, actions: as children of `h`
+ * @returns {HTMLElement}
+ */
+export function empty({ title, text, actions }) {
+  return state("none", title, text, actions);
+}
+
+/**
+ * What the API refused, in its own words.
+ * @param {Error} problem a Problem, or a fault of ours
+ * @param {() => void} [retry]
+ * @returns {HTMLElement}
+ */
+export function failed(problem, retry) {
+  const known = problem.status !== undefined;
+  const fields = (problem.errors ?? []).map((one) => h("li", {}, one.field ? `${one.field}: ${one.reason}` : one.reason));
+  const text = [
+    h("p", {}, known ? problem.detail : `The page broke down: ${problem.message}`),
+    fields.length > 0 && h("ul", {}, fields),
+    problem.instance && h("p", { class: "muted" }, "In the log as ", h("span", { class: "mono" }, problem.instance.split("/").pop())),
+  ];
+  const title = known ? problem.title : "This page cannot be shown";
+  return state("bad", title, text, retry && h("button", { class: "button", type: "button", onClick: retry }, "Try again"));
+}
+
+/**
+ * The service is gone; asks until it is back.
+ * @param {() => void} back what to do then
+ * @param {AbortSignal} signal
+ * @returns {HTMLElement}
+ */
+export function gone(back, signal) {
+  const timer = setInterval(async () => {
+    if (signal.aborted || !(await lives(signal)) || signal.aborted) return;
+    clearInterval(timer);
+    back();
+  }, 1000 * AGAIN_S);
+  signal.addEventListener("abort", () => clearInterval(timer), { once: true });
+  const text = "It may be restarting. This page comes back by itself as soon as it answers.";
+  return state("wait", "The service does not answer", text, h("span", { class: "muted" }, `Trying every ${AGAIN_S} seconds…`));
+}
+
+/**
+ * Say what has happened, at the edge of the page.
+ * @param {string} text
+ * @param {{kind?: "good" | "bad"}} [how]
+ */
+export function toast(text, { kind = "good" } = {}) {
+  const region = document.getElementById("toasts");
+  const close = h("button", { class: "button quiet", type: "button", "aria-label": "Dismiss", onClick: () => one.remove() }, "×");
+  const one = h("div", { class: "toast", dataset: { kind } }, shape(kind), h("span", {}, text), close);
+  region.append(one);
+  while (region.children.length > 4) region.firstChild.remove();
+  // what went wrong stays until it was seen
+  if (kind === "good") setTimeout(() => one.remove(), 1000 * TOAST_S);
+}
+
+/**
+ * Ask before something is done.
+ * @param {{title: string, text: any, word?: string, action?: string}} what word: to be typed
+ *   first, for what cannot be undone; action: what the button says
+ * @returns {Promise<boolean>}
+ */
+export function confirm({ title, text, word, action = "Continue" }) {
+  return new Promise((resolve) => {
+    const button = h("button", { class: word ? "button danger" : "button primary", value: "yes", disabled: Boolean(word) }, action);
+    const look = (event) => { button.disabled = event.target.value !== word; };
+    const field = word && h("label", { class: "field" }, h("span", {}, "Type ", h("strong", { class: "mono" }, word), " to confirm"),
+      h("input", { class: "mono", autocomplete: "off", spellcheck: "false", onInput: look }));
+    const dialog = sheet({ title, children: [h("div", { class: "dialog-text" }, text), field], buttons: [button] });
+    dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"));
+    dialog.querySelector("form").addEventListener("submit", (event) => {
+      event.preventDefault();
+      if (!button.disabled) dialog.close("yes");
+    });
+  });
+}
+
+/**
+ * A dialog with a form, shown at once and removed when it closes; what its form does is the
+ * caller's. Escape and Cancel close it.
+ * @param {{title: string, children: any, buttons: any}} what
+ * @returns {HTMLDialogElement}
+ */
+export function sheet({ title, children, buttons }) {
+  const cancel = h("button", { class: "button", type: "button", onClick: () => dialog.close() }, "Cancel");
+  const dialog = h("dialog", { class: "dialog", "aria-label": title },
+    h("form", { novalidate: true }, h("h2", {}, title), children, h("div", { class: "dialog-foot" }, cancel, buttons)));
+  const before = document.activeElement;
+  dialog.addEventListener("close", () => { dialog.remove(); if (before?.isConnected) before.focus(); });
+  document.body.append(dialog);
+  dialog.showModal();
+  dialog.querySelector("input, select, textarea")?.focus();
+  return dialog;
+}
+
+/** Words of a state with a shape of their own, in place of a page or a part of it. */
+function state(kind, title, text, actions) {
+  return h("section", { class: "state", dataset: { kind } }, shape(kind),
+    h("h2", { tabindex: "-1" }, title), h("div", { class: "state-text" }, text),
+    actions && h("div", { class: "toolbar" }, actions));
+}
+
+function shape(kind) {
+  const round = kind === "none" ? null : svg("circle", { cx: 12, cy: 12, r: 10 });
+  return svg("svg", { class: "shape", viewBox: "0 0 24 24", "aria-hidden": "true" }, round, svg("path", { d: SHAPES[kind] }));
+}
+
+/** Show a skeleton in an element if what comes takes longer than a blink. @param {Element} root
+ * @returns {() => void} to be called when it has come */
+export function soon(root, text) {
+  const timer = setTimeout(() => { if (!root.hasChildNodes()) put(root, loading(text)); }, 150);
+  return () => {
+    clearTimeout(timer);
+    if (root.firstElementChild?.classList.contains("skeleton")) root.firstElementChild.remove();
+  };
+}

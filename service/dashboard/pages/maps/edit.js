@@ -1,0 +1,131 @@
+// Maps made, retitled and removed.
+import { at, get, send } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { bytes, count } from "../lib/format.js";
+import { link } from "../lib/router.js";
+import { confirm, sheet, toast } from "../lib/states.js";
+
+// what the models that ship are for; their size comes from the API
+const FOR = {
+  paper: ["Rooms", "For depth cameras indoors. The paper's size: finds the most."],
+  compact: ["Rooms, compact", "A tenth as large and a third faster to sign, for many frames."],
+  lidar: ["LiDAR", "For scans that reach far: halls, storeys, city blocks."],
+};
+
+// what the API's regular expression means
+const PATTERN = "Lower-case letters, digits, - and _ only, and a letter or a digit first.";
+
+/** Ask for a name, a title and a model, and make a map of them. @param {(hash: string) => void} go */
+export async function createMap(go) {
+  const { items } = await get("models");
+  const name = h("input", { id: "new-name", name: "name", class: "mono", autocomplete: "off", spellcheck: "false", maxlength: 63 });
+  const title = h("input", { id: "new-title", name: "title", autocomplete: "off", maxlength: 200 });
+  const models = items.filter((one) => one.preset).map((one, i) => choice(one, i === 0));
+  await form({
+    title: "New map", action: "Create map",
+    children: [
+      field("Name", name, "Lower-case letters, digits, - and _. It is in every address, and never changes."),
+      field("Title", title, "For people; optional, and can be changed."),
+      h("fieldset", { class: "models" }, h("legend", {}, "Model"), models,
+        h("p", { class: "field-error", id: "new-model-error", role: "alert" })),
+    ],
+    async save(dialog) {
+      const model = dialog.querySelector("input[name=model]:checked")?.value;
+      const json = { name: name.value.trim(), title: title.value.trim() || null, model };
+      const { status, data } = await send("POST", "maps", { json });
+      toast(status === 201 ? `${data.name} was made.` : `${data.name} was there already, as wanted.`);
+      go(link("maps", data.name));
+    },
+    place: (problem) => (problem.type === "map-exists" ? "name" : null),
+  });
+}
+
+/**
+ * Ask for another title; an edit of another is not overwritten unseen.
+ * @param {Object<string, any>} map
+ * @param {() => Promise<void>} changed
+ */
+export async function retitleMap(map, changed) {
+  let { etag } = map;
+  const title = h("input", { id: "new-title", name: "title", autocomplete: "off", maxlength: 200, value: map.title ?? "" });
+  await form({
+    title: `Retitle ${map.name}`, action: "Save title",
+    children: [field("Title", title, "Empty: it is called by its name.")],
+    async save() {
+      await send("PATCH", at("maps", map.name), {
+        json: { title: title.value.trim() || null }, type: "application/merge-patch+json", headers: { "If-Match": `"${etag}"` },
+      });
+      toast(`${map.name} was retitled.`);
+      await changed();
+    },
+    async place(problem) {
+      if (problem.type !== "precondition-failed") return null;
+      const now = await get(at("maps", map.name));
+      etag = now.etag;
+      problem.detail = `Somebody else has called it “${now.title ?? now.name}” meanwhile. Save again to call it as you wrote.`;
+      return "title";
+    },
+  });
+}
+
+/** Ask for the name of a map to be typed, and remove it. */
+export async function deleteMap(map, changed) {
+  const frames = Object.entries(map.frames).reduce((n, [state, one]) => n + (state === "deleted" ? 0 : one), 0);
+  const text = `Its ${count(frames)} ${frames === 1 ? "frame" : "frames"} with their uploads, signatures and index are removed for good. There is no way back but a snapshot.`;
+  if (!(await confirm({ title: `Delete ${map.title ?? map.name}?`, text, word: map.name, action: "Delete map" }))) return;
+  await send("DELETE", at("maps", map.name));
+  toast(`${map.name} was deleted.`);
+  await changed();
+}
+
+/** A dialog that stays until what it asks for is saved; refusals are told at their fields. */
+async function form({ title, action, children, save, place }) {
+  const rest = h("p", { class: "field-error", role: "alert" });
+  const button = h("button", { class: "button primary" }, action);
+  const dialog = sheet({ title, children: [children, rest], buttons: button });
+  dialog.querySelector("form").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    if (button.disabled) return;
+    button.disabled = true;
+    for (const one of dialog.querySelectorAll(".field-error")) put(one);
+    for (const one of dialog.querySelectorAll("[aria-invalid]")) one.removeAttribute("aria-invalid");
+    try {
+      await save(dialog);
+      dialog.close();
+    } catch (error) {
+      if (error.status === undefined || error.status === 401) { dialog.close(); throw error; }
+      const own = await place(error);
+      const told = own ? [{ field: own, reason: error.detail }] : error.errors;
+      const left = told.filter((one) => !tell(dialog, one));
+      if (left.length || !told.length) put(rest, error.detail);
+      dialog.querySelector("[aria-invalid]")?.focus();
+    } finally {
+      button.disabled = false;
+    }
+  });
+}
+
+/** Say what is wrong with a field; false where the dialog has none of that name. */
+function tell(dialog, { field: name, reason }) {
+  const input = dialog.querySelector(`[name="${CSS.escape(name)}"]`);
+  const place = dialog.querySelector(`#new-${CSS.escape(name)}-error`);
+  if (!place) return false;
+  put(place, reason.includes("match pattern") ? PATTERN : reason);
+  if (input.type !== "radio") input.setAttribute("aria-invalid", "true");
+  return true;
+}
+
+function field(text, input, hint) {
+  const [why, note] = [`${input.id}-error`, `${input.id}-hint`];
+  input.setAttribute("aria-describedby", `${why} ${note}`);
+  return h("div", { class: "field" }, h("label", { for: input.id }, text), input,
+    h("p", { class: "field-error", id: why, role: "alert" }), h("p", { class: "muted hint", id: note }, hint));
+}
+
+function choice(model, checked) {
+  const [text, use] = FOR[model.name] ?? [model.name, ""];
+  return h("label", { class: "model" },
+    h("input", { type: "radio", name: "model", value: model.name, checked }),
+    h("span", {}, h("strong", {}, text), " ", h("span", { class: "muted mono" }, model.name), h("br", {}),
+      h("span", { class: "muted" }, `${use} ${bytes(model.signature_bytes)} a frame.`)));
+}

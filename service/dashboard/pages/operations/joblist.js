@@ -1,0 +1,152 @@
+// Jobs as rows: what each is about, how it went, its traceback folded, and trying it again.
+import { at, get, send } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { count, ms, seconds, shortId, time } from "../lib/format.js";
+import { link } from "../lib/router.js";
+import { may } from "../lib/session.js";
+import { confirm, toast } from "../lib/states.js";
+
+/** Kinds of badge by state. */
+export const STATES = {
+  queued: "neutral", running: "warn", succeeded: "good", failed: "bad", cancelled: "neutral", dead: "bad",
+};
+const GIVEN_UP = new Set(["dead", "cancelled", "failed"]);
+const SIDE_BY_SIDE = 4; // requests of "retry all" at a time: the service has others to serve
+
+/** A state with its shape. @param {string} state @returns {HTMLElement} */
+export function stateBadge(state) {
+  return h("span", { class: "badge", dataset: { kind: STATES[state] ?? "neutral" } }, state);
+}
+
+/** Whether a job can be tried again: given up, and by nobody tried since. */
+export function canRetry(job) {
+  return GIVEN_UP.has(job.state) && !job.followed_by && may("write", job.map ?? undefined);
+}
+
+/** Seconds that the latest try took, or takes so far; null where it has not begun. */
+export function took(job) {
+  if (!job.started_at) return null;
+  const end = job.finished_at ? Date.parse(job.finished_at) : Date.now();
+  return Math.max(end - Date.parse(job.started_at), 0) / 1000;
+}
+
+/** A span, also a short one. @param {number} s */
+export function span(s) {
+  return s < 1 ? ms(1000 * s) : seconds(s);
+}
+
+/**
+ * A job as a row of a list.
+ * @param {Object<string, any>} job
+ * @param {(job: Object<string, any>) => void} changed after a retry or a cancel, with the new job
+ * @returns {HTMLElement}
+ */
+export function jobRow(job, changed) {
+  const about = [
+    job.map && h("a", { href: link("maps", job.map), dataset: { part: "map" } }, job.map),
+    job.frame_id && [" / ", h("a", { class: "mono", href: link("maps", job.map, "frames", job.frame_id), title: job.frame_id, dataset: { part: "frame" } }, shortId(job.frame_id))],
+  ];
+  const facts = [
+    job.attempts > 1 && `${count(job.attempts)} tries`,
+    job.finished_at && ["ended ", time(job.finished_at)],
+    !job.finished_at && ["came ", time(job.created_at)],
+    job.finished_at && took(job) !== null && `took ${span(took(job))}`,
+  ].filter(Boolean).flatMap((one, i) => (i ? [" · ", one] : one));
+  return h("li", { class: "job", dataset: { job: job.job_id } },
+    h("div", { class: "job-line" }, stateBadge(job.state),
+      h("a", { class: "job-kind", href: link("operations", "jobs", job.job_id), dataset: { part: "job" }, "aria-label": `${job.kind}, job ${shortId(job.job_id)}` }, job.kind),
+      h("span", { class: "job-about" }, about),
+      h("span", { class: "job-facts muted" }, facts),
+      h("span", { class: "job-actions" }, actions(job, changed))),
+    job.progress && !job.finished_at && progress(job.progress),
+    job.error && h("p", { class: "job-error" }, job.error),
+    traceback(job));
+}
+
+/** The traceback, folded. @param {Object<string, any>} job @param {boolean} [open] */
+export function traceback(job, open = false) {
+  return job.traceback && h("details", { open }, h("summary", { dataset: { part: "traceback" } }, "Traceback of the last try"),
+    h("pre", { class: "traceback", tabindex: "0", role: "region", "aria-label": "Traceback" }, job.traceback));
+}
+
+/** How far a long job is. */
+export function progress({ done, total }) {
+  return h("div", { class: "job-progress" },
+    h("progress", { "aria-label": "Progress", max: total ?? null, value: total === null ? null : done }),
+    h("span", { class: "muted number" }, total === null ? count(done) : `${count(done)} of ${count(total)}`));
+}
+
+/**
+ * Buttons of a job, by its state and what the key may.
+ * @param {Object<string, any>} job
+ * @param {(job: Object<string, any>) => void} changed
+ */
+export function actions(job, changed) {
+  if (job.followed_by) return h("a", { href: link("operations", "jobs", job.followed_by), dataset: { part: "next" } }, "tried again");
+  const press = (what, told) => async (event) => {
+    event.target.disabled = true;
+    try {
+      const { data } = await send("POST", at("jobs", job.job_id, what));
+      toast(told);
+      changed(data);
+    } catch (error) {
+      event.target.disabled = false;
+      throw error;
+    }
+  };
+  if (canRetry(job)) return h("button", { class: "button", type: "button", dataset: { part: "act" }, onClick: press("retry", "Queued once more") }, "Retry");
+  const over = job.state !== "queued" && job.state !== "running";
+  if (over || !may("write", job.map ?? undefined)) return null;
+  return h("button", { class: "button quiet", type: "button", dataset: { part: "act" }, onClick: press("cancel", "Cancelled") }, "Cancel");
+}
+
+/**
+ * Try again all dead jobs of a map or of all, after asking.
+ * @param {string | null} map
+ * @param {AbortSignal} signal
+ * @param {(text: string) => void} tell how far it is
+ */
+export async function retryAll(map, signal, tell) {
+  const dead = [];
+  let cursor = null;
+  do {
+    const page = await get("jobs", { params: { state: "dead", map, cursor, limit: 1000 }, signal });
+    dead.push(...page.items.filter(canRetry));
+    cursor = page.next_cursor;
+  } while (cursor);
+  if (dead.length === 0) { tell("No dead job is left to be tried again."); return; }
+  const many = dead.length === 1 ? "1 dead job" : `${count(dead.length)} dead jobs`;
+  const text = h("p", {}, `${many}${map ? ` of map ${map}` : ""} will be queued once more, each with its tries anew. What broke them may break them again.`);
+  if (!(await confirm({ title: "Retry all dead jobs", text, action: `Retry ${many}` }))) return;
+  const left = [...dead];
+  let done = 0;
+  let refused = 0;
+  await Promise.all(Array.from({ length: SIDE_BY_SIDE }, async () => {
+    for (let job = left.shift(); job !== undefined && !signal.aborted; job = left.shift()) {
+      try {
+        await send("POST", at("jobs", job.job_id, "retry"), { signal });
+        done += 1;
+      } catch (error) {
+        if (error.status === 409) refused += 1; // somebody else was first
+        else { left.length = 0; throw error; }
+      }
+      tell(`Queued ${count(done)} of ${count(dead.length)}…`);
+    }
+  }));
+  tell(`${count(done)} queued once more${refused ? `, ${count(refused)} could not be` : ""}.`);
+}
+
+/** A status line that tells what `retryAll` does, and its button. */
+export function retryAllButton(map, signal, changed) {
+  const status = h("span", { class: "muted", role: "status" });
+  const button = h("button", { class: "button", type: "button", onClick: async () => {
+    button.disabled = true;
+    try {
+      await retryAll(map, signal, (text) => put(status, text));
+    } finally {
+      button.disabled = false;
+      changed();
+    }
+  } }, "Retry all dead");
+  return [status, button];
+}

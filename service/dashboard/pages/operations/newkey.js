@@ -1,0 +1,83 @@
+// Making a key, and showing its secret the one time that it can be shown.
+import { get, send } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { sheet, toast } from "../lib/states.js";
+
+const SCOPES = [["read", "read: look and query"], ["write", "write: upload and edit frames, too"], ["admin", "admin: change the map itself, too"]];
+
+/**
+ * Ask for a name and grants, and make the key.
+ * @param {AbortSignal} signal
+ * @param {() => Promise<void>} made
+ */
+export async function newKey(signal, made) {
+  const names = (await get("maps", { signal })).items.map((one) => one.name);
+  const name = h("input", { required: true, maxlength: "128", autocomplete: "off", spellcheck: "false", placeholder: "robot-7" });
+  const expires = h("input", { type: "datetime-local" });
+  const lines = h("div", { class: "grants" });
+  const add = (map) => lines.append(grantLine(map));
+  const why = h("p", { class: "field-error", role: "alert" });
+  const button = h("button", { class: "button primary", type: "submit" }, "Make the key");
+  const dialog = sheet({ title: "Make a key", buttons: button, children: [
+    h("label", { class: "field" }, h("span", {}, "Name: who it is for"), name),
+    h("fieldset", { class: "grants-set" }, h("legend", {}, "What it may do"), lines,
+      h("datalist", { id: "key-maps" }, ["*", ...names].map((one) => h("option", { value: one }))),
+      h("p", { class: "muted" }, "* stands for all maps, and for what is of none."),
+      h("button", { class: "button quiet", type: "button", onClick: () => add("") }, "Another map")),
+    h("label", { class: "field" }, h("span", {}, "Expires (never, if empty)"), expires), why,
+  ] });
+  add(names[0] ?? "*");
+  dialog.querySelector("form").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const grants = {};
+    for (const line of lines.children) {
+      const map = line.querySelector("input").value.trim();
+      if (map) grants[map] = line.querySelector("select").value;
+    }
+    const until = expires.value ? new Date(expires.value).toISOString() : null;
+    button.disabled = true;
+    try {
+      const { data } = await send("POST", "keys", { json: { name: name.value.trim(), grants, expires_at: until }, signal });
+      dialog.close();
+      secret(data);
+      await made();
+    } catch (error) {
+      if (error.status === undefined) throw error;
+      const fields = error.errors.map((one) => `${one.field}: ${one.reason}`);
+      put(why, fields.length ? fields.join(". ") : error.message);
+    } finally {
+      button.disabled = false;
+    }
+  });
+}
+
+function grantLine(map) {
+  const line = h("div", { class: "joined" },
+    h("input", { class: "mono", "aria-label": "Map", list: "key-maps", value: map, autocomplete: "off", spellcheck: "false", placeholder: "name of a map, or *" }),
+    h("select", { "aria-label": "Scope" }, SCOPES.map(([value, text]) => h("option", { value }, text))),
+    h("button", { class: "button quiet", type: "button", "aria-label": "Leave out this map", onClick: () => { if (line.parentElement.children.length > 1) line.remove(); } }, "×"));
+  return line;
+}
+
+/** The secret, until the dialog is closed: then it is nowhere. */
+function secret(key) {
+  const field = h("input", { class: "mono", readonly: true, value: key.secret, "aria-label": "Secret", onFocus: () => field.select() });
+  const copy = h("button", { class: "button", type: "button", onClick: async () => {
+    field.select();
+    try {
+      await navigator.clipboard.writeText(key.secret);
+      toast("Copied");
+    } catch { // not in a page that came over plain http: it is selected, to be copied by hand
+      toast("Selected: copy it with Ctrl+C");
+    }
+  } }, "Copy");
+  const done = h("button", { class: "button primary", type: "button", onClick: () => dialog.close() }, "I have stored it");
+  const dialog = h("dialog", { class: "dialog", "aria-label": `Key ${key.name}` }, h("form", { method: "dialog" },
+    h("h2", {}, `Key ${key.name} is made`),
+    h("p", {}, h("strong", {}, "This is the only time its secret is shown."), " The service keeps a hash of it. Send it as ", h("code", {}, "Authorization: Bearer SECRET"), "."),
+    h("div", { class: "joined" }, field, copy), h("div", { class: "dialog-foot" }, done)));
+  dialog.addEventListener("close", () => { field.value = ""; dialog.remove(); });
+  document.body.append(dialog);
+  dialog.showModal();
+  field.focus();
+}

@@ -1,0 +1,84 @@
+// How the service does, on one page: what waits, the last hour, what failed, what happens now.
+import { get } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { go, link } from "../lib/router.js";
+import { may } from "../lib/session.js";
+import { empty } from "../lib/states.js";
+import { events } from "./events.js";
+import { health } from "./health.js";
+import { history } from "./history.js";
+import { canRetry, jobRow, retryAllButton } from "./joblist.js";
+import { indexes, room, workers } from "./machines.js";
+import { mapField } from "./mapfield.js";
+import { poll, renewTimes, rows } from "./poll.js";
+import { tiles } from "./tiles.js";
+
+const POLL_S = 5;
+const SOON_MS = 800; // after an event: many come at once, and one look is enough for all
+const FAILURES = 8;
+const EVENTS = 12;
+
+/** See operations.js. */
+export async function renderTab(root, { search, signal }) {
+  const all = may("read");
+  let map = search.get("map");
+  if (map === null && !all) { // the service as a whole is not for this key: one of its maps is
+    map = (await get("maps", { signal })).items[0]?.name ?? null;
+    if (map === null) {
+      put(root, empty({ title: "Nothing to tell", text: "Your key reads no map that exists, and figures of the whole service are for keys that read all maps." }));
+      return;
+    }
+  }
+  const whole = map === null;
+  const line = health();
+  const failures = failureList(map, signal);
+  const figures = tiles(whole);
+  const hour = history(whole);
+  const index = indexes();
+  const parts = whole ? [figures, hour, index, workers(), room()] : [figures, hour, index, room()];
+
+  async function look() {
+    const [stats] = await Promise.all([get("stats", { params: { map }, signal }), line.look(signal), failures.look()]);
+    for (const one of parts) one.update(stats);
+    renewTimes(failures.element);
+  }
+
+  let timer = null;
+  const again = await poll(look, POLL_S, signal, () => line.look(signal).catch(() => {}));
+  const soon = () => { timer ??= setTimeout(() => { timer = null; again(); }, SOON_MS); };
+  signal.addEventListener("abort", () => clearTimeout(timer), { once: true });
+  failures.onchange = again;
+  const feed = await events({ map, limit: EVENTS, signal, onstate: line.live, onevent: soon });
+  const choose = await mapField(map, signal, (name) => go(link("operations", { map: name })), all);
+  put(root, h("div", { class: "toolbar spread" }, line.element, choose),
+    !whole && h("p", { class: "muted" }, all ? "Of this map alone. Workers, requests, query times and the disk are told of all maps together."
+      : "Of this map alone: workers, requests, query times and the disk are told to keys that may read all maps."),
+    figures.element, hour.element,
+    h("div", { class: "columns" }, parts.slice(2).map((one) => one.element)),
+    failures.element,
+    h("section", { class: "card", "aria-labelledby": "events" }, h("div", { class: "card-head" }, h("h2", { id: "events" }, "Recent events"),
+      h("a", { href: link("operations", { tab: "events", map: whole ? null : map }) }, "All events")), feed));
+}
+
+/** What broke down or was refused, and has not been tried again since. */
+function failureList(map, signal) {
+  const list = h("ul", { class: "list jobs" });
+  const none = h("p", { class: "muted" }, "Nothing failed that was not tried again.");
+  const rest = h("a", { href: link("operations", { tab: "jobs", state: "dead", map }), hidden: true }, "There are more");
+  const own = { onchange: () => {} };
+  const show = rows(list, (job) => job.job_id, (job) => jobRow(job, () => own.onchange()));
+  const [status, button] = retryAllButton(map, signal, () => own.onchange());
+  return Object.assign(own, {
+    element: h("section", { class: "card", "aria-labelledby": "failures" }, h("div", { class: "card-head" }, h("h2", { id: "failures" }, "Failures"),
+      h("div", { class: "toolbar" }, status, button)), none, list, rest),
+    async look() {
+      const pages = await Promise.all(["dead", "failed"].map((state) => get("jobs", { params: { state, map, limit: 100 }, signal })));
+      const left = pages.flatMap((page) => page.items).filter((job) => !job.followed_by);
+      left.sort((a, b) => Date.parse(b.finished_at) - Date.parse(a.finished_at));
+      none.hidden = left.length > 0;
+      rest.hidden = left.length <= FAILURES && pages.every((page) => page.next_cursor === null);
+      button.hidden = !left.some((job) => job.state === "dead" && canRetry(job));
+      show(left.slice(0, FAILURES));
+    },
+  });
+}

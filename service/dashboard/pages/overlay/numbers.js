@@ -1,0 +1,129 @@
+// Beside the view: the verdict, what it was reached from, and how far it can be trusted.
+import { count, degrees, metres, percent, shortId } from "../lib/format.js";
+import { h } from "../lib/dom.js";
+import { link } from "../lib/router.js";
+import { statusOf } from "../query/words.js";
+import { apart, axisName, deviations, freedom, isOptical, shiftOf, turnOf } from "./words.js";
+
+const MEANT = {
+  accepted: "Both directions agree on this transform, and what both frames saw supports it.",
+  ambiguous: "It fits, but so does another pose, or a direction is free: not counted as found.",
+  rejected: "The best transform there is, and not to be believed.",
+};
+
+/** Degrees that are next to none. */
+const fine = (x) => (x < 1 ? `${x.toFixed(2)}°` : degrees(x));
+
+/** @param {string} title @param {...any} children */
+const card = (title, ...children) => h("section", { class: "card overlay-card" }, h("h2", {}, title), children);
+
+/** What came of it, in a word and a sentence. @param {object} details */
+export function verdictCard(details) {
+  const { validation } = details, { kind, text } = statusOf(validation);
+  const note = details.transform ? MEANT[validation.status] : "The frames gave no transform at all.";
+  return card("Verdict",
+    h("p", {}, h("span", { class: "badge overlay-verdict", dataset: { kind } }, text)),
+    h("p", { class: "overlay-reason" }, sentence(validation.reason)),
+    note && h("p", { class: "muted" }, note));
+}
+
+export const sentence = (text) => `${text.charAt(0).toUpperCase()}${text.slice(1)}.`;
+
+/** What the verdict was reached from. @param {object} details */
+export function evidenceCard(details) {
+  const v = details.validation, sampled = (details.query?.sampled ?? 0) + (details.match?.sampled ?? 0);
+  const residual = v.residual ? `${metres(v.residual.translation_m)}, ${fine(v.residual.rotation_deg)}` : "–";
+  const rows = [
+    ["Overlap", percent(v.overlap), "of the points of both frames agree"],
+    ["Plane overlap", percent(v.plane_overlap), "the same, every plane counting alike"],
+    ["Inliers", sampled ? `${count(v.inliers)} of ${count(sampled)}` : count(v.inliers), "points that lie on the other's surface"],
+    ["Violations", v.free_space_violations === null ? "–" : percent(v.free_space_violations),
+      v.free_space_violations === null ? "without a viewpoint nothing is known of free space" : "lie where the other saw through"],
+    ["Residual", residual, "query to match and back, estimated apart"],
+    ["Ambiguity", percent(v.ambiguity), "of what agrees, the best rival explains"],
+    ["Patches", details.patches ? count(details.patches.query.length) : "–", "pairs coincide"],
+  ];
+  if (!details.transform) return card("Evidence", h("p", { class: "muted" }, "Without a transform there is nothing to count."));
+  return card("Evidence", h("dl", { class: "overlay-numbers" }, rows.map(([name, value, note]) => h("div", {},
+    h("dt", {}, name), h("dd", { class: "number" }, value), h("dd", { class: "overlay-note" }, note)))));
+}
+
+/** Query to match. @param {object} details @param {{query: string, match: string}} names */
+export function transformCard(details) {
+  const { transform } = details;
+  if (!transform) return null;
+  const optical = isOptical(transform.parent_frame), { x, y, z } = transform.translation;
+  return card("Transform",
+    h("p", { class: "muted" }, "The query moves ", h("strong", {}, metres(shiftOf(transform.translation))), " and turns ",
+      h("strong", {}, degrees(turnOf(transform.matrix))), ", in the match’s axes:"),
+    axes(optical, [["Shift", [x, y, z].map(metres)]]),
+    h("details", {}, h("summary", {}, "Matrix"),
+      h("p", { class: "muted overlay-frames" }, h("span", { class: "mono" }, short(transform.parent_frame)), " ← ",
+        h("span", { class: "mono" }, short(transform.child_frame))),
+      h("pre", { class: "mono overlay-matrix", tabindex: 0, "aria-label": "4 by 4 matrix, row by row" },
+        transform.matrix.map((row) => row.map((v) => v.toFixed(4).padStart(9)).join("")).join("\n"))));
+}
+
+const short = (name) => {
+  const dot = name.lastIndexOf(".");
+  return dot > 0 ? `${shortId(name.slice(0, dot))}${name.slice(dot)}` : name;
+};
+
+function axes(optical, rows) {
+  return h("table", { class: "table overlay-axes" },
+    h("thead", {}, h("tr", {}, h("td", {}), [0, 1, 2].map((k) => h("th", { scope: "col", class: "number" }, axisName(k, optical))))),
+    h("tbody", {}, rows.map(([name, values]) => h("tr", {}, h("th", { scope: "row" }, name),
+      values.map((value) => h("td", { class: "number" }, value))))));
+}
+
+/** How far off it may be. @param {object} details */
+export function uncertaintyCard(details) {
+  const { uncertainty, transform } = details;
+  if (!uncertainty || !transform) {
+    return card("Uncertainty", h("p", { class: "muted" }, "Told of accepted matches alone."));
+  }
+  const optical = isOptical(transform.parent_frame), sigma = deviations(uncertainty.covariance);
+  const free = uncertainty.degenerate;
+  return card("Uncertainty",
+    h("p", { class: "muted" }, "One standard deviation, along the match’s axes."),
+    axes(optical, [["Shift", sigma.slice(0, 3).map((s) => `± ${metres(s)}`)],
+      ["Turn", sigma.slice(3).map((s) => `± ${fine((s * 180) / Math.PI)}`)]]),
+    free.length
+      ? h("div", {}, h("p", {}, h("span", { class: "badge", dataset: { kind: "warn" } }, `${free.length} free ${free.length === 1 ? "direction" : "directions"}`)),
+        h("ul", { class: "overlay-free" }, free.map((one) => h("li", {}, freedom(one, optical)))))
+      : h("p", { class: "muted" }, "No direction is free: all six are held."));
+}
+
+/**
+ * Another pose that explains the frames.
+ * @param {object} details
+ * @param {Object<string, object>} tallies of `tally`, by pose; the rival's may be missing yet
+ */
+export function rivalCard(details, tallies) {
+  const { rival, transform, validation } = details;
+  if (!rival) return null;
+  const away = transform && apart(rival, transform);
+  const share = (pose, name) => (tallies[pose] ? percent(tallies[pose][name] / Math.max(tallies[pose].total, 1)) : "…");
+  const rows = [["On the other’s surface", "agree"], ["Seen through", "violations"]];
+  return card("Rival pose",
+    h("p", {}, "Another pose explains ", h("strong", {}, percent(validation.ambiguity)), " of both frames, every plane counting alike",
+      away && [", ", h("strong", {}, metres(away.metres)), " and ", h("strong", {}, degrees(away.degrees)), " from the one that was found"], "."),
+    h("table", { class: "table" },
+      h("thead", {}, h("tr", {}, h("td", {}, "Share of all points"), h("th", { scope: "col", class: "number" }, "Found"), h("th", { scope: "col", class: "number" }, "Rival"))),
+      h("tbody", {}, rows.map(([name, key]) => h("tr", {}, h("th", { scope: "row" }, name),
+        h("td", { class: "number" }, share("aligned", key)), h("td", { class: "number" }, share("rival", key)))))));
+}
+
+/** Who was compared. @param {object} answer @param {object} details @param {object | null} frame */
+export function framesCard(answer, details, frame) {
+  const asked = answer.frame;
+  const row = (side, name, href, note) => h("li", { dataset: { side } },
+    h("span", { class: "overlay-swatch", "aria-hidden": "true" }), h("span", {}, h("strong", {}, side === "query" ? "Query" : "Match"), " ",
+      href ? h("a", { class: "mono", href }, name) : name, note && h("span", { class: "overlay-note" }, note)));
+  const told = (one) => [one?.session && `session ${one.session}`, one?.robot && `robot ${one.robot}`].filter(Boolean).join(", ");
+  return card("Frames", h("ul", { class: "overlay-who" },
+    row("query", asked ? shortId(asked.frame_id) : "an upload, not kept in a map",
+      asked && link("maps", asked.map, "frames", asked.frame_id), asked && `map ${asked.map}`),
+    row("match", shortId(details.frame_id), link("maps", details.map, "frames", details.frame_id),
+      [`map ${details.map}`, told(frame)].filter(Boolean).join(", "))));
+}

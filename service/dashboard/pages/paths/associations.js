@@ -1,0 +1,123 @@
+// Associations beside the picture: which one is drawn, what it came to, and how a new one is begun.
+
+import { at, get, send } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { count, metres, degrees } from "../lib/format.js";
+import { sheet, toast } from "../lib/states.js";
+import { EDGES } from "./scene.js";
+
+const OVER = new Set(["succeeded", "failed", "dead", "cancelled"]);
+const POLL_MS = 700;
+
+/** @param {Object<string, any>} edge of the API @returns {string} kind of EDGES */
+export const kindOf = (edge) => (edge.consistent === null ? "unchecked" : edge.consistent ? "consistent" : "inconsistent");
+
+/** Name of an association in a list. @param {Object<string, any>} one */
+export function titleOf(one) {
+  const sessions = one.asked.sessions.map((name, i) => (one.asked.robots?.[i] ? `${name} (${one.asked.robots[i]})` : name));
+  const what = sessions.length === 1 ? `${sessions[0]}, loops` : sessions.join(" – ");
+  return one.state === "succeeded" ? `${what} · ${count(one.result.edges)} edges` : `${what} · ${one.state}`;
+}
+
+/**
+ * @param {{associations: any[], chosen: any | null, edges: {edges: any[], more: boolean, drawn: number} | null,
+ *   maywrite: boolean, onchoose: (id: string | null) => void, onbegin: () => void}} what
+ */
+export function associationsPanel({ associations, chosen, edges, maywrite, onchoose, onbegin }) {
+  const select = h("select", { id: "paths-association", onChange: () => onchoose(select.value || null) },
+    h("option", { value: "" }, associations.length ? "None" : "There are none yet"),
+    associations.map((one) => h("option", { value: one.association_id, selected: one === chosen }, titleOf(one))));
+  select.disabled = associations.length === 0;
+  return h("section", { class: "card paths-section", "aria-labelledby": "paths-associations" },
+    h("h2", { id: "paths-associations" }, "Associations"),
+    h("label", { class: "field" }, h("span", {}, "Edges of"), select),
+    chosen && told(chosen, edges),
+    maywrite ? h("button", { class: "button", type: "button", id: "paths-begin", onClick: onbegin }, "New association…")
+      : h("p", { class: "muted" }, "To begin a new one takes a key that may write."));
+}
+
+function told(one, edges) {
+  if (!OVER.has(one.state)) return progress(one);
+  if (one.state !== "succeeded") return h("p", { class: "paths-note" }, `It ${one.state === "cancelled" ? "was cancelled" : "broke down"}. ${one.error ?? ""}`);
+  const kinds = EDGES.map(({ kind }) => h("li", {},
+    h("span", { class: "paths-line", dataset: { kind } }), h("span", {}, kind),
+    h("span", { class: "number" }, count(one.result[kind]))));
+  const joins = one.result.joins.map((join) => h("li", {},
+    h("span", { class: "badge", dataset: { kind: join.transform === null ? "warn" : join.strength === "strong" ? "good" : "neutral" } }, join.transform === null ? "not joined" : `joined, ${join.strength}`),
+    h("span", {}, h("span", { class: "mono" }, `${join.from_parent} → ${join.to_parent}`),
+      h("span", { class: "muted" }, join.transform === null ? ` ${join.reason}` : ` ${join.support} of ${join.votes} edges agree, within ${metres(join.spread_m)}, ${degrees(join.spread_deg)}`))));
+  return [
+    h("ul", { class: "paths-kinds" }, kinds),
+    edges && edges.drawn < one.result.edges && h("p", { class: "muted" },
+      `${count(edges.drawn)} of ${count(one.result.edges)} are drawn${edges.more ? "" : ": the others have an end that is not in this picture"}.`),
+    joins.length > 0 && h("ul", { class: "paths-joins" }, joins),
+  ];
+}
+
+function progress(one) {
+  const { done = 0, total = null } = one.progress ?? {};
+  const text = one.state === "queued" ? "Waits for a worker" : total ? `${count(done)} of ${count(total)} frames looked up` : "Begins";
+  return h("div", { role: "status", class: "paths-progress" }, h("span", {}, text),
+    h("progress", { max: total ?? 1, value: done, "aria-label": "Progress of the association" }));
+}
+
+/**
+ * Ask which runs to associate, and begin it.
+ * @param {string} map
+ * @param {import("./data.js").Run[]} runs
+ * @param {(begun: Object<string, any>) => void} onbegun
+ */
+export function begin(map, runs, onbegun) {
+  const options = (first) => runs.map((one, i) => h("option", { value: i, selected: i === first }, one.robot === null || one.robot === one.session ? one.session : `${one.session} (${one.robot})`));
+  const from = h("select", { name: "from" }, options(0));
+  const to = h("select", { name: "to" }, h("option", { value: "" }, "itself: close its loops"), options(1));
+  const error = h("p", { class: "field-error", role: "alert" });
+  const button = h("button", { class: "button primary", type: "submit" }, "Begin");
+  const dialog = sheet({
+    title: "New association",
+    children: [
+      h("p", { class: "muted" }, "Each frame of the first run is looked up among those of the second, and what is accepted becomes an edge. Some 0.1 s a frame."),
+      h("label", { class: "field" }, h("span", {}, "Look up the frames of"), from),
+      h("label", { class: "field" }, h("span", {}, "among those of"), to), error,
+    ],
+    buttons: button,
+  });
+  dialog.querySelector("form").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const chosen = [from, to].filter((one) => one.value !== "").map((one) => runs[Number(one.value)]);
+    const json = { sessions: chosen.map((one) => one.session) };
+    if (chosen.every((one) => one.robot !== null)) json.robots = chosen.map((one) => one.robot);
+    button.disabled = true;
+    put(error);
+    try {
+      const { data } = await send("POST", at("maps", map, "associations"), { json });
+      dialog.close();
+      onbegun(data);
+    } catch (problem) {
+      put(error, problem.detail ?? problem.message);
+      button.disabled = false;
+    }
+  });
+}
+
+/**
+ * Follow an association until it is over.
+ * @param {string} map @param {string} id
+ * @param {(now: Object<string, any>) => void} onchange
+ * @param {AbortSignal} signal
+ */
+export async function follow(map, id, onchange, signal) {
+  for (;;) {
+    const now = await get(at("maps", map, "associations", id), { signal });
+    onchange(now);
+    if (OVER.has(now.state)) {
+      if (now.state !== "succeeded") toast(`The association ${now.state === "cancelled" ? "was cancelled" : "broke down"}. ${now.error ?? ""}`, { kind: "bad" });
+      return;
+    }
+    await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+    if (signal.aborted) return;
+  }
+}
+
+/** Whether it goes on. @param {Object<string, any>} one */
+export const goesOn = (one) => !OVER.has(one.state);

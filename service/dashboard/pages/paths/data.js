@@ -1,0 +1,98 @@
+// What the API knows of the paths of a map, a part of it at a time: never a full list of frames.
+
+import { at, get } from "../lib/api.js";
+import { ofQuaternion } from "../viewer/matrix.js";
+
+/** Runs that are told of at most, and drawn in one picture; poses of all of them together. */
+export const MOST_RUNS = 1000, MOST_DRAWN = 40;
+const POSES = 6000, MOST_POSES = 2000;
+/** Edges that are drawn, at most. */
+export const MOST_EDGES = 2000;
+
+/**
+ * @typedef {{session: string, robot: string | null, parent: string, number: number, frames: number}} Run
+ *   frames: of the session, with those that have no pose
+ * @typedef {Run & {ids: string[], times: number[], poses: number[][], posed: number, leftOut: number,
+ *   camera: Object<string, number> | null, isCloud: boolean, byTime: boolean}} Path
+ *   poses: T_parent_sensor, 16 column-major
+ */
+
+/**
+ * The runs of a map that have poses, one for each frame that these lead to; and why others are not
+ * among them.
+ * @param {Object<string, any>[]} sessions as the API lists them
+ * @returns {{runs: Run[], without: {name: string, frames: number, why: string}[]}}
+ */
+export function runsOf(sessions) {
+  const runs = [], without = [];
+  const robots = new Map();
+  for (const one of sessions) robots.set(one.session, (robots.get(one.session) ?? 0) + 1);
+  for (const one of sessions) {
+    const frames = Object.values(one.frames).reduce((a, b) => a + b, 0);
+    const name = one.session ?? (one.robot === null ? "Frames of no session" : `${one.robot}, no session`);
+    if (one.with_pose === 0) {
+      without.push({ name, frames, why: "no poses" });
+    } else if (one.session === null) {
+      without.push({ name, frames, why: "poses, but no session: a path is that of one" });
+    } else if (one.robot === null && robots.get(one.session) > 1) {
+      without.push({ name, frames, why: "no robot, and robots have runs of the same name" });
+    } else {
+      for (const parent of one.parent_frames) {
+        runs.push({
+          session: one.session, robot: one.robot, parent, frames, number: runs.length,
+          timed: one.first_captured_at !== null, last: one.last_captured_at,
+        });
+      }
+    }
+  }
+  return { runs, without };
+}
+
+/** All sessions, up to MOST_RUNS. @returns {Promise<{items: Object<string, any>[], more: boolean}>} */
+export async function sessionsOf(map, signal) {
+  const page = await get(at("maps", map, "sessions"), { params: { limit: MOST_RUNS }, signal });
+  return { items: page.items, more: page.next_cursor !== null };
+}
+
+/**
+ * The poses of a run, thinned to a share of what is drawn in all.
+ * @param {string} map @param {Run} run
+ * @param {number} share of so many runs
+ * @returns {Promise<Path>}
+ */
+export async function pathOf(map, run, share, signal) {
+  const { session, robot, parent } = run;
+  const most = Math.max(Math.min(Math.floor(POSES / share), MOST_POSES), 50);
+  const params = { session, robot, parent_frame: parent, most, clock: run.timed ? "captured" : "received" };
+  const sample = { session, robot: robot ?? [], parent_frame: parent, has_pose: true, limit: 1 };
+  const [told, frames] = await Promise.all([
+    get(at("maps", map, "trajectory"), { params, signal }),
+    get(at("maps", map, "frames"), { params: sample, signal }),
+  ]);
+  const first = frames.items[0];
+  return {
+    ...run, ids: told.frame_ids, times: told.poses.map((row) => row[0]), posed: told.posed,
+    poses: told.poses.map(([, x, y, z, ...q]) => ofQuaternion(q, [x, y, z])),
+    leftOut: told.left_out, byTime: run.timed,
+    camera: first?.intrinsics ?? null, isCloud: first?.kind === "cloud",
+  };
+}
+
+/** Associations of a map, the newest first. */
+export async function associationsOf(map, signal) {
+  const page = await get(at("maps", map, "associations"), { params: { limit: 100 }, signal });
+  return page.items;
+}
+
+/** Edges of an association in the order in which they were found, up to MOST_EDGES. */
+export async function edgesOf(map, association, signal) {
+  const found = [];
+  let cursor = null;
+  do {
+    const params = { limit: 1000, cursor };
+    const page = await get(at("maps", map, "associations", association, "edges"), { params, signal });
+    found.push(...page.items);
+    cursor = page.next_cursor;
+  } while (cursor !== null && found.length < MOST_EDGES);
+  return { edges: found, more: cursor !== null };
+}

@@ -1,0 +1,187 @@
+// What is drawn, as segments: paths, frustums, edges, the grid, an ellipsoid. Numbers in, numbers
+// out; all of them about an origin near the paths, since those that are drawn have 32 bits.
+
+import { transformed } from "../viewer/matrix.js";
+
+/** Half an axis of the ellipsoid that holds 95 % of a normal error in space, in deviations. */
+export const SIGMAS = Math.sqrt(7.8147);
+
+/** @param {number[]} m a pose, 16 column-major @returns {number[]} where it is */
+export const placeOf = (m) => [m[12], m[13], m[14]];
+
+/** A segment from each place to the next. @param {number[][]} places @returns {Float32Array} */
+export function polyline(places) {
+  const out = new Float32Array(6 * Math.max(places.length - 1, 0));
+  for (let i = 1; i < places.length; i += 1) {
+    out.set(places[i - 1], 6 * (i - 1));
+    out.set(places[i], 6 * (i - 1) + 3);
+  }
+  return out;
+}
+
+/** One shape at many poses. @param {Float32Array} shape segments @param {number[][]} poses */
+export function copies(shape, poses) {
+  const out = new Float32Array(shape.length * poses.length);
+  poses.forEach((pose, i) => {
+    for (let k = 0; k < shape.length; k += 3) {
+      const [x, y, z] = transformed(pose, [shape[k], shape[k + 1], shape[k + 2]]);
+      out.set([x, y, z], i * shape.length + k);
+    }
+  });
+  return out;
+}
+
+/**
+ * Segments as dashes, so that what they stand for does not show by colour alone.
+ * @param {[number[], number[]][]} pairs ends
+ * @param {number} dash @param {number} gap metres
+ * @param {number} [most] dashes of one segment: a long one has longer dashes
+ */
+export function dashes(pairs, dash, gap, most = 40) {
+  const out = [];
+  for (const [a, b] of pairs) {
+    const length = Math.hypot(b[0] - a[0], b[1] - a[1], b[2] - a[2]);
+    const scale = Math.max(length / ((dash + gap) * most), 1);
+    const on = dash * scale, period = (dash + gap) * scale;
+    const at = (s) => a.map((x, k) => x + (b[k] - x) * Math.min(s / length, 1));
+    for (let s = 0; s < length; s += period) out.push(...at(s), ...at(s + on));
+  }
+  return new Float32Array(out);
+}
+
+/** Every so-manieth, with the first and the last. @param {number} count @param {number} most */
+export function evenly(count, most) {
+  if (count <= most) return Array.from({ length: count }, (_, i) => i);
+  if (most < 2) return count ? [0] : [];
+  return Array.from({ length: most }, (_, i) => Math.round((i * (count - 1)) / (most - 1)));
+}
+
+/**
+ * Places along a way that lie so far apart that what is drawn at them does not hide each other; the
+ * first and the last are among them.
+ * @param {number[][]} places @param {number} apart metres @param {number} most
+ * @returns {number[]} their numbers
+ */
+export function spaced(places, apart, most) {
+  const found = [];
+  places.forEach((p, i) => {
+    const before = places[found.at(-1)];
+    if (!before || Math.hypot(p[0] - before[0], p[1] - before[1], p[2] - before[2]) >= apart) found.push(i);
+  });
+  if (places.length && found.at(-1) !== places.length - 1) found.push(places.length - 1);
+  return evenly(found.length, most).map((i) => found[i]);
+}
+
+/** The least of 1, 2, 5, 10, 20... times a power of ten that is not below. @param {number} x */
+export function nice(x) {
+  const power = 10 ** Math.floor(Math.log10(x));
+  return power * [1, 2, 5, 10].find((step) => step * power >= x * (1 - 1e-9));
+}
+
+/** The box about places; null about none. @param {number[][]} places */
+export function boxAbout(places) {
+  if (!places.length) return null;
+  const low = [...places[0]], high = [...places[0]];
+  for (const p of places) {
+    for (let k = 0; k < 3; k += 1) {
+      low[k] = Math.min(low[k], p[k]);
+      high[k] = Math.max(high[k], p[k]);
+    }
+  }
+  return { low, high };
+}
+
+/** Which axis is up, and its sign. */
+export const AXES = { z: [2, 1], y: [1, 1], "-y": [1, -1] };
+
+/**
+ * A grid on the ground, a square about what stands on it.
+ * @param {{low: number[], high: number[]}} box of what stands on it
+ * @param {"z" | "y" | "-y"} up
+ * @param {number} height of the ground along the axis that is up (its sign not counted)
+ * @param {number[]} origin what was taken off: lines are at whole steps of the true coordinates
+ * @returns {{positions: Float32Array, step: number}} step: metres
+ */
+export function grid(box, up, height, origin) {
+  const axis = AXES[up][0], level = [0, 1, 2].filter((k) => k !== axis);
+  const size = Math.max(...level.map((k) => box.high[k] - box.low[k]), 0.2);
+  const step = nice(size / 10), out = [];
+  const middle = level.map((k) => (box.low[k] + box.high[k]) / 2 + origin[k]);
+  const low = middle.map((x) => Math.floor((x - 0.55 * size) / step - 1) * step);
+  const high = middle.map((x) => Math.ceil((x + 0.55 * size) / step + 1) * step);
+  const point = (u, v) => {
+    const p = [0, 0, 0];
+    p[level[0]] = u - origin[level[0]];
+    p[level[1]] = v - origin[level[1]];
+    p[axis] = height - origin[axis];
+    return p;
+  };
+  for (let u = 0; u <= Math.round((high[0] - low[0]) / step); u += 1) {
+    out.push(...point(low[0] + u * step, low[1]), ...point(low[0] + u * step, high[1]));
+  }
+  for (let v = 0; v <= Math.round((high[1] - low[1]) / step); v += 1) {
+    out.push(...point(low[0], low[1] + v * step), ...point(high[0], low[1] + v * step));
+  }
+  return { positions: new Float32Array(out), step };
+}
+
+/**
+ * What is up, as cameras are mostly held upright: the axis that theirs is nearest to on average.
+ * @param {{matrix: number[], isCloud: boolean}[]} poses of the sensors in the frame of the picture
+ * @returns {"z" | "y" | "-y"}
+ */
+export function upright(poses) {
+  let y = 0, z = 0;
+  for (const { matrix, isCloud } of poses) {
+    y += isCloud ? matrix[9] : -matrix[5];
+    z += isCloud ? matrix[10] : -matrix[6];
+  }
+  if (z >= Math.abs(y)) return "z";
+  return y > 0 ? "y" : "-y";
+}
+
+/**
+ * Axes of a normal error: eigenvalues and eigenvectors of a symmetric matrix, by Jacobi's rotations.
+ * @param {number[][]} covariance 3 x 3
+ * @returns {{deviation: number, axis: number[]}[]} the longest first
+ */
+export function axesOf(covariance) {
+  const a = covariance.map((row) => [...row]);
+  const v = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+  for (let sweep = 0; sweep < 12; sweep += 1) {
+    for (const [p, q] of [[0, 1], [0, 2], [1, 2]]) {
+      if (Math.abs(a[p][q]) < 1e-300) continue;
+      const angle = 0.5 * Math.atan2(2 * a[p][q], a[q][q] - a[p][p]);
+      const [c, s] = [Math.cos(angle), Math.sin(angle)];
+      const turn = (m) => {
+        for (const row of m) [row[p], row[q]] = [c * row[p] - s * row[q], s * row[p] + c * row[q]];
+      };
+      turn(a);
+      for (let k = 0; k < 3; k += 1) {
+        [a[p][k], a[q][k]] = [c * a[p][k] - s * a[q][k], s * a[p][k] + c * a[q][k]];
+      }
+      turn(v);
+    }
+  }
+  return [0, 1, 2]
+    .map((k) => ({ deviation: Math.sqrt(Math.max(a[k][k], 0)), axis: v.map((row) => row[k]) }))
+    .sort((one, other) => other.deviation - one.deviation);
+}
+
+/**
+ * The three great circles of an ellipsoid about the origin.
+ * @param {{deviation: number, axis: number[]}[]} axes
+ * @param {number} sigmas half an axis, in deviations
+ */
+export function ellipsoid(axes, sigmas = SIGMAS, parts = 48) {
+  const out = [];
+  for (const [i, j] of [[0, 1], [0, 2], [1, 2]]) {
+    const at = (k) => {
+      const t = (2 * Math.PI * k) / parts;
+      const [c, s] = [Math.cos(t) * axes[i].deviation * sigmas, Math.sin(t) * axes[j].deviation * sigmas];
+      return axes[i].axis.map((x, n) => c * x + s * axes[j].axis[n]);
+    };
+    for (let k = 0; k < parts; k += 1) out.push(...at(k), ...at(k + 1));
+  }
+  return new Float32Array(out);
+}

@@ -1,0 +1,65 @@
+// An answer by its id, as a robot or a colleague tells it: kept for about an hour.
+import { at, get } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { shortId, time } from "../lib/format.js";
+import { link } from "../lib/router.js";
+import { empty, soon } from "../lib/states.js";
+import { askAgain } from "./asking.js";
+import { pickFrame } from "./picker.js";
+import { recall } from "./recent.js";
+import { again, showAnswer } from "./result.js";
+import { thumbs } from "./thumbs.js";
+
+export const styles = ["query/query.css"];
+
+/** @param {HTMLElement} root @param {Object<string, any>} context see main.js */
+export async function render(root, { params, signal, title, actions }) {
+  title(`Answer ${shortId(params.query)}`);
+  const come = soon(root, "Fetching the answer");
+  let answer;
+  let question;
+  try {
+    [answer, question] = await Promise.all([
+      get(at("queries", params.query), { signal }), get(`${at("queries", params.query)}/question`, { signal })]);
+  } catch (error) {
+    come();
+    if (error.status !== 404) throw error;
+    put(root, notKept(params.query));
+    return;
+  }
+  come();
+  const other = again(answer, "Ask with other options");
+  other.className = "button primary";
+  actions(other);
+  const pictures = thumbs(signal);
+  const body = h("div", { class: "query-answer" });
+  put(root, h("div", { class: "query-page is-answer" }, asked(question), body));
+  await showAnswer(body, answer, {
+    signal, pictures, isOwnPage: true,
+    ask: async (frame) => (await askAgain(answer.query_id, { explain_frame: frame, explain: null, keep: false }, signal)).explained_frame,
+    pick: answer.maps.length === 1 ? () => pickFrame(answer.maps[0], { pictures, signal, title: "Why not this frame?" }) : undefined,
+  });
+}
+
+function asked(question) {
+  const { options } = question;
+  const said = Object.entries(options).filter(([name]) => !["explain", "explain_frame", "keep"].includes(name));
+  const who = [question.robot && `robot ${question.robot}`, question.session && `session ${question.session}`].filter(Boolean);
+  return h("p", { class: "muted query-note" },
+    "Asked ", time(question.asked_at), " of ", question.maps.map((name, i) => [i > 0 && ", ", h("a", { href: link("maps", name) }, name)]),
+    question.frame ? [" with frame ", h("a", { class: "mono", href: link("maps", question.frame.map, "frames", question.frame.frame_id) }, shortId(question.frame.frame_id))]
+      : ` with an uploaded ${question.kind === "cloud" ? "cloud" : "depth image"}`,
+    who.length > 0 && ` of ${who.join(", ")}`, ". ",
+    said.length ? ["Options: ", h("span", { class: "mono" }, said.map(([name, value]) => `${name} ${typeof value === "object" ? JSON.stringify(value) : value}`).join(", ")), "."]
+      : "All options as by default.");
+}
+
+function notKept(id) {
+  const address = recall(id);
+  return empty({
+    title: "This answer is no longer kept",
+    text: ["Answers are kept for about an hour, and while there is room; or there never was one of this id, or it is not for your key.",
+      !address && " Ask again with the frame, from the page of its map."],
+    actions: [address && h("a", { class: "button primary", href: address }, "Ask again as before"), h("a", { class: "button", href: "#/" }, "All maps")],
+  });
+}

@@ -1,0 +1,140 @@
+// An answer as it is shown: the verdict, the rows, the funnel, the heat map, "why not?".
+import { at, get } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { degrees, metres, percent, shortId } from "../lib/format.js";
+import { heatmap } from "../lib/heatmap.js";
+import { link } from "../lib/router.js";
+import { failed, loading } from "../lib/states.js";
+import { choice } from "./choice.js";
+import { funnel } from "./funnel.js";
+import { rows } from "./rows.js";
+import { whyNot } from "./whynot.js";
+import { deviation, differences, keyOf, number, verdict } from "./words.js";
+
+/** Frames of the ranking that are compared with each other at first, and at most. */
+const FIRST = 50;
+const MOST = 200;
+const SHAPES = { found: "✓", ambiguous: "≈", not_found: "✕", unvalidated: "?" };
+
+/**
+ * Show an answer in an element.
+ * @param {Element} root
+ * @param {Object<string, any>} answer
+ * @param {{signal: AbortSignal, turn?: AbortSignal, isOwnPage?: boolean, pictures: any, ask: (frame: string) => Promise<any>, chosen?: string | null,
+ *   before?: Object<string, any> | null, change?: (said: any) => void, pick?: () => Promise<string | null>}} how
+ *   turn: aborted when a later answer is to be shown in its place; ask: again, explaining a frame; before: the answer that this one replaces; chosen: the frame that was
+ *   marked in it; change, pick: see `whyNot`
+ * @returns {Promise<{choice: any}>}
+ */
+export async function showAnswer(root, answer, { signal, turn = signal, isOwnPage = false, pictures, ask, chosen = null, before = null, change, pick }) {
+  const looked = choice();
+  const alike = await similarities(answer, FIRST, turn);
+  const ranked = answer.explanations === null ? fromSimilarities(answer, alike) : { ranking: answer.explanations, told: true };
+  const steps = funnel(answer);
+  const map = h("section", { class: "card query-heat", "aria-label": "Similarity of the ranking" });
+  put(root, lead(answer, before, isOwnPage),
+    answer.explanations === null && h("p", { class: "muted query-note" },
+      "It was not asked with explanations: distances of what was not selected, and why, are told when it is asked again. ",
+      again(answer)),
+    rows(answer, ranked, { pictures, choice: looked, before }),
+    whyNot(answer, { ask, choice: looked, funnel: steps, change, pick }),
+    h("div", { class: "query-below" }, steps, map));
+  heat(map, answer, alike, looked, signal);
+  if (chosen !== null) looked.choose(chosen);
+  return { choice: looked };
+}
+
+/** To where it is asked again with other options. */
+export function again(answer, text = "Ask it again") {
+  return h("a", { href: link("maps", answer.maps[0], "query", { query: answer.query_id }) }, text);
+}
+
+function lead(answer, before, isOwnPage) {
+  const changed = before && differences(before, answer);
+  const { kind, title, text, details } = verdict(answer);
+  const pose = answer.location;
+  return h("section", { class: "card query-verdict", dataset: { kind, status: answer.status }, "aria-label": "Verdict" },
+    h("span", { class: "query-verdict-shape", "aria-hidden": "true" }, SHAPES[answer.status]),
+    h("div", { class: "query-verdict-text" },
+      h("p", {}, h("strong", {}, `${title}. `), text),
+      details.length > 0 && h("ul", { class: "query-verdict-details" }, details.map((one) => h("li", {}, one))),
+      changed !== null && h("p", { class: "query-changed" }, h("span", { class: "muted" }, "Against the answer before: "),
+        changed.length ? changed.join("; ") : "nothing changed"),
+      pose && poseOf(pose, answer.kind)),
+    h("div", { class: "query-verdict-links" },
+      pose && h("a", { class: "button", href: link("maps", pose.map ?? answer.maps[0], "paths", { query: answer.query_id }) }, "On the map"),
+      !isOwnPage && h("a", { class: "button", href: link("queries", answer.query_id), title: "Can be shared for an hour" }, `Answer ${shortId(answer.query_id)}`)));
+}
+
+function poseOf(location, kind) {
+  const { translation: t, rotation: q, matrix, parent_frame: parent } = location.pose;
+  const ahead = kind === "depth" && matrix.slice(0, 3).map((row) => number(row[2])).join(", ");
+  const sure = deviation(location.uncertainty?.covariance);
+  const free = location.uncertainty?.degenerate ?? [];
+  return h("details", { class: "query-pose" }, h("summary", {}, "The pose in full"),
+    h("dl", { class: "query-facts" }, [
+      ["Translation, m", [t.x, t.y, t.z].map((x) => x.toFixed(4)).join(", ")],
+      ["Rotation x, y, z, w", [q.x, q.y, q.z, q.w].map((x) => x.toFixed(5)).join(", ")],
+      ahead && ["Looks along", ahead],
+      ["In the frame", parent], ["Of", location.pose.child_frame],
+      sure && ["One standard deviation", `${metres(sure.m)}, ${degrees(sure.deg)} (worst axis)`],
+      free.length > 0 && ["Hardly held", `${free.length} ${free.length === 1 ? "direction" : "directions"}`],
+    ].filter(Boolean).map(([term, value]) => h("div", {}, h("dt", {}, term), h("dd", { class: "number" }, value)))));
+}
+
+async function similarities(answer, limit, signal) {
+  if (answer.counts.ranked === 0) return null;
+  return get(`${at("queries", answer.query_id)}/similarities`, { params: { limit }, signal });
+}
+
+// without explanations the ranking is known by how alike each frame is to the query
+function fromSimilarities(answer, alike) {
+  const known = new Map(answer.matches.map((one) => [keyOf(one), one]));
+  const frames = (alike?.frames ?? []).map((one, i) => ({ ...one, rank: i + 1, similarity: alike.similarity[0][i + 1], ...known.get(keyOf(one)) }));
+  return { ranking: frames, told: frames.every((one) => one.distance !== undefined) };
+}
+
+function heat(root, answer, alike, looked, signal) {
+  if (alike === null) { root.hidden = true; return; }
+  const isSelected = new Set(answer.matches.filter((one) => one.selected).map(keyOf));
+  const limits = [10, 20, FIRST, 100, MOST].filter((n, i, all) => n < answer.counts.ranked || all[i - 1] < answer.counts.ranked || i === 0);
+  const field = h("select", { id: "heat-limit", onchange: async () => {
+    put(body, loading("Comparing"));
+    try { draw(await similarities(answer, Number(field.value), signal)); } catch (error) {
+      if (error.name !== "AbortError") put(body, failed(error, () => field.dispatchEvent(new Event("change"))));
+    }
+  } }, limits.map((n) => h("option", { value: n, selected: n === FIRST }, n >= answer.counts.ranked ? `all ${answer.counts.ranked}` : `first ${n}`)));
+  if (![...field.options].some((one) => one.selected && Number(one.value) === FIRST)) field.value = String(limits.at(-1));
+  const body = h("div");
+  let shown = null;
+  let keys = [];
+  looked.hear((key) => shown?.point(key === null || !keys.includes(key) ? null : keys.indexOf(key) + 1));
+
+  function draw({ frames, similarity }) {
+    keys = frames.map(keyOf);
+    const marked = new Set(keys.flatMap((key, i) => (isSelected.has(key) ? [i + 1] : [])));
+    shown = heatmap({
+      values: similarity, signal, marked,
+      names: ["the query", ...frames.map((one, i) => `${i + 1}: frame ${shortId(one.frame_id)}${marked.has(i + 1) ? ", selected" : ""}`)],
+      ticks: ["Q", ...frames.map((_, i) => String(i + 1))],
+      label: gist(similarity), format: percent, size: Math.max(240, Math.min(560, body.clientWidth)),
+      onmove: (cell) => looked.point(cell === null ? null : keys[Math.max(...cell) - 1] ?? null),
+    });
+    put(body, shown);
+  }
+
+  put(root, h("div", { class: "toolbar query-heat-head" }, h("h3", {}, "How alike they are, each to each"),
+    h("label", { for: "heat-limit" }, h("span", { class: "muted" }, "Of the ranking "), field)),
+  h("p", { class: "muted" }, "The query first, then its ranking, the nearest first. ",
+    isSelected.size > 0 ? "Bars beside the numbers mark what the diverse selection took: it avoids bright cells." : ""), body);
+  draw(alike);
+}
+
+function gist(similarity) {
+  const n = similarity.length;
+  let pair = null;
+  for (let i = 1; i < n; i += 1) for (let j = 1; j < i; j += 1) if (pair === null || similarity[i][j] > similarity[pair[0]][pair[1]]) pair = [j, i];
+  const [, ...own] = similarity[0];
+  const alike = pair === null ? "" : ` The two most alike are ${pair[0]} and ${pair[1]}, ${percent(similarity[pair[0]][pair[1]])}.`;
+  return `Similarity of the query and ${own.length} frames of its ranking: to the query from ${percent(Math.max(...own))} down to ${percent(Math.min(...own))}.${alike}`;
+}

@@ -1,0 +1,108 @@
+// "Why not this frame?": asks again with `explain_frame`, and says where the frame was lost.
+import { h, put } from "../lib/dom.js";
+import { count, percent, shortId } from "../lib/format.js";
+import { link } from "../lib/router.js";
+import { failed, loading } from "../lib/states.js";
+import { figures } from "./words.js";
+
+/** What each place of loss means, and what would bring the frame further. */
+const LOST = {
+  state: ["It is not searched at all", "Only indexed frames can be found.", null],
+  query: ["It is the query itself", "A frame does not find itself.", null],
+  filter: ["Lost at the filter", "Only frames that pass it are searched.", () => [{ session: null, not_within_s: null }, "Ask without the filter"]],
+  shortlist: ["Lost at the index", "Its shortlist did not propose the frame.", () => [{ exact: true }, "Compare every frame"]],
+  ranking: ["Lost in the ranking", "Others are nearer by their signatures.", null],
+  selection: ["Lost in the selection", "Others of the ranking were taken as candidates.",
+    (answer) => [{ candidates: Math.min(200, Math.max(2 * answer.counts.selected, answer.counts.ranked)) }, "Ask with all of the ranking as candidates"]],
+  turn: ["It was not its turn", "Enough were accepted before it.", (answer) => [{ k: Math.min(50, answer.counts.accepted + 5) }, "Ask for more matches"]],
+  deadline: ["Lost to the deadline", "No time was left for it.", () => [{ deadline_ms: null }, "Ask without a deadline"]],
+  validation: ["Lost at validation", "Laid on the query, it does not stand.", null],
+};
+
+/**
+ * @param {Object<string, any>} answer
+ * @param {{ask: (frame: string) => Promise<any>, choice: any, funnel: any, change?: (said: any) => void,
+ *   pick?: () => Promise<string | null>}} how ask: again, with that frame explained; change: other options,
+ *   where there are controls; pick: lets a frame of the map be picked
+ * @returns {HTMLElement}
+ */
+export function whyNot(answer, { ask, choice, funnel, change, pick }) {
+  const typed = h("input", { type: "text", id: "why-frame", class: "mono", autocomplete: "off", spellcheck: "false", required: true, list: "why-known" });
+  const result = h("div", { class: "query-why-result", role: "status" });
+  const known = [...(answer.explanations ?? answer.matches)].map((one) => one.frame_id);
+  const marked = h("button", { type: "button", class: "button", hidden: true, onclick: () => {
+    typed.value = choice.chosen.slice(choice.chosen.indexOf("/") + 1);
+    run();
+  } });
+  choice.hear((_, chosen) => {
+    marked.hidden = chosen === null;
+    put(marked, chosen && `Why not ${shortId(chosen.slice(chosen.indexOf("/") + 1))}, the marked one?`);
+  });
+  let turn = 0; // a later question is the one to be answered
+  const tell = (told) => {
+    funnel.lose(told.lost_at);
+    put(result, explained(told, answer, change));
+  };
+  if (answer.explained_frame !== null) {
+    typed.value = answer.explained_frame.frame_id;
+    tell(answer.explained_frame);
+  }
+
+  async function run() {
+    const id = typed.value.trim();
+    if (!id) return;
+    const own = ++turn;
+    put(result, loading("Asking again"));
+    try {
+      const told = await ask(id);
+      if (own !== turn) return;
+      tell(told);
+    } catch (error) {
+      if (own !== turn || error.name === "AbortError") return;
+      if (error.status === 401) throw error;
+      funnel.lose(undefined);
+      put(result, failed(error, run));
+    }
+  }
+
+  return h("section", { class: "card query-why", "aria-label": "Why not this frame?" },
+    h("h3", {}, "Why not this frame?"),
+    h("p", { class: "muted" }, "Any frame of the map, whether it was ever a candidate or not. It is compared exactly and laid on the query for this."),
+    h("form", { class: "toolbar", onsubmit: (event) => { event.preventDefault(); run(); } },
+      h("label", { class: "field query-why-field", for: "why-frame" }, h("span", {}, "Frame id"), typed),
+      h("datalist", { id: "why-known" }, known.map((value) => h("option", { value }))),
+      h("button", { class: "button primary" }, "Why not?"),
+      pick && h("button", { type: "button", class: "button", onclick: async () => {
+        const id = await pick();
+        if (id !== null) { typed.value = id; run(); }
+      } }, "Pick a frame…"),
+      marked),
+    result);
+}
+
+function explained(told, answer, change) {
+  const [title, text, remedy] = told.lost_at === null ? ["It is a match", "It was not lost anywhere.", null] : LOST[told.lost_at] ?? [told.lost_at, "", null];
+  const kind = told.lost_at === null ? "good" : "bad";
+  const [said, offer] = remedy?.(answer) ?? [];
+  const yes = (value) => (value === null ? "not looked at" : value ? "yes" : "no");
+  const facts = [
+    ["State", told.state], ["Passes the filter", yes(told.passes_filter)],
+    ["Exact rank", told.rank === null ? "–" : `${count(told.rank)} of ${count(told.of)}`],
+    ["Distance", count(told.distance)], ["Similarity", percent(told.similarity)],
+    ["Proposed by the index", yes(told.shortlisted)], ["Ranked", yes(told.ranked)], ["A candidate", yes(told.selected)],
+    ...(told.validation ? [["Laid on the query", told.validation.status], ...figures(told.validation)] : []),
+  ];
+  return [
+    h("div", { class: "query-why-head", dataset: { lost: told.lost_at ?? "none" } },
+      h("span", { class: "badge", dataset: { kind } }, title),
+      h("a", { class: "mono", href: link("maps", told.map, "frames", told.frame_id), title: told.frame_id }, shortId(told.frame_id)),
+      h("span", { class: "muted" }, `of map ${told.map}`)),
+    h("p", {}, `${text} ${sentence(told.reason)}`),
+    change && offer && h("button", { type: "button", class: "button", onclick: () => change(said) }, offer),
+    h("dl", { class: "query-facts" }, facts.map(([term, value]) => h("div", {}, h("dt", {}, term), h("dd", { class: "number" }, value)))),
+  ];
+}
+
+function sentence(text) {
+  return `${text.charAt(0).toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
+}

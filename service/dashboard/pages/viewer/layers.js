@@ -1,0 +1,241 @@
+// What is drawn: each layer keeps its arrays on this side too, so that it can be made again when
+// the context is lost.
+
+import { BESIDE, STEPS, VIOLATES, colourOf, manyColours } from "./colours.js";
+import { identity, transformed } from "./matrix.js";
+import { boxOf, someOf } from "./points.js";
+
+const MODES = { tint: 0, normal: 1, patch: 2, residual: 3, height: 4 };
+const unit = (bytes) => bytes.map((x) => x / 255);
+
+/** The box about a box that has been moved. */
+function movedBox({ low, high }, matrix) {
+  const out = { low: [Infinity, Infinity, Infinity], high: [-Infinity, -Infinity, -Infinity] };
+  for (let corner = 0; corner < 8; corner += 1) {
+    const p = transformed(matrix, low.map((x, k) => ((corner >> k) & 1 ? high[k] : x)));
+    for (let k = 0; k < 3; k += 1) {
+      out.low[k] = Math.min(out.low[k], p[k]);
+      out.high[k] = Math.max(out.high[k], p[k]);
+    }
+  }
+  return out;
+}
+
+class Layer {
+  constructor(told) {
+    this.visible = true;
+    this.matrix = identity();
+    this.set(told);
+  }
+
+  /** @param {object} told what changes; what is undefined stays */
+  set(told) {
+    for (const [name, value] of Object.entries(told)) if (value !== undefined) this[name] = value;
+  }
+
+  /** The box in the world, null where there is nothing. */
+  get box() {
+    this.own ??= this.bounds();
+    return this.own && movedBox(this.own, this.matrix);
+  }
+
+  /** Points of the world that show where it is. */
+  get outline() {
+    if (!this.box) return [];
+    const { low, high } = this.own, more = low.map((x, k) => (high[k] - x) / 6);
+    const near = (x, k) => Math.min(Math.max(x, low[k] - more[k]), high[k] + more[k]);
+    this.some ??= this.samples().map((p) => p.map(near)); // but for strays
+    return this.some.map((p) => transformed(this.matrix, p).slice(0, 3));
+  }
+
+  /** Buffers of this context; made once, and again after it was lost. */
+  free(gl) {
+    if (gl && this.made) for (const one of this.made.buffers) gl.deleteBuffer(one);
+    if (gl && this.made?.array) gl.deleteVertexArray(this.made.array);
+    if (gl && this.made?.texture) gl.deleteTexture(this.made.texture);
+    this.made = null;
+  }
+
+  buffer(gl, data) {
+    const made = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, made);
+    gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
+    this.made.buffers.push(made);
+  }
+
+  begin(gl) {
+    this.made = { buffers: [], array: gl.createVertexArray() };
+    gl.bindVertexArray(this.made.array);
+  }
+}
+
+/** Points as the API sends them. */
+export class CloudLayer extends Layer {
+  kind = "points";
+
+  set(told) {
+    const isOther = told.points !== undefined && told.points !== this.points;
+    if (isOther) this.own = this.some = undefined;
+    super.set(told);
+    this.fresh = !isOther && told.patchColours === undefined && this.fresh;
+  }
+
+  bounds() {
+    return this.points?.count ? boxOf(this.points) : null;
+  }
+
+  samples() {
+    return someOf(this.points);
+  }
+
+  upload(gl) {
+    const { data, offset, stride, count } = this.points;
+    this.begin(gl);
+    this.buffer(gl, new Uint8Array(data, offset, count * stride));
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribPointer(0, 3, gl.UNSIGNED_SHORT, true, stride, 0);
+    gl.enableVertexAttribArray(1);
+    gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_SHORT, stride, 6);
+    gl.enableVertexAttribArray(2);
+    gl.vertexAttribPointer(2, 3, gl.BYTE, true, stride, 8);
+    gl.enableVertexAttribArray(3);
+    gl.vertexAttribIPointer(3, 1, gl.UNSIGNED_BYTE, stride, 11);
+    this.made.texture = this.palette(gl);
+  }
+
+  palette(gl) {
+    const colours = this.patchColours ?? manyColours(4096);
+    const rows = Math.max(1, Math.ceil(colours.length / 3 / 256));
+    const texels = new Uint8Array(256 * rows * 4).fill(150);
+    for (let i = 0; i < colours.length / 3; i += 1) {
+      texels.set(colours.subarray(3 * i, 3 * i + 3), 4 * i);
+    }
+    const texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 256, rows, 0, gl.RGBA, gl.UNSIGNED_BYTE, texels);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+      gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+    }
+    return texture;
+  }
+
+  draw(gl, { at }, view) {
+    const { points } = this;
+    if (!points?.count) return;
+    if (!this.made || !this.fresh) {
+      this.free(gl);
+      this.upload(gl);
+      this.fresh = true;
+    }
+    const mode = MODES[this.colour ?? "tint"] ?? 0;
+    gl.uniformMatrix4fv(at.model, false, this.matrix);
+    gl.uniform3fv(at.origin, points.origin);
+    gl.uniform3fv(at.extent, points.extent);
+    gl.uniform1i(at.mode, mode);
+    gl.uniform3fv(at.tint, unit(colourOf(this.tint ?? "match")));
+    gl.uniform1f(at.shade, points.hasNormals ? this.shade ?? 0.45 : 0);
+    gl.uniform3fv(at.outside, unit(BESIDE));
+    gl.uniform3fv(at.violation, unit(VIOLATES));
+    gl.uniform3fv(at.steps, unit(STEPS.flat()));
+    gl.uniform1f(at.size, (this.size ?? this.spacing()) * view.pixelsAtOneMetre);
+    gl.uniform2fv(at.pixels, [1.5 * view.density, 14 * view.density]);
+    gl.uniform2fv(at.heights, view.heights);
+    gl.bindTexture(gl.TEXTURE_2D, this.made.texture);
+    gl.bindVertexArray(this.made.array);
+    gl.drawArrays(gl.POINTS, 0, points.count);
+  }
+
+  /** Metres from point to point, about: as if they lay on the walls of their box. */
+  spacing() {
+    this.own ??= this.bounds();
+    const [a, b, c] = this.own.high.map((x, k) => x - this.own.low[k]);
+    return Math.max(Math.sqrt((a * b + b * c + a * c) / this.points.count), 1e-3);
+  }
+}
+
+/** Segments (every two positions) or triangles (every three), with a tint or a colour each. */
+export class ShapeLayer extends Layer {
+  /** @param {"lines" | "triangles"} kind */
+  constructor(kind, told) {
+    super(told);
+    this.kind = kind;
+  }
+
+  set(told) {
+    if (told.positions !== undefined) this.own = this.some = undefined;
+    // colours that are not sent again are not those of new positions of another number
+    if (told.positions !== undefined && told.colours === undefined) this.colours = undefined;
+    super.set(told);
+    this.fresh = told.positions === undefined && told.colours === undefined && this.fresh;
+  }
+
+  bounds() {
+    const p = this.positions;
+    if (!p?.length) return null;
+    const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x);
+    for (let i = 0; i < p.length; i += 1) {
+      low[i % 3] = Math.min(low[i % 3], p[i]);
+      high[i % 3] = Math.max(high[i % 3], p[i]);
+    }
+    return { low, high };
+  }
+
+  samples() {
+    const { positions: p, own: { low, high } } = this, out = [];
+    if (p.length > 3000) { // their box will do
+      for (let i = 0; i < 8; i += 1) out.push(low.map((x, k) => ((i >> k) & 1 ? high[k] : x)));
+    }
+    for (let i = 0; i < p.length && p.length <= 3000; i += 3) out.push([p[i], p[i + 1], p[i + 2]]);
+    return out;
+  }
+
+  upload(gl) {
+    const lines = this.kind === "lines", corners = lines ? 2 : 1;
+    const attribute = (place, size, type, normalised, stride, offset) => {
+      gl.enableVertexAttribArray(place);
+      gl.vertexAttribPointer(place, size, type, normalised, stride, offset);
+      if (lines) gl.vertexAttribDivisor(place, 1);
+    };
+    this.begin(gl);
+    this.buffer(gl, new Float32Array(this.positions));
+    for (let k = 0; k < corners; k += 1) {
+      attribute(k, 3, gl.FLOAT, false, 12 * corners, 12 * k);
+    }
+    if (this.colours) {
+      this.buffer(gl, new Uint8Array(this.colours));
+      for (let k = 0; k < corners; k += 1) {
+        attribute(corners + k, 3, gl.UNSIGNED_BYTE, true, 3 * corners, 3 * k);
+      }
+    }
+  }
+
+  draw(gl, { at }, view) {
+    if (!this.positions?.length) return;
+    if (!this.made || !this.fresh) {
+      this.free(gl);
+      this.upload(gl);
+      this.fresh = true;
+    }
+    gl.uniformMatrix4fv(at.model, false, this.matrix);
+    gl.uniform4fv(at.tint, [...unit(colourOf(this.tint ?? "ink")), this.colours ? 0 : 1]);
+    gl.bindVertexArray(this.made.array);
+    if (this.kind === "lines") {
+      gl.uniform1f(at.width, Math.max(this.width ?? 1.5, 1.5) * view.density);
+      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, Math.floor(this.positions.length / 6));
+    } else {
+      gl.uniform1f(at.alpha, this.alpha ?? 1);
+      gl.drawArrays(gl.TRIANGLES, 0, Math.floor(this.positions.length / 9) * 3);
+    }
+  }
+}
+
+/** The box about some boxes, null about none. @param {({low, high} | null)[]} boxes */
+export function around(boxes) {
+  const there = boxes.filter((one) => one !== null);
+  if (!there.length) return null;
+  return {
+    low: [0, 1, 2].map((k) => Math.min(...there.map((one) => one.low[k]))),
+    high: [0, 1, 2].map((k) => Math.max(...there.map((one) => one.high[k]))),
+  };
+}
+

@@ -1,0 +1,265 @@
+// Points, lines and triangles in 3-D: one canvas, drawn when something has changed and not before.
+
+import { Orbit, VIEW } from "./camera.js";
+import { colourOf, onTheme } from "./colours.js";
+import { hands } from "./controls.js";
+import { CloudLayer, ShapeLayer, around } from "./layers.js";
+import { dot, transformed } from "./matrix.js";
+import { programs } from "./shaders.js";
+
+export { frustum } from "./shapes.js";
+
+const KEYS = "Arrow keys turn, with Shift they move; plus and minus zoom; 0 shows all.";
+const NOTHING = { low: [-1, -1, -1], high: [1, 1, 1] };
+/** More pixels than that per CSS pixel nobody sees, and each costs. */
+const DENSEST = 2;
+
+/**
+ * @param {HTMLCanvasElement} canvas with a size of its own by CSS
+ * @param {object} options
+ * @param {string} options.label what is to be seen, for who does not see it
+ * @param {"-y" | "y" | "z"} [options.up] "-y" of a camera's optical axes, "z" of maps and LiDAR
+ * @param {boolean} [options.antialias]
+ * @param {string} [options.background] a token's name
+ * @param {(lost: boolean) => void} [options.onlost] the context went, or came back
+ * @param {() => void} [options.onview] it was drawn anew: labels may have to move
+ * @returns {Viewer} where there is no WebGL 2 its `available` is false, a sentence stands in place
+ *   of the canvas, and all else does nothing
+ */
+export function createViewer(canvas, options) {
+  return new Viewer(canvas, options);
+}
+
+class Viewer {
+  #gl; #made = null; #layers = new Map(); #dirty = 0; #watcher; #stops = [];
+  #fitted = null; #lost = false;
+
+  constructor(canvas, {
+    label, up = "-y", antialias = true, background = "sunken", onlost = () => {},
+    onview = () => {},
+  }) {
+    this.canvas = canvas;
+    this.frames = 0;
+    this.orbit = new Orbit(up);
+    this.background = background;
+    this.onview = onview;
+    this.#gl = canvas.getContext("webgl2", { antialias, alpha: false, powerPreference: "low-power" });
+    this.available = this.#gl !== null;
+    if (!this.available) {
+      const told = document.createElement("p");
+      told.className = "viewer-none muted";
+      told.textContent = "This browser has no WebGL 2, so nothing can be drawn in 3-D here.";
+      canvas.hidden = true;
+      canvas.after(told);
+      return;
+    }
+    canvas.tabIndex = 0;
+    canvas.setAttribute("role", "application"); // a screen reader leaves the arrow keys to it
+    canvas.setAttribute("aria-roledescription", "3-D view");
+    canvas.setAttribute("aria-label", `${label}. ${KEYS}`);
+    canvas.style.setProperty("touch-action", "none");
+    const changed = () => { this.#fitted = null; this.redraw(); };
+    this.#stops.push(
+      hands(canvas, this.orbit, { changed, fit: () => this.fit() }),
+      onTheme(() => this.redraw()),
+    );
+    const lost = (event) => {
+      event.preventDefault(); // or it never comes back
+      this.#lost = true;
+      onlost(true);
+    };
+    const back = () => {
+      this.#lost = false;
+      this.#begin();
+      onlost(false);
+    };
+    canvas.addEventListener("webglcontextlost", lost);
+    canvas.addEventListener("webglcontextrestored", back);
+    this.#stops.push(() => {
+      canvas.removeEventListener("webglcontextlost", lost);
+      canvas.removeEventListener("webglcontextrestored", back);
+    });
+    this.#watcher = new ResizeObserver(() => {
+      if (this.#fitted) this.orbit.fit(this.#fitted, this.#aspect());
+      this.redraw();
+    });
+    this.#watcher.observe(canvas);
+    this.#begin();
+  }
+
+  /**
+   * Set a cloud, or change one: what is left out stays.
+   * @param {string} id
+   * @param {object} told points, matrix (16, column-major), colour ("tint", "normal", "patch",
+   *   "residual", "height"), tint (a token's name, or red, green, blue), size (metres), shade (share
+   *   of light that a slant surface loses), visible, patchColours (Uint8Array, rgb of each patch)
+   */
+  cloud(id, told) {
+    this.#set(id, told, () => new CloudLayer(told));
+  }
+
+  /** Segments: positions (six numbers each), colours (rgb of each end), tint, matrix, width (CSS
+   * pixels), visible, onTop (nothing hides them). */
+  lines(id, told) {
+    this.#set(id, told, () => new ShapeLayer("lines", told));
+  }
+
+  /** Triangles: positions (nine numbers each), colours, tint, matrix, alpha, visible. */
+  triangles(id, told) {
+    this.#set(id, told, () => new ShapeLayer("triangles", told));
+  }
+
+  #set(id, told, make) {
+    if (!this.available) return;
+    const layer = this.#layers.get(id);
+    if (layer) layer.set(told);
+    else this.#layers.set(id, make());
+    this.redraw();
+  }
+
+  has(id) {
+    return this.#layers.has(id);
+  }
+
+  remove(id) {
+    this.#layers.get(id)?.free(this.#gl);
+    if (this.#layers.delete(id)) this.redraw();
+  }
+
+  /** Look at some layers, or at all that can be seen, from the side one is looking from. */
+  fit(ids = null) {
+    if (!this.available) return;
+    const there = [...this.#layers].filter(([id, one]) => (ids ? ids.includes(id) : one.visible));
+    const outline = there.flatMap(([, one]) => one.outline);
+    this.#fitted = outline.length ? outline : [NOTHING.low, NOTHING.high];
+    this.orbit.fit(this.#fitted, this.#aspect());
+    this.redraw();
+  }
+
+  /** @param {object} where target (metres), distance (metres), azimuth, elevation (radians) */
+  look(where) {
+    if (!this.available) return;
+    this.#fitted = null;
+    this.orbit.look(where);
+    this.redraw();
+  }
+
+  /** Where one looks from: target, distance, azimuth, elevation, as `look` takes them. */
+  get camera() {
+    const { target, distance, azimuth, elevation } = this.orbit;
+    return { target: [...target], distance, azimuth, elevation };
+  }
+
+  /** Where a point of the world is on the canvas: CSS pixels from its left and top, and metres
+   * before the eye; null behind it. */
+  project(point) {
+    const [x, y, , w] = transformed(this.#clip(), point);
+    if (w <= 0) return null;
+    const { clientWidth, clientHeight } = this.canvas;
+    return [((x / w + 1) / 2) * clientWidth, ((1 - y / w) / 2) * clientHeight, w];
+  }
+
+  redraw() {
+    if (this.available && !this.#dirty) {
+      this.#dirty = requestAnimationFrame(() => { this.#dirty = 0; this.#draw(); });
+    }
+  }
+
+  /** Draw now and wait for it: milliseconds; for benchmarks. */
+  timing() {
+    const begun = performance.now();
+    this.pixels(0, 0, 1, 1);
+    return performance.now() - begun;
+  }
+
+  /** Draw now and read: rgba bytes row by row from the upper left, of all or a part, in device
+   * pixels. Chromium warns in its console that this is slow. */
+  pixels(x = 0, y = 0, width = this.canvas.width, height = this.canvas.height) {
+    this.#draw();
+    const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+    copy.drawImage(this.canvas, -x, -y);
+    return copy.getImageData(0, 0, width, height).data;
+  }
+
+  destroy() {
+    if (!this.available) return;
+    for (const stop of this.#stops) stop();
+    this.#watcher.disconnect();
+    cancelAnimationFrame(this.#dirty);
+    for (const layer of this.#layers.values()) layer.free(this.#gl);
+    this.#layers.clear();
+    this.available = false;
+    this.#gl.getExtension("WEBGL_lose_context")?.loseContext(); // browsers keep only a few
+  }
+
+  #begin() {
+    for (const layer of this.#layers.values()) layer.free(null); // went with the old context
+    this.#made = programs(this.#gl);
+    this.redraw();
+  }
+
+  #aspect() {
+    return (this.canvas.clientWidth || 1) / (this.canvas.clientHeight || 1);
+  }
+
+  #clip() {
+    const seen = [...this.#layers.values()].filter((one) => one.visible).map((one) => one.box);
+    return this.orbit.projection(this.#aspect(), around(seen) ?? NOTHING);
+  }
+
+  #heights() {
+    const above = this.orbit.above, heights = [];
+    for (const one of this.#layers.values()) {
+      if (one.visible && one.kind === "points" && one.box) {
+        heights.push(dot(one.box.low, above), dot(one.box.high, above));
+      }
+    }
+    return heights.length ? [Math.min(...heights), Math.max(...heights)] : [0, 1];
+  }
+
+  #draw() {
+    const { canvas } = this, gl = this.#gl;
+    if (!this.available || this.#lost || gl.isContextLost() || !canvas.clientWidth || !canvas.clientHeight) return;
+    const density = Math.min(devicePixelRatio || 1, DENSEST);
+    const width = Math.round(canvas.clientWidth * density);
+    const height = Math.round(canvas.clientHeight * density);
+    if (canvas.width !== width || canvas.height !== height) {
+      canvas.width = width;
+      canvas.height = height;
+    }
+    const view = {
+      density, heights: this.#heights(), pixelsAtOneMetre: height / 2 / Math.tan(VIEW / 2),
+    };
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(...colourOf(this.background).map((x) => x / 255), 1);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.enable(gl.DEPTH_TEST);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA); // colours come times alpha
+    const clip = this.#clip();
+    const clear = (one) => one.kind === "triangles" && (one.alpha ?? 1) < 1;
+    const layers = [...this.#layers.values()].filter((one) => one.visible);
+    for (const kind of ["points", "lines", "triangles"]) {
+      const { made, at } = this.#made[kind];
+      gl.useProgram(made);
+      gl.uniformMatrix4fv(at.clip, false, clip);
+      if (kind === "points") {
+        gl.uniform3fv(at.eye, this.orbit.eye());
+        gl.uniform3fv(at.above, this.orbit.above);
+      }
+      if (kind === "lines") gl.uniform2f(at.screen, width, height);
+      const mine = layers.filter((one) => one.kind === kind && !one.onTop);
+      for (const one of [...mine.filter((x) => !clear(x)), ...mine.filter(clear)]) {
+        gl[clear(one) ? "enable" : "disable"](gl.BLEND);
+        gl.depthMask(!clear(one)); // what is behind glass is seen
+        one.draw(gl, this.#made[kind], view);
+      }
+    }
+    gl.disable(gl.BLEND);
+    gl.depthMask(true);
+    gl.disable(gl.DEPTH_TEST);
+    gl.useProgram(this.#made.lines.made);
+    for (const one of layers) if (one.kind === "lines" && one.onTop) one.draw(gl, this.#made.lines, view);
+    this.frames += 1;
+    this.onview();
+  }
+}

@@ -1,0 +1,320 @@
+"""A real service with real workers, and a real Chromium that looks at it.
+
+Playwright's loop runs in this process as long as `browser` lasts: fixtures are of the package, so
+that it has ended before tests of others begin loops of their own.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from PIL import Image
+from playwright.sync_api import Browser, Page, Request, sync_playwright
+
+from sceneprint.datasets import write_depth_png
+from sceneprint.synth import synthesise_room
+
+FLAGS = [
+    "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+#: What Chromium says of drawing without a graphics card, whatever a page does.
+NOISE = "GL Driver Message"
+#: Processors are few and shared: what takes longer than this does not come.
+PATIENCE_S = 60.0
+ROOMS, VIEWS = 2, 8
+#: When the first frame was taken; each next one is a second later.
+TAKEN = "2026-11-20T09:{minute:02d}:{second:02d}Z"
+Settle = Callable[[Page], None]
+
+
+def until(what: Callable[[], Any], seconds: float = PATIENCE_S) -> Any:
+    """The first true value of it."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        found = what()
+        if found:
+            return found
+        time.sleep(0.05)
+    raise AssertionError(f"{what} did not come true within {seconds:g} s")
+
+
+@dataclass(frozen=True)
+class Sent:
+    """A frame as it was uploaded to the map `building`.
+
+    Parameters
+    ----------
+    frame_id : that it got
+    png : its depth image
+    meta : what was sent with it
+    """
+
+    frame_id: str
+    png: bytes
+    meta: dict[str, Any]
+
+    def form(self, **fields: object) -> dict[str, Any]:
+        """Arguments of a request that sends it again, with its camera alone."""
+        known = {"intrinsics": self.meta["intrinsics"]}
+        parts = {"frame": ("frame.png", self.png, "image/png")}
+        return {"files": parts, "data": {"meta": json.dumps(known), **fields}}
+
+
+@dataclass
+class Station:
+    """A service of its own processes.
+
+    Parameters
+    ----------
+    url : where it listens, without a slash at the end
+    data : its folder
+    client : asks it as one of its own machine, which needs no key
+    frames : of the map `building`, in the order of time
+    """
+
+    url: str
+    data: Path
+    client: httpx.Client
+    frames: list[Sent] = field(default_factory=list)
+
+    @property
+    def home(self) -> str:
+        """Address of the dashboard."""
+        return f"{self.url}/dashboard"
+
+    def key(self, name: str, grants: dict[str, str], **more: object) -> str:
+        """The secret of a new key."""
+        made = self.client.post("/v1/keys", json={"name": name, "grants": grants, **more})
+        assert made.status_code == 201, made.text
+        return str(made.json()["secret"])
+
+    def make_map(self, name: str, **more: object) -> str:
+        """Make a map; its path."""
+        made = self.client.post("/v1/maps", json={"name": name, "model": "compact", **more})
+        assert made.status_code == 201, made.text
+        return f"/v1/maps/{name}"
+
+
+@contextmanager
+def running(data: Path, workers: int, port: int = 0) -> Iterator[Station]:
+    """`sceneprint serve` on a loopback port; it is gone when this ends."""
+    with (data / "service.log").open("ab") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "sceneprint", "serve", "--port", str(port),
+             "--data", str(data), "--workers", str(workers)],
+            stdout=subprocess.PIPE, stderr=log, text=True,
+        )  # fmt: skip
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()
+        said = (data / "service.log").read_text()
+        assert line.startswith("sceneprint: serving http://"), said
+        url = line.split()[-1].rstrip("/")
+        with httpx.Client(base_url=url, timeout=60, trust_env=False) as client:
+            yield Station(url, data, client)
+    finally:
+        process.terminate()
+        try:
+            process.wait(PATIENCE_S)
+        finally:
+            process.kill()
+            process.wait()
+            process.stdout.close()
+
+
+@pytest.fixture(scope="package")
+def serve() -> Callable[..., Any]:
+    """Run a service of one's own: `with serve(folder, workers=0, port=0) as station`."""
+    return running
+
+
+@pytest.fixture(scope="package")
+def browser() -> Iterator[Browser]:
+    """Debian's Chromium, or another that is installed."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    found = next(filter(None, map(shutil.which, names)), None)
+    if found is None:
+        pytest.skip(f"no Chromium is installed ({', '.join(names)})")
+    with sync_playwright() as playwright:
+        one = playwright.chromium.launch(executable_path=found, args=FLAGS)
+        yield one
+        one.close()
+
+
+@pytest.fixture(scope="package")
+def station(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Station]:
+    """A service with two workers, and a map `building` of two rooms, all of it indexed.
+
+    Tests leave `building` as it is; what they change they make. The frames of a room have the
+    parent frame ROOM, and are of two runs, ROOM/ann (even ones) and ROOM/bob (odd ones).
+    """
+    del browser  # asked for first: without a browser nothing needs to be made
+    with running(tmp_path_factory.mktemp("station"), 2) as found:
+        found.client.post(
+            "/v1/maps", json={"name": "building", "title": "Two rooms", "model": "compact"}
+        )
+        metas, files = [], []
+        for meta, png in _shots(tmp_path_factory.mktemp("shots")):
+            metas.append(meta)
+            files.append(("frame", (f"{len(files)}.png", png, "image/png")))
+        sent = found.client.post(
+            "/v1/maps/building/frames/batch", data={"metas": json.dumps(metas)}, files=files
+        )
+        assert sent.status_code == 200, sent.text
+        found.frames = [
+            Sent(item["frame"]["frame_id"], file[1][1], meta)
+            for item, file, meta in zip(sent.json()["items"], files, metas, strict=True)
+        ]
+        states: dict[str, int] = {}
+
+        def signed() -> bool:
+            states.update(found.client.get("/v1/maps/building").json()["frames"])
+            return states.get("indexed") == len(files)
+
+        until(signed, 4 * PATIENCE_S)  # a machine of many engineers signs slowly
+        yield found
+
+
+def _shots(folder: Path) -> Iterator[tuple[dict[str, Any], bytes]]:
+    """Views along a path through each room, with what is known of them, in the order of time."""
+    path = folder / "frame.png"
+    for room in range(ROOMS):
+        for view, frame in enumerate(synthesise_room(21, room, VIEWS, along_path=True).frames):
+            write_depth_png(path, frame.depth, 1000.0)
+            lens, who = frame.intrinsics, "bob" if view % 2 else "ann"
+            assert frame.pose is not None
+            yield (
+                {
+                    "intrinsics": {
+                        n: getattr(lens, n) for n in ("width", "height", "fx", "fy", "cx", "cy")
+                    },
+                    "robot": who,
+                    "session": f"room-{room}/{who}",
+                    "captured_at": TAKEN.format(minute=room, second=view),
+                    "pose": {"parent_frame": f"room-{room}", "matrix": frame.pose.tolist()},
+                    "tags": ["door"] if view == 0 else [],
+                },
+                path.read_bytes(),
+            )
+
+
+@pytest.fixture
+def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
+    """Open a page in a context of its own; arguments as of Browser.new_context.
+
+    The test fails on whatever a page says in its console as a warning or an error, on what is
+    thrown in it, and on requests to other places than the address it was sent to first. A page
+    that provokes such has `page.allowed`, parts of what may be said.
+    """
+    opened: list[Page] = []
+
+    def open_one(**context: Any) -> Page:
+        size = {"width": 1280, "height": 800}
+        page = browser.new_context(**{"viewport": size, **context}).new_page()
+        page.allowed, page.said, page.pending = [], [], set()  # type: ignore[attr-defined]
+        page.on(
+            "console",
+            lambda one: (
+                one.type in ("error", "warning") and page.said.append(f"{one.type}: {one.text}")
+            ),
+        )  # type: ignore[attr-defined]
+        page.on("pageerror", lambda one: page.said.append(f"thrown: {one}"))  # type: ignore[attr-defined]
+        page.on("request", lambda one: _asked(page, one))
+        for end in ("requestfinished", "requestfailed"):
+            page.on(end, lambda one: page.pending.discard(one))  # type: ignore[attr-defined, call-overload]
+        opened.append(page)
+        return page
+
+    yield open_one
+    said = [
+        text for page in opened for text in page.said  # type: ignore[attr-defined]
+        if not any(part in text for part in (NOISE, *page.allowed))  # type: ignore[attr-defined]
+    ]  # fmt: skip
+    for page in opened:
+        page.context.close()
+    assert said == []
+
+
+@pytest.fixture
+def page(open_page: Callable[..., Page]) -> Page:
+    """A page, 1280 x 800, that goes nowhere yet; see `open_page` for what it must not say."""
+    return open_page()
+
+
+def _asked(page: Page, request: Request) -> None:
+    """Note what a page asks for; a stream is never over."""
+    home = httpx.URL(page.url if page.url.startswith("http") else request.url)
+    there = httpx.URL(request.url.removeprefix("blob:"))
+    if (there.host, there.port) != (home.host, home.port):
+        page.said.append(f"elsewhere: {request.url}")  # type: ignore[attr-defined]
+    if request.headers.get("accept") != "text/event-stream":
+        page.pending.add(request)  # type: ignore[attr-defined]
+
+
+@pytest.fixture(scope="package")
+def settle() -> Settle:
+    """Wait until a page is there: nothing in flight, and the main part not busy."""
+
+    def wait(page: Page) -> None:
+        # by evaluate: wait_for_function evaluates in the page, which the policy forbids
+        busy = "() => document.getElementById('main')?.getAttribute('aria-busy') !== 'false'"
+        end, quiet = time.monotonic() + PATIENCE_S, 0
+        while quiet < 3:  # what was just answered may ask for more
+            assert time.monotonic() < end, [one.url for one in page.pending]  # type: ignore[attr-defined]
+            page.wait_for_timeout(20)
+            quiet = 0 if page.pending or page.evaluate(busy) else quiet + 1  # type: ignore[attr-defined]
+
+    return wait
+
+
+@pytest.fixture(scope="package")
+def axe() -> Callable[[Page], list[str]]:
+    """What axe finds serious or critical on a page, in the light theme and in the dark one."""
+    judge = Axe()
+
+    def look(page: Page) -> list[str]:
+        found = []
+        for theme in ("light", "dark"):
+            page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
+            for one in judge.run(page).response["violations"]:
+                if one["impact"] in ("serious", "critical"):
+                    where = [node["html"][:200] for node in one["nodes"][:5]]
+                    found.append(f"{theme}: {one['id']}: {one['help']}: {where}")
+        return found
+
+    return look
+
+
+@pytest.fixture(scope="package")
+def pixels() -> Callable[..., Image.Image]:
+    """What an element, or a page, looks like."""
+    return lambda shown: Image.open(io.BytesIO(shown.screenshot())).convert("RGB")
+
+
+@pytest.fixture(scope="package")
+def free_port() -> int:
+    """A port that nobody listens on, for a service that is to come back to the same one."""
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+@pytest.fixture(scope="package", name="until")
+def patience() -> Callable[..., Any]:
+    """Poll: the first true value of what is called."""
+    return until

@@ -1,0 +1,237 @@
+"""Operations in a real browser, over real jobs: what is told is what the API tells."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import signal
+import tarfile
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+
+FIGURES = """() => Object.fromEntries([
+    ...[...document.querySelectorAll("[data-figure]")]
+      .map((one) => [one.dataset.figure, one.textContent]),
+    ["at", document.querySelector("[data-at]").dataset.at],
+    ["minutes", [...document.querySelectorAll("figure:first-of-type tbody tr")].map((row) =>
+      [...row.cells].map((one) => one.textContent))],
+    ["indexes", [...document.querySelectorAll("[aria-labelledby=indexes] tbody tr")].map((row) =>
+      [...row.cells].map((one) => one.textContent))]])"""
+
+
+def damaged(station, name: str, places: list[int]):
+    """Upload frames to a new map, and damage them on the disk before a worker reads them.
+
+    Returns what makes them sound again.
+    """
+    path = station.make_map(name)
+    workers = [one["name"] for one in station.client.get("/v1/stats").json()["workers"]]
+    processes = [int(one.rpartition(":")[2]) for one in workers]
+    sound = {}
+    for process in processes:
+        os.kill(process, signal.SIGSTOP)
+    try:
+        for place in places:
+            sent = station.frames[place]
+            mirrored = np.asarray(Image.open(io.BytesIO(sent.png)))[:, ::-1]
+            packed = io.BytesIO()
+            Image.fromarray(mirrored).save(packed, "png")
+            data = packed.getvalue()
+            form = sent.form()
+            form["files"] = {"frame": ("mirrored.png", data, "image/png")}
+            assert station.client.post(f"{path}/frames", **form).status_code == 202
+            digest = hashlib.sha256(data).hexdigest()
+            blob = station.data / "blobs" / digest[:2] / digest
+            assert blob.read_bytes() == data
+            sound[blob] = data
+            blob.chmod(0o644)
+            blob.write_bytes(data[:-99])
+    finally:
+        for process in processes:
+            os.kill(process, signal.SIGCONT)
+    return lambda: [blob.write_bytes(data) for blob, data in sound.items()]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def repair(station):
+    """Three frames of the map `spoilt` that die in every try, until this is called."""
+    return damaged(station, "spoilt", [1, 3, 5])
+
+
+def test_what_is_shown_is_what_the_service_counted(station, page, settle, axe, until):
+    asked = station.client.post("/v1/maps/building/queries", **station.frames[2].form())
+    assert asked.json()["status"] == "found"
+    refused = station.client.get("/v1/maps/nowhere")
+    assert refused.status_code == 404
+    until(lambda: station.client.get("/v1/stats").json()["total"]["queries"].get("found"))
+    answers = []
+    page.on("response", lambda one: "/v1/stats" in one.url and answers.append(one))
+    page.goto(f"{station.home}#/operations")
+    settle(page)
+    until(lambda: page.evaluate(FIGURES)["live"] == "live")
+
+    page.locator("figure", has_text="Frames a minute").get_by_text("As a table").click()
+
+    def told():
+        """What is shown at one moment, and the answer that it is of: the page asks again."""
+        shown = page.evaluate(FIGURES)
+        of_it = [one for one in answers if one.json()["at"] == shown["at"]]
+        return (shown, of_it[0].json()) if of_it else None
+
+    shown, stats = until(told)
+    total = stats["total"]
+    assert shown["waiting"] == str(stats["waiting"])
+    assert shown["workers"] == str(len(stats["workers"])) == "2"
+    assert shown["requests"] == f"{total['requests']:,}"
+    assert shown["refused"] == f"{total['refused']} refused"
+    assert shown["broken"] == f"{total['broken']} broken" == "0 broken"
+    assert total["refused"] >= 1
+    full = 1 - stats["bytes"]["free"] / stats["bytes"]["disk"]
+    assert abs(float(shown["disk"].split()[0]) - 100 * full) < 1
+    for one in stats["workers"]:
+        assert page.get_by_text(one["name"], exact=True).is_visible()
+    assert shown["indexes"] == [
+        [one["map"], "none", str(one["tail"]), "compared whole"] for one in stats["indexes"]
+    ]
+    names = ("indexed", "redundant", "rejected", "failed", "received")
+    assert [row[1:] for row in reversed(shown["minutes"])] == [
+        [str(one[name]) for name in names] for one in stats["minutes"]
+    ]
+    assert total["received"] >= 19
+    assert page.get_by_text(f"version {station.client.get('/readyz').json()['version']}").count()
+    assert axe(page) == []
+
+
+def test_dead_jobs_are_shown_with_their_tracebacks_and_tried_again(
+    station, page, settle, axe, until, repair
+):
+    page.goto(f"{station.home}#/operations?map=spoilt")
+    settle(page)
+    failures = page.get_by_role("region", name="Failures").locator("li")
+    until(lambda: failures.count() == 3)  # as they die, without a reload
+    first = failures.first
+    assert first.locator(".badge").inner_text() == "dead"
+    assert "is damaged: its content has another hash" in first.inner_text()
+    trace = first.get_by_role("region", name="Traceback")
+    assert not trace.is_visible()
+    first.get_by_text("Traceback of the last try").click()
+    assert "sceneprint.errors.DamagedBlob" in trace.inner_text()
+    assert axe(page) == []
+    place = first.get_by_role("link", name="sign").get_attribute("href")
+    repair()
+    first.get_by_role("button", name="Retry").click()
+    until(lambda: failures.count() == 2)
+    page.goto(f"{station.home}{place}")
+    settle(page)
+    assert page.get_by_role("button", name="Retry").count() == 0
+    page.get_by_role("definition").locator("a[href*='operations/jobs']").click()
+    until(lambda: page.locator("main .badge").all_inner_texts() == ["succeeded"])
+    assert axe(page) == []
+    page.goto(f"{station.home}#/operations?tab=jobs&state=dead&map=spoilt")
+    settle(page)
+    page.get_by_role("button", name="Retry all dead").click()
+    page.get_by_role("dialog").get_by_role("button", name="Retry 2 dead jobs").click()
+    frames = lambda: station.client.get("/v1/maps/spoilt").json()["frames"]  # noqa: E731
+    until(lambda: frames() == {"indexed": 3})
+    assert page.get_by_text("2 queued once more.").is_visible()
+    until(lambda: page.locator("li.job").get_by_text("tried again").count() == 3)
+
+
+def test_events_come_live_and_take_no_focus(station, page, settle, until, axe):
+    page.goto(f"{station.home}#/operations?tab=events")
+    settle(page)
+    until(lambda: page.locator("main .badge").first.inner_text() == "live")
+    page.locator("#events-kind").focus()
+    page.evaluate("document.querySelector('li.event').mine = true")
+    before = page.locator("li.event").count()
+    station.make_map("passing")
+    until(lambda: page.locator("li.event").count() == before + 1)
+    assert page.locator("li.event").first.inner_text().split("\n")[1:] == ["map.created", "passing"]
+    assert page.evaluate("document.activeElement.id") == "events-kind"
+    assert (
+        page.evaluate("[...document.querySelectorAll('li.event')].findIndex((one) => one.mine)")
+        == 1
+    )
+    assert axe(page) == []
+    told = station.client.get("/v1/events", params={"order": "newest", "limit": 1000}).json()[
+        "items"
+    ]
+    assert page.locator("li.event").count() == min(len(told), 101)
+
+
+def test_a_key_for_one_map_is_told_of_that_and_what_it_may_not_see(station, open_page, settle, axe):
+    page = open_page(extra_http_headers={"X-Forwarded-For": "192.0.2.7"})
+    page.allowed.append("401")
+    secret = station.key("guest", {"building": "read"})
+    page.goto(f"{station.home}#/operations")
+    settle(page)
+    page.locator("#key").fill(secret)
+    page.get_by_role("button", name="Use this key").click()
+    page.get_by_text("are told to keys that may read all maps").wait_for()
+    settle(page)
+    assert page.evaluate(FIGURES)["indexed"] == "16"
+    assert page.get_by_role("link", name="Snapshots").count() == 0
+    assert page.get_by_text("are shown to keys that are admin of all maps").is_visible()
+    assert page.locator("#operations-map option").all_inner_texts() == ["building"]
+    assert page.get_by_role("heading", name="Workers").count() == 0
+    assert axe(page) == []
+
+
+def test_keys_are_made_shown_once_and_withdrawn(station, page, settle, axe):
+    page.goto(f"{station.home}#/operations?tab=keys")
+    settle(page)
+    page.get_by_role("button", name="Make a key").click()
+    page.get_by_label("Name: who it is for").fill("robot/7")
+    page.get_by_role("combobox", name="Map").fill("no such name")
+    page.get_by_role("button", name="Make the key").click()
+    page.allowed.append("422")
+    page.get_by_role("alert").filter(has_text="grants").wait_for()
+    assert axe(page) == []
+    page.get_by_role("combobox", name="Map").fill("building")
+    page.get_by_role("combobox", name="Scope").select_option("write")
+    page.get_by_role("button", name="Make the key").click()
+    secret = page.get_by_label("Secret").input_value()
+    shown = {"Authorization": f"Bearer {secret}", "X-Forwarded-For": "192.0.2.7"}
+    me = httpx.get(f"{station.url}/v1/keys/me", headers=shown).json()
+    assert (me["name"], me["grants"]) == ("robot/7", {"building": "write"})
+    page.get_by_role("button", name="I have stored it").click()
+    assert secret not in page.content()
+    row = page.get_by_role("row", name="robot/7")
+    assert "building: write" in row.inner_text()
+    row.get_by_role("button", name="Withdraw").click()
+    page.get_by_role("dialog").get_by_role("textbox").fill("robot/7")
+    page.get_by_role("dialog").get_by_role("button", name="Withdraw").click()
+    row.wait_for(state="detached")
+    assert httpx.get(f"{station.url}/v1/keys/me", headers=shown).status_code == 401
+    page.goto(f"{station.home}#/operations?tab=audit")
+    settle(page)
+    newest = page.locator("tbody tr").first.inner_text().split("\t")
+    assert newest[1:5] == ["no key asked for", "revoke key", "–", "robot/7"]
+    assert axe(page) == []
+
+
+def test_snapshots_are_taken_downloaded_and_deleted(station, page, settle, axe, tmp_path):
+    page.goto(f"{station.home}#/operations?tab=snapshots")
+    settle(page)
+    page.get_by_role("button", name="Take a snapshot").click()
+    row = page.locator("tbody tr")
+    row.wait_for()
+    (found,) = station.client.get("/v1/snapshots").json()["items"]
+    assert found["snapshot_id"] in row.inner_text()
+    with page.expect_download() as download:
+        row.get_by_role("button", name="Download").click()
+    download.value.save_as(tmp_path / "s.tar")
+    data = (tmp_path / "s.tar").read_bytes()
+    assert (len(data), hashlib.sha256(data).hexdigest()) == (found["bytes"], found["sha256"])
+    with tarfile.open(tmp_path / "s.tar") as archive:
+        assert archive.getnames()
+    assert axe(page) == []
+    row.get_by_role("button", name="Delete").click()
+    page.get_by_role("dialog").get_by_role("textbox").fill(found["snapshot_id"])
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    row.wait_for(state="detached")
+    assert station.client.get("/v1/snapshots").json()["items"] == []

@@ -1,0 +1,298 @@
+"""Asking, and the answer: what the page shows is what the API tells, number by number."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+
+def tiles(page, row: str) -> list[dict[str, Any]]:
+    """What stands on the tiles of a row, in their order."""
+    found: list[dict[str, Any]] = page.locator(f"[data-row={row}] .query-tile").evaluate_all(
+        """all => all.map(one => ({
+            key: one.dataset.key, status: one.dataset.status ?? null, text: one.innerText,
+            rank: Number(one.querySelector(".query-rank").textContent),
+            figures: Object.fromEntries([...one.querySelectorAll("dt")].map(
+                (term) => [term.textContent, term.nextSibling.textContent])),
+        }))"""
+    )
+    return found
+
+
+def key(one: dict[str, Any]) -> str:
+    return f"{one['map']}/{one['frame_id']}"
+
+
+@pytest.fixture
+def ask(station, page, settle):
+    """Open the page that asks with a frame; returns the answer that it shows, as the API has it."""
+
+    def open_it(search: str = "", frame: int = 0) -> dict[str, Any]:
+        page.goto("about:blank")
+        address = f"{station.home}#/maps/building/query?frame={station.frames[frame].frame_id}"
+        page.goto(address + search)
+        settle(page)
+        return shown(station, page)
+
+    return open_it
+
+
+def shown(station, page) -> dict[str, Any]:
+    """The answer that the page shows, as the API has it."""
+    link = page.locator(".query-verdict-links a", has_text="Answer").get_attribute("href")
+    reply = station.client.get(f"/v1/queries/{link.rpartition('/')[2]}")
+    assert reply.status_code == 200
+    answer: dict[str, Any] = reply.json()
+    return answer
+
+
+def test_the_rows_are_the_answer(station, page, ask, axe):
+    answer = ask("&k=2&candidates=4")
+    frame_id = station.frames[0].frame_id
+    asked = {"frame_id": frame_id, "k": 2, "candidates": 4, "explain": True}
+    again = station.client.post("/v1/maps/building/queries", json=asked).json()
+    for name in ("matches", "explanations", "counts", "location", "status"):
+        assert again[name] == answer[name]  # the page asks as one asks by hand
+
+    ranking, selection, validated = (tiles(page, row) for row in ("R", "DR", "VDR"))
+    assert [one["key"] for one in ranking] == [key(one) for one in answer["explanations"]]
+    for tile, told in zip(ranking, answer["explanations"], strict=True):
+        assert tile["rank"] == told["rank"]
+        assert f"distance {told['distance']:,}" in tile["text"]
+        similar = 100 * told["similarity"]
+        assert f"similar {similar:.{1 if similar < 9.95 else 0}f} %" in tile["text"]
+    chosen = sorted(answer["matches"], key=lambda one: one["rank"])
+    assert [one["key"] for one in selection] == [key(one) for one in chosen]
+    for tile, told in zip(selection, chosen, strict=True):
+        assert f"gain {round(told['diversity_gain'], 2):g}" in tile["text"]
+    assert [one["key"] for one in validated] == [key(one) for one in answer["matches"]]
+    for tile, told in zip(validated, answer["matches"], strict=True):
+        validation = told["validation"]
+        assert tile["status"] == validation["status"]
+        assert validation["reason"] in tile["text"]
+        if validation["inliers"] is not None:
+            assert tile["figures"]["Inliers"] == f"{validation['inliers']:,}"
+            assert tile["figures"]["Overlap"] == f"{100 * validation['overlap']:.0f} %"
+            assert tile["figures"]["Residual"].endswith(
+                f", {validation['residual']['rotation_deg']:.1f}°"
+            )
+    counts = page.locator(".query-step").evaluate_all(
+        "all => Object.fromEntries(all.map(one => [one.dataset.step,"
+        " one.querySelector('.query-step-count').textContent]))"
+    )
+    assert counts == {name: str(n) for name, n in answer["counts"].items()}
+
+    # a frame that fell out is followed through the rows
+    lost = next(one for one in answer["explanations"] if one["outcome"] == "not_selected")
+    page.locator(f"[data-row=R] [data-key='{key(lost)}'] button").click()
+    page.mouse.move(0, 0)
+    assert page.locator("[data-row=R] .is-marked").count() == 1
+    assert page.locator("[data-row=DR] .is-marked").count() == 0
+    trace = page.locator("[data-row=DR] .query-trace")
+    assert trace.inner_text() == f"Lost here: {lost['reason']}"
+    best = key(answer["matches"][0])
+    page.locator(f"[data-row=R] [data-key='{best}'] button").click()
+    page.mouse.move(0, 0)
+    assert page.locator(f".is-marked[data-key='{best}']").count() == 3
+    overlay = page.locator(f"[data-row=VDR] [data-key='{best}'] .query-overlay")
+    match = best.partition("/")[2]
+    assert overlay.get_attribute("href") == (
+        f"#/queries/{answer['query_id']}/matches/{match}?map=building"
+    )
+    assert axe(page) == []
+
+
+@pytest.mark.parametrize(
+    ("search", "status", "title"),
+    [
+        ("", "found", "Found."),
+        ("&ambiguous=0", "ambiguous", "Ambiguous, so not found."),
+        ("&residual_m=0.00001&candidates=3", "not_found", "Not found."),
+        ("&stages=retrieve", "unvalidated", "Not validated."),
+        ("&session=nobody", "not_found", "Not found."),
+    ],
+)
+def test_the_verdict_is_the_status(page, ask, search, status, title):
+    answer = ask(search)
+    assert answer["status"] == status
+    verdict = page.locator(".query-verdict")
+    assert verdict.get_attribute("data-status") == status
+    said = verdict.locator("p").first.inner_text()
+    assert said.startswith(title)
+    if status == "found":
+        p = answer["location"]["pose"]["translation"]
+        assert f"x {round(p['x'], 2):g}, y {round(p['y'], 2):g}, z {round(p['z'], 2):g} m" in said
+        assert answer["location"]["pose"]["parent_frame"] in said
+    if "session" in search:
+        assert f"None of the {answer['counts']['map']} frames" in said
+    if search == "&stages=retrieve":
+        assert tiles(page, "VDR") == tiles(page, "DR") == []
+
+
+def test_a_control_asks_again(station, page, ask, settle):
+    first = ask()
+    sent = []
+    page.on("request", lambda one: one.method == "POST" and sent.append(one))
+    page.locator(".query-group > summary", has_text="What a match must stand").click()
+    field = page.locator("#ask-residual_m")
+    assert field.input_value() == "0.08"  # the default of the map's model
+    field.fill("0.00001")
+    field.press("Enter")
+    page.wait_for_timeout(400)  # it waits for the last of several changes
+    settle(page)
+    assert len(sent) == 1
+    body = json.loads(sent[0].post_data)
+    assert body["validation"] == {"residual_m": 0.00001}
+    assert "k" not in body  # what is default is left to the service
+    second = shown(station, page)
+    assert (first["status"], second["status"]) == ("found", "not_found")
+    changed = page.locator(".query-changed").inner_text()
+    assert "not found (was found)" in changed
+    assert f"accepted {first['counts']['accepted']} → 0" in changed
+    was = {key(one): one["validation"]["strength"] for one in first["matches"]}
+    for tile in tiles(page, "VDR"):
+        strength = was[tile["key"]]
+        assert (f"was accepted, {strength}" in tile["text"]) is (strength is not None)
+    # the address asks the same
+    assert "residual_m=0.00001" in page.url
+    page.reload()
+    settle(page)
+    assert shown(station, page)["matches"] == second["matches"]
+    page.get_by_role("button", name="Reset").click()
+    page.wait_for_timeout(400)
+    settle(page)
+    assert shown(station, page)["matches"] == first["matches"]
+    assert "residual_m" not in page.url
+    # the service is gone for a while: what was changed then is asked when it is back
+    page.allowed.append("ERR_INTERNET_DISCONNECTED")
+    page.context.set_offline(True)
+    page.locator("#ask-k").fill("1")
+    page.locator("#ask-k").press("Enter")
+    page.get_by_role("heading", name="The service does not answer").wait_for()
+    page.context.set_offline(False)
+    page.locator(".query-verdict").wait_for()
+    settle(page)
+    assert shown(station, page)["counts"]["accepted"] == 1
+
+
+def test_why_not_is_told_as_the_api_explains_it(station, page, ask, settle):
+    answer = ask("&k=1&candidates=4&session=room-0/ann,room-0/bob,room-1/ann")
+    options = {
+        "k": 1, "candidates": 4, "filter": {"session": ["room-0/ann", "room-0/bob", "room-1/ann"]}
+    }  # fmt: skip
+    ids = [one.frame_id for one in station.frames]
+    steps = {"query": "map", "filter": "passed", "selection": "selected", "turn": "validated"}
+    seen = set()
+    left = [one["frame_id"] for one in answer["explanations"] if one["outcome"] != "not_selected"]
+    out = next(one for one in answer["explanations"] if one["outcome"] == "not_selected")
+    for frame_id in (ids[0], ids[9], left[0], left[-1], out["frame_id"]):
+        told = station.client.post(
+            "/v1/maps/building/queries",
+            json={"frame_id": ids[0], "explain_frame": frame_id, **options},
+        ).json()["explained_frame"]
+        page.locator("#why-frame").fill(frame_id)
+        page.locator("#why-frame").press("Enter")
+        settle(page)
+        head = page.locator(".query-why-head")
+        assert head.get_attribute("data-lost") == (told["lost_at"] or "none")
+        said = page.locator(".query-why-result").inner_text()
+        assert told["reason"][1:] in said
+        if told["rank"] is not None:
+            assert f"{told['rank']} of {told['of']}" in said
+            assert f"{told['distance']:,}" in said
+        marked = page.locator(".query-step[data-lost=here], .query-step[data-lost=not]")
+        step = steps.get(told["lost_at"], "accepted")
+        assert marked.evaluate_all("all => all.map(one => one.dataset.step)") == [step]
+        seen.add(told["lost_at"])
+    assert seen == {"query", "filter", "selection", "turn", None}
+    # what would help is one click away, and the frame is explained with the next answer too
+    page.locator("#why-frame").fill(left[-1])
+    page.locator("#why-frame").press("Enter")
+    settle(page)
+    page.get_by_role("button", name="Ask for more matches").click()
+    page.wait_for_timeout(100)
+    settle(page)
+    later = shown(station, page)
+    assert later["explained_frame"]["frame_id"] == left[-1]
+    lost = later["explained_frame"]["lost_at"]
+    assert lost in (None, "validation")  # its turn came
+    assert page.locator(".query-why-head").get_attribute("data-lost") == (lost or "none")
+    # an id that no frame has
+    page.allowed.append("404")
+    page.locator("#why-frame").fill("nobody")
+    page.locator("#why-frame").press("Enter")
+    settle(page)
+    assert "nobody" in page.locator(".query-why-result").inner_text()
+
+
+def test_a_file_is_asked_and_looked_at_again(station, page, settle, axe):
+    """It is sent once: the kept answer is asked with every change, and by who has its id."""
+    frame = station.frames[3]
+    sent = []
+    page.on("request", lambda one: one.method == "POST" and sent.append(one.url))
+    page.goto(f"{station.home}#/maps/building/query")
+    settle(page)
+    camera = json.dumps(frame.meta["intrinsics"]).encode()
+    page.locator("#ask-file").set_input_files([
+        {"name": "view.png", "mimeType": "image/png", "buffer": frame.png},
+        {"name": "intrinsics.json", "mimeType": "application/json", "buffer": camera},
+    ])  # fmt: skip
+    page.locator(".query-verdict").wait_for()
+    settle(page)
+    first = shown(station, page)
+    assert first["frame"] is None
+    assert first["matches"][0]["frame_id"] == frame.frame_id  # it finds itself in the map
+    page.locator("#ask-k").fill("1")
+    page.locator("#ask-k").press("Enter")
+    page.wait_for_timeout(400)
+    settle(page)
+    answer = shown(station, page)
+    assert answer["counts"]["accepted"] == 1
+    assert [one.partition("/v1/")[2] for one in sent] == [
+        "maps/building/queries", f"queries/{first['query_id']}/again",
+    ]  # fmt: skip
+
+    page.goto(f"{station.home}#/queries/{answer['query_id']}")
+    settle(page)
+    assert page.locator(".query-asked canvas").get_attribute("data-drawn") == "true"
+    assert "with an uploaded depth image" in page.locator(".query-note").first.inner_text()
+    similar = station.client.get(f"/v1/queries/{answer['query_id']}/similarities").json()
+    heat = page.locator("canvas.heatmap")
+    heat.focus()
+    for pressed in ("ArrowDown", "ArrowDown", "End"):
+        heat.press(pressed)
+    n = len(similar["frames"])
+    told = page.locator(".heatmap-told").inner_text()
+    a, b = (similar["frames"][i]["frame_id"][:8] for i in (1, n - 1))
+    value = 100 * similar["similarity"][2][n]
+    assert told.startswith(f"2: frame {a}")
+    assert f"{n}: frame {b}" in told
+    assert told.endswith(f"{value:.{1 if value < 9.95 else 0}f} %")
+    assert axe(page) == []
+    page.locator(".heatmap-table summary").click()
+    cells = page.locator(".heatmap-table tbody tr").first.locator("td").all_inner_texts()
+    assert cells[0] == "100 %"
+    assert len(cells) == n + 1
+    # and on from there with other options
+    page.get_by_role("link", name="Ask with other options").click()
+    settle(page)
+    assert page.locator("#ask-k").input_value() == "1"
+    assert shown(station, page)["matches"] == answer["matches"]
+
+
+def test_what_is_no_longer_kept_is_asked_again_where_it_can_be(station, page, ask, settle):
+    answer = ask("&k=1")
+    (station.data / "queries" / answer["query_id"]).unlink()
+    page.allowed.append("404")
+    page.goto(f"{station.home}#/queries/{answer['query_id']}")
+    settle(page)
+    assert "no longer kept" in page.locator("h2").first.inner_text()
+    page.get_by_role("link", name="Ask again as before").click()
+    settle(page)
+    assert shown(station, page)["matches"] == answer["matches"]
+    page.goto(f"{station.home}#/queries/{'0' * 32}")
+    settle(page)
+    assert "no longer kept" in page.locator("h2").first.inner_text()
+    assert page.get_by_role("link", name="Ask again as before").count() == 0

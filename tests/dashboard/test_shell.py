@@ -1,0 +1,190 @@
+"""The shell: what the first page costs, themes, keys, focus, and a service that goes and comes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Page, expect
+
+PROXIED = {"X-Forwarded-For": "192.0.2.7"}
+BUDGET = 30_000
+
+
+def test_the_first_page_is_small_and_asks_for_nothing_long(
+    station: Any, page: Page, settle: Callable[[Page], None], axe: Callable[[Page], list[str]]
+) -> None:
+    code: dict[str, int] = {}
+    asked: list[str] = []
+
+    def note(answer: Any) -> None:
+        path = answer.url.removeprefix(station.url).partition("?")[0]
+        if path.startswith("/dashboard"):
+            assert answer.headers["content-encoding"] == "gzip"
+            code[path] = int(answer.headers["content-length"])
+        else:
+            asked.append(answer.url.removeprefix(station.url))
+
+    page.on("response", note)
+    page.goto(station.url)  # led on to the dashboard
+    settle(page)
+    assert page.url == station.home
+    expect(page.get_by_role("heading", level=1)).to_have_text("Maps")
+    expect(page).to_have_title("Maps · sceneprint")
+    code.pop("/", None)
+    assert sum(code.values()) <= BUDGET, code
+    assert set(code) >= {"/dashboard", "/dashboard/main.js", "/dashboard/maps/maps.js"}
+    # a list of frames is none of the first page's, nor of any map that is not in view
+    kinds = {one.partition("?")[0] for one in asked if "growth" not in one}
+    assert kinds <= {"/", "/v1/keys/me", "/v1/maps", "/v1/stats", "/v1/events"}
+    assert axe(page) == []
+
+
+def test_a_theme_is_kept(station: Any, page: Page, settle: Callable[[Page], None]) -> None:
+    page.emulate_media(color_scheme="light")
+    page.goto(station.home)
+    settle(page)
+    colour = "() => getComputedStyle(document.documentElement).backgroundColor"
+    light = page.evaluate(colour)
+    page.get_by_role("button", name="Theme: Dark").click()
+    dark = page.evaluate(colour)
+    assert dark != light
+    expect(page.get_by_role("button", name="Theme: Dark")).to_have_attribute("aria-pressed", "true")
+    expect(page.get_by_role("button", name="Theme: Dark")).to_be_focused()
+    page.reload()
+    settle(page)
+    assert page.evaluate(colour) == dark
+    page.get_by_role("button", name="Theme: As the system").click()
+    assert page.evaluate(colour) == light
+    page.emulate_media(color_scheme="dark")
+    assert page.evaluate(colour) == dark
+
+
+def test_keys(
+    station: Any,
+    open_page: Callable[..., Page],
+    settle: Callable[[Page], None],
+    axe: Callable[[Page], list[str]],
+) -> None:
+    station.make_map("secret-place")
+    reader = station.key("dashboard-reader", {"building": "read"})
+    late = station.key("dashboard-late", {"*": "read"}, expires_at="2026-01-01T00:00:00Z")
+    page = open_page(extra_http_headers=PROXIED)  # a key is asked for
+    page.allowed += ["401", "403", "404"]
+    page.goto(station.home)
+    settle(page)
+    expect(page.get_by_role("heading", name="This service asks for a key")).to_be_visible()
+    assert axe(page) == []
+    field = page.get_by_label("Key", exact=True)
+    for wrong, told in (
+        ("", "Paste a key first"), ("sp_nonsense", "does not know this key"),
+        ("schlüssel", "no key has"), (late, "has expired"),
+    ):  # fmt: skip
+        field.fill(wrong)
+        page.keyboard.press("Enter")
+        expect(page.get_by_role("alert")).to_contain_text(told)
+    field.fill(f" {reader} ")
+    page.keyboard.press("Enter")
+    settle(page)
+    # what the key may not read is not there, and what it may not do is not offered
+    expect(page.locator(".map")).to_have_count(1)
+    expect(page.locator(".map")).to_contain_text("Two rooms")
+    expect(page.get_by_role("button", name="New map")).to_have_count(0)
+    expect(page.get_by_role("button", name="Delete building")).to_have_count(0)
+    expect(page.get_by_role("banner")).to_contain_text("dashboard-reader")
+    # a map that it may not read is none, and the page says what it may, and takes another
+    page.goto(f"{station.home}#/maps/secret-place")
+    settle(page)
+    expect(page.get_by_role("main")).to_contain_text("your key may not see it")
+    expect(page.get_by_role("main")).to_contain_text("building: read")
+    page.goto(station.home)
+    page.reload()  # the tab keeps it
+    settle(page)
+    expect(page.locator(".map")).to_have_count(1)
+    page.get_by_role("button", name="Forget").click()
+    expect(page.get_by_role("heading", name="This service asks for a key")).to_be_visible()
+    assert page.evaluate("() => Object.keys(sessionStorage)") == []
+
+
+def test_addresses_focus_and_keyboard(
+    station: Any, page: Page, settle: Callable[[Page], None]
+) -> None:
+    page.goto(f"{station.home}#/maps/a/b/c/d")
+    settle(page)
+    expect(page.get_by_role("heading", name="There is no such page")).to_be_visible()
+    page.get_by_role("link", name="To the maps").click()
+    settle(page)
+    assert page.evaluate("() => document.activeElement.id") == "title"  # told as a page of its own
+    page.go_back()
+    settle(page)
+    expect(page.get_by_role("heading", name="There is no such page")).to_be_visible()
+    page.go_forward()
+    settle(page)
+    page.reload()
+    settle(page)
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("link", name="Skip to content")).to_be_focused()
+    page.keyboard.press("Enter")
+    assert page.evaluate("() => document.activeElement.id") == "main"
+    assert page.url == f"{station.home}#/"
+    button = page.get_by_role("button", name="New map")
+    button.focus()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("dialog")).to_be_visible()
+    expect(page.get_by_role("textbox", name="Name")).to_be_focused()
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    expect(button).to_be_focused()
+
+
+def test_a_service_without_maps_goes_and_comes_back(
+    serve: Callable[..., Any],
+    free_port: int,
+    page: Page,
+    settle: Callable[[Page], None],
+    axe: Callable[[Page], list[str]],
+    tmp_path: Path,
+) -> None:
+    page.allowed += [
+        "ERR_CONNECTION_REFUSED",
+        "ERR_INCOMPLETE_CHUNKED_ENCODING",
+        "ERR_CONNECTION_RESET",
+    ]
+    with serve(tmp_path, workers=0, port=free_port) as alone:
+        page.goto(alone.home)
+        settle(page)
+        expect(page.get_by_role("main")).to_contain_text("No maps yet")
+        assert axe(page) == []
+        page.get_by_role("button", name="New map").last.click()  # the one of the empty page
+        page.get_by_role("textbox", name="Name").fill("first")
+        page.get_by_label("Rooms, compact").check()
+        page.get_by_role("button", name="Create map").click()
+        expect(page).to_have_url(f"{alone.home}#/maps/first")
+        page.goto(alone.home + "#/")
+        settle(page)
+        expect(page.locator(".map")).to_have_count(1)
+    # what is shown stays, and it is said that it may be old
+    expect(page.locator("#banner")).to_contain_text("does not answer", timeout=30_000)
+    expect(page.locator(".map")).to_have_count(1)
+    page.evaluate("() => { location.hash = '#/nowhere'; }")
+    page.evaluate("() => { location.hash = '#/'; }")
+    expect(page.get_by_role("main")).to_contain_text("The service does not answer")
+    with serve(tmp_path, workers=0, port=free_port):
+        expect(page.locator(".map")).to_have_count(1, timeout=30_000)  # by itself
+        expect(page.locator("#banner")).to_be_hidden(timeout=30_000)
+
+
+def test_nothing_is_wider_than_a_small_screen(
+    station: Any, open_page: Callable[..., Page], settle: Callable[[Page], None]
+) -> None:
+    page = open_page(viewport={"width": 768, "height": 900})
+    page.goto(station.home)
+    settle(page)
+    small = """() => [...document.querySelectorAll('button, nav a, .button')]
+        .filter((one) => one.offsetParent && Math.min(one.offsetWidth, one.offsetHeight) < 35.5)
+        .map((one) => one.outerHTML)"""
+    for width in (768, 390):
+        page.set_viewport_size({"width": width, "height": 900})
+        assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+        assert page.evaluate(small) == []

@@ -1,0 +1,221 @@
+"""Uploads by the page, held to what the API has of them afterwards."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import FilePayload, Locator, Page, Response, expect
+
+LENS = {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0}
+
+
+def wall(seed: int, columns: int = 64, rows: int = 48) -> bytes:
+    """A depth image of a wall 2 m away."""
+    depth = 2000 + np.random.default_rng(seed).integers(0, 3, (rows, columns))
+    buffer = io.BytesIO()
+    Image.fromarray(depth.astype(np.uint16)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def room(seed: int) -> np.ndarray[Any, Any]:
+    """Points (N, 3) of a corner of a room about the origin, metres."""
+    rng = np.random.default_rng(seed)
+    plane = rng.uniform(-1.5, 1.5, (3, 1500, 2))
+    sides = [np.insert(plane[k], k, (2.0, 2.0, -1.0)[k], axis=1) for k in range(3)]
+    return np.concatenate(sides).astype(np.float32)
+
+
+def named(name: str, data: bytes) -> FilePayload:
+    return {"name": name, "mimeType": "application/octet-stream", "buffer": data}
+
+
+def row(page: Page, name: str) -> Locator:
+    return page.locator(f".row[data-name='{name}']")
+
+
+def _states(station: Any, path: str) -> set[str]:
+    return {one["state"] for one in station.client.get(path).json()["items"]}
+
+
+def _count(station: Any, path: str) -> int:
+    return len(station.client.get(path).json()["items"])
+
+
+def open_upload(page: Page, station: Any, name: str, settle: Callable[[Page], None]) -> Locator:
+    """The upload page of a new map; its file input."""
+    station.make_map(name)
+    page.goto(f"{station.home}#/maps/{name}/upload")
+    settle(page)
+    return page.locator("input[name=files]")
+
+
+def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(
+    page: Page, station: Any, settle: Callable[[Page], None], axe: Callable[[Page], list[str]],
+    until: Callable[..., Any],
+) -> None:  # fmt: skip
+    page.allowed.append("422")  # type: ignore[attr-defined]
+    chooser = open_upload(page, station, "dropped", settle)
+    pose = np.eye(4)
+    pose[:3, 3] = (1.0, 2.0, 0.5)
+    scan = np.column_stack([room(1), np.ones(4500)]).astype(np.float32)
+    array = io.BytesIO()
+    np.save(array, room(2))
+    broken = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n"
+    chooser.set_input_files(
+        [
+            named("frame-000000.depth.png", wall(0)),
+            named("frame-000001.depth.png", wall(1)),
+            named("frame-000001.pose.txt", "\n".join(" ".join(map(str, r)) for r in pose).encode()),
+            named("intrinsics.json", json.dumps({**LENS, "depth_scale": 500}).encode()),
+            named("000000.bin", scan.tobytes()),
+            named("cloud.npy", array.getvalue()),
+            named("broken.ply", broken),
+            named("notes.txt", b"of no kind"),
+        ]
+    )
+    expect(page.get_by_text("1 file is no frame, and left out: notes.txt")).to_be_visible()
+    expect(page.get_by_label("fx")).to_have_value("60")
+    start = page.get_by_role("button", name="Upload 5 files")
+    start.click()  # a pose leads to a frame that has a name
+    expect(page.get_by_role("alert")).to_contain_text("frame-000001.depth.png has a pose")
+    expect(page.get_by_label("Session")).to_be_focused()
+    page.get_by_label("Robot").fill("r7")
+    page.get_by_label("Session").fill("monday")
+    page.get_by_label("Tags").fill("door, north")
+    assert axe(page) == []
+    start.click()
+    path = "/v1/maps/dropped/frames"
+    settled = {"indexed", "rejected"}
+    # the first cloud of a worker may wait for its kernels to be compiled
+    until(lambda: _states(station, path) <= settled and _count(station, path) == 4, 180)
+    for name in ("frame-000000.depth.png", "frame-000001.depth.png"):
+        expect(row(page, name).locator(".badge")).to_have_text("indexed", timeout=30_000)
+
+    refusal = station.client.post(
+        path, data={"meta": "{}"}, files={"frame": ("broken.ply", broken)}
+    ).json()
+    expect(row(page, "broken.ply").locator(".badge")).to_have_text("refused")
+    expect(row(page, "broken.ply").locator(".row-more")).to_have_text(
+        f"{refusal['title']}. {refusal['detail']}"
+    )
+    frames = {one["bytes"]: one for one in station.client.get(path).json()["items"]}
+    posed, plain = frames[len(wall(1))], frames[len(wall(0))]
+    assert posed["pose"]["parent_frame"] == "r7/monday"
+    assert posed["pose"]["matrix"] == pose.tolist()
+    assert plain["pose"] is None
+    for one in frames.values():
+        assert (one["robot"], one["session"], one["tags"]) == ("r7", "monday", ["door", "north"])
+    assert {n: posed["intrinsics"][n] for n in LENS} == LENS
+    assert posed["depth_scale"] == 500
+    assert {one["points"] for one in frames.values() if one["kind"] == "cloud"} == {4500}
+    link = row(page, "frame-000001.depth.png").get_by_role("link")
+    assert link.get_attribute("href") == f"#/maps/dropped/frames/{posed['frame_id']}"
+
+
+def test_a_drop_waits_for_its_camera_and_an_archive_goes_to_imports(
+    page: Page, station: Any, settle: Callable[[Page], None]
+) -> None:
+    open_upload(page, station, "archive", settle)
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr("run/intrinsics.json", json.dumps(LENS))
+        archive.writestr("run/a.png", wall(3))
+        archive.writestr("run/b.png", b"no picture")
+    files = [("run.zip", list(packed.getvalue())), ("lone.png", list(wall(4)))]
+    transfer = page.evaluate_handle(
+        """(files) => {
+            const transfer = new DataTransfer();
+            for (const [name, data] of files) {
+                transfer.items.add(new File([new Uint8Array(data)], name));
+            }
+            return transfer;
+        }""",
+        files,
+    )
+    page.locator(".drop").dispatch_event("drop", {"dataTransfer": transfer})
+    start = page.get_by_role("button", name="Upload 2 files")
+    start.click()
+    expect(page.get_by_role("alert")).to_contain_text("lone.png is a depth image: give its camera")
+    page.get_by_label("Preset").select_option(label="Kinect, 640 × 480, f 585")
+    expect(page.get_by_label("cx")).to_have_value("320")
+    for name, value in LENS.items():
+        page.locator(f"input[name={name}]").fill(f"{value:g}")
+    expect(page.get_by_label("Preset")).to_have_value("")
+    start.click()
+    expect(row(page, "run.zip").locator(".badge")).to_have_text("taken", timeout=60_000)
+    expect(row(page, "lone.png").locator(".badge")).to_have_text("indexed", timeout=60_000)
+    expect(row(page, "run.zip").locator(".row-more > p")).to_have_text(
+        "Frames: 1 taken, 1 refused."
+    )
+    [lone] = [
+        one for one in station.client.get("/v1/maps/archive/frames").json()["items"]
+        if one["session"] is None
+    ]  # fmt: skip
+    assert {n: lone["intrinsics"][n] for n in LENS} == LENS
+    page.reload()  # what was typed is remembered in this tab
+    settle(page)
+    expect(page.get_by_label("cx")).to_have_value("32")
+
+
+def test_five_hundred_files_and_a_service_that_asks_to_wait(
+    open_page: Callable[..., Page], serve: Callable[..., Any], settle: Callable[[Page], None],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, until: Callable[..., Any],
+) -> None:  # fmt: skip
+    monkeypatch.setenv("SCENEPRINT_REQUESTS_PER_S", "2")  # of a key, and ten at once
+    page = open_page(extra_http_headers={"X-Forwarded-For": "192.0.2.7"})
+    page.allowed.append("429")  # type: ignore[attr-defined]
+    refused: list[str] = []
+
+    def heard(answer: Response) -> None:
+        if answer.status == 429 and "frames" in answer.url:
+            refused.append(answer.url)
+
+    page.on("response", heard)
+    with serve(tmp_path, workers=0) as station:
+        key = station.key("uploader", {"slow": "write"})
+        page.add_init_script(f"sessionStorage.setItem('sceneprint.key', '{key}')")
+        chooser = open_upload(page, station, "slow", settle)
+        chooser.set_input_files([named(f"{i}.png", wall(i, 32, 24)) for i in range(500)])
+        expect(page.get_by_role("button", name="Upload 500 files")).to_be_visible()
+        # a page that shows all of ten thousand files is of no use
+        expect(page.locator(".row")).to_have_count(100)
+        for name, value in LENS.items():
+            page.locator(f"input[name={name}]").fill(f"{value:g}")
+        page.locator("input[name=width]").fill("")  # of the image
+        page.locator("input[name=height]").fill("")
+        page.get_by_role("button", name="Upload 500 files").click()
+        until(lambda: page.locator(".row[data-state=received]").count() >= 10)
+        page.get_by_role("button", name="Cancel all").click()
+        assert refused, "the service never asked to wait"
+        settle(page)
+        states = page.locator(".row").evaluate_all("(rows) => rows.map((one) => one.dataset.state)")
+        assert set(states) == {"received", "cancelled"}
+        first = page.locator(".row[data-state=cancelled]").first
+        name = str(first.get_attribute("data-name"))
+        first.get_by_role("button", name="Retry").click()
+        expect(row(page, name)).to_have_attribute("data-state", "received", timeout=30_000)
+        page.close()  # it asks no more
+
+
+def test_who_may_only_look_is_told_so(
+    open_page: Callable[..., Page], station: Any, settle: Callable[[Page], None]
+) -> None:
+    key = station.key("looker", {"building": "read"})
+    page = open_page(extra_http_headers={"X-Forwarded-For": "192.0.2.7"})
+    page.add_init_script(f"sessionStorage.setItem('sceneprint.key', '{key}')")
+    page.goto(f"{station.home}#/maps/building/upload")
+    settle(page)
+    expect(page.get_by_role("heading", name="Your key may not upload here")).to_be_visible()
+    expect(page.locator("input[name=files]")).to_have_count(0)
+    page.get_by_role("link", name="Frames").click()
+    settle(page)
+    assert page.locator("#frames > .tile").count() == 16
+    expect(page.get_by_role("link", name="Upload frames")).to_have_count(0)
