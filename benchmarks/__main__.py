@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks import dpp, growth, readiness, registration, scan, search, service
+from benchmarks import dashboard, dpp, growth, readiness, registration, scan, search, service
 from benchmarks.encode import EncodeFigures, measure
 from benchmarks.growth_page import GrowthFigures
 from benchmarks.growth_page import table as growth_table
@@ -108,6 +108,7 @@ class Rows:
     service: service.ServiceFigures
     readiness: readiness.ReadinessFigures | None = None
     growth: GrowthFigures | None = None
+    dashboard: dashboard.DashboardFigures | None = None
 
 
 def page(machine: Machine, rows: Rows, start: float) -> str:
@@ -124,6 +125,7 @@ def page(machine: Machine, rows: Rows, start: float) -> str:
         lines += table(preset, figures, peak)
     lines += service.table(rows.service)
     lines += readiness.table(rows.readiness) if rows.readiness is not None else []
+    lines += dashboard.table(rows.dashboard)
     lines += [line for one in rows.scan for line in scan.table(one)] + search.table(rows.search)
     lines += dpp.table(rows.dpp) + registration.table(rows.registration)
     lines += growth_table(rows.growth) if rows.growth is not None else []
@@ -138,6 +140,7 @@ def measure_all(n_frames: int, n_pairs: int) -> Rows:
     with service.frames_of(recording if recording.is_dir() else None) as served_frames:
         served = service.measure(served_frames)
         started = readiness.measure(served_frames[0], list(served_frames[1:201]))
+    looked = dashboard.measure()
     pin_to_one_processor()  # the service above has all processors, as it would
     signers = {preset: open_signer(preset) for preset in PRESETS}
     return Rows(
@@ -149,6 +152,7 @@ def measure_all(n_frames: int, n_pairs: int) -> Rows:
         service=served,
         readiness=started,
         growth=growth.measure_small(),
+        dashboard=looked,
     )
 
 
@@ -177,6 +181,7 @@ def main() -> int:
         "service": asdict(rows.service),
         "readiness": None if rows.readiness is None else asdict(rows.readiness),
         "growth": None if rows.growth is None else asdict(rows.growth),
+        "dashboard": None if rows.dashboard is None else asdict(rows.dashboard),
     }
     options.json.write_text(json.dumps(result, indent=1) + "\n")
     if options.page is not None:
