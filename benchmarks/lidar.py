@@ -28,7 +28,7 @@ from benchmarks.lidar_answers import first_answers
 from sceneprint.evaluation.baselines.rings import ring_descriptor, ring_distances
 from sceneprint.geometry.retrieval import distances
 from sceneprint.geometry.rigid import inverse, rotation_angle
-from sceneprint.geometry.validation import ValidationParameters
+from sceneprint.geometry.validation import Validation, ValidationParameters
 from sceneprint.pipeline import Signature, prepare, validate
 from sceneprint.scans import decode_cloud
 from sceneprint.signing import Signer, open_signer
@@ -123,15 +123,11 @@ def believed(
     rows: list[dict[str, object]] = []
     for i, j in tqdm(pairs, desc="validate", unit="pair", disable=None):
         v = validate(geometries[i], geometries[j], p=p)
-        truth = inverse(_pose(walk[j])) @ _pose(walk[i])
-        right, off, turn = False, math.inf, math.inf
-        if v.T_match_query is not None:
-            wrong = inverse(truth) @ v.T_match_query
-            off, turn = float(np.linalg.norm(wrong[:3, 3])), rotation_angle(wrong[:3, :3])
-            right = off <= RIGHT_M and turn <= RIGHT_RAD
+        off, turn = _off(walk, i, j, v)
+        right = off <= RIGHT_M and turn <= RIGHT_RAD
         rows.append(
             {
-                "query": i, "match": j, "apart": float(np.linalg.norm(truth[:3, 3])),
+                "query": i, "match": j, "apart": _apart(walk, i, j),
                 "status": v.status, "strength": v.strength, "reason": v.reason, "right": right,
                 "off_m": off, "off_deg": math.degrees(turn), "overlap": v.overlap,
                 "plane_overlap": v.plane_overlap, "violations": v.violations,
@@ -146,6 +142,22 @@ def believed(
         ),
         rows,
     )  # fmt: skip
+
+
+def _truth(walk: Sequence[Cloud], i: int, j: int) -> Floats:
+    return inverse(_pose(walk[j])) @ _pose(walk[i])
+
+
+def _apart(walk: Sequence[Cloud], i: int, j: int) -> float:
+    return float(np.linalg.norm(_truth(walk, i, j)[:3, 3]))
+
+
+def _off(walk: Sequence[Cloud], i: int, j: int, v: Validation) -> tuple[float, float]:
+    """Metres and radians between a transform and what odometry says; infinite without one."""
+    if v.T_match_query is None:
+        return math.inf, math.inf
+    wrong = inverse(_truth(walk, i, j)) @ v.T_match_query
+    return float(np.linalg.norm(wrong[:3, 3])), rotation_angle(wrong[:3, :3])
 
 
 def pairs_within(at: Floats, allowed: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -192,9 +204,14 @@ def measure(walk: Sequence[Cloud], signer: Signer, *, pairs: bool) -> dict[str, 
         geometries = [g for _, g in made]
         p = signer.model.parameters.validation
         near = np.linalg.norm(at[:, None] - at[None, :], axis=2) < WITHIN_M
+
+        def confirmed(i: int, j: int, v: Validation) -> bool:
+            off, turn = _off(walk, i, j, v)
+            return off <= RIGHT_M and turn <= RIGHT_RAD
+
         for name, both_ways in (("earlier", False), ("any", True)):
             allowed = apart(at, both_ways=both_ways)
-            answered = first_answers(geometries, rows, near, allowed, p)
+            answered = first_answers(geometries, rows, near, allowed, p, confirmed)
             result[f"first match, {name}"] = asdict(answered)
         allowed = apart(at, both_ways=True)
         everything = np.ones((len(at), len(at)), bool)

@@ -6,19 +6,20 @@ that validation accepts, strong before weak; with the nearest where it accepts n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from sceneprint.geometry.validation import ValidationParameters
-from sceneprint.pipeline import validate
+from sceneprint.geometry.retrieval import Ranking
+from sceneprint.geometry.validation import Validation, ValidationParameters
+from sceneprint.matches import associate
 from sceneprint.types import Floats, Geometry
 
-CANDIDATES = 10  #: of a query, as the service has by default
-_ORDER = {"strong": 0, "weak": 1}
+#: As the service has by default: candidates of a query, and accepted ones after which it stops.
+CANDIDATES, K = 10, 5
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Answered:
     right: int  #: the first match is within reach, believed or not
     found: int  #: queries of which a match is accepted
     found_right: int  #: of these, those whose first match is within reach
+    placed: int  #: of these, those whose transform odometry confirms
 
 
 def first_answers(
@@ -37,6 +39,7 @@ def first_answers(
     near: NDArray[np.bool_],
     allowed: NDArray[np.bool_],
     p: ValidationParameters,
+    confirmed: Callable[[int, int, Validation], bool],
 ) -> Answered:
     """Answer every query that has a right answer.
 
@@ -47,15 +50,18 @@ def first_answers(
     near : (n, n) whether the second would be a right answer to the first
     allowed : (n, n) whether the second is in the database of the first
     p : of the model
+    confirmed : of query, match and what was said of them, whether the transform is right
     """
-    asked = np.flatnonzero((near & allowed).any(axis=1))
-    right, found = np.zeros(len(asked), bool), np.zeros(len(asked), bool)
+    asked = [int(i) for i in np.flatnonzero((near & allowed).any(axis=1))]
+    right, found, placed = (np.zeros(len(asked), bool) for _ in range(3))
     for row, i in enumerate(tqdm(asked, desc="answer", unit="query", disable=None)):
-        ranked = np.argsort(np.where(allowed[i], rows[i], np.inf), kind="stable")[:CANDIDATES]
-        tried = [int(j) for j in ranked if allowed[i, j]]
-        said = [validate(geometries[i], geometries[j], p=p) for j in tried]
-        order = [_ORDER[str(v.strength)] if v.status == "accepted" else len(_ORDER) for v in said]
-        first = int(np.argmin(order))  # of equals the nearest
-        found[row] = order[first] < len(_ORDER)
-        right[row] = near[i, tried[first]]
-    return Answered(len(asked), int(right.sum()), int(found.sum()), int((right & found).sum()))
+        far = np.where(allowed[i], rows[i], np.inf)
+        ranked = np.argsort(far, kind="stable")[: int(allowed[i].sum())]
+        ranking = Ranking(ranked, far[ranked].astype(np.int64), np.zeros(len(ranked)))
+        among = range(min(CANDIDATES, len(ranked)))
+        first = associate(geometries[i], ranking, among, geometries.__getitem__, K, p=p)[0]
+        found[row] = first.validation.status == "accepted"
+        right[row] = near[i, first.index]
+        placed[row] = found[row] and confirmed(i, first.index, first.validation)
+    counts = (int(one.sum()) for one in (right, found, right & found, placed))
+    return Answered(len(asked), *counts)

@@ -139,6 +139,11 @@ class Sphere:
         """Whether the last column is a neighbour of the first."""
         return self.width * self.step > 2 * math.pi - self.step / 2
 
+    @property
+    def sees_around(self) -> bool:
+        """Whether three quarters of a turn or more are seen, whichever way the sensor is turned."""
+        return self.width * self.step > 1.5 * math.pi
+
 
 #: Either kind of looking.
 Camera = Intrinsics | Sphere

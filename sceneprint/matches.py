@@ -80,8 +80,8 @@ def associate(
 
     Returns
     -------
-    matches : all that were tried: C_vld first, strong before weak, each in the order of R; then
-        those that were not accepted
+    matches : all that were tried: C_vld first, strong before weak, each in the order of R (of
+        scans all around, the nearest first); then those that were not accepted
 
     Raises
     ------

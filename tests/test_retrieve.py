@@ -267,6 +267,17 @@ def test_preferred() -> None:
     assert preferred([strong, strong]) == [0, 1]
 
 
+def test_of_scans_all_around_the_nearest_goes_first() -> None:
+    far, near, nearest = (outcome(T=shifted(x)) for x in (3.0, -2.0, 1.0))
+    weak = outcome(strength="weak", T=shifted(0.5))
+    said = [far, weak, near, nearest]
+    assert preferred(said) == [0, 2, 3, 1]  # cameras: the order of R
+    around = [replace(one, around=True) for one in said]
+    assert preferred(around) == [3, 2, 0, 1]
+    assert preferred([*around[:3], nearest]) == [0, 2, 3, 1]  # one of a camera: not comparable
+    assert preferred([replace(far, around=True)]) == [0]
+
+
 # locate
 
 
@@ -346,3 +357,24 @@ def test_locate_takes_the_first_few() -> None:
     default = locate(matches, [np.eye(4)] * 8)
     assert default is not None
     assert default.average.votes == 5
+
+
+def test_frames_are_judged_by_the_numbers_of_their_model(
+    room_frames: tuple[Frame, ...], small_model: Model, small_signer: Signer
+) -> None:
+    """Of a preset, whoever made the artifacts; of a model of one's own, once it was used."""
+    query, match = (prepare(frame, small_signer)[1] for frame in room_frames[:2])
+    lidar = read_model("lidar")
+    halls = [replace(one, model_id=lidar.id) for one in (query, match)]
+    p = lidar.parameters.validation
+    own, told, indoors = validate(*halls), validate(*halls, p=p), validate(query, match)
+    assert (own.reason, own.inliers) == (told.reason, told.inliers)
+    assert own.inliers != indoors.inliers
+    strict = replace(small_model.parameters.validation, minimum_patches=10_000)
+    other = replace(small_model, parameters=replace(small_model.parameters, validation=strict))
+    mine = [replace(one, model_id=other.id) for one in (query, match)]
+    with pytest.raises(ModelMismatch, match=r"has not been used by this process. Give `p`"):
+        validate(*mine)
+    made = geometry_of(see(room_frames[0], other.parameters), other)
+    assert made.model_id == other.id
+    assert validate(*mine).status == "rejected"

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from sceneprint.geometry.validation import Validation
 
 
@@ -14,14 +16,26 @@ def preferred(validations: Sequence[Validation]) -> list[int]:
     """Positions of the accepted: the strong in their order, then the weak in theirs.
 
     The paper keeps the order of R. A weak match has a rival that explains the frames nearly as
-    well, so a later strong one goes before it.
+    well, so a later strong one goes before it. Where all frames see all around, what is nearest
+    is most like the query, and the transforms say what is nearest better than signatures do. Of
+    cameras the nearest may look elsewhere.
 
     Parameters
     ----------
     validations : in the order of R
     """
     accepted = [i for i, v in enumerate(validations) if v.status == "accepted"]
-    return sorted(accepted, key=lambda i: validations[i].strength != "strong")
+    around = all(validations[i].around for i in accepted)
+    return sorted(
+        accepted,
+        key=lambda i: (validations[i].strength != "strong", _away(validations[i]) * around),
+    )
+
+
+def _away(validation: Validation) -> float:
+    """Metres between the two sensors."""
+    T = validation.T_match_query
+    return 0.0 if T is None else float(np.linalg.norm(T[:3, 3]))
 
 
 def voters(parents: Sequence[str], strong: Sequence[bool], most: int = 5) -> list[int]:

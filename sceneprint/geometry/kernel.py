@@ -31,8 +31,9 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     compiled: Any
     try:
         compiled = numba.njit(nogil=True, cache=True, error_model="numpy")(function)
-        files = compiled._cache._cache_file
-        files._source_stamp = _stamp(function, files._source_stamp)
+        if compiled is not function:  # as it is under NUMBA_DISABLE_JIT, to be debugged
+            files = compiled._cache._cache_file
+            files._source_stamp = _stamp(function, files._source_stamp)
     except RuntimeError:  # no folder to keep the code in: compile in every process instead
         compiled = numba.njit(nogil=True, error_model="numpy")(function)
     return cast(Callable[P, R], compiled)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sceneprint.cameras import Sphere
 from sceneprint.geometry.acceptance import (
     AcceptanceParameters,
     Evidence,
@@ -76,6 +77,7 @@ class Validation:
     T_rival : (4, 4) that rival, or None
     seed : of the random choices
     covariance : (6, 6) of T_match_query where it is accepted, else None; see `covariance.py`
+    around : whether both frames see all around their sensors, as spinning scanners do
     """
 
     status: Status
@@ -92,6 +94,7 @@ class Validation:
     T_rival: Floats | None
     seed: int
     covariance: Floats | None = None
+    around: bool = False
 
 
 def middle(a: Floats, b: Floats) -> Floats:
@@ -210,7 +213,13 @@ def _decided(
     return Validation(
         status, strength, reason, T, e.residual_m, e.residual_rad, e.overlap, e.plane_overlap,
         e.violations, inliers, ambiguity, T_rival, seed, covariance,
+        _sees_around(query) and _sees_around(match),
     )  # fmt: skip
+
+
+def _sees_around(frame: Geometry) -> bool:
+    camera = frame.surface.camera
+    return isinstance(camera, Sphere) and camera.sees_around
 
 
 def _evidence(
