@@ -17,13 +17,16 @@ from sceneprint.engine.asking import Asked, check_taken
 from sceneprint.engine.deadlines import Deadline
 from sceneprint.engine.kept import Kept, KeptQueries
 from sceneprint.engine.switches import steadily
-from sceneprint.errors import InvalidRequest, NotIndexed
+from sceneprint.errors import DamagedSignature, InvalidRequest, NotIndexed, UnknownFrame
 from sceneprint.previews import depth_view, normals_view, picture
 from sceneprint.schemas import Answer, NamedFrame, Query
 from sceneprint.schemas.again import Question
 from sceneprint.schemas.outputs import View
 from sceneprint.store import Store
+from sceneprint.store.frames import find_frame
+from sceneprint.store.maps import find_map
 from sceneprint.store.records import MapRow
+from sceneprint.store.signatures import stored_vector
 
 
 class Asks(Protocol):
@@ -111,7 +114,8 @@ class Again:
         Raises
         ------
         UnknownQuery : it is not kept, or no longer.
-        UnknownMap, UnknownFrame : a map, or the stored frame that was asked for, is gone.
+        UnknownMap, UnknownFrame : a map, or the stored frame that was asked for, is gone, or
+            another frame has its id.
         NotIndexed : it was an upload asked without validation, and this asks for it; or a map has
             another model than its signature.
         InvalidRequest : see `ask_upload` and `ask_stored`.
@@ -120,6 +124,7 @@ class Again:
         frame = kept.answer.frame
         if frame is not None:
             named = NamedFrame(map=frame.map, frame_id=frame.frame_id)
+            self._check_same(kept, named)
             return self._queries.stored(maps, named, query, since)
         deadline = Deadline(query.deadline_ms, since)
 
@@ -133,6 +138,20 @@ class Again:
             return self._queries.answer(rows, _ready(kept, query), query, deadline)
 
         return steadily(self._store, maps, ask)
+
+    def _check_same(self, kept: Kept, named: NamedFrame) -> None:
+        """Frames that are deleted give up their ids; one of the same content signs the same."""
+        with self._store.database.read() as connection:
+            frame = find_frame(connection, find_map(connection, named.map), named.frame_id)
+            try:
+                vector = stored_vector(connection, frame.number, kept.model_id)
+            except DamagedSignature:  # whoever asks for it has it made again
+                return
+        if vector is not None and vector != kept.vector.tobytes():
+            raise UnknownFrame(
+                f"Frame {named.frame_id} of map {named.map!r} was deleted since it was asked for, "
+                "and another has its id. Ask anew."
+            )
 
 
 def _given(kept: Kept) -> dict[str, Any]:

@@ -128,7 +128,7 @@ class Statistics:
                 jobs = count_jobs_of(connection, row.number)
                 maps, indexes = 1, [index_state(connection, self._indexes, row)]
                 oldest, workers = oldest_waiting(connection, row.number), None
-            taken = self.sizes() if row is None else self._sizes_of_map(connection, row)
+            taken = None if row is None else self._sizes_of_map(connection, row)
         return Stats(
             at=when(now),
             map=map_name,
@@ -139,7 +139,7 @@ class Statistics:
             oldest_waiting_s=None if oldest is None else max(now - oldest, 0.0),
             indexes=indexes,
             workers=workers,
-            bytes=taken,
+            bytes=taken or self.sizes(),
             total=Counted(**_counted(happened, range(minutes), samples)),
             minutes=_minutes(happened, samples, start, minutes),
         )

@@ -119,8 +119,7 @@ def read_manifest(path: Path) -> Manifest:
         if record.pop("schema_version") != SCHEMA_VERSION:
             raise DamagedIndex(f"{path}: of another schema than {SCHEMA_VERSION}.")
         record["files"] = tuple((str(name), int(size)) for name, size in record["files"])
-        if record.get("recall") is not None:
-            record["recall"] = Recall(**record["recall"])
+        record["recall"] = _recall(record.get("recall"))
         manifest = Manifest(**record)
     except (ValueError, TypeError, KeyError) as error:  # of another version, if of any
         raise DamagedIndex(f"{path}: no manifest ({error}).") from error
@@ -129,3 +128,11 @@ def read_manifest(path: Path) -> Manifest:
     ):
         raise DamagedIndex(f"{path}: names files that no generation has.")
     return manifest
+
+
+def _recall(told: dict[str, Any] | None) -> Recall | None:
+    """None where nothing was measured, or otherwise than now: no search depends on it."""
+    try:
+        return None if told is None else Recall(**told)
+    except TypeError:
+        return None

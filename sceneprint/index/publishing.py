@@ -7,6 +7,7 @@ killed at any moment leaves the generation before, and files that the next build
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -120,9 +121,11 @@ def _recall(
 ) -> Recall:
     """As measured of the generation before, while that stands for this one; else measured."""
     if previous is not None and previous.code is generation.code:
-        known = [read_manifest(path).recall for number, path in listed if number == previous.number]
-        if known and known[0] is not None and still_holds(known[0], len(generation)):
-            return known[0]
+        for _, path in [each for each in listed if each[0] == previous.number]:
+            with suppress(DamagedIndex):  # since it was opened: it is measured anew
+                known = read_manifest(path).recall
+                if known is not None and still_holds(known, len(generation)):
+                    return known
     return measure_recall(generation, seed)
 
 

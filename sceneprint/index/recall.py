@@ -45,17 +45,13 @@ def measure_recall(generation: Generation, seed: int = 0) -> Recall:
     return Recall(found / (NEAR * len(chosen)), NEAR, len(chosen), SHORTLIST, n)
 
 
-def still_holds(recall: Recall | None, frames: int) -> bool:
+def still_holds(recall: Recall, frames: int) -> bool:
     """Whether what was measured of a generation stands for one that follows it by the same code.
 
     A large map is appended to often, and each time to read all of it would cost more than the
     appending.
     """
-    return (
-        recall is not None
-        and recall.sample > 0
-        and abs(frames - recall.frames) <= DRIFT * recall.frames
-    )
+    return recall.sample > 0 and abs(frames - recall.frames) <= DRIFT * recall.frames
 
 
 def _farthest_wanted(queries: Bytes, keys: list[int], generation: Generation) -> list[int]:

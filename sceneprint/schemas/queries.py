@@ -153,8 +153,8 @@ class Answer(Told):
         "before a match was accepted."
     )
     matches: list[Match] = Field(
-        description="Accepted ones first, strong before weak, of equals as ranked, or, of scans all "
-        "around, the nearest first; then the others that were tried."
+        description="Accepted ones first, strong before weak, of equals as ranked, or, of scans "
+        "all around, the nearest first; then the others that were tried."
     )
     location: Location | None = Field(description="Where accepted matches have poses.")
     seed: int

@@ -37,7 +37,11 @@ def _changes() -> dict[str, Any]:
     """The body of `again`, for the OpenAPI document."""
     names = {**Options.model_fields, "maps": None}
     properties = SeveralQuery.model_json_schema(ref_template=TEMPLATE)["properties"]
-    own = {name: one for name, one in properties.items() if name in names}
+    own = {
+        name: {"anyOf": [one, {"type": "null"}]}
+        for name, one in properties.items()
+        if name in names
+    }
     schema = {"type": "object", "additionalProperties": False, "properties": own}
     return {"requestBody": {"required": True, "content": {JSON: {"schema": schema}}}}
 

@@ -135,7 +135,9 @@ def test_indexes_and_sizes_are_told(data, make_engine):
     engine.rebuild_index("hall")
     (index,) = engine.operations.statistics.tell(1).indexes
     assert (index.generation, index.tail) == (1, 0)
-    assert index.recall == IndexRecall(share=1, near=10, sample=0, shortlist=500)  # compared whole
+    assert index.recall == IndexRecall(  # compared whole
+        share=1, near=10, sample=0, shortlist=500, frames=indexed
+    )
     told = measuring.sizes(engine.settings)
     assert told.index == sum(p.stat().st_size for p in (data / "index").rglob("*") if p.is_file())
     assert told.blobs == sum(p.stat().st_size for p in (data / "blobs").rglob("*") if p.is_file())

@@ -87,6 +87,26 @@ def test_a_stored_frame_is_asked_again_of_other_maps(served, asked, make_map, sh
     assert (told["counts"]["map"], told["counts"]["validated"]) == (3, 3)  # not itself
 
 
+def test_another_frame_of_the_same_id_is_not_asked_in_its_place(served, make_map, shots, refused):
+    path = make_map(served, "again-other")
+
+    def put(i: int) -> None:
+        reply = served.client.put(
+            f"{path}/frames/door", **shots[i].form(), headers={"Prefer": "wait=60"}
+        )
+        assert reply.json()["state"] == "indexed", reply.text
+
+    put(0)
+    asked = {"frame_id": "door", "stages": "retrieve"}
+    query_id = served.client.post(f"{path}/queries", json=asked).json()["query_id"]
+    for i, status in ((0, 200), (2, 404)):  # the same frame once more, and another
+        assert served.client.delete(f"{path}/frames/door").status_code == 204
+        put(i)
+        reply = served.client.post(f"/v1/queries/{query_id}/again", json={})
+        assert reply.status_code == status, reply.text
+    refused(reply, 404, "unknown-frame", "another has its id")
+
+
 def test_the_query_is_drawn_as_the_frame_is(served, asked):
     """The first match is the same view: what the query saw is drawn to the pixel as the frame."""
     path, best = f"/v1/queries/{asked['query_id']}/preview.png", asked["matches"][0]["frame_id"]

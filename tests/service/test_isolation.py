@@ -305,6 +305,15 @@ def test_asking_all_maps_asks_those_that_the_key_may_read(walled, there):
     answer = walled.ask("reader", "POST", "/v1/queries", json=body).json()
     assert {match["map"] for match in answer["matches"]} == {OWN}
     assert THEIRS not in json.dumps(answer)
+    path = f"/v1/queries/{answer['query_id']}/again"
+    again = walled.ask("reader", "POST", path, json={"maps": "*"}).json()
+    assert again["matches"] == answer["matches"]
+    assert THEIRS not in json.dumps(again)
+    refused = [
+        walled.ask("reader", "POST", path, json={"maps": [OWN, name]}) for name in (THEIRS, NONE)
+    ]
+    assert told(refused[0], there[THEIRS]) == told(refused[1], there[NONE])
+    assert refused[0].status_code == 404
 
 
 def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
@@ -314,9 +323,14 @@ def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
     assert asked.status_code == 200, asked.text
     mixed = asked.json()["query_id"]
     assert {match["map"] for match in asked.json()["matches"]} == {OWN, THEIRS}
-    for end in ("", "/cloud.ply", "/similarities", f"/matches/{there[OWN].frame}"):
+    match = f"/matches/{there[OWN].frame}"
+    for end in (
+        "", "/cloud.ply", "/similarities", "/points", "/question", "/preview.png", match,
+        f"{match}/points",
+    ):  # fmt: skip
         unseen(walled, "GET", "/v1/queries/{}" + end, mixed)
     unseen(walled, "POST", "/v1/queries/{}/reconstruction", mixed)
+    unseen(walled, "POST", "/v1/queries/{}/again", mixed)
     fused = walled.ask("boss", "POST", f"/v1/queries/{mixed}/reconstruction", json={})
     assert fused.status_code == 202, fused.text
     job = fused.json()["job_id"]

@@ -28,7 +28,9 @@ KEYS: dict[str, dict[str, Scope]] = {
 #: Ids and seals; times; how long something took, and in which minutes it was.
 CHANCE = re.compile(r"\b[0-9a-f]{32}\b")
 TIMES = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|\+00:00)")
-TOOK = re.compile(r'"milliseconds":{[^}]*}|"oldest_waiting_s":[\d.e-]+|"(minutes|buckets)":\[[^]]*\]')
+TOOK = re.compile(
+    r'"milliseconds":{[^}]*}|"oldest_waiting_s":[\d.e-]+|"(minutes|buckets)":\[[^]]*\]'
+)
 OWN_HEADERS = ("date", "x-request-id", "content-length")
 
 
