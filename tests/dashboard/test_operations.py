@@ -67,7 +67,13 @@ def test_what_is_shown_is_what_the_service_counted(station, page, settle, axe, u
     assert asked.json()["status"] == "found"
     refused = station.client.get("/v1/maps/nowhere")
     assert refused.status_code == 404
-    until(lambda: station.client.get("/v1/stats").json()["total"]["queries"].get("found"))
+
+    def counted():
+        """Each process tells what it counted every few seconds."""
+        total = station.client.get("/v1/stats").json()["total"]
+        return total["queries"].get("found") and total["refused"]
+
+    until(counted)
     answers = []
     page.on("response", lambda one: "/v1/stats" in one.url and answers.append(one))
     page.goto(f"{station.home}#/operations")
@@ -179,6 +185,10 @@ def test_a_key_for_one_map_is_told_of_that_and_what_it_may_not_see(station, open
     assert page.locator("#operations-map option").all_inner_texts() == ["building"]
     assert page.get_by_role("heading", name="Workers").count() == 0
     assert axe(page) == []
+    page.get_by_role("link", name="Jobs").click()
+    settle(page)
+    assert page.locator(".job").count() > 0
+    assert page.get_by_role("button", name="Retry all dead").count() == 0  # it may read
 
 
 def test_keys_are_made_shown_once_and_withdrawn(station, page, settle, axe):

@@ -192,7 +192,7 @@ def box(ahead: float) -> dict[str, Any]:
 
 
 def test_an_ambiguous_match_has_its_rival(
-    page: Page, station: Any, settle: Any, axe: Any, until: Any
+    page: Page, station: Any, settle: Any, axe: Any, until: Any, pixels: Any
 ) -> None:
     path = station.make_map("boxes")
     added = station.client.post(f"{path}/frames", **box(0), headers={"Prefer": "wait=50"})
@@ -210,6 +210,28 @@ def test_an_ambiguous_match_has_its_rival(
         row = card.locator("tbody tr").first.locator("td").nth(column)
         assert row.inner_text() == percent((found <= 250).mean())
     page.emulate_media(reduced_motion="reduce")
+    # residuals are of the pose that is shown: while its own have not come, none are
+    waiting: list[Any] = []
+    page.route("**/points*transform=rival*", lambda route: waiting.append(route))
+    page.reload()
+    until(lambda: page.evaluate("true") and len(waiting) == 2)  # routes are heard of in a call
+    page.get_by_role("button", name="Rival").click()
+    page.get_by_role("button", name="Residual").click()
+
+    def green() -> int:
+        page.wait_for_timeout(120)
+        picture = np.asarray(pixels(page.locator(".overlay-canvas"))).astype(int)
+        return int((abs(picture - (38, 130, 60)).max(axis=2) <= 2).sum())
+
+    assert "Comparing the points" in text(page, ".overlay-legend")
+    assert green() == 0
+    for route in waiting:
+        route.continue_()
+    page.unroute("**/points*transform=rival*")
+    until(lambda: "Comparing" not in text(page, ".overlay-legend"))
+    assert green() > 30
+    page.get_by_role("button", name="Source").click()
+    page.get_by_role("button", name="Aligned").click()
     page.get_by_role("button", name="Rival").click()
     details = f"/v1/queries/{answer['query_id']}/matches/{match['frame_id']}"
     rival = np.array(station.client.get(details).json()["rival"]["matrix"])
@@ -229,6 +251,24 @@ def test_an_ambiguous_match_has_its_rival(
     assert "No transform." in text(page, ".overlay-none")
     assert page.get_by_role("button", name="Aligned").is_disabled()
     assert matrix(page).tolist() == np.eye(4).tolist()
+
+
+def test_a_camera_that_is_not_known_is_as_wide_as_what_was_seen(
+    page: Page, station: Any, settle: Any
+) -> None:
+    page.goto(station.home)
+    settle(page)
+    drawn = page.evaluate(
+        """async () => {
+          const { lens } = await import(`${location.pathname}/overlay/page.js`);
+          const { frustum } = await import(`${location.pathname}/viewer/shapes.js`);
+          return [...frustum(lens(null, {origin: [-1, -0.5, 1], extent: [3, 1, 1]}, "depth"), 2)];
+        }"""
+    )
+    corners = np.reshape(drawn, (-1, 3))
+    far = corners[corners[:, 2] == 2][:8]  # without the mark that says which way is up
+    assert far.min(axis=0) == pytest.approx([-1, -0.5, 2])
+    assert far.max(axis=0) == pytest.approx([2, 0.5, 2])
 
 
 def test_what_is_gone_says_so(page: Page, station: Any, answer: Any, settle: Any, axe: Any) -> None:

@@ -136,6 +136,32 @@ def test_addresses_focus_and_keyboard(
     page.keyboard.press("Escape")
     expect(page.get_by_role("dialog")).to_have_count(0)
     expect(button).to_be_focused()
+    button.dblclick()  # one dialog, and it is of this page
+    settle(page)
+    expect(page.get_by_role("dialog")).to_have_count(1)
+    page.go_back()
+    expect(page.get_by_role("heading", name="There is no such page")).to_be_visible()
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    # steps upwards in an address lead to nothing else of the API
+    page.goto(f"{station.home}#/maps/building/frames/..")
+    settle(page)
+    expect(page.get_by_role("main")).to_contain_text("The address leads nowhere.")
+
+
+def test_a_page_looks_the_same_wherever_one_comes_from(
+    station: Any, page: Page, settle: Callable[[Page], None]
+) -> None:
+    look = """() => { const one = getComputedStyle(document.querySelector(".gallery .tile"));
+      return [one.padding, one.gap, one.borderRadius]; }"""
+    page.goto(f"{station.home}#/maps/building")
+    settle(page)
+    alone = page.evaluate(look)
+    for area in ("Operations", "Maps"):  # operations have tiles, too
+        page.get_by_role("link", name=area, exact=True).click()
+        settle(page)
+    page.locator("main a[href='#/maps/building']").first.click()
+    settle(page)
+    assert page.evaluate(look) == alone
 
 
 def test_a_service_without_maps_goes_and_comes_back(

@@ -79,11 +79,13 @@ def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(
             named("cloud.npy", array.getvalue()),
             named("broken.ply", broken),
             named("notes.txt", b"of no kind"),
+            named("twice.png", wall(0)),
+            named("empty.png", b""),
         ]
     )
     expect(page.get_by_text("1 file is no frame, and left out: notes.txt")).to_be_visible()
     expect(page.get_by_label("fx")).to_have_value("60")
-    start = page.get_by_role("button", name="Upload 5 files")
+    start = page.get_by_role("button", name="Upload 7 files")
     start.click()  # a pose leads to a frame that has a name
     expect(page.get_by_role("alert")).to_contain_text("frame-000001.depth.png has a pose")
     expect(page.get_by_label("Session")).to_be_focused()
@@ -96,9 +98,10 @@ def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(
     settled = {"indexed", "rejected"}
     # the first cloud of a worker may wait for its kernels to be compiled
     until(lambda: _states(station, path) <= settled and _count(station, path) == 4, 180)
-    for name in ("frame-000000.depth.png", "frame-000001.depth.png"):
+    for name in ("frame-000000.depth.png", "frame-000001.depth.png", "twice.png"):
         expect(row(page, name).locator(".badge")).to_have_text("indexed", timeout=30_000)
 
+    expect(row(page, "empty.png").locator(".row-more")).to_have_text("The file is empty.")
     refusal = station.client.post(
         path, data={"meta": "{}"}, files={"frame": ("broken.ply", broken)}
     ).json()

@@ -1,6 +1,7 @@
 // The shell: finds the page of an address, renders it, and shows what came of it.
 import { get, lives, Problem } from "./lib/api.js";
 import { h, put } from "./lib/dom.js";
+import { ago } from "./lib/format.js";
 import { go, parse } from "./lib/router.js";
 import { doubt, identify, may } from "./lib/session.js";
 import { empty, failed, gone, soon, toast } from "./lib/states.js";
@@ -8,6 +9,7 @@ import { drawHead, drawRail, setTitle } from "./lib/shell.js";
 
 const PAGES = new URL("./", import.meta.url);
 const LATE_MS = 2500;
+const AGES_MS = 20_000; // "just now" is not true for long
 const main = document.getElementById("main");
 const sheets = new Map(); // address -> <link> of styles
 let turn = null; // aborts what the page that is shown began
@@ -20,7 +22,9 @@ async function show() {
   const { signal } = turn;
   const { route, params, search, path } = parse(location.hash);
   const moved = shownPath !== null && shownPath !== path;
-  const focused = moved ? null : document.activeElement?.id;
+  for (const one of document.querySelectorAll("dialog")) one.close(); // it was of the page that is left
+  const before = moved ? null : document.activeElement;
+  const inside = main.contains(before);
   shownPath = path;
   main.setAttribute("aria-busy", "true");
   lost(false); // it was of the page that is left
@@ -48,18 +52,23 @@ async function show() {
     const actions = (...nodes) => { if (!signal.aborted) put(document.getElementById("actions"), nodes); };
     const title = (text) => { if (!signal.aborted) setTitle(text); };
     await page.render(root, { params, search, signal, go, title, actions });
-    if (focused && !signal.aborted) document.getElementById(focused)?.focus();
   } catch (error) {
     if (!signal.aborted && error.name !== "AbortError") await fault(root, error, signal);
   } finally {
     came();
-    if (!signal.aborted) main.setAttribute("aria-busy", "false");
+    if (!signal.aborted) {
+      main.setAttribute("aria-busy", "false");
+      // where that was is drawn anew: the keyboard must not begin at the top again
+      if (document.activeElement === document.body) (document.getElementById(before?.id) ?? (inside ? main : null))?.focus({ preventScroll: true });
+    }
   }
 }
 
 /** Show in place of a page why it is not there. */
 async function fault(root, error, signal) {
   put(document.getElementById("actions"));
+  if (isUnfetched(error)) error = await unloaded(error).catch((told) => told); // by the page itself
+  if (signal.aborted) return;
   if (error.status === 0) {
     // a module that could not be fetched is not asked for again before the page is loaded anew
     put(root, gone(error.reload ? () => location.reload() : show, signal));
@@ -70,7 +79,7 @@ async function fault(root, error, signal) {
     if (!signal.aborted) put(root, keyPage(error, show));
   } else {
     if (error.status === undefined) console.error(error); // a fault of ours
-    put(root, failed(error, show));
+    put(root, failed(error, error.reload ? () => location.reload() : show));
   }
 }
 
@@ -78,10 +87,9 @@ async function fault(root, error, signal) {
 function uncaught(event) {
   const error = event.reason;
   if (error?.name === "AbortError") { event.preventDefault(); return; }
-  const unfetched = /dynamically imported module/.test(error?.message);
-  if (error?.status === undefined && !unfetched) return; // a fault of ours: the console has it
+  if (error?.status === undefined && !isUnfetched(error)) return; // a fault of ours: the console has it
   event.preventDefault();
-  if (error.status === 401) { doubt(); show(); } else toast(error.message, { kind: "bad" });
+  if (error.status === 401) { doubt(); show(); } else toast(isUnfetched(error) ? "A part of this page could not be loaded. Load the page again." : error.message, { kind: "bad" });
 }
 
 async function styled(name) {
@@ -100,6 +108,10 @@ async function styled(name) {
   return link;
 }
 
+function isUnfetched(error) {
+  return /dynamically imported module/.test(error?.message);
+}
+
 async function unloaded(error) {
   const isUp = await lives();
   const document = { title: "This page cannot be loaded", detail: error.message };
@@ -110,16 +122,21 @@ const banner = document.getElementById("banner");
 let late = null; // a stream that is back at once is not worth a word
 
 function lost(isLost) {
+  if (isLost) { late ??= setTimeout(tellLost, LATE_MS); return; }
   clearTimeout(late);
-  if (!isLost) { banner.hidden = true; put(banner); return; }
-  late = setTimeout(() => {
-    banner.hidden = false;
-    put(banner, "The service does not answer. What is shown may be old; trying again…");
-  }, LATE_MS);
+  late = null;
+  banner.hidden = true;
+  put(banner);
+}
+
+function tellLost() {
+  banner.hidden = false;
+  put(banner, "The service does not answer. What is shown may be old; trying again…");
 }
 
 window.addEventListener("sceneprint:live", (event) => lost(event.detail === "waiting"));
 window.addEventListener("unhandledrejection", uncaught);
+setInterval(() => { for (const one of document.querySelectorAll("time")) put(one, ago(one.dateTime)); }, AGES_MS);
 window.addEventListener("hashchange", show);
 window.addEventListener("sceneprint:go", show);
 document.querySelector(".skip").addEventListener("click", (event) => {

@@ -39,9 +39,9 @@ export function editFrame(frame, edited) {
       toast("The frame was edited.");
       edited(data);
     } catch (error) {
+      if (error.status === 401 || !dialog.open) throw error; // told elsewhere
       if (error.status === 412) await meet();
-      else if (error.status === 401) throw error;
-      else put(said, h("p", { class: "field-error" }, error.message), (error.errors ?? []).map((one) => h("p", { class: "field-error" }, `${one.field}: ${one.reason}`)));
+      else put(said, h("p", { class: "field-error" }, error.message), (error.errors ?? []).map((one) => h("p", { class: "field-error" }, one.field ? `${one.field}: ${one.reason}` : one.reason)));
     } finally {
       save.disabled = false;
     }
@@ -51,8 +51,8 @@ export function editFrame(frame, edited) {
   function changes() {
     const patch = {};
     for (const [name, input] of Object.entries(inputs)) {
-      if (input.value.trim() === textOf(frame, name)) continue;
-      patch[name] = name === "tags" ? input.value.split(",").map((one) => one.trim()).filter(Boolean) : input.value.trim() || null;
+      if ([input.value, input.value.trim()].includes(textOf(frame, name))) continue;
+      patch[name] = name === "tags" ? tagsOf(input.value, frame.tags) : input.value.trim() || null;
     }
     return patch;
   }
@@ -73,6 +73,14 @@ export function editFrame(frame, edited) {
       h("button", { class: "button", type: "button", onClick: theirs }, "Take what is there now"));
     put(save, "Save mine over it");
   }
+}
+
+/** Tags as they were typed; one that was there and has a comma of its own stays one. */
+function tagsOf(text, there) {
+  const flat = (one) => `,${one.split(",").map((part) => part.trim()).join(",")},`;
+  let rest = flat(text);
+  const kept = there.filter((one) => one.includes(",") && rest !== (rest = rest.replace(flat(one), ",")));
+  return [...kept, ...rest.split(",").filter(Boolean)];
 }
 
 function textOf(frame, name) {

@@ -48,9 +48,14 @@ export function filterBar(search, runs, choose) {
   function moment(name, label) {
     const input = h("input", {
       type: "datetime-local", title: "In the time zone of this computer",
-      onChange: () => choose({ [name]: input.value ? new Date(input.value).toISOString() : null }),
+      onChange: () => {
+        const at = new Date(input.value);
+        // a year that is being typed is told digit by digit: 0002, 0020, 0202
+        if (input.value && !(at.getFullYear() >= 1000 && at.getFullYear() <= 9999)) return;
+        choose({ [name]: input.value ? at.toISOString() : null });
+      },
     });
-    return field(name, label, Object.assign(input, { show: (value) => { input.value = local(value); } }));
+    return field(name, label, Object.assign(input, { show: (value) => { if (input.value !== local(value)) input.value = local(value); } }));
   }
 
   const tag = (event) => choose({ tag: event.target.value.trim() || null });
@@ -82,10 +87,10 @@ function local(iso) {
 export function countOf(search, runs) {
   const uncounted = ["tag", "captured_after", "captured_before"];
   if (runs === null || uncounted.some((name) => search.has(name))) return null;
-  const state = search.get("state");
+  const states = search.getAll("state");
   const passes = (run, name) => !search.has(name) || search.getAll(name).includes(run[name]);
   return runs.filter((run) => passes(run, "robot") && passes(run, "session"))
     .flatMap((run) => Object.entries(run.frames))
-    .filter(([one]) => (state ? one === state : one !== "deleted"))
+    .filter(([one]) => (states.length ? states.includes(one) : one !== "deleted"))
     .reduce((sum, [, n]) => sum + n, 0);
 }

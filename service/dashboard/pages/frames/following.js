@@ -3,6 +3,7 @@ import { at, get, watch } from "../lib/api.js";
 import { isPending } from "./badge.js";
 
 const PAUSE_MS = 150;
+const AGAIN_MS = 3000; // where nothing answers, or too much is asked
 const AT_ONCE = 4;
 const MOST_UNKNOWN = 2000;
 
@@ -26,9 +27,10 @@ export function follow({ map, signal, shown, pending, changed, missed, arrived, 
   let timer = null;
   let begun = false;
 
+  // one look at a time: an older answer must not come after a newer one
   async function look() {
-    timer = null;
     const ids = [...waiting].slice(0, AT_ONCE);
+    let rest = PAUSE_MS;
     for (const id of ids) waiting.delete(id);
     await Promise.all(ids.map(async (id) => {
       try {
@@ -36,18 +38,23 @@ export function follow({ map, signal, shown, pending, changed, missed, arrived, 
       } catch (error) {
         if (error.name === "AbortError") return;
         if (error.status === 404 && shown(id)) changed({ frame_id: id, state: "deleted", reason: null });
+        else if (error.status === 0 || error.status === 429 || error.status >= 500) { waiting.add(id); rest = AGAIN_MS; }
         else if (error.status === 401) throw error;
       }
-    }));
-    if (waiting.size && !signal.aborted) soon();
+    })).finally(() => { timer = waiting.size && !signal.aborted ? setTimeout(look, rest) : null; });
   }
 
   function soon() {
     timer ??= setTimeout(look, PAUSE_MS);
   }
 
+  function doubt() {
+    for (const id of pending?.() ?? []) waiting.add(id);
+    if (waiting.size) soon();
+  }
+
   function hear(event) {
-    if (event.kind === "events.missed") { missed(); return; }
+    if (event.kind === "events.missed" || event.kind === "map.deleted") { doubt(); missed(); return; }
     if (!event.frame_id) return;
     if (shown(event.frame_id)) { waiting.add(event.frame_id); soon(); return; }
     unknown.add(event.frame_id);
@@ -57,14 +64,13 @@ export function follow({ map, signal, shown, pending, changed, missed, arrived, 
 
   signal.addEventListener("abort", () => clearTimeout(timer), { once: true });
   watch({
-    map, kinds: ["frame."], signal, onevent: hear,
+    map, kinds: ["frame.", "map."], signal, onevent: hear,
     onstate: (state) => {
       // what happened between the list and the stream was told to nobody
       if (state !== "live") return;
       if (!begun) begins?.();
       begun = true;
-      for (const id of pending?.() ?? []) waiting.add(id);
-      if (waiting.size) soon();
+      doubt();
     },
   });
   return { look: (id) => { if (unknown.delete(id)) { waiting.add(id); soon(); } } };

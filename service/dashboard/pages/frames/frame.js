@@ -29,7 +29,9 @@ export async function render(root, { params, search, signal, go, title, actions 
   put(root, h("div", { class: "frame-page" }, main, side));
 
   async function draw() {
+    const isEdit = document.activeElement?.id === "edit";
     put(side, about(frame, job, { edit: canWrite && frame.state !== "deleted" ? () => editFrame(frame, take) : null }));
+    if (isEdit) document.getElementById("edit")?.focus();
     if (drawn === frame.state) return;
     drawn = frame.state;
     actions(
@@ -38,7 +40,7 @@ export async function render(root, { params, search, signal, go, title, actions 
     if (frame.state !== "indexed") { put(main, look()); return; }
     const { scene } = await import("./scene.js");
     const cards = await scene(frame, signal);
-    if (!signal.aborted) put(main, look(), cards, neighbours(frame, signal));
+    if (!signal.aborted && frame.state === "indexed") put(main, look(), cards, neighbours(frame, signal));
   }
 
   /** The picture, with what its colours mean, and the files. */
@@ -46,12 +48,12 @@ export async function render(root, { params, search, signal, go, title, actions 
     const place = h("div", { class: "frame-look" });
     const meaning = h("p", { class: "muted frame-meaning" });
     const show = async (view) => {
-      put(place, preview(frame, { view, width: WIDTH, signal }));
+      const shown = preview(frame, { view, width: WIDTH, signal });
+      put(place, shown);
       put(meaning);
-      if (frame.state !== "indexed") return;
-      await place.querySelector("canvas").ready;
+      if (frame.state !== "indexed" || !(await shown.querySelector("canvas").ready)) return;
       const png = await bytes(`${path}/preview.png`, { params: { view, width: WIDTH }, signal, accept: "image/png" });
-      put(meaning, textOf(png, "Description"));
+      if (shown.isConnected) put(meaning, textOf(png, "Description")); // else another view was chosen meanwhile
     };
     const first = ["normals", "patches"].includes(search.get("view")) ? search.get("view") : "depth";
     const views = viewSwitch(first, (view) => {
@@ -81,7 +83,7 @@ export async function render(root, { params, search, signal, go, title, actions 
     if (!sure) return;
     await send("DELETE", path);
     toast(`Frame ${shortId(frame.frame_id)} was deleted.`);
-    go(link("maps", params.map));
+    if (!signal.aborted) go(link("maps", params.map));
   }
 
   function take(given) {
@@ -107,7 +109,7 @@ export async function render(root, { params, search, signal, go, title, actions 
       job = given.job_id ? await jobOf(given) : job;
       await take(given);
     },
-    missed: async () => take(await get(path, { signal })),
+    missed: () => {}, // it is pending
   });
 }
 

@@ -29,6 +29,7 @@ export async function render(root, { params, search, signal, go, title, actions 
   let runs = null; // of the map's sessions: 100,000 frames are counted for them, and the list need not wait
   let list = null;
   let last = null; // the page that is shown
+  let offered = null; // robots and sessions that the filters offer
   const tiles = new Map(); // by frame
   const come = new Set(); // frames that came since the list was asked for
   const grid = h("ul", { class: "gallery", id: "frames" });
@@ -60,7 +61,9 @@ export async function render(root, { params, search, signal, go, title, actions 
   function shownFault(error) {
     if (error.name === "AbortError") return;
     if (error.status === 401 || error.status === 0) throw error;
-    put(place, failed(error, () => fetchList().catch(shownFault)));
+    put(place, failed(error, () => fetchList().catch(shownFault)),
+      // an address that was cut off, or is too old: what it asks for is refused each time
+      error.status === 422 && h("div", { class: "toolbar gallery-news" }, wanted.has("cursor") && first("First page"), !clear.hidden && h("button", { class: "button", type: "button", onClick: () => clear.click() }, "Clear filters")));
     grid.removeAttribute("aria-busy");
     put(over); put(under);
   }
@@ -94,12 +97,22 @@ export async function render(root, { params, search, signal, go, title, actions 
 
   async function fetchRuns() {
     runs = await get(`${path}/sessions`, { params: { limit: 1000 }, signal });
+    if (last) drawPager(last);
+    // what is being typed or chosen in it stays; only other choices are worth another bar
+    const names = JSON.stringify(runs.items.map((one) => [one.robot, one.session]));
+    const at = document.activeElement;
+    if (!bar.contains(at)) { offer(names); return; }
+    at.addEventListener("focusout", () => setTimeout(() => { if (!signal.aborted) offer(names); }), { once: true });
+  }
+
+  function offer(names) {
+    if (names === offered) return;
+    offered = names;
     const before = bar;
     const focused = before.contains(document.activeElement) ? document.activeElement.id : null;
     bar = filterBar(wanted, runs.items, turn);
     before.replaceWith(bar);
     if (focused) document.getElementById(focused)?.focus();
-    if (last) drawPager(last);
   }
 
   function nothing() {
@@ -147,7 +160,8 @@ export async function render(root, { params, search, signal, go, title, actions 
   counted.catch(() => {}); // told below, if the list is there to be filtered
   await Promise.all([named, fetchList().catch((error) => {
     // another list may have been asked for meanwhile
-    if (error.name !== "AbortError" || signal.aborted) throw error;
+    if (error.status === 422) shownFault(error);
+    else if (error.name !== "AbortError" || signal.aborted) throw error;
   })]);
   counted.catch((error) => { if (error.name !== "AbortError") toast(error.message, { kind: "bad" }); });
   const isFirst = () => !wanted.has("cursor") && wanted.get("order") !== "asc";

@@ -7,7 +7,8 @@ const BREATH_MS = 12;
 const NATURAL = new Intl.Collator("en", { numeric: true });
 const PARENTS = 4; // folders above a frame that are looked into, as `sceneprint upload` does
 
-/** @typedef {{file: File, path: string}} Dropped path: with the folders that were dropped */
+/** @typedef {{file: File | null, path: string}} Dropped path: with the folders that were dropped; file:
+ *   null where it cannot be read */
 /** @typedef {{file: File, path: string, source: import("./kinds.js").Source, said: object,
  *   pose: File | null}} Found said: fields of the nearest intrinsics.json or clouds.json */
 
@@ -31,13 +32,14 @@ async function* walk(entries) {
     if (entry.name.startsWith(".")) continue;
     if (entry.isFile) {
       const file = await new Promise((resolve, reject) => { entry.file(resolve, reject); }).catch(() => null);
-      if (file) yield { file, path: entry.fullPath.replace(/^\//, "") };
+      yield { file, path: entry.fullPath.replace(/^\//, "") };
       continue;
     }
     const reader = entry.createReader();
     for (;;) { // a hundred at a time
-      const some = await new Promise((resolve, reject) => { reader.readEntries(resolve, reject); }).catch(() => []);
-      if (!some.length) break;
+      const some = await new Promise((resolve, reject) => { reader.readEntries(resolve, reject); }).catch(() => null);
+      if (some === null) yield { file: null, path: entry.fullPath.replace(/^\//, "") };
+      if (!some?.length) break;
       yield* walk(some);
     }
   }
@@ -58,6 +60,7 @@ export async function taken(files, signal) {
   let since = performance.now();
   for await (const { file, path } of files) {
     if (signal.aborted) break;
+    if (file === null) { faults.push(`${path} cannot be read.`); continue; }
     const source = await kindOf(file).catch(() => ({ kind: "other" }));
     if (source.kind === "pose") poses.set(`${folderOf(path)}/${stemOf(file.name)}`, file);
     else if (source.kind === "camera" || source.kind === "clouds") {

@@ -9,6 +9,7 @@ import { formOf, settings } from "./source.js";
 const AT_ONCE = 3;
 const TRIES = 6; // where nothing answers, or too much is asked
 const POLL_S = 1;
+const REST_S = 5;
 // what would be said of all that follow as well
 const ENDS_ALL = new Set([401, 403, 404, 507]);
 
@@ -36,7 +37,7 @@ class Queue {
     this.map = map;
     this.items = [];
     this.given = settings();
-    this.byFrame = new Map();
+    this.byFrame = new Map(); // the items of each: the same file may have been given twice
     this.running = false;
     this.stopped = null; // the Problem that ended all
     this.pausedUntil = 0;
@@ -77,7 +78,7 @@ class Queue {
 
   cancel(item) {
     item.stop?.abort();
-    if (item.state === "importing") send("POST", `${at("jobs", item.job.job_id)}/cancel`).catch(() => {});
+    if (item.state === "importing") send("POST", `${at("jobs", item.job.job_id)}/cancel`); // main tells of a refusal
     else if (["ready", "waiting", "sending"].includes(item.state)) this.change(item, { state: "cancelled" });
   }
 
@@ -121,6 +122,8 @@ class Queue {
     item.stop = new AbortController();
     this.change(item, { state: "sending", share: 0, problem: null });
     try {
+      // else the network would be blamed for it, and it asked again and again
+      await item.file.slice(0, 1).arrayBuffer().catch(() => { throw new Error("It cannot be read any more: it was changed, moved or removed since it was chosen. Choose it again."); });
       if (item.source.kind === "archive") await this.sendArchive(item);
       else await this.sendFrame(item);
     } catch (error) {
@@ -130,13 +133,16 @@ class Queue {
   }
 
   async sendFrame(item) {
+    if (item.file.size === 0) throw new Error("The file is empty.");
+    // the service would speak of the size of an image that this is not
+    if (item.source.kind === "depth" && !item.source.format) throw new Error("It is named as an image, and holds none: its bytes are no PNG and no NPY.");
     const pose = item.pose ? await poseOf(item.pose) : null;
     const form = await formOf(item.file, this.saidOf(item), { source: item.source, pose });
     const answer = await send("POST", at("maps", this.map, "frames"), {
       form, signal: item.stop.signal, onprogress: (share) => this.change(item, { share }),
     });
     const { frame_id, job_id, state, reason } = answer.data;
-    this.byFrame.set(frame_id, item);
+    this.byFrame.set(frame_id, [...(this.byFrame.get(frame_id) ?? []).filter((one) => one !== item), item]);
     this.change(item, { frame_id, job: { job_id }, state, reason, share: 1, isThere: answer.status === 200 });
   }
 
@@ -168,11 +174,13 @@ class Queue {
 
   async followImport(item) {
     const path = at("maps", this.map, "imports", item.job.job_id);
+    let wait = POLL_S;
     while (item.state === "importing") {
-      await new Promise((resolve) => { setTimeout(resolve, 1000 * POLL_S); });
+      await new Promise((resolve) => { setTimeout(resolve, 1000 * wait); });
       let job;
-      try { job = await get(path); } catch (error) {
-        if (error.status === 0 || error.status === 429 || error.status >= 500) continue;
+      try { job = await get(path); wait = POLL_S; } catch (error) {
+        wait = REST_S; // without a key, or an answer, it goes on all the same
+        if (error.status !== 404) continue;
         this.change(item, { state: "refused", problem: error });
         return;
       }
@@ -207,8 +215,9 @@ class Queue {
 
   /** What became of a frame of this queue. @param {Object<string, any>} frame */
   became(frame) {
-    const item = this.byFrame.get(frame.frame_id);
-    if (item && isPending(item.state)) this.change(item, { state: frame.state, reason: frame.reason });
+    for (const item of this.byFrame.get(frame.frame_id) ?? []) {
+      if (isPending(item.state)) this.change(item, { state: frame.state, reason: frame.reason });
+    }
   }
 
   /** Frames that are on their way to the index. */

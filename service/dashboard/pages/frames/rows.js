@@ -49,6 +49,7 @@ export function rowsOf(queue, signal) {
     const wanted = queue.items.filter((one) => group === "all" || groupOf(one.state) === group);
     const shown = wanted.slice(0, most);
     const ids = new Set(shown.map((one) => one.id));
+    const had = list.contains(document.activeElement);
     for (const [id, row] of rows) if (!ids.has(id)) { row.remove(); rows.delete(id); }
     shown.forEach((item, i) => {
       let row = rows.get(item.id);
@@ -60,6 +61,7 @@ export function rowsOf(queue, signal) {
     more.hidden = wanted.length <= most;
     put(more, `Show ${count(Math.min(STEP, wanted.length - most))} more of ${count(wanted.length - most)}`);
     element.hidden = queue.items.length === 0;
+    if (had && !list.contains(document.activeElement)) (list.querySelector(".row-action button") ?? choose.firstElementChild).focus({ preventScroll: true });
   }
 
   // a transfer tells of itself many times a second, and several are under way
@@ -87,7 +89,9 @@ function rowOf(queue, item) {
     row.dataset.state = item.state;
     put(about, aboutOf(queue, item));
     put(state, stateOf(item));
+    const had = action.contains(document.activeElement);
     put(action, actionOf(queue, item));
+    if (had) action.querySelector("button, a")?.focus();
     put(more, reasonOf(item));
     if (item.state === "waiting" && item.until) setTimeout(() => { if (item.state === "waiting") put(more, reasonOf(item)); }, 1000);
   };
@@ -138,7 +142,7 @@ function reasonOf(item) {
     return [
       state === "waiting" && h("p", {}, `Again ${rest > 0.5 ? `in ${seconds(rest)}` : "now"}: `),
       h("p", {}, problem.status ? h("strong", {}, `${problem.title}. `) : null, problem.detail ?? problem.message),
-      (problem.errors ?? []).length > 0 && h("ul", {}, problem.errors.map((one) => h("li", {}, `${one.field}: ${one.reason}`))),
+      (problem.errors ?? []).length > 0 && h("ul", {}, problem.errors.map((one) => h("li", {}, one.field ? `${one.field}: ${one.reason}` : one.reason))),
     ];
   }
   if (item.isThere && !isPending(state)) return h("p", {}, "The map has this frame already.", item.reason && ` ${item.reason}`);

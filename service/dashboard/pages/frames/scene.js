@@ -41,6 +41,7 @@ export async function scene(frame, signal) {
       state.points = parsePoints(await bytes(`${path}/points`, { signal }));
     } catch (error) {
       if (error.name === "AbortError") return;
+      if (error.status === 401) throw error;
       put(told, failed(error, () => { put(told, "Loading the points…"); begin(); }));
       return;
     }
@@ -56,6 +57,7 @@ export async function scene(frame, signal) {
     if (frame.kind !== "cloud" || frame.viewpoint) {
       viewer.lines("sensor", { positions: frustum(frame.intrinsics, 0.25), tint: "query" });
     }
+    if (frame.kind === "cloud") viewer.look({ elevation: 0.8 }); // a scan is wide and flat
     viewer.fit(["points"]);
     draw();
   }
@@ -66,6 +68,7 @@ export async function scene(frame, signal) {
       state.levels = [...told.levels.map((one, i) => levelOf(one, `Level ${i + 1}`)), levelOf(told.validation, "Validation")];
     } catch (error) {
       if (error.name === "AbortError") return;
+      if (error.status === 401) throw error;
       put(patchesPlace, failed(error, describe));
       return;
     }

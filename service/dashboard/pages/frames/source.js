@@ -32,7 +32,7 @@ export function settings() {
 
 /** Keep settings for this tab. @param {typeof EMPTY} given */
 export function remember(given) {
-  sessionStorage.setItem(KEPT_AS, JSON.stringify(given));
+  try { sessionStorage.setItem(KEPT_AS, JSON.stringify(given)); } catch { /* until a reload */ }
 }
 
 /**
@@ -71,7 +71,9 @@ function ofDepth(given, source) {
 }
 
 function ofCloud(given, source) {
-  const meta = {}, format = source.format === "kitti" ? "kitti" : given.format;
+  const meta = {};
+  // the file's own bytes tell its format, whatever was said of others
+  const format = source.format === "kitti" ? "kitti" : source.format ? null : given.format;
   if (format) meta.format = format;
   if (said(given.units_per_metre)) meta.units_per_metre = numberOf(given.units_per_metre);
   const seen = given.viewpoint;

@@ -12,6 +12,8 @@ import { queueOf } from "./queue.js";
 import { groupOf, rowsOf } from "./rows.js";
 import { cameraFields, hasCamera, remember } from "./source.js";
 
+const ALOUD_MS = 5000;
+
 export const styles = ["frames/source.css", "frames/upload.css", "frames/frames.css"];
 
 /** The page: #/maps/NAME/upload */
@@ -24,9 +26,11 @@ export async function render(root, { params, signal, title, actions }) {
   }
   const queue = queueOf(params.map);
   const said = h("p", { class: "field-error", role: "alert" });
-  const note = h("p", { class: "muted" });
+  const note = h("p", { class: "muted", role: "status" });
   const summary = h("div", { class: "upload-sum" });
-  const status = h("strong", { role: "status" });
+  const status = h("strong");
+  const aloud = h("p", { class: "visually-hidden", role: "status" }); // the same, less often
+  const stop = h("p", { class: "field-error", role: "alert" });
   const rows = rowsOf(queue, signal);
   const fields = cameraFields(queue.given);
   const start = h("button", { class: "button primary", type: "button", onClick: begin });
@@ -36,7 +40,7 @@ export async function render(root, { params, signal, title, actions }) {
   const bar = h("div", { class: "upload-bar" }, summary, h("div", { class: "toolbar" }, tidy, retry, cancel, start));
   const place = dropZone((files) => take(files));
   put(root, h("div", { class: "upload" },
-    h("div", { class: "upload-main" }, place, note, bar, said, rows),
+    h("div", { class: "upload-main" }, place, note, bar, aloud, said, rows),
     h("aside", { class: "card upload-said", "aria-label": "What is said of the files" }, whoFields(queue.given), fields)));
   actions(h("a", { class: "button", href: link("maps", params.map) }, "To the frames"));
 
@@ -109,19 +113,39 @@ export async function render(root, { params, signal, title, actions }) {
       status,
       h("span", { class: "muted number" }, sending ? `${bytes(sent)} of ${bytes(size)} sent` : bytes(size)),
       sending && h("progress", { max: size || 1, value: sent, "aria-label": "All files, sent" }),
-      queue.stopped && h("p", { class: "field-error", role: "alert" }, `It was stopped, as all others would be refused as well: ${queue.stopped.message}`),
+      stop,
     ]);
+    const why = queue.stopped?.status === 401 ? "It was stopped: the service asks for another key. With one, upload the rest."
+      : queue.stopped ? `It was stopped, as all others would be refused as well: ${queue.stopped.message}` : "";
+    if (stop.textContent !== why) put(stop, why);
+    tell(parts.join(" · "));
   }
 
+  let telling = null;
+  let toTell = "";
+  function tell(words) { // a count that moves five times a second is no speech
+    toTell = words;
+    if (toTell === aloud.textContent) return;
+    telling ??= setTimeout(() => { telling = null; put(aloud, toTell); }, ALOUD_MS);
+  }
+
+  // a drop that misses its zone would have the browser leave the page for the file
+  const isFiles = (event) => event.dataTransfer?.types.includes("Files");
+  document.addEventListener("dragover", (event) => { if (isFiles(event)) event.preventDefault(); }, { signal });
+  document.addEventListener("drop", (event) => {
+    if (!isFiles(event) || event.defaultPrevented) return;
+    event.preventDefault();
+    take(dropped(event.dataTransfer));
+  }, { signal });
   queue.listeners.add(show);
-  signal.addEventListener("abort", () => { queue.listeners.delete(show); clearTimeout(timer); }, { once: true });
+  signal.addEventListener("abort", () => { queue.listeners.delete(show); clearTimeout(timer); clearTimeout(telling); }, { once: true });
   sum();
   const following = follow({
     map: params.map, signal,
     shown: (id) => queue.byFrame.has(id),
     pending: () => queue.pending(),
     changed: (frame) => queue.became(frame),
-    missed: () => { for (const id of queue.pending()) get(at("maps", params.map, "frames", id), { signal }).then((frame) => queue.became(frame)); },
+    missed: () => {}, // those that are pending are looked at
   });
 }
 

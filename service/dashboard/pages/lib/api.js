@@ -56,11 +56,12 @@ export async function bytes(path, { params, signal, accept = "*/*" } = {}) {
   const known = kept.get(name);
   if (known) headers["If-None-Match"] = known.tag;
   const answer = await ask(path, params, { headers, signal }, known ? 304 : undefined);
+  const same = answer.status === 304;
+  const body = same ? known.body : await whole(answer.arrayBuffer());
+  const tag = same ? known.tag : answer.headers.get("ETag");
+  // by now another may have asked for it as well
+  keptBytes -= kept.get(name)?.body.byteLength ?? 0;
   kept.delete(name);
-  if (answer.status === 304) { kept.set(name, known); return known.body; }
-  if (known) keptBytes -= known.body.byteLength;
-  const body = await whole(answer.arrayBuffer());
-  const tag = answer.headers.get("ETag");
   if (tag && body.byteLength <= KEPT_BYTES / 4) {
     kept.set(name, { tag, body });
     keptBytes += body.byteLength;

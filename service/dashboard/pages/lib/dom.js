@@ -38,6 +38,16 @@ export function put(parent, ...children) {
   return parent;
 }
 
+/**
+ * What a button does, once at a time: a second click while it is under way does nothing.
+ * @param {() => Promise<any>} act
+ * @returns {() => Promise<any>}
+ */
+export function once(act) {
+  let turn = null;
+  return () => (turn ??= act().finally(() => { turn = null; }));
+}
+
 function made(element, props, children) {
   const isProps = props === null || props === undefined
     || (typeof props === "object" && !Array.isArray(props) && !(props instanceof Node));

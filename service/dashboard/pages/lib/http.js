@@ -26,6 +26,8 @@ export class Problem extends Error {
 
 /** A path of the API from its segments, which may hold any character. @param {...string} segments */
 export function at(...segments) {
+  // nothing is called so, and a URL would take it for a step to elsewhere
+  if (segments.some((one) => /^\.{0,2}$/.test(one))) throw new Problem(404, { title: "Not found", detail: "The address leads nowhere." });
   return segments.map((one) => encodeURIComponent(one)).join("/");
 }
 
@@ -44,7 +46,7 @@ export async function ask(path, params, init = {}, alsoGood) {
     throw unreachable();
   }
   if (answer.ok || answer.status === alsoGood) return answer;
-  throw new Problem(answer.status, await answer.json().catch(() => ({})), answer.headers.get("Retry-After"));
+  throw new Problem(answer.status, (await answer.json().catch(() => null)) ?? {}, answer.headers.get("Retry-After"));
 }
 
 /** The address of something of the API, for a link. @param {string} path @param {any} [params] */

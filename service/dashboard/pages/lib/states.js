@@ -108,7 +108,11 @@ export function sheet({ title, children, buttons }) {
   const dialog = h("dialog", { class: "dialog", "aria-label": title },
     h("form", { novalidate: true }, h("h2", {}, title), children, h("div", { class: "dialog-foot" }, cancel, buttons)));
   const before = document.activeElement;
-  dialog.addEventListener("close", () => { dialog.remove(); if (before?.isConnected) before.focus(); });
+  dialog.addEventListener("close", () => {
+    dialog.remove();
+    // what was pressed may have been drawn anew
+    (before?.isConnected ? before : document.getElementById(before?.id))?.focus();
+  });
   document.body.append(dialog);
   dialog.showModal();
   dialog.querySelector("input, select, textarea")?.focus();

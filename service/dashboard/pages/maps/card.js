@@ -1,6 +1,6 @@
 // A map as a card: what is in it, how it grew, what it is signed with, how far its index is.
 import { at, get } from "../lib/api.js";
-import { h, put, svg } from "../lib/dom.js";
+import { h, once, put, svg } from "../lib/dom.js";
 import { bytes, count } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
@@ -49,6 +49,7 @@ export function mapCard(map, { signal, changed }) {
       h("div", {}, h("dt", {}, "Disk"), parts.disk)));
   let filled = null; // when the figures were asked for; null: never
   let timer = null;
+  let looks = 0;
   const card = { element, map, update, fill };
 
   function update(next) {
@@ -78,6 +79,7 @@ export function mapCard(map, { signal, changed }) {
   async function fill() {
     filled = Date.now();
     timer = null;
+    const look = looks += 1;
     const { name, created_at } = card.map;
     const hours = Math.max(2, Math.ceil((Date.now() - Date.parse(created_at)) / HOUR_MS) + 1);
     const young = hours <= YOUNG_H;
@@ -87,6 +89,7 @@ export function mapCard(map, { signal, changed }) {
         get("stats", { params: { map: name, minutes: 1 }, signal }),
         get(at("maps", name, "growth"), { params: span, signal }),
       ]);
+      if (look !== looks) return; // a newer one is under way, or was faster
       put(parts.index, lag(stats.indexes.find((one) => one.map === name), stats.frames.indexed ?? 0));
       const { database, blobs, index } = stats.bytes;
       put(parts.disk, h("span", { title: `${bytes(database ?? 0)} signatures, ${bytes(blobs)} uploads and geometry, ${bytes(index)} index` },
@@ -141,6 +144,6 @@ function first(map) {
 }
 
 function tool(path, label, act) {
-  return h("button", { class: "button quiet", type: "button", "aria-label": label, title: label, onClick: act },
+  return h("button", { class: "button quiet", type: "button", "aria-label": label, title: label, onClick: once(act) },
     svg("svg", { class: "icon", viewBox: "0 0 24 24", "aria-hidden": "true" }, svg("path", { d: path })));
 }

@@ -15,9 +15,10 @@ const FOR = {
 // what the API's regular expression means
 const PATTERN = "Lower-case letters, digits, - and _ only, and a letter or a digit first.";
 
-/** Ask for a name, a title and a model, and make a map of them. @param {(hash: string) => void} go */
-export async function createMap(go) {
-  const { items } = await get("models");
+/** Ask for a name, a title and a model, and make a map of them. @param {(hash: string) => void} go
+ * @param {AbortSignal} signal */
+export async function createMap(go, signal) {
+  const { items } = await get("models", { signal });
   const name = h("input", { id: "new-name", name: "name", class: "mono", autocomplete: "off", spellcheck: "false", maxlength: 63 });
   const title = h("input", { id: "new-title", name: "title", autocomplete: "off", maxlength: 200 });
   const models = items.filter((one) => one.preset).map((one, i) => choice(one, i === 0));
@@ -34,7 +35,7 @@ export async function createMap(go) {
       const json = { name: name.value.trim(), title: title.value.trim() || null, model };
       const { status, data } = await send("POST", "maps", { json });
       toast(status === 201 ? `${data.name} was made.` : `${data.name} was there already, as wanted.`);
-      go(link("maps", data.name));
+      if (dialog.open) go(link("maps", data.name)); // else it was left meanwhile
     },
     place: (problem) => (problem.type === "map-exists" ? "name" : null),
   });
@@ -76,6 +77,7 @@ export async function deleteMap(map, changed) {
   await send("DELETE", at("maps", map.name));
   toast(`${map.name} was deleted.`);
   await changed();
+  if (document.activeElement === document.body) document.getElementById("title").focus({ preventScroll: true }); // its card is gone
 }
 
 /** A dialog that stays until what it asks for is saved; refusals are told at their fields. */
@@ -93,7 +95,7 @@ async function form({ title, action, children, save, place }) {
       await save(dialog);
       dialog.close();
     } catch (error) {
-      if (error.status === undefined || error.status === 401) { dialog.close(); throw error; }
+      if (error.status === undefined || error.status === 401 || !dialog.open) { dialog.close(); throw error; }
       const own = await place(error);
       const told = own ? [{ field: own, reason: error.detail }] : error.errors;
       const left = told.filter((one) => !tell(dialog, one));

@@ -1,6 +1,6 @@
 // The maps: a card each, with what is in them; they are made here, and their counts move by events.
 import { at, get, watch } from "../lib/api.js";
-import { h, put } from "../lib/dom.js";
+import { h, once, put } from "../lib/dom.js";
 import { count } from "../lib/format.js";
 import { may, me } from "../lib/session.js";
 import { empty } from "../lib/states.js";
@@ -10,6 +10,7 @@ import { inView } from "./turns.js";
 export const styles = ["maps/maps.css"];
 
 const SOON_MS = 600; // events come in bursts: one look is enough for all of them
+const AGAIN_MS = 4000;
 const MANY = 6; // from here on one list costs less than each map for itself
 const FILTER_FROM = 9;
 
@@ -27,7 +28,7 @@ export async function render(root, { signal, go, title, actions }) {
 
   function draw(items) {
     const names = new Set(items.map((one) => one.name));
-    for (const [name, card] of cards) if (!names.has(name)) { view.leave(card.element); cards.delete(name); }
+    for (const [name, card] of cards) if (!names.has(name)) { view.leave(card.element); card.element.remove(); cards.delete(name); }
     for (const one of items) {
       const known = cards.get(one.name);
       if (known) { known.update(one); continue; }
@@ -35,9 +36,10 @@ export async function render(root, { signal, go, title, actions }) {
       cards.set(one.name, card);
       view.join(card.element, card.fill);
     }
-    const wantedOrder = items.map((one) => cards.get(one.name).element);
-    // moved only where they stand otherwise: moving takes the focus from what is in a card
-    if (wantedOrder.length !== grid.children.length || wantedOrder.some((one, i) => one !== grid.children[i])) put(grid, wantedOrder);
+    items.forEach(({ name }, i) => { // those that stand right stay: moving takes the focus from what is in a card
+      const { element } = cards.get(name);
+      if (grid.children[i] !== element) grid.insertBefore(element, grid.children[i] ?? null);
+    });
     if (items.length === 0) { put(root, begin()); return; }
     if (!grid.isConnected) put(root, h("div", { class: "toolbar spread" }, summary, wanted), nothing, grid);
     wanted.hidden = items.length < FILTER_FROM;
@@ -69,8 +71,22 @@ export async function render(root, { signal, go, title, actions }) {
     draw((await get(at("maps"), { signal })).items);
   }
 
+  // one look at a time: an older answer must not come after a newer one
   async function look() {
-    timer = null;
+    const [...asked] = dirty;
+    let rest = SOON_MS;
+    try {
+      await lookAt();
+    } catch (error) {
+      if (error.name === "AbortError" || !(error.status === 0 || error.status === 429 || error.status >= 500)) throw error;
+      for (const one of asked) dirty.add(one);
+      rest = AGAIN_MS;
+    } finally {
+      timer = dirty.size && !signal.aborted ? setTimeout(look, rest) : null;
+    }
+  }
+
+  async function lookAt() {
     const names = [...dirty].filter((name) => cards.has(name));
     const all = dirty.has(null) || names.length > MANY;
     dirty.clear();
@@ -98,7 +114,7 @@ export async function render(root, { signal, go, title, actions }) {
   }
 
   const mayMake = may("admin") || Object.values(me()?.grants ?? {}).includes("admin");
-  const make = async () => (await edit()).createMap(go);
+  const make = once(async () => (await edit()).createMap(go, signal));
   const button = (id) => h("button", { class: "button primary", type: "button", id, onClick: make }, "New map");
   const begin = () => empty({
     title: "No maps yet",

@@ -111,23 +111,23 @@ export async function retryAll(map, signal, tell) {
   let cursor = null;
   do {
     const page = await get("jobs", { params: { state: "dead", map, cursor, limit: 1000 }, signal });
-    dead.push(...page.items.filter(canRetry));
+    dead.push(...page.items.filter(canRetry).map((job) => job.job_id)); // a traceback of each is much
     cursor = page.next_cursor;
   } while (cursor);
   if (dead.length === 0) { tell("No dead job is left to be tried again."); return; }
   const many = dead.length === 1 ? "1 dead job" : `${count(dead.length)} dead jobs`;
   const text = h("p", {}, `${many}${map ? ` of map ${map}` : ""} will be queued once more, each with its tries anew. What broke them may break them again.`);
   if (!(await confirm({ title: "Retry all dead jobs", text, action: `Retry ${many}` }))) return;
-  const left = [...dead];
+  const left = dead.toReversed(); // taken from its end
   let done = 0;
   let refused = 0;
   await Promise.all(Array.from({ length: SIDE_BY_SIDE }, async () => {
-    for (let job = left.shift(); job !== undefined && !signal.aborted; job = left.shift()) {
+    for (let job = left.pop(); job !== undefined && !signal.aborted; job = left.pop()) {
       try {
-        await send("POST", at("jobs", job.job_id, "retry"), { signal });
+        await send("POST", at("jobs", job, "retry"), { signal });
         done += 1;
       } catch (error) {
-        if (error.status === 409) refused += 1; // somebody else was first
+        if (error.status === 409 || error.status === 404) refused += 1; // somebody else was first
         else { left.length = 0; throw error; }
       }
       tell(`Queued ${count(done)} of ${count(dead.length)}…`);

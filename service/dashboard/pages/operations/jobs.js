@@ -3,7 +3,7 @@ import { get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count } from "../lib/format.js";
 import { go, link } from "../lib/router.js";
-import { may } from "../lib/session.js";
+import { may, me } from "../lib/session.js";
 import { empty } from "../lib/states.js";
 import { jobRow, retryAllButton } from "./joblist.js";
 import { mapField } from "./mapfield.js";
@@ -26,6 +26,7 @@ export async function renderTab(root, { search, signal }) {
   const kind = h("select", { id: "jobs-kind", onChange: () => go(to({ kind: kind.value })) },
     h("option", { value: "" }, "All kinds"), KINDS.map((one) => h("option", { value: one, selected: one === asked.kind }, one)));
   const [status, button] = retryAllButton(asked.map, signal, () => again());
+  const writes = asked.map === null ? mayAny("write") : may("write", asked.map);
   let pages = 1;
 
   async function look() {
@@ -43,7 +44,7 @@ export async function renderTab(root, { search, signal }) {
     renewTimes(list);
     const known = await counts(asked.map, signal);
     tell(known);
-    button.hidden = known !== null && !known.dead;
+    button.hidden = !writes || (known !== null && !known.dead);
   }
 
   const again = await poll(look, POLL_S, signal);
@@ -52,6 +53,9 @@ export async function renderTab(root, { search, signal }) {
       await mapField(asked.map, signal, (map) => go(to({ map }))),
       status, button)), list, nothing, more);
 }
+
+/** Whether the key may do that with any map. */
+const mayAny = (scope) => may(scope) || Object.keys(me().grants).some((map) => may(scope, map));
 
 /** How many jobs are in each state; null for who may not have them counted. */
 async function counts(map, signal) {

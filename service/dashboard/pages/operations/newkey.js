@@ -37,10 +37,10 @@ export async function newKey(signal, made) {
     const until = expires.value ? new Date(expires.value).toISOString() : null;
     button.disabled = true;
     try {
-      const { data } = await send("POST", "keys", { json: { name: name.value.trim(), grants, expires_at: until }, signal });
+      const { data } = await send("POST", "keys", { json: { name: name.value.trim(), grants, expires_at: until } }); // even if the page is left: only this answer has the secret
       dialog.close();
       secret(data);
-      await made();
+      if (!signal.aborted) await made();
     } catch (error) {
       if (error.status === undefined) throw error;
       const fields = error.errors.map((one) => `${one.field}: ${one.reason}`);

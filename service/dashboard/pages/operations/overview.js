@@ -75,9 +75,10 @@ function failureList(map, signal) {
       const pages = await Promise.all(["dead", "failed"].map((state) => get("jobs", { params: { state, map, limit: 100 }, signal })));
       const left = pages.flatMap((page) => page.items).filter((job) => !job.followed_by);
       left.sort((a, b) => Date.parse(b.finished_at) - Date.parse(a.finished_at));
-      none.hidden = left.length > 0;
-      rest.hidden = left.length <= FAILURES && pages.every((page) => page.next_cursor === null);
-      button.hidden = !left.some((job) => job.state === "dead" && canRetry(job));
+      const older = pages.map((page) => page.next_cursor !== null); // that were not looked at
+      none.hidden = left.length > 0 || older.some(Boolean);
+      rest.hidden = left.length <= FAILURES && !older.some(Boolean);
+      button.hidden = !older[0] && !left.some((job) => job.state === "dead" && canRetry(job));
       show(left.slice(0, FAILURES));
     },
   });

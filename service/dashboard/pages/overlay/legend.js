@@ -3,6 +3,8 @@ import { count, metres, percent } from "../lib/format.js";
 import { h, svg } from "../lib/dom.js";
 import { BESIDE, STEPS, VIOLATES } from "../viewer/colours.js";
 
+const LISTED = 2000; // violations of a side that the API lists, at most
+
 const rgb = (bytes) => `rgb(${bytes.join(" ")})`;
 
 /** A shape as it is drawn: "dot", "cross", "line" or "lens". */
@@ -49,7 +51,8 @@ export function legend(shown, details, points, tally) {
   if (isWhole && seen("violations") && shown.colour !== "residual") {
     const n = (details.query?.violations.length ?? 0) + (details.match?.violations.length ?? 0);
     const asked = (details.query?.sampled ?? 0) + (details.match?.sampled ?? 0), isRival = shown.pose === "rival";
-    const more = isRival ? "some of them" : `${count(n)} of ${count(asked)} points that were looked up`;
+    const least = [details.query, details.match].some((one) => one?.violations.length >= LISTED) ? "at least " : "";
+    const more = isRival ? "some of them" : `${least}${count(n)} of ${count(asked)} points that were looked up`;
     if (isRival ? tally?.violations : n) add("cross", "var(--violation)", "Violation: the other saw through here", more);
   }
   if (seen("patches") && details.patches && shown.pose !== "rival") add("line", "var(--ink)", "Patches that coincide", `${count(details.patches.query.length)} pairs`);
@@ -57,6 +60,6 @@ export function legend(shown, details, points, tally) {
     add("lens", "var(--query)", "Query’s sensor");
     add("lens", "var(--match)", "Match’s sensor");
   }
-  if (isWhole && seen("free") && shown.pose === "aligned" && details.uncertainty?.degenerate.length) add("both", "var(--warn)", "Free direction");
+  if (isWhole && seen("free") && shown.pose === "aligned" && details.uncertainty?.degenerate.length) add("both", "var(--accent)", "Free direction");
   return h("ul", { class: "overlay-legend", "aria-label": "What the colours mean" }, rows);
 }

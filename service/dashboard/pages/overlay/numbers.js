@@ -38,9 +38,10 @@ export function evidenceCard(details) {
     ["Plane overlap", percent(v.plane_overlap), "the same, every plane counting alike"],
     ["Inliers", sampled ? `${count(v.inliers)} of ${count(sampled)}` : count(v.inliers), "points that lie on the other's surface"],
     ["Violations", v.free_space_violations === null ? "–" : percent(v.free_space_violations),
-      v.free_space_violations === null ? "without a viewpoint nothing is known of free space" : "lie where the other saw through"],
+      v.free_space_violations === null ? "without a viewpoint nothing is known of free space" : "of these and the inliers: the other saw through"],
     ["Residual", residual, "query to match and back, estimated apart"],
-    ["Ambiguity", percent(v.ambiguity), "of what agrees, the best rival explains"],
+    v.ambiguity === 0 && v.status !== "accepted" ? ["Ambiguity", "–", "rivals are looked for only where all else agrees"]
+      : ["Ambiguity", percent(v.ambiguity), "of both frames, the best rival explains"],
     ["Patches", details.patches ? count(details.patches.query.length) : "–", "pairs coincide"],
   ];
   if (!details.transform) return card("Evidence", h("p", { class: "muted" }, "Without a transform there is nothing to count."));
@@ -104,7 +105,7 @@ export function rivalCard(details, tallies) {
   if (!rival) return null;
   const away = transform && apart(rival, transform);
   const share = (pose, name) => (tallies[pose] ? percent(tallies[pose][name] / Math.max(tallies[pose].total, 1)) : "…");
-  const rows = [["On the other’s surface", "agree"], ["Seen through", "violations"]];
+  const rows = [["On the other’s surface", "agree"], ["Violations", "violations"]];
   return card("Rival pose",
     h("p", {}, "Another pose explains ", h("strong", {}, percent(validation.ambiguity)), " of both frames, every plane counting alike",
       away && [", ", h("strong", {}, metres(away.metres)), " and ", h("strong", {}, degrees(away.degrees)), " from the one that was found"], "."),
@@ -115,7 +116,7 @@ export function rivalCard(details, tallies) {
 }
 
 /** Who was compared. @param {object} answer @param {object} details @param {object | null} frame */
-export function framesCard(answer, details, frame) {
+export function framesCard(answer, details, frame, query) {
   const asked = answer.frame;
   const row = (side, name, href, note) => h("li", { dataset: { side } },
     h("span", { class: "overlay-swatch", "aria-hidden": "true" }), h("span", {}, h("strong", {}, side === "query" ? "Query" : "Match"), " ",
@@ -123,7 +124,7 @@ export function framesCard(answer, details, frame) {
   const told = (one) => [one?.session && `session ${one.session}`, one?.robot && `robot ${one.robot}`].filter(Boolean).join(", ");
   return card("Frames", h("ul", { class: "overlay-who" },
     row("query", asked ? shortId(asked.frame_id) : "an upload, not kept in a map",
-      asked && link("maps", asked.map, "frames", asked.frame_id), asked && `map ${asked.map}`),
+      asked && link("maps", asked.map, "frames", asked.frame_id), asked && [`map ${asked.map}`, told(query)].filter(Boolean).join(", ")),
     row("match", shortId(details.frame_id), link("maps", details.map, "frames", details.frame_id),
       [`map ${details.map}`, told(frame)].filter(Boolean).join(", "))));
 }

@@ -79,14 +79,15 @@ export class Scene {
       const way = [t.x, t.y, t.z].map((v) => v * reach);
       out.push(...at.map((v, k) => v - way[k]), ...at.map((v, k) => v + way[k]));
     }
-    this.viewer.lines("free", { positions: new Float32Array(out), tint: "warn", width: 3, onTop: true });
+    this.viewer.lines("free", { positions: new Float32Array(out), tint: "accent", width: 3, onTop: true });
   }
 
   /** Set what is drawn to what is shown; the matrices follow by themselves. */
   paint() {
     const { viewer, shown, details } = this;
-    const set = this.sets[shown.colour === "residual" ? shown.pose : "aligned"] ?? this.sets.aligned;
-    const colour = { source: "tint", normal: "normal", residual: "residual" }[shown.colour];
+    const own = this.sets[shown.pose], set = (shown.colour === "residual" && own) || this.sets.aligned;
+    // residuals of another pose would be untrue: until its own have come there are none
+    const colour = { source: "tint", normal: "normal", residual: own ? "residual" : "tint" }[shown.colour];
     const seen = (name) => !shown.hidden.has(name);
     const isWhole = shown.pose !== "before" && shown.share === 1; // evidence is of the whole pose
     if (isWhole) this.crossesOf(shown.pose);

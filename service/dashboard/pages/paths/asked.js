@@ -8,7 +8,7 @@ import { inverseRigid, multiply, ofRows } from "../viewer/matrix.js";
 import { axesOf, SIGMAS } from "./shapes.js";
 
 /**
- * @typedef {{id: string, status: string, parent: string | null, pose: number[] | null,
+ * @typedef {{id: string, status: string, kind: "depth" | "cloud", parent: string | null, pose: number[] | null,
  *   axes: {deviation: number, axis: number[]}[] | null,
  *   matches: {frame: string, parent: string, pose: number[], strength: string}[],
  *   accepted: number, location: Object<string, any> | null, elsewhere: string | null}} Asked
@@ -26,7 +26,7 @@ export async function answerOf(query, map, signal) {
   const here = accepted.filter((one) => one.map === map && one.pose_in_map && one.transform);
   const location = answer.location && (answer.location.map ?? map) === map ? answer.location : null;
   return {
-    id: query, status: answer.status, accepted: accepted.length, location,
+    id: query, status: answer.status, kind: answer.kind, accepted: accepted.length, location,
     parent: location?.pose.parent_frame ?? null,
     pose: location && ofRows(location.pose.matrix),
     axes: location?.uncertainty ? axesOf(block(location.uncertainty.covariance)) : null,

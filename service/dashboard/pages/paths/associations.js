@@ -108,9 +108,11 @@ export function begin(map, runs, onbegun) {
  */
 export async function follow(map, id, onchange, signal) {
   for (;;) {
-    const now = await get(at("maps", map, "associations", id), { signal });
-    onchange(now);
-    if (OVER.has(now.state)) {
+    // a service that restarts does not end it: it is asked again
+    const now = await get(at("maps", map, "associations", id), { signal })
+      .catch((error) => { if (error.status === 0 || error.status === 503) return null; throw error; });
+    if (now) onchange(now);
+    if (now && OVER.has(now.state)) {
       if (now.state !== "succeeded") toast(`The association ${now.state === "cancelled" ? "was cancelled" : "broke down"}. ${now.error ?? ""}`, { kind: "bad" });
       return;
     }

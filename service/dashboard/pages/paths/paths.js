@@ -176,10 +176,16 @@ class Page {
     }));
     const camera = this.#drawn.find((one) => one.camera)?.camera ?? null;
     this.scene.ask(drawn ? {
-      pose: multiply(join, asked.pose), axes: asked.axes, turn: join, camera, matchCamera: camera,
+      pose: multiply(join, asked.pose), axes: asked.axes, turn: join, camera: asked.kind === "cloud" ? null : camera,
       matches: asked.matches.filter((one) => this.#reached.has(one.parent))
-        .map((one) => multiply(this.#reached.get(one.parent).matrix, one.pose)),
+        .map((one) => ({ pose: multiply(this.#reached.get(one.parent).matrix, one.pose), camera: this.#cameraOf(one) })),
     } : null);
+  }
+
+  // of the run that a match is from: a map can hold depth images and clouds; null of a cloud
+  #cameraOf({ frame, parent }) {
+    const run = this.#drawn.find((one) => one.ids.includes(frame)) ?? this.#drawn.find((one) => one.parent === parent);
+    return run && !run.isCloud ? run.camera : null;
   }
 
   /** Fetch and draw the edges of the association that is chosen. */
@@ -188,7 +194,9 @@ class Page {
     let told = null;
     if (one?.state === "succeeded") {
       if (this.#edges?.of !== one.association_id) {
-        this.#edges = { of: one.association_id, ...await edgesOf(this.map, one.association_id, this.signal) };
+        const found = await edgesOf(this.map, one.association_id, this.signal);
+        if (one.association_id !== this.association?.association_id) return; // another was chosen meanwhile
+        this.#edges = { of: one.association_id, ...found };
       }
       const drawn = this.#edges.edges.map((edge) => ({ kind: kindOf(edge), from: this.#end(edge.from_pose), to: this.#end(edge.to_pose) }))
         .filter((edge) => edge.from && edge.to);

@@ -124,22 +124,23 @@ class Scene {
 
   /**
    * The query among the paths; null: none.
-   * @param {{pose: number[], axes: any, turn: number[], camera: any, matches: number[][]} | null} asked
-   *   all in the picture's frame, but the axes, which `turn` brings there
+   * @param {{pose: number[], axes: any, turn: number[], camera: any, matches: {pose: number[], camera: any}[]} | null} asked
+   *   camera: null of a cloud's sensor; all in the picture's frame, but the axes, which `turn` brings there
    */
   ask(asked) {
     this.#asked = asked;
     for (const id of ["query", "ellipsoid", "matches", "matched"]) this.#viewer.remove(id);
     if (asked === null) { this.#moved(); return; }
     const eye = this.#near(placeOf(asked.pose)), size = 2.4 * this.#size;
-    this.#viewer.lines("query", { positions: copies(frustum(asked.camera, size), [this.#moveOrigin(asked.pose)]), tint: "query", width: 3.5 });
+    this.#viewer.lines("query", { positions: copies(sensor(asked.camera, size), [this.#moveOrigin(asked.pose)]), tint: "query", width: 3.5 });
     if (asked.axes) {
       const turn = [...asked.turn.slice(0, 12), ...eye, 1];
       this.#viewer.lines("ellipsoid", { positions: copies(ellipsoid(asked.axes), [turn]), tint: "query", width: 1.5 });
     }
-    const there = asked.matches.map((pose) => this.#moveOrigin(pose));
+    const there = asked.matches.map(({ pose }) => this.#moveOrigin(pose));
+    const seen = asked.matches.map(({ camera }, i) => copies(sensor(camera, 1.3 * this.#size), [there[i]]));
     this.#viewer.lines("matches", { positions: links(there.map(() => eye), there.map(placeOf)), tint: "query", width: 1.5 });
-    this.#viewer.lines("matched", { positions: copies(frustum(asked.matchCamera, 1.3 * this.#size), there), tint: "match", width: 2.5 });
+    this.#viewer.lines("matched", { positions: Float32Array.from(seen.flatMap((one) => [...one])), tint: "match", width: 2.5 });
     this.#label();
   }
 
@@ -155,6 +156,7 @@ class Scene {
 
   /** Look at all of it. @param {"top" | "side" | "keep"} from which side; keep: as it is */
   look(from) {
+    if (this.#viewer === null) return; // nothing has come yet
     if (from === "top") this.#viewer.look({ azimuth: 0, elevation: STEEP });
     if (from === "side") this.#viewer.look({ azimuth: 0.6, elevation: 0.55 });
     const seen = this.#drawn.flatMap((_, i) => (this.#hidden.has(i) ? [] : [`path ${i}`, `frustums ${i}`]));
@@ -173,7 +175,7 @@ class Scene {
 
   #moveOrigin(pose) { return [...pose.slice(0, 12), ...this.#near(placeOf(pose)), 1]; }
 
-  #sensor(path, size) { return frustum(path.isCloud ? null : path.camera, path.isCloud ? size / 2 : size); }
+  #sensor(path, size) { return sensor(path.isCloud ? null : path.camera, size); }
 
   #pick(x, y) {
     const shown = this.#drawn.map((one, path) => ({ one, path })).filter(({ path }) => !this.#hidden.has(path));
@@ -251,6 +253,9 @@ class Scene {
     }
   }
 }
+
+// a cloud's ring is as wide as a frustum
+const sensor = (camera, size) => frustum(camera, camera ? size : size / 2);
 
 function rgb(text) {
   const number = parseInt(text.trim().slice(1), 16);

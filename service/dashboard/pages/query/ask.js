@@ -29,6 +29,7 @@ export async function render(root, { params, search, signal, go, title }) {
     search.get("query") ? get(`${at("queries", search.get("query"))}/question`, { signal }).catch(kept) : null,
   ]);
   come();
+  if (map.title) title(`Query ${map.title}`);
   const page = new Page({ root, params, search, signal, go, map, question, fields: fieldsOf(models.items.find((one) => one.label === map.model) ?? null),
     sessions: sessions.items.map((one) => one.session).filter(Boolean) });
   page.show();
@@ -141,7 +142,7 @@ class Page {
         signal: this.signal, turn: signal, pictures: this.pictures, before: this.answer, chosen: this.choice?.chosen ?? null,
         ask: async (frame) => {
           const told = await ask(source, this.maps, { ...options, explain: null, explain_frame: frame, keep: false }, this.signal);
-          this.why = frame;
+          if (this.source === source) this.why = frame; // another may have been taken meanwhile
           return told.explained_frame;
         },
         change: (said) => this.change(said),

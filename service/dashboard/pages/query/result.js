@@ -28,7 +28,8 @@ const SHAPES = { found: "✓", ambiguous: "≈", not_found: "✕", unvalidated: 
  */
 export async function showAnswer(root, answer, { signal, turn = signal, isOwnPage = false, pictures, ask, chosen = null, before = null, change, pick }) {
   const looked = choice();
-  const alike = await similarities(answer, FIRST, turn);
+  // the rows wait for it only where nothing else tells the ranking
+  const alike = answer.explanations === null && answer.counts.ranked > 0 ? await similarities(answer, FIRST, turn).catch(passed) : null;
   const ranked = answer.explanations === null ? fromSimilarities(answer, alike) : { ranking: answer.explanations, told: true };
   const steps = funnel(answer);
   const map = h("section", { class: "card query-heat", "aria-label": "Similarity of the ranking" });
@@ -39,7 +40,7 @@ export async function showAnswer(root, answer, { signal, turn = signal, isOwnPag
     rows(answer, ranked, { pictures, choice: looked, before }),
     whyNot(answer, { ask, choice: looked, funnel: steps, change, pick }),
     h("div", { class: "query-below" }, steps, map));
-  heat(map, answer, alike, looked, signal);
+  heat(map, answer, { alike, ranked }, looked, signal, turn);
   if (chosen !== null) looked.choose(chosen);
   return { choice: looked };
 }
@@ -83,40 +84,68 @@ function poseOf(location, kind) {
 }
 
 async function similarities(answer, limit, signal) {
-  if (answer.counts.ranked === 0) return null;
   return get(`${at("queries", answer.query_id)}/similarities`, { params: { limit }, signal });
+}
+
+// where they cannot be told any more, what is known is shown, and the heat map says why
+function passed(error) {
+  if (error.name === "AbortError" || error.status === 401) throw error;
+  return null;
 }
 
 // without explanations the ranking is known by how alike each frame is to the query
 function fromSimilarities(answer, alike) {
+  if (alike === null || alike.frames.length === 0) return { ranking: answer.matches.toSorted((a, b) => a.rank - b.rank), told: true };
   const known = new Map(answer.matches.map((one) => [keyOf(one), one]));
-  const frames = (alike?.frames ?? []).map((one, i) => ({ ...one, rank: i + 1, similarity: alike.similarity[0][i + 1], ...known.get(keyOf(one)) }));
+  const taken = new Set(answer.matches.map((one) => one.rank));
+  let last = 0;
+  // frames deleted since are left out: the rank of a match is not another's
+  const next = () => { do { last += 1; } while (taken.has(last)); return last; };
+  const frames = alike.frames.map((one, i) => {
+    const match = known.get(keyOf(one));
+    if (match) last = match.rank; else next();
+    return { ...one, rank: last, similarity: alike.similarity[0][i + 1], ...match };
+  });
   return { ranking: frames, told: frames.every((one) => one.distance !== undefined) };
 }
 
-function heat(root, answer, alike, looked, signal) {
-  if (alike === null) { root.hidden = true; return; }
+function heat(root, answer, { alike, ranked }, looked, signal, turn) {
+  if (answer.counts.ranked === 0) { root.hidden = true; return; }
+  const ranks = new Map(ranked.ranking.map((one) => [keyOf(one), one.rank]));
   const isSelected = new Set(answer.matches.filter((one) => one.selected).map(keyOf));
   const limits = [10, 20, FIRST, 100, MOST].filter((n, i, all) => n < answer.counts.ranked || all[i - 1] < answer.counts.ranked || i === 0);
-  const field = h("select", { id: "heat-limit", onchange: async () => {
-    put(body, loading("Comparing"));
-    try { draw(await similarities(answer, Number(field.value), signal)); } catch (error) {
-      if (error.name !== "AbortError") put(body, failed(error, () => field.dispatchEvent(new Event("change"))));
-    }
-  } }, limits.map((n) => h("option", { value: n, selected: n === FIRST }, n >= answer.counts.ranked ? `all ${answer.counts.ranked}` : `first ${n}`)));
+  const field = h("select", { id: "heat-limit", onchange: () => load(Number(field.value)) }, limits.map((n) => h("option", { value: n, selected: n === FIRST }, n >= answer.counts.ranked ? `all ${answer.counts.ranked}` : `first ${n}`)));
   if (![...field.options].some((one) => one.selected && Number(one.value) === FIRST)) field.value = String(limits.at(-1));
   const body = h("div");
   let shown = null;
   let keys = [];
+  let asked = 0; // the last that was asked for is the one to be shown
   looked.hear((key) => shown?.point(key === null || !keys.includes(key) ? null : keys.indexOf(key) + 1));
 
+  async function load(limit) {
+    const own = ++asked;
+    put(body, loading("Comparing"));
+    try {
+      const found = await similarities(answer, limit, turn);
+      if (own === asked) draw(found);
+    } catch (error) {
+      if (error.status === 401) throw error;
+      if (own === asked && error.name !== "AbortError") put(body, failed(error, () => load(limit)));
+    }
+  }
+
   function draw({ frames, similarity }) {
+    if (frames.length === 0) {
+      put(body, h("p", { class: "muted" }, "No frame of the ranking is left to be compared: they were deleted since, or the map has changed its model."));
+      return;
+    }
     keys = frames.map(keyOf);
     const marked = new Set(keys.flatMap((key, i) => (isSelected.has(key) ? [i + 1] : [])));
+    const rank = (i) => ranks.get(keys[i]) ?? i + 1; // frames deleted since are left out
     shown = heatmap({
       values: similarity, signal, marked,
-      names: ["the query", ...frames.map((one, i) => `${i + 1}: frame ${shortId(one.frame_id)}${marked.has(i + 1) ? ", selected" : ""}`)],
-      ticks: ["Q", ...frames.map((_, i) => String(i + 1))],
+      names: ["the query", ...frames.map((one, i) => `${rank(i)}: frame ${shortId(one.frame_id)}${marked.has(i + 1) ? ", selected" : ""}`)],
+      ticks: ["Q", ...frames.map((_, i) => String(rank(i)))],
       label: gist(similarity), format: percent, size: Math.max(240, Math.min(560, body.clientWidth)),
       onmove: (cell) => looked.point(cell === null ? null : keys[Math.max(...cell) - 1] ?? null),
     });
@@ -127,7 +156,7 @@ function heat(root, answer, alike, looked, signal) {
     h("label", { for: "heat-limit" }, h("span", { class: "muted" }, "Of the ranking "), field)),
   h("p", { class: "muted" }, "The query first, then its ranking, the nearest first. ",
     isSelected.size > 0 ? "Bars beside the numbers mark what the diverse selection took: it avoids bright cells." : ""), body);
-  draw(alike);
+  if (alike !== null) draw(alike); else load(FIRST);
 }
 
 function gist(similarity) {

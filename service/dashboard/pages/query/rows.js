@@ -40,7 +40,7 @@ export function rows(answer, ranked, { pictures, choice, before = null }) {
     tiles.length = 0;
     put(query, asked(answer, pictures));
     lines = [
-      line("R", "Ranking by distance", `${count(ranked.ranking.length)} of ${count(answer.counts.compared)} compared`,
+      line("R", "Ranking by distance", `${count(answer.counts.ranked)} of ${count(answer.counts.compared)} compared${ranked.ranking.length < answer.counts.ranked ? `, ${count(ranked.ranking.length)} shown` : ""}`,
         ranked.ranking, (one) => [
           ranked.told && h("span", { class: "query-figure" }, h("span", { class: "muted" }, "distance "), count(one.distance)),
           similarity(one.similarity)],

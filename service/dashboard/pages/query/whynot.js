@@ -97,7 +97,7 @@ function explained(told, answer, change) {
       h("span", { class: "badge", dataset: { kind } }, title),
       h("a", { class: "mono", href: link("maps", told.map, "frames", told.frame_id), title: told.frame_id }, shortId(told.frame_id)),
       h("span", { class: "muted" }, `of map ${told.map}`)),
-    h("p", {}, `${text} ${sentence(told.reason)}`),
+    h("p", {}, sentence(told.reason).startsWith(text.replace(/\.$/, "")) ? null : `${text} `, sentence(told.reason)),
     change && offer && h("button", { type: "button", class: "button", onclick: () => change(said) }, offer),
     h("dl", { class: "query-facts" }, facts.map(([term, value]) => h("div", {}, h("dt", {}, term), h("dd", { class: "number" }, value)))),
   ];

@@ -54,9 +54,10 @@ export function verdict(answer) {
   }
   if (answer.status === "unvalidated") {
     const why = answer.deadline_reached ? "The deadline came before a match was accepted." : "Validation was not asked for.";
-    const near = matches[0];
+    const [near] = matches.filter((one) => one.validation.status === "skipped").sort((a, b) => a.rank - b.rank);
+    const nearest = counts.validated ? "Of those that were not tried the nearest" : "The nearest frame";
     return { kind: "neutral", shape: "?", title: "Not validated",
-      text: near ? `${why} The nearest frame is ${shortId(near.frame_id)} of map ${near.map}, ${percent(near.similarity)} similar; whether it is the same place is not known.` : why,
+      text: near ? `${why} ${nearest} is ${shortId(near.frame_id)} of map ${near.map}, ${percent(near.similarity)} similar; whether it is the same place is not known.` : why,
       details: [] };
   }
   return { kind: "bad", shape: "✕", title: "Not found", text: notFound(answer, where), details: reasons(matches) };
@@ -96,10 +97,11 @@ export function figures(validation) {
   return [
     ["Residual", residual ? `${metres(residual.translation_m)}, ${degrees(residual.rotation_deg)}` : "none"],
     ["Overlap", percent(overlap)],
-    ["By planes", percent(planes)],
+    ["Plane overlap", percent(planes)],
     ["Inliers", count(inliers)],
-    ["Seen through", through === null ? "unknown" : percent(through)],
-    ["Ambiguity", number(ambiguity)],
+    ["Violations", through === null ? "unknown" : percent(through)],
+    // rivals are looked for only where nothing else speaks against it
+    ["Ambiguity", ambiguity === 0 && validation.status !== "accepted" ? "–" : percent(ambiguity)],
   ];
 }
 

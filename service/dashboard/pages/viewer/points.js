@@ -81,7 +81,7 @@ export function residualCounts(points) {
  * @param {number} share left out on either side
  * @returns {{low: number[], high: number[]}} in the points' own coordinates
  */
-export function boxOf(points, share = 0.01) {
+export function boxOf(points, share = 0.05) {
   const step = Math.max(1, Math.floor(points.count / 2000));
   const words = new Uint16Array(points.data, points.offset);
   const low = [...points.origin], high = [...points.origin];

@@ -68,7 +68,7 @@ out vec3 colour;
 void main() {
   vec4 a = clip * (model * vec4(from, 1.0)), b = clip * (model * vec4(to, 1.0));
   const float near = 1e-4;
-  bool second = gl_VertexID >= 2;
+  bool second = (gl_VertexID & 2) != 0;
   float side = (gl_VertexID & 1) == 0 ? -0.5 : 0.5;
   colour = mix(second ? toColour : fromColour, tint.rgb, tint.a);
   if (a.w < near && b.w < near) { gl_Position = vec4(2.0, 2.0, 2.0, 1.0); return; }

@@ -189,7 +189,8 @@ class Viewer {
     for (const layer of this.#layers.values()) layer.free(this.#gl);
     this.#layers.clear();
     this.available = false;
-    this.#gl.getExtension("WEBGL_lose_context")?.loseContext(); // browsers keep only a few
+    // browsers keep only a few; one that is lost already has no extensions
+    if (!this.#gl.isContextLost()) this.#gl.getExtension("WEBGL_lose_context")?.loseContext();
   }
 
   #begin() {
