@@ -100,7 +100,7 @@ def measure(frames: int = FRAMES, runs: int = RUNS) -> DashboardFigures | None:
     path = installed()
     if path is None:
         return None
-    made = shots(2, 8)
+    made = shots((0, 1), 8)
     with TemporaryDirectory() as folder, chromium(path) as browser:
         data = Path(folder)
         with serving(data, workers=2) as url, httpx.Client(base_url=url, timeout=60) as client:
@@ -121,7 +121,7 @@ def _make(client: httpx.Client, name: str) -> None:
 def _match(client: httpx.Client, name: str, made: list[Shot]) -> str:
     """Ask for a frame with one that is near it; the address of their overlay."""
     camera = {"intrinsics": made[3].meta["intrinsics"]}
-    files = {"frame": ("frame.png", made[3].png, "image/png")}
+    files = {"frame": (made[3].name, made[3].data, "image/png")}
     answer = client.post(
         f"/v1/maps/{name}/queries", data={"meta": json.dumps(camera), "k": "2"}, files=files
     )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,8 +13,10 @@ from typing import Any
 
 import httpx
 import numpy as np
+from PIL import Image
 from sqlalchemy import insert, select
 
+from sceneprint.clouds import write_ply
 from sceneprint.datasets import write_depth_png
 from sceneprint.engine import Engine
 from sceneprint.schemas import NewMap
@@ -20,7 +24,7 @@ from sceneprint.settings import Settings
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames as frame_table
 from sceneprint.store.tables import jobs, signatures
-from sceneprint.synth import synthesise_room
+from sceneprint.synth import synthesise_room, synthesise_survey
 
 SEED = 21
 #: Frames that are written in one commit.
@@ -29,20 +33,25 @@ _BLOCK = 5_000
 
 @dataclass(frozen=True)
 class Shot:
-    """A depth image of a room, and what is sent with it."""
+    """A depth image of a room (or a scan of a hall), and what is sent with it."""
 
-    png: bytes
+    data: bytes
     meta: dict[str, Any]
+    name: str = "frame.png"
 
 
-def shots(rooms: int, views: int) -> list[Shot]:
-    """Views along a path through each room, by two robots in turn, a second apart."""
+def shots(rooms: Sequence[int], views: int, step: int = 1) -> list[Shot]:
+    """Views along a path through each room, by two robots in turn, a second apart.
+
+    `rooms`: their numbers; `step`: of so many views on the path (some 5 cm or 2 degrees apart)
+    one is taken.
+    """
     found = []
     with TemporaryDirectory() as folder:
         path = Path(folder) / "frame.png"
-        for room in range(rooms):
-            made = synthesise_room(SEED, room, views, along_path=True).frames
-            for view, frame in enumerate(made):
+        for room, number in enumerate(rooms):
+            made = synthesise_room(SEED, number, views * step, along_path=True).frames
+            for view, frame in enumerate(made[::step]):
                 write_depth_png(path, frame.depth, 1000.0)
                 lens, who = frame.intrinsics, "bob" if view % 2 else "ann"
                 if frame.pose is None:
@@ -61,11 +70,38 @@ def shots(rooms: int, views: int) -> list[Shot]:
     return found
 
 
+def scans(views: int) -> list[Shot]:
+    """Scans of a spinning LiDAR on one walk through a hall."""
+    made = synthesise_survey(SEED, 0, views, along_path=True, kind="hall").clouds
+    found = []
+    for view, cloud in enumerate(made):
+        if cloud.pose is None:
+            raise ValueError(f"scan {view} has no pose")
+        meta = {
+            "robot": "cart", "session": "hall-3/cart",
+            "captured_at": f"2026-11-20T10:00:{view:02d}Z",
+            "pose": {"parent_frame": "hall-3", "matrix": cloud.pose.tolist()},
+        }  # fmt: skip
+        found.append(Shot(write_ply(cloud.points), meta, f"scan-{view:06d}.ply"))
+    return found
+
+
+def box(ahead: float) -> Shot:
+    """A bare box of a room, `ahead` metres nearer its end; upside down it looks the same."""
+    v, u = np.mgrid[:240, :320].astype(float)
+    x, y = abs(u - 159.5) / 292.5, abs(v - 119.5) / 292.5
+    depth = np.minimum.reduce([1.5 / np.maximum(x, 1e-6), 1.1 / y, np.full(x.shape, 3.2 - ahead)])
+    file = io.BytesIO()
+    Image.fromarray((depth * 1000).round().astype(np.uint16)).save(file, "PNG")
+    lens = {"width": 320, "height": 240, "fx": 292.5, "fy": 292.5, "cx": 159.5, "cy": 119.5}
+    return Shot(file.getvalue(), {"intrinsics": lens})
+
+
 def send(client: httpx.Client, name: str, of: list[Shot]) -> list[str]:
     """Send frames to a map; their ids."""
     ids = []
     for shot in of:
-        files = {"frame": ("frame.png", shot.png, "image/png")}
+        files = {"frame": (shot.name, shot.data, "application/octet-stream")}
         answer = client.post(
             f"/v1/maps/{name}/frames", data={"meta": json.dumps(shot.meta)}, files=files
         )

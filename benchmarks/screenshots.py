@@ -1,6 +1,6 @@
 """`make screenshots`: every page of the dashboard, light and dark, over a real service.
 
-All that is to be seen is synthetic: rooms of `sceneprint.synth`, signed by two workers.
+All that is to be seen is synthetic: rooms and a hall of `sceneprint.synth`, signed by two workers.
 """
 
 from __future__ import annotations
@@ -10,24 +10,33 @@ import json
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import httpx
 from tqdm import tqdm
 
-from benchmarks.chromium import chromium, installed, settled, watched
-from benchmarks.rooms import Shot, send, shots, wait
+from benchmarks.chromium import PATIENCE_S, chromium, installed, settled, watched
+from benchmarks.rooms import Shot, box, scans, send, shots, wait
 from sceneprint.cli.served import serving
 
-MAP, HALLS = "building", "hall-3"
+if TYPE_CHECKING:
+    from playwright.sync_api import FilePayload
+
+MAP, HALL, BOXES = "building", "hall-3", "boxes"
 THEMES = ("light", "dark")
+#: Which rooms, views of each, and every how many-th of its path one is.
+ROOMS, VIEWS, STEP = (3, 0), 12, 4
 #: Width, and least and greatest height of a picture.
 WIDTH, LOW, HIGH = 1280, 800, 2400
+#: Width and height of a tablet held upright.
+TABLET = (768, 1024)
 #: Seconds that a page may go on drawing after it is there.
 LINGER_S = 2.0
+#: Bytes a second at which uploads are sent, to be seen at it.
+SLOWLY = 20_000
 #: Whether all pictures that a page has asked for are drawn.
 _PICTURES = """Promise.all([...document.querySelectorAll("canvas.picture")].map((one) =>
   one.ready)).then(() => true)"""
@@ -39,24 +48,28 @@ ELSEWHERE = {"X-Forwarded-For": "192.0.2.7"}
 class View:
     """A page to be taken: name of the picture, address behind the dashboard's.
 
-    `tall`: as high as what is on it; `headers`: sent with every request; `press`: the text of
-    buttons that are pressed first.
+    `tall`: as high as what is on it; `size`: of the window; `headers`: sent with every request;
+    `key`: kept in the tab; `files`: chosen on the page, by name; `press`: the text of buttons that
+    are pressed then; `gone`: whether the service is out of reach when the page is entered.
     """
 
     name: str
     address: str
     tall: bool = False
+    size: tuple[int, int] = (WIDTH, LOW)
     headers: dict[str, str] | None = None
+    key: str | None = None
+    files: tuple[tuple[str, bytes], ...] = ()
     press: tuple[str, ...] = ()
+    gone: bool = False
 
 
-def take(out: Path, rooms: int = 2, views: int = 12) -> list[Path]:
+def take(out: Path) -> list[Path]:
     """Fill a service, and take all pages.
 
     Parameters
     ----------
     out : folder of the pictures; made if need be
-    rooms, views : of the map
 
     Raises
     ------
@@ -66,56 +79,70 @@ def take(out: Path, rooms: int = 2, views: int = 12) -> list[Path]:
     if path is None:
         raise FileNotFoundError("no Chromium is installed (on Debian: apt install chromium)")
     out.mkdir(parents=True, exist_ok=True)
-    made = shots(rooms, views)
+    made = shots(ROOMS, VIEWS, STEP)
     with TemporaryDirectory() as folder:
         data = Path(folder)
-        with serving(data, workers=0) as url, httpx.Client(base_url=url, timeout=60) as client:
-            ids = _sent(client, data, made)
-        with serving(data, workers=2) as url, httpx.Client(base_url=url, timeout=60) as client:
-            pages = _asked(client, made, ids)
+        with serving(data, workers=0) as url, httpx.Client(base_url=url, timeout=120) as client:
+            fill(client, data, made)
+        with serving(data, workers=2) as url, httpx.Client(base_url=url, timeout=120) as client:
+            pages = views(client, made)
             with chromium(path) as browser:
                 return [
-                    _picture(
-                        browser, url, view, theme, out / f"{place:02d}-{view.name}-{theme}.png"
-                    )
+                    picture(browser, url, view, theme, out / f"{place:02d}-{view.name}-{theme}.png")
                     for place, view in enumerate(tqdm(pages, desc="pages", disable=None), 1)
                     for theme in THEMES
                 ]
 
 
-def _sent(client: httpx.Client, data: Path, made: list[Shot]) -> list[str]:
+def fill(client: httpx.Client, data: Path, made: list[Shot]) -> None:
     """Upload all frames while nobody signs them, and damage one of them on the disk."""
-    for name, title in ((MAP, "Two rooms, two robots"), (HALLS, "Hall 3"), ("empty", None)):
-        new = {"name": name, "title": title, "model": "compact"}
+    for name, title, model in (
+        (MAP, "Two rooms, two robots", "compact"), (HALL, "Hall 3", "lidar"),
+        (BOXES, "Rooms without furniture", "compact"), ("empty", None, "compact"),
+    ):  # fmt: skip
+        new = {"name": name, "title": title, "model": model}
         client.post("/v1/maps", json=new).raise_for_status()
-    ids = send(client, MAP, made[:-1])
+    send(client, MAP, made)
+    send(client, BOXES, [box(0.0)])
+    walk = scans(4)
+    send(client, HALL, walk[:-1])
     known = set((data / "blobs").rglob("*"))
-    send(client, HALLS, made[-1:])
+    send(client, HALL, walk[-1:])
     (blob,) = (one for one in set((data / "blobs").rglob("*")) - known if one.is_file())
     blob.chmod(0o644)
     blob.write_bytes(blob.read_bytes()[:-1])
-    return ids
 
 
-def _asked(client: httpx.Client, made: list[Shot], ids: list[str]) -> list[View]:
-    """Have all frames signed, ask, associate, make a key and a snapshot; the pages of all that."""
+def views(client: httpx.Client, made: list[Shot]) -> list[View]:
+    """Have all frames signed, ask, associate, make keys and a snapshot; the pages of all that."""
     wait(client, f"/v1/maps/{MAP}", {"indexed"})
-    wait(client, f"/v1/maps/{HALLS}", {"failed"})
+    wait(client, f"/v1/maps/{BOXES}", {"indexed"})
+    wait(client, f"/v1/maps/{HALL}", {"indexed", "failed"})
     whole = {"grants": {"*": "admin"}}
     client.post("/v1/keys", json={"name": "operator", **whole}).raise_for_status()
-    few = {"name": "robot-7", "grants": {MAP: "write", HALLS: "read"}}
-    client.post("/v1/keys", json=few).raise_for_status()
+    few = {"name": "robot-7", "grants": {MAP: "write", HALL: "read"}}
+    key = client.post("/v1/keys", json=few).raise_for_status().json()["secret"]
     snapshot = client.post("/v1/snapshots").raise_for_status().json()["job_id"]
     both = {"sessions": ["room-0/ann", "room-0/bob"]}
     found = client.post(f"/v1/maps/{MAP}/associations", json=both).raise_for_status().json()
     for job in (snapshot, found["association_id"]):
         _done(client, job)
-    answers = [_ask(client, one, k) for one in (made[2], made[5], made[-2]) for k in (1, 5)]
-    answers += [_ask(client, made[7], 3) for _ in range(3)]
-    best = next(one for one in reversed(answers) if one["status"] == "found")
-    match = best["matches"][-1]["frame_id"]
+    ids = [str(one["frame_id"]) for one in _listed(client, MAP)]
+    asked = {"frame_id": ids[3], "k": 4, "explain": True, "explain_frame": ids[-1]}
+    answer = client.post(f"/v1/maps/{MAP}/queries", json=asked).raise_for_status().json()
+    for one in (made[5], made[8], made[-2]):
+        _ask(client, MAP, one)
+    boxed = _ask(client, BOXES, box(0.3))
     (dead,) = client.get("/v1/jobs", params={"state": "dead"}).json()["items"]
-    return list(_views(best["query_id"], match, ids[3], dead["job_id"]))
+    hall = str(_listed(client, HALL, "indexed")[0]["frame_id"])
+    return list(_views(answer, boxed, ids[3], hall, dead["job_id"], key, made))
+
+
+def _listed(client: httpx.Client, name: str, state: str | None = None) -> list[dict[str, Any]]:
+    """Frames of a map, the first taken first."""
+    params = {"limit": "100"} if state is None else {"limit": "100", "state": state}
+    items = client.get(f"/v1/maps/{name}/frames", params=params).raise_for_status().json()["items"]
+    return sorted(items, key=lambda one: str(one["captured_at"]))
 
 
 def _done(client: httpx.Client, job: str) -> None:
@@ -123,60 +150,121 @@ def _done(client: httpx.Client, job: str) -> None:
         time.sleep(0.2)
 
 
-def _ask(client: httpx.Client, shot: Shot, k: int) -> dict[str, Any]:
-    fields = {"meta": json.dumps({"intrinsics": shot.meta["intrinsics"]}), "k": str(k)}
-    files = {"frame": ("frame.png", shot.png, "image/png")}
-    answer = client.post(f"/v1/maps/{MAP}/queries", data=fields, files=files)
+def _ask(client: httpx.Client, name: str, shot: Shot) -> dict[str, Any]:
+    fields = {"meta": json.dumps({"intrinsics": shot.meta["intrinsics"]})}
+    files = {"frame": (shot.name, shot.data, "image/png")}
+    answer = client.post(f"/v1/maps/{name}/queries", data=fields, files=files)
     found: dict[str, Any] = answer.raise_for_status().json()
     return found
 
 
-def _views(query: str, match: str, frame: str, dead: str) -> Iterator[View]:
-    overlay = f"#/queries/{query}/matches/{match}?map={MAP}"
-    yield View("maps", "#/")
-    yield View("frames", f"#/maps/{MAP}")
+def _farthest(answer: dict[str, Any]) -> str:
+    """Of the strong matches the one from whose sensor the query's is farthest."""
+    found = [one for one in answer["matches"] if one["validation"]["strength"] == "strong"]
+
+    def distance(one: dict[str, Any]) -> float:
+        return sum(float(row[3]) ** 2 for row in one["transform"]["matrix"][:3])
+
+    return str(max(found, key=distance)["frame_id"])
+
+
+def _views(
+    answer: dict[str, Any], boxed: dict[str, Any], frame: str, scan: str, dead: str, key: str,
+    made: list[Shot],
+) -> Iterator[View]:  # fmt: skip
+    query = answer["query_id"]
+    overlay = f"#/queries/{query}/matches/{_farthest(answer)}?map={MAP}"
+    rival = f"#/queries/{boxed['query_id']}/matches/{boxed['matches'][0]['frame_id']}?map={BOXES}"
+    maps, frames = View("maps", "#/"), View("frames", f"#/maps/{MAP}")
+    rows = View("answer", f"#/queries/{query}", tall=True)
+    aligned = View("overlay", overlay, tall=True)
+    paths = View("map-view", f"#/maps/{MAP}/paths?query={query}", tall=True)
+    operations = View("operations", "#/operations", tall=True)
+    yield from (maps, frames)
     yield View("frames-normals", f"#/maps/{MAP}?view=normals")
     yield View("frames-patches", f"#/maps/{MAP}?view=patches")
+    yield View("frames-scans", f"#/maps/{HALL}")
     yield View("frames-none", "#/maps/empty")
     yield View("frame", f"#/maps/{MAP}/frames/{frame}", tall=True)
+    yield View("frame-scan", f"#/maps/{HALL}/frames/{scan}", tall=True)
     yield View("upload", f"#/maps/{MAP}/upload")
     yield View("query", f"#/maps/{MAP}/query?frame={frame}", tall=True)
-    yield View("answer", f"#/queries/{query}", tall=True)
-    yield View("overlay", overlay, tall=True)
+    yield rows
+    yield aligned
     yield View("overlay-before", f"{overlay}&pose=before", tall=True)
     yield View("overlay-residual", f"{overlay}&colour=residual", tall=True)
-    yield View("map-view", f"#/maps/{MAP}/paths?query={query}", tall=True)
-    yield View("operations", "#/operations", tall=True)
-    yield View("operations-map", f"#/operations?map={HALLS}", tall=True)
+    yield View("overlay-rival", f"{rival}&pose=rival", tall=True)
+    yield from (paths, operations)
+    yield View("operations-map", f"#/operations?map={HALL}", tall=True)
     for tab in ("jobs", "events", "keys", "audit", "snapshots"):
         yield View(tab, f"#/operations?tab={tab}")
+    yield View("new-map", "#/", press=("New map",))
     yield View("new-key", "#/operations?tab=keys", press=("Make a key",))
     yield View("job-dead", f"#/operations/jobs/{dead}")
     yield View("key", "#/", headers=ELSEWHERE)
+    yield View("key-too-little", "#/operations?tab=keys", headers=ELSEWHERE, key=key)
     yield View("nowhere", "#/nowhere")
+    yield View("gone", f"#/maps/{MAP}", gone=True)
+    for one in (maps, frames, rows, aligned, paths, operations):
+        yield replace(one, name=f"{one.name}-tablet", size=TABLET)
+    # the last: the map is empty no more
+    sent = [(f"frame-{i:06d}.depth.png", one.data) for i, one in enumerate(made[:6])]
+    lens = json.dumps({**made[0].meta["intrinsics"], "depth_scale": 1000}).encode()
+    files = (("torn.ply", b"ply\nformat ascii 1.0\n"), *sent, ("intrinsics.json", lens))
+    yield View("uploading", "#/maps/empty/upload", files=files, press=("Upload 7 files",))
 
 
-def _picture(browser: Any, url: str, view: View, theme: str, path: Path) -> Path:
+def picture(browser: Any, url: str, view: View, theme: str, path: Path) -> Path:
+    """Take one page.
+
+    Parameters
+    ----------
+    browser : see `benchmarks.chromium.chromium`
+    url : of the service
+    view : the page
+    theme : "light" or "dark"
+    path : of the picture
+    """
+    width, low = view.size
     context = browser.new_context(
-        viewport={"width": WIDTH, "height": LOW}, color_scheme=theme,
+        viewport={"width": width, "height": low}, color_scheme=theme,
         extra_http_headers=view.headers or {},
     )  # fmt: skip
+    context.set_default_timeout(1000 * PATIENCE_S)
     try:
         page = watched(context.new_page())
-        page.goto(f"{url}/dashboard{view.address}")
+        if view.key is not None:
+            page.add_init_script(f"sessionStorage.setItem('sceneprint.key', '{view.key}')")
+        page.goto(f"{url}/dashboard{'#/' if view.gone else view.address}")
         settled(page)
+        if view.gone:
+            context.set_offline(True)
+            page.evaluate("address => { location.hash = address; }", view.address)
+        if view.files:
+            _throttled(context, page)
+            given: list[FilePayload] = [
+                {"name": n, "mimeType": "", "buffer": data} for n, data in view.files
+            ]
+            page.locator("input[name=files]").set_input_files(given)
         for text in view.press:
             page.get_by_role("button", name=text).click()
-        page.evaluate(_PICTURES)
         page.wait_for_timeout(1000 * LINGER_S)
         if view.tall:
             height = page.evaluate("document.documentElement.scrollHeight")
-            page.set_viewport_size({"width": WIDTH, "height": min(max(height, LOW), HIGH)})
+            page.set_viewport_size({"width": width, "height": min(max(height, low), HIGH)})
             page.wait_for_timeout(1000 * LINGER_S)
+        page.evaluate(_PICTURES)
         page.screenshot(path=path)
         return path
     finally:
         context.close()
+
+
+def _throttled(context: Any, page: Any) -> None:
+    network = context.new_cdp_session(page)
+    network.send("Network.enable")
+    slow = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": SLOWLY}
+    network.send("Network.emulateNetworkConditions", slow)
 
 
 def main() -> int:
