@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,19 +25,16 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from benchmarks.lidar_answers import first_answers
+from benchmarks.lidar_pairs import believed, candidates, confirmed, pairs_within, pose_of
 from sceneprint.evaluation.baselines.rings import ring_descriptor, ring_distances
 from sceneprint.geometry.retrieval import distances
-from sceneprint.geometry.rigid import inverse, rotation_angle
-from sceneprint.geometry.validation import Validation, ValidationParameters
 from sceneprint.pipeline import Signature, prepare, validate
 from sceneprint.scans import decode_cloud
 from sceneprint.signing import Signer, open_signer
 from sceneprint.synth.surveys import synthesise_survey
-from sceneprint.types import Cloud, Floats, Geometry
+from sceneprint.types import Cloud, Floats
 
 GAP_M, WITHIN_M = 30.0, 5.0  #: of travel between query and database; of a right answer
-PAIRS_WITHIN_M = 10.0  #: pairs that are validated
-RIGHT_M, RIGHT_RAD = 0.3, math.radians(3.0)  #: a transform that odometry confirms
 CANDIDATES = 3  #: of a query, validated in order
 MOST_PAIRS = 150  #: of a kind, spread over all there are
 HELD_OUT = 2000  #: seed of synthetic sites to measure on; training has 0, tuning had 1000
@@ -51,16 +48,6 @@ class Found:
     queries: int
     ours: int
     ring: int
-
-
-@dataclass(frozen=True)
-class Believed:
-    """What validation said of pairs."""
-
-    pairs: int
-    accepted: int
-    right: int  #: of the accepted, those that odometry confirms
-    recall_of: int  #: pairs whose transform is right, accepted or not
 
 
 def read_walk(folder: Path) -> list[Cloud]:
@@ -77,12 +64,7 @@ def read_walk(folder: Path) -> list[Cloud]:
 
 def positions(walk: Sequence[Cloud]) -> Floats:
     """(n, 3) metres."""
-    return np.stack([_pose(cloud)[:3, 3] for cloud in walk])
-
-
-def _pose(cloud: Cloud) -> Floats:
-    assert cloud.pose is not None
-    return cloud.pose
+    return np.stack([pose_of(cloud)[:3, 3] for cloud in walk])
 
 
 def apart(at: Floats, *, both_ways: bool) -> NDArray[np.bool_]:
@@ -111,65 +93,6 @@ def ring_rows(walk: Sequence[Cloud]) -> Floats:
     """(n, n) distances of ring descriptors."""
     stored = np.stack([ring_descriptor(cloud.points) for cloud in walk])
     return np.stack([ring_distances(one, stored) for one in stored]).astype(float)
-
-
-def believed(
-    walk: Sequence[Cloud],
-    geometries: Sequence[Geometry],
-    pairs: Sequence[tuple[int, int]],
-    p: ValidationParameters,
-) -> tuple[Believed, list[dict[str, object]]]:
-    """Pairs (query, match) validated, and each of them for those who want to see."""
-    rows: list[dict[str, object]] = []
-    for i, j in tqdm(pairs, desc="validate", unit="pair", disable=None):
-        v = validate(geometries[i], geometries[j], p=p)
-        off, turn = _off(walk, i, j, v)
-        right = off <= RIGHT_M and turn <= RIGHT_RAD
-        rows.append(
-            {
-                "query": i, "match": j, "apart": _apart(walk, i, j),
-                "status": v.status, "strength": v.strength, "reason": v.reason, "right": right,
-                "off_m": off, "off_deg": math.degrees(turn), "overlap": v.overlap,
-                "plane_overlap": v.plane_overlap, "violations": v.violations,
-                "residual_m": v.residual_m, "ambiguity": v.ambiguity,
-            }
-        )  # fmt: skip
-    accepted = [row for row in rows if row["status"] == "accepted"]
-    return (
-        Believed(
-            len(rows), len(accepted), sum(bool(row["right"]) for row in accepted),
-            sum(bool(row["right"]) for row in rows),
-        ),
-        rows,
-    )  # fmt: skip
-
-
-def _truth(walk: Sequence[Cloud], i: int, j: int) -> Floats:
-    return inverse(_pose(walk[j])) @ _pose(walk[i])
-
-
-def _apart(walk: Sequence[Cloud], i: int, j: int) -> float:
-    return float(np.linalg.norm(_truth(walk, i, j)[:3, 3]))
-
-
-def _off(walk: Sequence[Cloud], i: int, j: int, v: Validation) -> tuple[float, float]:
-    """Metres and radians between a transform and what odometry says; infinite without one."""
-    if v.T_match_query is None:
-        return math.inf, math.inf
-    wrong = inverse(_truth(walk, i, j)) @ v.T_match_query
-    return float(np.linalg.norm(wrong[:3, 3])), rotation_angle(wrong[:3, :3])
-
-
-def pairs_within(at: Floats, allowed: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Pairs that `allowed` (n, n) names and that lie within PAIRS_WITHIN_M."""
-    near = np.linalg.norm(at[:, None] - at[None, :], axis=2) < PAIRS_WITHIN_M
-    return [(int(i), int(j)) for i, j in np.argwhere(near & allowed) if i > j]
-
-
-def candidates(rows: Floats, allowed: NDArray[np.bool_], k: int) -> list[tuple[int, int]]:
-    """Each query with its nearest `k` of the allowed."""
-    ranked = np.argsort(np.where(allowed, rows, np.inf), axis=1, kind="stable")[:, :k]
-    return [(i, int(j)) for i, row in enumerate(ranked) for j in row if allowed[i, j]]
 
 
 def timed(run: Callable[[], object], times: int = 5) -> float:
@@ -205,13 +128,9 @@ def measure(walk: Sequence[Cloud], signer: Signer, *, pairs: bool) -> dict[str, 
         p = signer.model.parameters.validation
         near = np.linalg.norm(at[:, None] - at[None, :], axis=2) < WITHIN_M
 
-        def confirmed(i: int, j: int, v: Validation) -> bool:
-            off, turn = _off(walk, i, j, v)
-            return off <= RIGHT_M and turn <= RIGHT_RAD
-
         for name, both_ways in (("earlier", False), ("any", True)):
             allowed = apart(at, both_ways=both_ways)
-            answered = first_answers(geometries, rows, near, allowed, p, confirmed)
+            answered = first_answers(geometries, rows, near, allowed, p, partial(confirmed, walk))
             result[f"first match, {name}"] = asdict(answered)
         allowed = apart(at, both_ways=True)
         everything = np.ones((len(at), len(at)), bool)
