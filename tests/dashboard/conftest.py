@@ -137,33 +137,39 @@ def running(data: Path, workers: int, port: int = 0) -> Iterator[Station]:
             process.stdout.close()
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def serve() -> Callable[..., Any]:
     """Run a service of one's own: `with serve(folder, workers=0, port=0) as station`."""
     return running
 
 
-@pytest.fixture(scope="package")
-def browser() -> Iterator[Browser]:
+@pytest.fixture(scope="session")
+def chromium() -> str:
     """Debian's Chromium, or another that is installed."""
     names = ("chromium", "chromium-browser", "google-chrome")
     found = next(filter(None, map(shutil.which, names)), None)
     if found is None:
         pytest.skip(f"no Chromium is installed ({', '.join(names)})")
+    return found
+
+
+@pytest.fixture(scope="module")
+def browser(chromium: str) -> Iterator[Browser]:
+    """One for each file: as long as it is there no other test may run an event loop."""
     with sync_playwright() as playwright:
-        one = playwright.chromium.launch(executable_path=found, args=FLAGS)
+        one = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
         yield one
         one.close()
 
 
-@pytest.fixture(scope="package")
-def station(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Station]:
+@pytest.fixture(scope="session")
+def station(chromium: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Station]:
     """A service with two workers, and a map `building` of two rooms, all of it indexed.
 
     Tests leave `building` as it is; what they change they make. The frames of a room have the
     parent frame ROOM, and are of two runs, ROOM/ann (even ones) and ROOM/bob (odd ones).
     """
-    del browser  # asked for first: without a browser nothing needs to be made
+    del chromium  # asked for first: without a browser nothing needs to be made
     with running(tmp_path_factory.mktemp("station"), 2) as found:
         found.client.post(
             "/v1/maps", json={"name": "building", "title": "Two rooms", "model": "compact"}
@@ -266,7 +272,7 @@ def _asked(page: Page, request: Request) -> None:
         page.pending.add(request)  # type: ignore[attr-defined]
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def settle() -> Settle:
     """Wait until a page is there: nothing in flight, and the main part not busy."""
 
@@ -282,7 +288,7 @@ def settle() -> Settle:
     return wait
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def axe() -> Callable[[Page], list[str]]:
     """What axe finds serious or critical on a page, in the light theme and in the dark one."""
     judge = Axe()
@@ -300,13 +306,13 @@ def axe() -> Callable[[Page], list[str]]:
     return look
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def pixels() -> Callable[..., Image.Image]:
     """What an element, or a page, looks like."""
     return lambda shown: Image.open(io.BytesIO(shown.screenshot())).convert("RGB")
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def free_port() -> int:
     """A port that nobody listens on, for a service that is to come back to the same one."""
     with socket.socket() as one:
@@ -314,7 +320,7 @@ def free_port() -> int:
         return int(one.getsockname()[1])
 
 
-@pytest.fixture(scope="package", name="until")
+@pytest.fixture(scope="session", name="until")
 def patience() -> Callable[..., Any]:
     """Poll: the first true value of what is called."""
     return until

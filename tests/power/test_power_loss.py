@@ -20,6 +20,7 @@ from sceneprint import writing
 from sceneprint.engine import Engine
 from sceneprint.index import Generation, Tail, newest, publish, signatures_of
 from sceneprint.index import publishing as index_publishing
+from sceneprint.index.manifests import Recall
 from sceneprint.schemas import CameraIntrinsics, FrameMeta, JobState, NewMap
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs
@@ -279,10 +280,10 @@ def test_old_generations_removed_too_early_are_found_out(
 ) -> None:
     write = index_publishing._write
 
-    def remove_first(folder: Path, generation: Generation) -> Path:
+    def remove_first(folder: Path, generation: Generation, recall: Recall) -> Path:
         for path in folder.glob("*.json"):
             path.unlink()
-        return write(folder, generation)
+        return write(folder, generation, recall)
 
     monkeypatch.setattr(index_publishing, "_write", remove_first)
     assert any(one.startswith("none after 1") for one in lost_generations(steps=2))
