@@ -16,9 +16,7 @@ from sceneprint.engine.signers import Signers
 from sceneprint.engine.telling import tell_uncertainty, tell_validation
 from sceneprint.engine.transforms import transform
 from sceneprint.engine.wire import query_sensor
-from sceneprint.errors import (
-    InvalidRequest,
-)
+from sceneprint.errors import InvalidRequest
 from sceneprint.geometry.covariance import PAIR_METHOD
 from sceneprint.geometry.overlays import overlay
 from sceneprint.geometry.retrieval import pairwise_distances, similarity

@@ -65,8 +65,16 @@ def test_cropped_to_what_is_seen(cloud_scenes: ModuleType) -> None:
     full = camera_of(cloud_scenes.room(60_000))
     assert full.is_closed
     assert full.width == 315
+    assert full.sees_around
     cone = camera_of(cloud_scenes.room(20_000, half_deg=25))
     assert not cone.is_closed
+    assert not cone.sees_around
+    degree = np.pi / 180
+    assert [Sphere(n, 9, degree, 0.0, 0.1).sees_around for n in (269, 271, 360)] == [
+        False,
+        True,
+        True,
+    ]
     assert cone.width == pytest.approx(50 * np.pi / 180 / cone.step, abs=2)
     # a cone across the seam of azimuth is no wider
     back = cloud_scenes.room(20_000, half_deg=25).points * np.float32(-1)

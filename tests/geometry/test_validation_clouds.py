@@ -118,6 +118,7 @@ def test_two_scans_of_a_room(rooms: list[tuple[Room, list[View]]]) -> None:
         assert v.overlap > 0.4
         assert v.violations is not None
         assert v.violations < 0.01
+        assert v.around
         assert v.covariance is not None
         assert np.linalg.eigvalsh(v.covariance)[0] > 0
 
@@ -161,7 +162,8 @@ def test_a_depth_image_beside_the_cloud_of_the_same_view(
     points = np.stack([(x - KINECT.cx) / KINECT.fx * z, (y - KINECT.cy) / KINECT.fy * z, z], axis=1)
     image, cloud = made(Frame(depth, KINECT)), made(Cloud(points.astype(np.float32)))
     assert isinstance(cloud.surface.camera, Sphere)
-    for v in (validate(image, cloud), validate(cloud, image)):
+    for v in (validate(image, cloud), validate(cloud, image), validate(cloud, cloud)):
+        assert not v.around  # a cloud may see no more than a camera does
         metres, degrees = off(v, np.eye(4))
         assert metres < 0.02
         assert degrees < 0.5
@@ -197,6 +199,7 @@ def test_where_there_is_no_viewpoint_a_match_is_weak(
             assert degrees < 0.3
             assert (v.status, v.strength) == ("accepted", "weak")
             assert "one frame" in v.reason
+            assert not v.around
             assert v.violations is not None
             assert v.violations < 0.02
     one_sided = validate(rooms[0][1][0].scan, fused[0][1], mode="paper")

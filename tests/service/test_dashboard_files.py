@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 from pathlib import Path
 
 import pytest
@@ -115,3 +116,17 @@ def test_it_is_for_whom_the_service_is_for(served, refused) -> None:
     told = served.client.get("/dashboard", headers={**HTML, "Host": "evil.example"})
     refused(told, 421, "misdirected")
     assert served.client.get("/dashboard", headers={"X-Forwarded-For": "192.0.2.7"}).is_success
+
+
+@pytest.mark.parametrize("name", ["style.css", "paths/paths.css"])
+def test_dark_is_the_same_whether_chosen_or_the_systems(name: str) -> None:
+    """The colours stand twice, since canvases read them as they are written."""
+    text = (dashboard.PAGES / name).read_text()
+    systems, chosen = (
+        re.search(rf"{start} {{([^}}]*)}}", text)
+        for start in (r':root:not\(\[data-theme="light"\]\)', r':root\[data-theme="dark"\]')
+    )
+    assert systems is not None
+    assert chosen is not None
+    assert systems[1] == chosen[1]
+    assert len(re.findall(r"--[\w-]+: #", systems[1])) >= 8
