@@ -33,6 +33,7 @@
       x PreconditionFailed      what is to be edited has been edited meanwhile
       x KeyRequired             the service asks for a key, and none or an unknown one was given
       x Forbidden               the key that was shown may not do this
+      x QuotaExceeded           the map holds as many frames or bytes as its quota allows
       x RateLimited             this caller asks too often; come back
       x Misdirected             the request is meant for another host than this machine
       x ForeignOrigin           a page of another host sent the request
@@ -236,6 +237,10 @@ class KeyRequired(SceneprintError):
 
 class Forbidden(SceneprintError):
     """The key that was shown may see this, but not do that."""
+
+
+class QuotaExceeded(SceneprintError):
+    """The map holds as many frames, or bytes of uploads, as its quota allows."""
 
 
 class RateLimited(SceneprintError):

@@ -6,10 +6,11 @@ import ipaddress
 import os
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
+from urllib.parse import urlsplit
 
 import platformdirs
-from pydantic import Field, SecretStr, field_validator
+from pydantic import Field, SecretStr, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from sceneprint.models import default_cache_dir
@@ -18,6 +19,10 @@ from sceneprint.models import default_cache_dir
 def default_data_dir() -> Path:
     """Where a user's maps are kept unless told otherwise."""
     return Path(platformdirs.user_data_dir("sceneprint", appauthor=False))
+
+
+#: Where blobs and snapshots may be, by what their URL begins with.
+OBJECT_SCHEMES = ("s3", "gs", "az", "file", "memory")
 
 
 def is_loopback(host: str) -> bool:
@@ -41,6 +46,19 @@ class Settings(BaseSettings):
     data_dir: Path = Field(default_factory=default_data_dir)
     #: SQLAlchemy URL of the database; default: SQLite in the data folder.
     database_url: SecretStr | None = None
+    #: SQLAlchemy URL of a read replica of it, of PostgreSQL, that queries are answered from.
+    replica_url: SecretStr | None = None
+    #: Seconds that the replica may be behind; farther behind, the database itself is asked.
+    replica_lag_s: float = Field(default=5.0, ge=0, le=3600)
+    #: Where blobs are kept: s3://bucket/prefix, gs://, az://, file:/// or memory:///; default:
+    #: `blobs` in the data folder. Credentials come from the environment of the cloud, never here.
+    blob_url: SecretStr | None = None
+    #: Where snapshots taken over the service are kept, likewise; default: `snapshots` in the data
+    #: folder.
+    snapshot_url: str | None = None
+    #: What proposes candidates to a query: FAISS on this node, pgvector in the database, or what
+    #: suits the database.
+    shortlist: Literal["auto", "local", "database"] = "auto"
     #: Folder of search indexes, of this machine alone. Deleting it loses nothing but minutes;
     #: default: `index` in the data folder.
     index_dir: Path | None = None
@@ -91,6 +109,22 @@ class Settings(BaseSettings):
     event_streams: int = Field(default=64, ge=0, le=10_000)
     #: Newest events of each map that are kept; older ones are removed, 200 bytes each.
     events_kept: int = Field(default=1_000_000, ge=1000)
+    #: Seconds after which no byte of a deleted frame is left in the caches of this node.
+    purge_s: float = Field(default=3600.0, ge=1, le=31_536_000)
+
+    @field_validator("replica_url")
+    @classmethod
+    def _has_primary(cls, given: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
+        if given is not None and info.data.get("database_url") is None:
+            raise ValueError("a replica is of the database that SCENEPRINT_DATABASE_URL names")
+        return given
+
+    @field_validator("blob_url", "snapshot_url")
+    @classmethod
+    def _holds_objects(cls, given: SecretStr | str | None) -> SecretStr | str | None:
+        if given is not None:
+            _require_objects(given if isinstance(given, str) else given.get_secret_value())
+        return given
 
     @field_validator("cors_origins", mode="before")
     @classmethod
@@ -147,3 +181,22 @@ class Settings(BaseSettings):
     def indexes(self) -> Path:
         """Folder of search indexes."""
         return self.index_dir or self.data_dir / "index"
+
+
+def _require_objects(url: str) -> None:
+    """See that a URL names a place for objects, and holds no credentials. It is never repeated."""
+    scheme, _, rest = url.partition("://")
+    if scheme not in OBJECT_SCHEMES or "://" not in url:
+        known = ", ".join(f"{one}://" for one in OBJECT_SCHEMES)
+        raise ValueError(f"it begins with none of {known}")
+    try:
+        holds = "@" in urlsplit(url).netloc or "?" in rest or "#" in rest
+    except ValueError:
+        holds = True
+    if holds:
+        raise ValueError(
+            "it holds more than a bucket and a prefix: credentials come from the environment "
+            "(AWS_..., GOOGLE_..., AZURE_...), never from a URL"
+        )
+    if scheme in ("s3", "gs", "az") and not urlsplit(url).netloc:
+        raise ValueError("it names no bucket")

@@ -33,6 +33,7 @@ STATUSES: dict[type[errors.SceneprintError], int] = {
     errors.PreconditionFailed: 412,
     errors.KeyRequired: 401,
     errors.Forbidden: 403,
+    errors.QuotaExceeded: 403,
     errors.RateLimited: 429,
     errors.Misdirected: 421,
     errors.ForeignOrigin: 403,

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import fcntl
 import os
+import secrets
+import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.fleet.postgres import NoServer, Server
 from sceneprint.cli.demo_building import write_building
 from sceneprint.geometry.bins import TableLayout
 from sceneprint.geometry.hierarchy import HierarchyParameters
@@ -22,6 +25,7 @@ from sceneprint.geometry.segmentation import SegmentationParameters
 from sceneprint.geometry.surroundings import Compression, SurroundingsParameters
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer
+from sceneprint.store import open_database
 from sceneprint.synth import synthesise_room
 from sceneprint.types import Frame
 
@@ -33,6 +37,8 @@ LONG = (
 )  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
+#: The database that new ones of a test are copied from.
+TEMPLATE = "sceneprint_template"
 #: What makes a folder of that name by calling that function.
 Once = Callable[[str, Callable[[Path], object]], Path]
 
@@ -67,6 +73,38 @@ def once(
 def building(once: Once) -> Path:
     """A room of the demo: 30 frames of a walk for the map, 20 to look up. Only to be read."""
     return once("building", lambda folder: list(write_building(folder, 1)))
+
+
+@pytest.fixture(scope="session")
+def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A PostgreSQL server of this process; `TEMPLATE` in it has the schema and no rows."""
+    try:
+        server = Server(tmp_path_factory.mktemp("postgres"))
+    except NoServer as error:
+        pytest.skip(str(error))
+    server.start()
+    try:
+        open_database(server.create(TEMPLATE)).close()
+        yield server
+    finally:
+        server.kill()  # nobody looks at its data again
+        shutil.rmtree(server.folder, ignore_errors=True)  # it is large
+
+
+@pytest.fixture
+def postgres_url(postgres: Server) -> Iterator[str]:
+    """URL of a new database with the schema of this version and no rows; removed again."""
+    name = f"t{secrets.token_hex(6)}"
+    yield postgres.create(name, TEMPLATE)
+    postgres.drop(name)
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def store_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """URL of a new database: the test runs once on each of the two."""
+    if request.param == "postgresql":
+        return str(request.getfixturevalue("postgres_url"))
+    return f"sqlite:///{tmp_path / 'sceneprint.db'}"
 
 
 @pytest.fixture(scope="session")

@@ -22,6 +22,7 @@ import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -156,6 +157,12 @@ def changed(text: str, old: str, new: str) -> str:
     return text.replace(old, new)
 
 
+def changed_all(text: str, old: str, new: str) -> str:
+    """The text with a part replaced wherever it is: parts of a composition have much in common."""
+    assert old in text, old
+    return text.replace(old, new)
+
+
 # Lint
 
 
@@ -271,12 +278,7 @@ def test_the_builder_gets_the_code_and_nothing_else() -> None:
 
 def context_files() -> list[str]:
     """What the builder is sent of a fresh checkout: no file that git does not know or would add."""
-    listed = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"],
-        cwd=ROOT, capture_output=True, text=True,
-    )  # fmt: skip
-    assert listed.returncode == 0, f"this needs a git checkout: {listed.stderr}"
-    paths = [path for path in listed.stdout.split("\0") if path and (ROOT / path).is_file()]
+    paths = sorted(path for path in tracked_files() if path and (ROOT / path).is_file())
     return [path for path in paths if not is_ignored(path)]
 
 
@@ -293,43 +295,97 @@ def defaults(value: str) -> str:
     return re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", value)
 
 
+def mount_problem(mount: str, volumes: set[str]) -> str | None:
+    """What is wrong with a mount: a volume that is not declared, or a file that is not in git."""
+    source, _, rest = mount.partition(":")
+    if not source.startswith("./"):
+        return None if source in volumes else f"volume {source} is not declared"
+    is_ours = source.removeprefix("./") in tracked_files()
+    return None if is_ours and rest.endswith(":ro") else f"{mount} is no file of ours to be read"
+
+
+@cache
+def tracked_files() -> frozenset[str]:
+    """Files that git knows or would add."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    return frozenset(listed.stdout.split("\0"))
+
+
+def waits_rightly(part: str, other: str, condition: str, parts: dict[str, Any]) -> bool:
+    """Whether a part waits until what it needs is of use; that there are workers no proxy needs."""
+    if other not in parts:
+        return False
+    if parts[other].get("restart") == "no":
+        return condition == "service_completed_successfully"
+    return condition == "service_healthy" or (part, other) == ("proxy", "signer")
+
+
+#: Of libraries that ours are built on: who they are to PostgreSQL and to the object store.
+OF_LIBRARIES = re.compile(r"PGPASSWORD|AWS_[A-Z_]+")
+
+
+def environment_problems(name: str, part: dict[str, Any]) -> list[str]:
+    """What is wrong with what a part is told."""
+    given, found = part.get("environment", {}), []
+    for key, value in given.items():
+        if re.search("PASSWORD|SECRET", key) and not re.fullmatch(r"\$\{SCENEPRINT_\w+:-\}", value):
+            found.append(f"{name}: {key} has a default")
+    if not part["image"].startswith("sceneprint:"):
+        return found
+    unknown = {key for key in set(given) - KNOWN_SETTINGS if not OF_LIBRARIES.fullmatch(key)}
+    if unknown:
+        found.append(f"{name}: nothing reads {', '.join(sorted(unknown))}")
+    try:
+        own = {k: v for k, v in given.items() if k in KNOWN_SETTINGS}
+        Settings(**{k.removeprefix("SCENEPRINT_").lower(): v for k, v in own.items()})
+    except ValueError as error:
+        found.append(f"{name}: {error}")
+    return found
+
+
+def health_problem(part: dict[str, Any]) -> str | None:
+    """What is wrong with how a part is asked whether it is well."""
+    if part["restart"] == "no":
+        return None if "healthcheck" not in part else "is over before anybody asks"
+    if part["image"].startswith("sceneprint:"):
+        command = part.get("healthcheck", {}).get("test", ["CMD", "python", "-c", "0"])
+        good = command[:3] == ["CMD", "python", "-c"] and parses(command[3])
+        return None if good else "the health check is no Python"
+    command = part.get("healthcheck", {}).get("test", [])
+    return None if command[:1] == ["CMD"] and len(command) > 1 else "no health check in exec form"
+
+
 def compose_problems(text: str) -> list[str]:
     """What our rules have against a composition."""
     document, found = composed(text), []
-    volumes = set(document.get("volumes", {}))
-    for name, part in document["services"].items():
-        for mount in part.get("volumes", []):
-            source, _, _ = mount.partition(":")
-            if source not in volumes:
-                found.append(f"{name}: volume {source} is not declared")
-        unknown = set(part.get("environment", {})) - KNOWN_SETTINGS
-        if unknown:
-            found.append(f"{name}: nothing reads {', '.join(sorted(unknown))}")
-        try:
-            own = {k: v for k, v in part["environment"].items() if k in KNOWN_SETTINGS}
-            Settings(**{k.removeprefix("SCENEPRINT_").lower(): v for k, v in own.items()})
-        except ValueError as error:
-            found.append(f"{name}: {error}")
+    parts, volumes = document["services"], set(document.get("volumes", {}))
+    for name, part in parts.items():
+        if not re.fullmatch(r"\S+:v?\d+\.\d+\S*", part["image"]):
+            found.append(f"{name}: {part['image']} has no version")
+        if name not in ("service", "worker") and part.get("profiles") != ["fleet"]:
+            found.append(f"{name}: is of no profile")
+        wrong = [mount_problem(mount, volumes) for mount in part.get("volumes", [])]
+        found += [f"{name}: {one}" for one in (*wrong, health_problem(part)) if one is not None]
+        found += environment_problems(name, part)
         found += [
             f"{name}: {port} is not published to this machine alone"
             for port in part.get("ports", [])
             if not re.fullmatch(r"127\.0\.0\.1:\d+:\d+", defaults(port))
         ]
         for other, wish in part.get("depends_on", {}).items():
-            if other not in document["services"] or wish["condition"] != "service_healthy":
+            if not waits_rightly(name, other, wish["condition"], parts):
                 found.append(f"{name}: does not wait until {other} is healthy")
         for key, want in (
             ("read_only", True), ("init", True), ("cap_drop", ["ALL"]),
-            ("security_opt", ["no-new-privileges:true"]), ("restart", "unless-stopped"),
+            ("security_opt", ["no-new-privileges:true"]),
+            ("restart", "no" if name == "bucket" else "unless-stopped"),
         ):  # fmt: skip
             if part.get(key) != want:
                 found.append(f"{name}: {key} is {part.get(key)!r}")
         limits = part.get("deploy", {}).get("resources", {}).get("limits", {})
         if set(limits) != {"cpus", "memory", "pids"}:
             found.append(f"{name}: limits only {sorted(limits)}")
-        command = part.get("healthcheck", {}).get("test", ["CMD", "python", "-c", "0"])
-        if command[:3] != ["CMD", "python", "-c"] or not parses(command[3]):
-            found.append(f"{name}: the health check is no Python")
     return found
 
 
@@ -347,7 +403,8 @@ PUBLISHED = "127.0.0.1:${SCENEPRINT_PUBLISHED_PORT:-8008}"
 
 def test_our_rules_have_nothing_against_the_composition() -> None:
     assert compose_problems(COMPOSE) == []
-    assert set(composed()["services"]) == {"service", "worker"}
+    fleet = {"database", "objects", "bucket", "api", "signer", "proxy"}
+    assert set(composed()["services"]) == {"service", "worker", *fleet}
 
 
 @pytest.mark.parametrize(
@@ -361,16 +418,26 @@ def test_our_rules_have_nothing_against_the_composition() -> None:
         ("service: 0.0.0.0:8008:8008 is not", PUBLISHED, "0.0.0.0:8008"),
         ("worker: does not wait until service", "service_healthy", "service_started"),
         ("service: read_only is False", "read_only: true", "read_only: false"),
-        ("worker: init is None", "  init: true\n", ""),
+        ("worker: init is None", "init: true", "x-init: true"),
         ("service: cap_drop is ['NET_RAW']", "- ALL", "- NET_RAW"),
         ("service: security_opt is ['no-new", "privileges:true", "privileges:false"),
         ("worker: restart is 'no'", "restart: unless-stopped", 'restart: "no"'),
         ("service: limits only ['cpus', 'memory']", "          pids: 256\n", ""),
         ("worker: the health check is no Python", "sys.exit(not any(", "sys.exit(not any"),
+        ("database: POSTGRES_PASSWORD has a default", "SCENEPRINT_DATABASE_PASSWORD:-", ":-x"),
+        ("objects: ROOT_SECRET_KEY has a default", "SCENEPRINT_OBJECTS_SECRET:-", "X:-secret"),
+        ("database: pgvector/pgvector has no version", ":0.8.6-pg18-trixie", ""),
+        ("objects: no health check in exec form", '["CMD", "wget"', '["wget"'),
+        ("objects: does not wait until bucket", "service_completed_successf", "service_f"),
+        ("api: does not wait until objects", "service_healthy", "service_started"),
+        ("signer: is of no profile", "profiles: [fleet]", "profiles: [robots]"),
+        ("proxy: ./docs/haproxy.cfg:", "./docs/deployment/haproxy", "./docs/haproxy"),
+        ("proxy: ./docs/deployment/haproxy.cfg:", "haproxy.cfg:ro", "haproxy.cfg"),
+        ("api: nothing reads SCENEPRINT_BLOBS", "SCENEPRINT_BLOB_URL", "SCENEPRINT_BLOBS"),
     ],
 )  # fmt: skip
 def test_our_rules_would_find_in_a_composition(problem: str, old: str, new: str) -> None:
-    found = compose_problems(changed(COMPOSE, old, new))
+    found = compose_problems(changed_all(COMPOSE, old, new))
     assert [one for one in found if one.startswith(problem)] != [], found
 
 
@@ -384,7 +451,7 @@ def test_the_composition_is_as_the_specification_has_it(tmp_path: Path) -> None:
     done = by_schema(ROOT / "docker-compose.yml")
     assert (done.returncode, done.stderr) == (0, "")
     broken = tmp_path / "docker-compose.yml"
-    broken.write_text(changed(COMPOSE, "  init: true\n", "  initt: true\n"))
+    broken.write_text(changed_all(COMPOSE, "  init: true\n", "  initt: true\n"))
     done = by_schema(broken)
     assert done.returncode == 1
     assert "'initt'" in done.stdout

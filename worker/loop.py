@@ -124,7 +124,7 @@ class Worker:
 
     def _pause(self) -> float:
         """Seconds until there may be something to do, if nobody rings."""
-        due, now = self._engine.next_due(), time.time()
-        left = LONGEST_S if due is None else min(due - now, LONGEST_S)
+        due_s = self._engine.due_in_s()
+        left = LONGEST_S if due_s is None else min(due_s, LONGEST_S)
         left = min(left, self._upkeep_at - time.monotonic())
         return max(left, SHORTEST_S * random.uniform(1, 2))  # not all workers at the same moment

@@ -68,10 +68,14 @@ def settings_of(options: argparse.Namespace) -> Settings:
         return Settings(**given)
     except ValidationError as error:
         first = error.errors()[0]
+        name = str(first["loc"][0])
+        # a URL may hold a password, and the error from pydantic quotes it as well
+        secret = name.endswith("_url")
+        value = "not usable" if secret else f"{first['input']!r:.60}"
         raise InvalidRequest(
-            f"The setting {first['loc'][0]} is {first['input']!r:.60}: {first['msg']}. Correct "
-            f"the option or SCENEPRINT_{str(first['loc'][0]).upper()}."
-        ) from error
+            f"The setting {name} is {value}: {first['msg']}. Correct the option or "
+            f"SCENEPRINT_{name.upper()}."
+        ) from (None if secret else error)
 
 
 def run(options: argparse.Namespace) -> int:

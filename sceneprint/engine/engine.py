@@ -146,10 +146,10 @@ class Engine(Administration):
         """Take the next job, or None; see `work.claim`."""
         return working.claim(self.store, worker, self.settings.lease_s)
 
-    def next_due(self) -> float | None:
-        """When the next job can be claimed if nobody comes before, seconds since 1970, or None."""
+    def due_in_s(self) -> float | None:
+        """Seconds until the next job can be claimed if nobody comes before, or None."""
         with self.store.database.read() as connection:
-            return queue.next_due(connection)
+            return queue.due_in_s(connection)
 
     def run(self, work: Work | Task, broke: Callable[[], None] | None = None) -> JobState | None:
         """Do a claimed job, or a slice of a long one; see `work.run` and `Tasks.run`."""

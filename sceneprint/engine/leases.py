@@ -23,7 +23,7 @@ def renewed(store: Store, claim: queue.Claim, lease_s: float, longest_s: float) 
         until = time.monotonic() + longest_s
         while not done.wait(lease_s / 3) and time.monotonic() < until:
             try:
-                with store.database.write() as connection:
+                with store.database.write(turn=False) as connection:
                     queue.renew(connection, claim, lease_s)
             except LostLease:
                 return  # the end of the work will learn of it

@@ -57,14 +57,10 @@ def claim(store: Store, worker: str, lease_s: float) -> Work | Task | None:
     with store.database.read() as connection:
         if not queue.has_due(connection):
             return None
-    with store.database.write() as connection:
-        for job in deaths.bury(connection):
-            if job.kind == REENCODE or job.frame_number is None:
-                continue
-            frame = frame_of(connection, job.frame)
-            set_state(connection, frame.number, FrameState.FAILED, job.error)
-            name = map_of(connection, frame.map_number).name
-            tell(connection, "frame.failed", name, frame.id, job.id)
+        given_up = deaths.is_given_up(connection)
+    if given_up:
+        _bury(store)
+    with store.database.write(turn=False) as connection:
         held = queue.claim(connection, worker, lease_s)
         if held is None:
             return None
@@ -75,6 +71,18 @@ def claim(store: Store, worker: str, lease_s: float) -> Work | Task | None:
         if held.job.kind != REENCODE:
             set_state(connection, frame.number, FrameState.SIGNING)
         return Work(held, frame, map_of(connection, frame.map_number))
+
+
+def _bury(store: Store) -> None:
+    """Give up jobs that kill every worker, and their frames."""
+    with store.database.write() as connection:
+        for job in deaths.bury(connection):
+            if job.kind == REENCODE or job.frame_number is None:
+                continue
+            frame = frame_of(connection, job.frame)
+            set_state(connection, frame.number, FrameState.FAILED, job.error)
+            name = map_of(connection, frame.map_number).name
+            tell(connection, "frame.failed", name, frame.id, job.id)
 
 
 def run(

@@ -7,7 +7,13 @@ from typing import Annotated
 
 from pydantic import Field, StringConstraints
 
-from sceneprint.errors import Conflict, InvalidRequest, SceneprintError, kebab_case
+from sceneprint.errors import (
+    Conflict,
+    InvalidRequest,
+    QuotaExceeded,
+    SceneprintError,
+    kebab_case,
+)
 from sceneprint.schemas.base import Given, Label, Problem, Told
 from sceneprint.schemas.frames import MOST_PRIORITY, Added, GivenBase
 
@@ -15,6 +21,8 @@ from sceneprint.schemas.frames import MOST_PRIORITY, Added, GivenBase
 FRAME_ID = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 #: Frames of one batch.
 MOST_OF_BATCH = 64
+#: Statuses of frames that are refused; of any other reason, 422.
+_STATUSES: dict[type[SceneprintError], int] = {Conflict: 409, QuotaExceeded: 403}
 
 
 #: As a folder may be called.
@@ -30,8 +38,8 @@ class BatchItem(Told):
     """What came of one frame of a batch."""
 
     status: int = Field(
-        description="As if it had been sent alone: 202 received, 200 the map has it already, 409 "
-        "or 422 refused."
+        description="As if it had been sent alone: 202 received, 200 the map has it already, 403 "
+        "beyond the map's quota, 409 or 422 refused."
     )
     frame: Added | None = Field(description="Null where it was refused.")
     problem: Problem | None = Field(description="Why it was refused, or null.")
@@ -92,7 +100,7 @@ def problem_of(error: SceneprintError) -> Problem:
     told: dict[str, object] = {
         "type": f"/problems/{name}",
         "title": name.replace("-", " ").capitalize(),
-        "status": 409 if isinstance(error, Conflict) else 422,
+        "status": next((n for kind, n in _STATUSES.items() if isinstance(error, kind)), 422),
         "detail": str(error),
     }
     return Problem.model_validate({**told, "errors": listed} if listed else told)

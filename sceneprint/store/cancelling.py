@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
-
 from sqlalchemy import Connection, update
 
 from sceneprint.errors import JobOver
 from sceneprint.schemas import JobState
+from sceneprint.store.clock import now
 from sceneprint.store.records import JobRow
 from sceneprint.store.tables import jobs
 
@@ -24,7 +23,7 @@ def cancel(connection: Connection, job: JobRow) -> None:
     connection.execute(
         update(jobs)
         .where(jobs.c.number == job.number)
-        .values(state=JobState.CANCELLED, finished_at=time.time(), leased_until=None)
+        .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
     )
 
 
@@ -36,7 +35,7 @@ def cancel_of(connection: Connection, frame_number: int) -> None:
             jobs.c.frame_number == frame_number,
             jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING)),
         )
-        .values(state=JobState.CANCELLED, finished_at=time.time(), leased_until=None)
+        .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
     )
 
 
@@ -47,6 +46,6 @@ def revive(connection: Connection, job: JobRow) -> None:
         .where(jobs.c.number == job.number)
         .values(
             state=JobState.QUEUED, attempts=0, failures=0, error=None, traceback=None,
-            finished_at=None, leased_until=None, worker=None, run_after=time.time(),
+            finished_at=None, leased_until=None, worker=None, run_after=now(connection),
         )
     )  # fmt: skip

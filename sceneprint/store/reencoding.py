@@ -6,13 +6,13 @@ it. What was made for a model that a map no longer has, or never came to have, i
 
 from __future__ import annotations
 
-import time
 import uuid
 from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, Connection, and_, exists, func, insert, select, update
 
 from sceneprint.schemas import FrameState, JobState
+from sceneprint.store.clock import read_clock
 from sceneprint.store.events import tell
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import next_revision
@@ -116,7 +116,7 @@ def unqueued(connection: Connection, row: MapRow, after: int, *, again: bool = F
 
 def enqueue_all(connection: Connection, row: MapRow, numbers: list[int]) -> None:
     """Queue the signing of frames with the next model of their map."""
-    now = time.time()
+    now = read_clock(connection)
     values = [
         {
             "id": uuid.uuid4().hex, "kind": REENCODE, "frame_number": number,

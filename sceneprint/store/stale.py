@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
-
 from sqlalchemy import Connection, delete, select, update
 
 from sceneprint.schemas import JobState
+from sceneprint.store.clock import now
 from sceneprint.store.records import MapRow
 from sceneprint.store.reencoding import (
     PENDING,
@@ -67,5 +66,5 @@ def cancel_jobs(connection: Connection, numbers: list[int]) -> None:
     connection.execute(
         update(jobs)
         .where(jobs.c.number.in_(numbers), jobs.c.state.in_(PENDING))
-        .values(state=JobState.CANCELLED, finished_at=time.time(), leased_until=None)
+        .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
     )

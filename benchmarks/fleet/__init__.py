@@ -1,0 +1,1 @@
+"""`make fleet`: real PostgreSQL, service processes and workers, and what breaks among them."""

@@ -1,0 +1,118 @@
+"""Two PostgreSQL servers, of which one follows the other and takes its place.
+
+Pair.begin  -->  primary, standby  --kill_primary-->  standby  --promote-->  primary  --renew-->  both
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+from benchmarks.fleet.postgres import Server
+from sceneprint.settings import Settings
+from sceneprint.store import open_store
+
+DATABASE = "fleet"
+
+
+@dataclass(frozen=True)
+class Unreceived:
+    """What a primary had acknowledged, and its standby had not received.
+
+    Parameters
+    ----------
+    frames : ids of the frames that the dead primary has and the promoted one has not
+    wal_bytes : of its log that never came to the standby
+    """
+
+    frames: frozenset[str]
+    wal_bytes: int
+
+
+class Pair:
+    """A primary and its standby, and who of them is which.
+
+    Parameters
+    ----------
+    folder : of their data
+    synchronous : whether a commit waits for the standby
+    """
+
+    def __init__(self, folder: Path, *, synchronous: bool) -> None:
+        self._folder, self._synchronous = folder, synchronous
+        self._made = 0
+        self.primary = Server(self._next(), durable=True)
+        self._standby: Server | None = None
+        self._dead: Server | None = None
+        self._received = 0
+
+    def begin(self) -> None:
+        """Start the primary with its database, and a standby that follows it."""
+        self.primary.start()
+        self.primary.create(DATABASE)
+        self._standby = self.primary.standby(self._next(), synchronous=self._synchronous)
+        self._ports = (self.primary.port, self._standby.port)
+
+    @property
+    def url(self) -> str:
+        """Of both hosts: whoever takes writes is the primary."""
+        hosts = "&".join(f"host=127.0.0.1:{port}" for port in self._ports)
+        return f"postgresql+psycopg://postgres@/{DATABASE}?{hosts}&target_session_attrs=read-write"
+
+    def stall(self) -> None:
+        """Let nothing more come to the standby, as a link that has failed would."""
+        senders = self.primary.execute("SELECT pid FROM pg_stat_replication")
+        for (pid,) in senders:
+            os.kill(cast(int, pid), signal.SIGSTOP)
+
+    def kill_primary(self) -> None:
+        """End it at once, as a machine that dies."""
+        self.primary.kill()
+
+    def promote(self) -> None:
+        """Make the standby the primary; returns when it takes writes."""
+        standby = self._standby
+        assert standby is not None
+        standby.promote()
+        self._dead, self.primary, self._standby = self.primary, standby, None
+
+    def unreceived(self) -> Unreceived:
+        """Ask the dead primary, begun for itself, what the promoted one has not.
+
+        To be asked before the robots have gone on for long: both are read as they are now, and
+        frames are only ever added.
+        """
+        dead = self._dead
+        assert dead is not None
+        alone = Server(dead.folder, durable=True, options={"synchronous_standby_names": ""})
+        alone.start()
+        try:
+            end = _lsn(alone, "pg_current_wal_lsn()")
+            frames = _frames(alone) - _frames(self.primary)
+        finally:
+            alone.stop("immediate")
+        return Unreceived(frozenset(frames), end - _forked_at(self.primary))
+
+    def renew(self) -> None:
+        """Let a new standby follow the new primary, on the address of the dead one."""
+        dead = self._dead
+        assert dead is not None
+        shutil.rmtree(dead.folder)
+        self._standby = self.primary.standby(
+            self._next(), synchronous=self._synchronous, port=dead.port
+        )
+        self._dead = None
+
+    def end(self) -> None:
+        """Kill all that runs."""
+        for server in (self.primary, self._standby):
+            if server is not None:
+                server.kill()
+
+    def _next(self) -> Path:
+        self._made += 1
+        return self._folder / f"server-{self._made}"

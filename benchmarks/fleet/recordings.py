@@ -1,0 +1,110 @@
+"""What the robots of the fleet replay: recorded walks, one of its own for each.
+
+folder of recordings  --walks-->  Walk, ... : one a sequence and grid of samples
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from sceneprint.cli.demo_building import write_building
+from sceneprint.datasets import FrameReference, find_sequences, write_depth_png
+from sceneprint.datasets.metas import meta_of
+from sceneprint.errors import DatasetError
+from sceneprint.schemas import CameraIntrinsics, FrameMeta
+from sceneprint.types import Frame
+
+#: Every so many samples of a frame, so that signing costs little; there are as many walks in a
+#: recording as such grids, and no two of their frames have the same content.
+STRIDE = 4
+#: Frames of a synthetic room's walks, and walks of it.
+ROOM_FRAMES, GRIDS = 30, STRIDE**2
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A frame as a robot sends it.
+
+    Parameters
+    ----------
+    png : its file
+    meta : its camera and its pose
+    """
+
+    png: bytes
+    meta: FrameMeta
+
+
+@contextmanager
+def recordings(data: Path | None, frames: int) -> Iterator[Path]:
+    """A folder of recordings: the one given, or synthetic rooms that hold so many frames."""
+    if data is not None:
+        yield data
+        return
+    with tempfile.TemporaryDirectory(prefix="sceneprint-walks-") as folder:
+        rooms = -(-frames // (ROOM_FRAMES * GRIDS))
+        for _ in write_building(Path(folder), rooms):
+            pass
+        yield Path(folder)
+
+
+def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
+    """`n` walks of up to `frames` frames; the same ones each time.
+
+    Parameters
+    ----------
+    data : folder of recordings
+    n : how many
+    frames : the most of each
+
+    Raises
+    ------
+    DatasetError : there are not so many frames.
+    """
+    recorded = [
+        [one for one in sequence.frames if one.kind == "depth"] for sequence in find_sequences(data)
+    ]
+    # every robot begins elsewhere; those of one recording see it through different grids
+    places = [(sequence, grid) for grid in range(GRIDS) for sequence in recorded if sequence]
+    found: list[list[Shot]] = [[] for _ in range(n)]
+    while any(len(one) < frames for one in found):
+        for walk in found:
+            if len(walk) >= frames:
+                continue
+            if not places:
+                raise DatasetError(
+                    f"{data} has fewer than {n * frames} frames in {GRIDS} grids. Send fewer "
+                    "robots, for a shorter time, or give more recordings."
+                )
+            sequence, grid = places.pop(0)
+            walk += [thinned(one, grid) for one in sequence[: frames - len(walk)]]
+    return found
+
+
+def thinned(frame: FrameReference, grid: int) -> Shot:
+    """A frame with every STRIDE-th of its samples, from one of the grids of them."""
+    read, meta = _read(frame), meta_of(frame)
+    k, (y, x) = read.intrinsics, divmod(grid, STRIDE)
+    depth = np.ascontiguousarray(read.depth[y::STRIDE, x::STRIDE])
+    height, width = depth.shape
+    camera = CameraIntrinsics(
+        width=width, height=height, fx=k.fx / STRIDE, fy=k.fy / STRIDE,
+        cx=(k.cx - x) / STRIDE, cy=(k.cy - y) / STRIDE,
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "frame.png"
+        write_depth_png(path, depth, 1000.0)
+        said = {"intrinsics": camera, "depth_scale": 1000.0, "depth_along_ray": False}
+        return Shot(path.read_bytes(), meta.model_copy(update=said))
+
+
+@lru_cache(maxsize=128)  # robots of one recording take the same frames, one after the other
+def _read(frame: FrameReference) -> Frame:
+    return frame.read_depth()

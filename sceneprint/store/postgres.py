@@ -1,0 +1,158 @@
+"""How PostgreSQL is set up: which URLs mean it, what a connection is told, and how a turn is taken.
+
+Writers take turns as they do in SQLite: each begins with one advisory lock of the database, held
+until its commit. So what a transaction reads stays true until it writes, and numbers that it is
+given are in the order of the commits.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy.engine import ExceptionContext
+
+from sceneprint.errors import UnusableStore
+from sceneprint.store.sqlite import BUSY_S
+
+#: Advisory locks are two numbers: this one, which is ours alone, and what is locked.
+LOCKS = 0x5CE7E
+#: Whose turn it is to write; uploads that are stored or removed (see `objects`).
+TURN, BLOBS = 1, 2
+#: Seconds for one statement, and for a transaction in which nothing is asked: a client that fell
+#: silent must not keep the turn from all others.
+STATEMENT_S, IDLE_S = 60.0, 30.0
+#: Seconds that a new schema may wait for its turn: another process may be making it.
+MIGRATION_S = 600.0
+#: Connections that a process keeps, and has at most.
+KEPT, MOST = 8, 32
+#: Seconds after which a connection is made anew, so that servers added since get their share.
+_OLD_S = 1800
+#: What of libpq is set where the URL does not: a server that is gone, and sent no word, is found
+#: out within ten seconds.
+_CONNECT = {
+    "connect_timeout": "3",
+    "application_name": "sceneprint",
+    "client_encoding": "utf8",
+    "keepalives_idle": "3",
+    "keepalives_interval": "2",
+    "keepalives_count": "3",
+    "tcp_user_timeout": "9000",
+}
+#: Drivers by what a URL begins with; the short ones are what providers hand out.
+_DRIVERS = ("postgresql", "postgres", "postgresql+psycopg")
+_OLDEST = 14
+
+
+def database_url(given: str) -> URL:
+    """The URL of a database, of one of the two kinds that are known.
+
+    Raises
+    ------
+    UnusableStore : it is of no such kind; the message repeats nothing of it but the kind.
+    ArgumentError, ValueError : it is no URL.
+    """
+    kind = given.partition(":")[0]
+    if kind in _DRIVERS:
+        if given.count("@") > 1:  # the rest would be taken for the name of a host, and be told
+            raise UnusableStore(
+                "The database's URL has more than one @. Write the one in a password as %40."
+            )
+        return make_url(given).set(drivername="postgresql+psycopg")
+    url = make_url(given)
+    if url.get_backend_name() != "sqlite":
+        raise UnusableStore(
+            f"{kind!r:.80} is no database that is known. Set SCENEPRINT_DATABASE_URL to "
+            "postgresql+psycopg://user:password@host/database, or leave it out for SQLite in the "
+            "data folder."
+        )
+    return url
+
+
+def open_postgres(url: URL) -> Engine:
+    """An engine whose connections are told what all are told; none is opened yet."""
+    engine = create_engine(
+        url,
+        connect_args=connect_options(url),
+        isolation_level="READ COMMITTED",  # a writer's statements see all that was committed
+        pool_pre_ping=True,
+        pool_recycle=_OLD_S,
+        pool_size=KEPT,
+        max_overflow=MOST - KEPT,
+        pool_timeout=BUSY_S,
+    )
+    event.listen(engine, "connect", configure)
+    event.listen(engine, "begin", _begin)
+    event.listen(engine, "handle_error", _leave_standby)
+    return engine
+
+
+def connect_options(url: URL) -> dict[str, str]:
+    """What of libpq is set beside what a URL says."""
+    return {name: value for name, value in _CONNECT.items() if name not in url.query}
+
+
+def configure(connection: Any, _record: object = None) -> None:
+    """Tell a connection of psycopg what all of them are told.
+
+    Raises
+    ------
+    UnusableStore : the server is too old, or its database is not of UTF-8.
+    """
+    info = connection.info
+    encoding = info.parameter_status("server_encoding")
+    if info.server_version < _OLDEST * 10_000 or encoding != "UTF8":
+        connection.close()
+        raise UnusableStore(
+            f"The database server is PostgreSQL {info.server_version // 10_000} with encoding "
+            f"{encoding}. Version {_OLDEST} or later is needed, and a database made with "
+            "ENCODING 'UTF8'."
+        )
+    before, connection.autocommit = connection.autocommit, True
+    connection.execute(
+        "SELECT set_config('lock_timeout', %s, false), set_config('statement_timeout', %s, false),"
+        " set_config('idle_in_transaction_session_timeout', %s, false),"
+        # a commit that was acknowledged survives the power, and the fall of the server where a
+        # standby is waited for: more than `on` is left as it is
+        " set_config('synchronous_commit', CASE current_setting('synchronous_commit')"
+        " WHEN 'off' THEN 'on' ELSE current_setting('synchronous_commit') END, false)",
+        [_milliseconds(seconds) for seconds in (BUSY_S, STATEMENT_S, IDLE_S)],
+    )
+    connection.autocommit = before
+
+
+def allow(connection: Connection, seconds: float) -> None:
+    """Let statements of this transaction, and pauses between them, take so long; 0: any time."""
+    if connection.dialect.name == "postgresql":
+        for name in ("statement_timeout", "idle_in_transaction_session_timeout"):
+            connection.execute(
+                text("SELECT set_config(:name, :value, true)"),
+                {"name": name, "value": _milliseconds(seconds)},
+            )
+
+
+def _begin(connection: Connection) -> None:
+    """Begin a transaction: of a writer with its turn, for which it waits so long."""
+    wait_s: float | None = connection.get_execution_options().get("sceneprint_write")
+    if wait_s is None:
+        return
+    turn = f"SELECT pg_advisory_xact_lock({LOCKS}, {TURN})"
+    if wait_s == BUSY_S:
+        connection.exec_driver_sql(turn)
+        return
+    # what is waited for so long is done without haste; others find the usual time again
+    after = "0" if wait_s > BUSY_S else _milliseconds(BUSY_S)
+    connection.exec_driver_sql(f"SET LOCAL lock_timeout = {_milliseconds(wait_s)}; {turn}")
+    connection.exec_driver_sql(f"SET LOCAL lock_timeout = {after}")
+    if wait_s > BUSY_S:
+        allow(connection, 0)
+
+
+def _leave_standby(context: ExceptionContext) -> None:
+    """Give a connection up whose server is a standby: the next may lead to the one that writes."""
+    if getattr(context.original_exception, "sqlstate", None) == "25006":
+        context.is_disconnect = True
+
+
+def _milliseconds(seconds: float) -> str:
+    return str(int(1000 * seconds))

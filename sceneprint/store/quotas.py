@@ -1,0 +1,88 @@
+"""What a map holds and may hold: frames, and bytes of their uploads.
+
+Counted are frames that are neither deleted nor redundant, whatever else became of them, and their
+uploads as they were sent. Not counted is what we make of them: signatures, artifacts, indexes.
+Two columns of the map count on in the transaction that changes it; writers take turns, so that a
+quota holds to the frame whoever sends at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sqlalchemy import Connection, func, select, update
+
+from sceneprint.errors import QuotaExceeded
+from sceneprint.schemas import FrameState
+from sceneprint.store.records import MapRow
+from sceneprint.store.tables import frames, maps
+
+#: States of frames that take no room: their uploads are removed.
+ROOMLESS = (FrameState.DELETED, FrameState.REDUNDANT)
+
+
+@dataclass(frozen=True)
+class Use:
+    """How much of a map is in use."""
+
+    frames: int
+    bytes: int
+
+
+def use_of(connection: Connection, map_number: int) -> Use:
+    """What a map holds, as it was counted on."""
+    asked = select(maps.c.used_frames, maps.c.used_bytes).where(maps.c.number == map_number)
+    return Use(*connection.execute(asked).one())
+
+
+def count_on(connection: Connection, map_number: int, more: int, more_bytes: int) -> None:
+    """Count that a map holds so many frames and bytes more, or less."""
+    connection.execute(
+        update(maps)
+        .where(maps.c.number == map_number)
+        .values(used_frames=maps.c.used_frames + more, used_bytes=maps.c.used_bytes + more_bytes)
+    )
+
+
+def counted_anew(connection: Connection, map_number: int) -> Use:
+    """What a map holds, counted over all its frames: what `use_of` must say."""
+    asked = select(func.count(), func.coalesce(func.sum(frames.c.bytes), 0)).where(
+        frames.c.map_number == map_number, frames.c.state.not_in(ROOMLESS)
+    )
+    n, size = connection.execute(asked).one()
+    return Use(int(n), int(size))
+
+
+def require_room(connection: Connection, row: MapRow, size: int) -> None:
+    """See that a map's quota leaves room for one more frame.
+
+    Parameters
+    ----------
+    connection : of the transaction that would add it, or of a reading one for a first look
+    row : of the map
+    size : bytes of the upload
+
+    Raises
+    ------
+    QuotaExceeded : it does not.
+    """
+    if row.quota_frames is None and row.quota_bytes is None:
+        return
+    use = use_of(connection, row.number)
+    if row.quota_frames is not None and use.frames >= row.quota_frames:
+        raise QuotaExceeded(
+            f"Map {row.name!r} holds {use.frames} frames of the {row.quota_frames} that its quota "
+            f"allows, so the frame was not taken. {_todo(row.name)}"
+        )
+    if row.quota_bytes is not None and use.bytes + size > row.quota_bytes:
+        raise QuotaExceeded(
+            f"Map {row.name!r} holds {use.bytes} bytes of uploads of the {row.quota_bytes} that "
+            f"its quota allows, so the frame of {size} bytes was not taken. {_todo(row.name)}"
+        )
+
+
+def _todo(name: str) -> str:
+    return (
+        "Delete frames that are not needed any more, or ask the operator for a larger quota "
+        f"(PATCH /v1/maps/{name})."
+    )
