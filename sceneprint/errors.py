@@ -279,6 +279,10 @@ class StoreLocked(UnusableStore):
     """Another process has kept the database from all other writers for long."""
 
 
+class StoreAway(UnusableStore):
+    """The server of the database does not answer, or the connection to it was lost."""
+
+
 class NewerSchema(StoreError):
     """A later version of sceneprint wrote the database."""
 

@@ -71,7 +71,7 @@ class Sampler:
         if not any(data.values()) or database.read_only:
             return False
         try:
-            with database.write() as connection:
+            with database.write(turn=False) as connection:
                 add_sample(connection, SERVICE, self._process, data)
         except SceneprintError as error:
             log.info("no sample kept", extra={"error": str(error)})

@@ -8,6 +8,7 @@ import secrets
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -37,16 +38,53 @@ LONG = (
 )  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
+#: Whether Settings without a database mean PostgreSQL: `make test-postgres`.
+ON_POSTGRES = os.environ.get("SCENEPRINT_TEST_DATABASE") == "postgresql"
 #: The database that new ones of a test are copied from.
 TEMPLATE = "sceneprint_template"
 #: What makes a folder of that name by calling that function.
 Once = Callable[[str, Callable[[Path], object]], Path]
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Begin the server that the whole run is on, where it is; see tests/on_postgres."""
+    config.addinivalue_line("markers", "sqlite_only(reason): of nothing that PostgreSQL does")
+    if ON_POSTGRES and "PYTEST_XDIST_WORKER" not in os.environ:
+        folder = Path(tempfile.mkdtemp(prefix="sceneprint-"))
+        server = Server(folder)
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+        config.add_cleanup(server.kill)
+        server.start()
+        open_database(server.create(TEMPLATE)).close()
+        server.execute("CREATE TABLE folders (name text, place text)")
+        # for this process, those of xdist and all that tests begin
+        os.environ["SCENEPRINT_TEST_SERVER"] = server.url("")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put long files first."""
     places = {name: place for place, name in enumerate(LONG)}
     items.sort(key=lambda item: places.get(item.path.name, len(LONG)))
+    for item in items if ON_POSTGRES else ():
+        if (only := item.get_closest_marker("sqlite_only")) is not None:
+            item.add_marker(pytest.mark.skip(reason=f"SQLite's own: {only.args[0]}"))
+
+
+@pytest.fixture(autouse=True)
+def _databases_go(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Where the run is on PostgreSQL, the databases of a test's own folders go with it."""
+    if not ON_POSTGRES or "tmp_path" not in request.fixturenames:
+        yield
+        return
+    place = f"{request.getfixturevalue('tmp_path')}"
+    yield
+    import psycopg
+
+    server = os.environ["SCENEPRINT_TEST_SERVER"].replace("+psycopg", "")
+    with psycopg.connect(f"{server}postgres", autocommit=True) as connection:
+        asked = "DELETE FROM folders WHERE place = %s OR starts_with(place, %s) RETURNING name"
+        for (name,) in connection.execute(asked, (place, f"{place}/")).fetchall():
+            connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)'.encode())
 
 
 @pytest.fixture(scope="session")

@@ -188,13 +188,14 @@ class Server:
             cursor = connection.execute(statement.encode())
             return cursor.fetchall() if cursor.description else []
 
-    def standby(self, folder: Path, *, synchronous: bool) -> Server:
+    def standby(self, folder: Path, *, synchronous: bool, port: int | None = None) -> Server:
         """Another server that follows this one, started.
 
         Parameters
         ----------
         folder : of it
         synchronous : whether a commit here waits until it has it too
+        port : a free one unless told
         """
         self._own(folder)
         self._run(
@@ -205,7 +206,10 @@ class Server:
         with (folder / "data" / "postgresql.auto.conf").open("a") as told:
             told.write("synchronous_standby_names = ''\n")  # who followed the other one
         name = f"standby{os.urandom(4).hex()}"
-        follower = Server(folder, options={**self._options, "cluster_name": name})
+        follower = Server(
+            folder, port, durable="fsync" not in self._options,
+            options={**self._options, "cluster_name": name},
+        )  # fmt: skip
         follower.start()
         if synchronous:
             # set after the copy was made: once promoted, it waits for nobody

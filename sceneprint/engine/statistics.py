@@ -158,7 +158,7 @@ class Statistics:
 
     def began(self, worker: str) -> None:
         """Note that a worker has begun; where that cannot be written, nobody will know."""
-        with suppress(SceneprintError), self._store.database.write() as connection:
+        with suppress(SceneprintError), self._store.database.write(turn=False) as connection:
             add_sample(connection, WORKER, worker, {})
 
     def _look(self) -> Figures:

@@ -1,7 +1,8 @@
 """Drafts: which signatures the next generation will have, and in which segments they lie.
 
 New signatures go to a segment of their own. A signature that is deleted or replaced stays in its
-segment, out of use, until more rows are out of use than in use; then all are rewritten.
+segment, out of use, until more rows are out of use than in use; then all are rewritten. Or until
+somebody asks that no byte of them is left: then the segments are rewritten that have such rows.
 """
 
 from __future__ import annotations
@@ -44,14 +45,17 @@ class Draft:
     kept: NDArray[np.int64]
 
 
-def remaining(folder: Path, previous: Generation | None, drop: frozenset[int]) -> Draft:
-    """What stays of the generation before, in its segments or in a rewritten one.
+def remaining(
+    folder: Path, previous: Generation | None, drop: frozenset[int], *, clean: bool = False
+) -> Draft:
+    """What stays of the generation before, in its segments or in rewritten ones.
 
     Parameters
     ----------
     folder : where a rewritten segment goes
     previous : the generation before, if any
     drop : keys of frames that do not stay
+    clean : leave no segment that has rows out of use
     """
     none = np.empty(0, np.int64)
     if previous is None:
@@ -62,7 +66,23 @@ def remaining(folder: Path, previous: Generation | None, drop: frozenset[int]) -
     if stored > SPARSE * len(kept) or len(segments) >= MANY:
         segments = _rewritten(folder, previous, rows)
         rows = np.arange(len(kept))
+    elif clean:
+        segments = _cleaned(folder, previous, rows)
+        rows = np.arange(len(kept))  # no row is out of use any more, and their order stays
     return Draft(segments, rows, previous.keys[kept], kept)
+
+
+def _cleaned(folder: Path, previous: Generation, rows: NDArray[np.int64]) -> tuple[Segment, ...]:
+    """Segments that hold those rows alone, each as it was or rewritten."""
+    found, start = list[Segment](), 0
+    for segment in previous.segments:
+        own = rows[(rows >= start) & (rows < start + len(segment))]
+        start += len(segment)
+        if len(own) == len(segment):
+            found.append(segment)
+        else:
+            found += _rewritten(folder, previous, own)
+    return tuple(found)
 
 
 def _rewritten(folder: Path, previous: Generation, rows: NDArray[np.int64]) -> tuple[Segment, ...]:

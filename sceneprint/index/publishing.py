@@ -38,6 +38,7 @@ def publish(
     drop: frozenset[int] = frozenset(),
     anchor: str = "",
     seed: int = 0,
+    clean: bool = False,
 ) -> Generation | None:
     """Publish the generation that follows `previous`.
 
@@ -55,6 +56,8 @@ def publish(
     drop : keys of frames that are no longer in the map
     anchor : of the database's state; kept as it is, for whoever opens the generation to check
     seed : of the rows that the code is fitted on, and of the frames that recall is measured by
+    clean : leave no file that has a byte of a frame that is no longer there: the generation
+        before is not kept
 
     Returns
     -------
@@ -73,7 +76,8 @@ def publish(
         if not mine or _overtaken(folder, previous):
             return None
         listed = manifests(folder)
-        draft = append(folder, remaining(folder, previous, drop), blocks, drop)
+        kept = remaining(folder, previous, drop, clean=clean)
+        draft = append(folder, kept, blocks, drop)
         code, coarse, fitted_on = _codes(draft, previous, seed)
         generation = Generation(
             number=listed[0][0] + 1 if listed else 1,
@@ -90,7 +94,7 @@ def publish(
         own = _write(folder, generation, _recall(listed, previous, generation, seed))
         if previous is not None:  # known to be sound, whatever lies between
             listed = [each for each in listed if each[0] == previous.number]
-        _clean(folder, {own, *(path for _, path in listed[:1])})
+        _clean(folder, {own, *(path for _, path in listed[: 0 if clean else 1])})
         return generation
 
 

@@ -1,13 +1,17 @@
 """The database in one file that nobody writes: made, checked, and asked what it refers to.
 
-database in use  --copy_database-->  file  --open_copy-->  Connection of sqlite3
+database in use  --open_source-->  Source  --copy-->  file  --open_copy-->  Connection of sqlite3
+
+Of PostgreSQL it is a SQLite file as well: one format, whatever the store is kept in.
 """
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -16,8 +20,10 @@ from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
 
 from sceneprint.errors import NewerSchema, SnapshotError, UnusableStore
+from sceneprint.maintenance.exporting import Written, copy_server, server_bytes
 from sceneprint.maintenance.manifests import Use
 from sceneprint.schemas import FrameState
+from sceneprint.store.looking import look_at
 from sceneprint.store.revisions import known_revisions
 from sceneprint.store.sealed import Sealed, sealed_file
 
@@ -33,22 +39,59 @@ _USES = (
 _USES_OF_JOBS = "SELECT blob AS digest, job_number AS number, 'job' AS role FROM job_files"
 
 
-def database_file(url: str) -> Path:
-    """The file of a database.
+@dataclass(frozen=True)
+class Source:
+    """A database to be copied.
+
+    Parameters
+    ----------
+    place : of it, for messages; without a password
+    bytes : it takes, about
+    copy : writes one state of it into a file that is made; tells the bytes of that so far
+    """
+
+    place: str
+    bytes: int
+    copy: Callable[[Path, Written], None]
+
+
+@contextmanager
+def open_source(url: str) -> Iterator[Source]:
+    """A database that may be in use; nothing is written to it.
 
     Raises
     ------
-    SnapshotError : it is no SQLite database in a file.
+    SnapshotError : it is a SQLite database in memory.
+    UnusableStore, NewerSchema : it is missing, cannot be read, or is of another schema.
+    """
+    path = _file_of(url)
+    if path is not None:
+        if not path.is_file():
+            raise UnusableStore(f"{path}: there is no database. Name its folder with --data.")
+        yield Source(str(path), path.stat().st_size, lambda to, _: copy_database(path, to))
+        return
+    with look_at(url) as database:
+        yield Source(database.shown, server_bytes(database), partial(copy_server, database))
+
+
+def _file_of(url: str) -> Path | None:
+    """The file of a SQLite database; None: it is another, or `look_at` says what is wrong.
+
+    Raises
+    ------
+    SnapshotError : it is in no file.
     """
     try:
         parsed = make_url(url)
-        kind, name = parsed.get_backend_name(), parsed.database or ""
     except (ArgumentError, ValueError):  # the URL may hold a password: it is not shown
-        kind, name = "unknown", ""
-    if kind != "sqlite" or name in ("", ":memory:") or name.startswith("file:"):
+        return None
+    if parsed.get_backend_name() != "sqlite":
+        return None
+    name = parsed.database or ""
+    if name in ("", ":memory:") or name.startswith("file:"):
         raise SnapshotError(
-            f"Snapshots are taken of SQLite databases that are named by their path; those of kind "
-            f"{kind} come with a later version. Use that database's own tools, then copy the blobs."
+            "Snapshots are taken of PostgreSQL, and of SQLite databases that are named by their "
+            "path."
         )
     return Path(name).absolute()
 

@@ -15,6 +15,7 @@ from sqlalchemy import URL, Connection
 from sceneprint.errors import UnusableStore
 from sceneprint.maintenance.columns import Form, Row, Sum, rows_of_file
 from sceneprint.store.database import Database, open_database
+from sceneprint.store.postgres import allow
 from sceneprint.store.tables import metadata
 
 #: Bytes written so far.
@@ -50,7 +51,7 @@ def copy_server(database: Database, to: Path, written: Written) -> None:
             file.execute("PRAGMA synchronous = OFF")
             indexes = _without_indexes(file)
             with database.read() as connection:
-                patient(connection)
+                allow(connection, 0)  # what is on the way may be large, and the disk slow
                 sums = [_copy(connection, file, Form(one), written, to)
                         for one in metadata.sorted_tables]  # fmt: skip
                 file.execute("BEGIN")
@@ -66,12 +67,6 @@ def copy_server(database: Database, to: Path, written: Written) -> None:
             f"{to.parent}: the database cannot be copied there ({error}). See that the disk has "
             "room, and try again."
         ) from error
-
-
-def patient(connection: Connection) -> None:
-    """Let a transaction take hours: what is on the way may be large, and the disk slow."""
-    connection.exec_driver_sql("SET LOCAL statement_timeout = 0")
-    connection.exec_driver_sql("SET LOCAL idle_in_transaction_session_timeout = '1h'")
 
 
 def rows_of_server(connection: Connection, form: Form, *, hashed: bool = False) -> Iterator[Row]:

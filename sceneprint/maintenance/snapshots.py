@@ -1,6 +1,6 @@
 """Snapshots: one state of database and blobs in one archive, taken while the service runs.
 
-data folder  --take_snapshot-->  archive
+data folder, or PostgreSQL and blobs  --take_snapshot-->  archive
 
 The database is copied first, in one transaction; then the blobs that this copy refers to. Blobs
 never change, and none is removed from before the first until after the second, so the archive
@@ -73,21 +73,25 @@ def take_snapshot(settings: Settings, path: Path, progress: Progress | None = No
 
     Raises
     ------
-    SnapshotError : the path is taken, or there is no room; or the database is another than SQLite.
+    SnapshotError : the path is taken, or there is no room.
     UnusableStore, NewerSchema : the database is missing, damaged, or a later version's.
     OSError : the archive's folder is missing or cannot be written.
     """
-    source = copies.database_file(settings.database)
-    if path.exists():
-        raise _taken(path)
-    if not source.is_file():
-        raise UnusableStore(f"{source}: there is no database. Name its folder with --data.")
-    if not settings.blob_dir.is_dir():  # a disk that is not mounted is not made up for
-        raise UnusableStore(
-            f"{settings.blob_dir}: there is no such folder. See that its disk is mounted, or run "
-            "`sceneprint fsck`."
-        )
-    blobs = BlobFolder(settings.blob_dir, make=False)
+    with copies.open_source(settings.database) as source:
+        if path.exists():
+            raise _taken(path)
+        if not settings.blob_dir.is_dir():  # a disk that is not mounted is not made up for
+            raise UnusableStore(
+                f"{settings.blob_dir}: there is no such folder. See that its disk is mounted, or "
+                "run `sceneprint fsck`."
+            )
+        blobs = BlobFolder(settings.blob_dir, make=False)
+        return _taken_of(source, blobs, path, progress or (lambda _done, _total: None))
+
+
+def _taken_of(
+    source: copies.Source, blobs: BlobFolder, path: Path, progress: Progress
+) -> Snapshot:
     folder = path.absolute().parent
     with (
         full_disk_explained(path),
@@ -95,11 +99,18 @@ def take_snapshot(settings: Settings, path: Path, progress: Progress | None = No
         blobs.kept(),  # before the copy: what it refers to must not go
     ):
         begun = datetime.now(UTC)
-        check_room(folder, 2 * source.stat().st_size, "a snapshot of the database alone")
+        check_room(folder, 2 * source.bytes, "a snapshot of the database alone")
         database = workplace / "database"
-        copies.copy_database(source, database)
+        ahead = 0  # bytes of the copy, where to write it takes long
+
+        def written(done: int) -> None:
+            nonlocal ahead
+            ahead = done
+            progress(done, max(2 * source.bytes, done))
+
+        source.copy(database, written)
         with copies.open_copy(database) as copy:
-            draft = _draft(copy, source, begun, database.stat().st_size)
+            draft = _draft(copy, source.place, begun, database.stat().st_size)
             total = draft.database.bytes + sum(
                 blobs.size(digest) or 0 for digest in copies.referred(copy)
             )
@@ -107,10 +118,10 @@ def take_snapshot(settings: Settings, path: Path, progress: Progress | None = No
             archive = workplace / "archive"
             with archive.open("xb") as file:
                 archive.chmod(0o600)  # it has all pictures, and the hashes of keys
-                tell = progress or (lambda _done, _total: None)
                 writer = ArchiveWriter(
-                    file, int(begun.timestamp()), lambda done: tell(min(done, total), total)
-                )
+                    file, int(begun.timestamp()),
+                    lambda done: progress(ahead + min(done, total), ahead + total),
+                )  # fmt: skip
                 manifest, damaged = _write(writer, draft, database, copy, blobs)
         try:
             put_new(archive, path)
@@ -119,9 +130,9 @@ def take_snapshot(settings: Settings, path: Path, progress: Progress | None = No
     return Snapshot(path, manifest, damaged)
 
 
-def _draft(copy: sqlite3.Connection, source: Path, begun: datetime, size: int) -> Manifest:
+def _draft(copy: sqlite3.Connection, source: str, begun: datetime, size: int) -> Manifest:
     """The manifest, as far as it is known before the archive is written."""
-    revision = copies.check_schema(copy, str(source))
+    revision = copies.check_schema(copy, source)
     wrong = copies.check_copy(copy)
     if wrong is not None:
         raise UnusableStore(

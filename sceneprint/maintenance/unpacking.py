@@ -69,6 +69,32 @@ def unpack(archive: Path, folder: Path, progress: Progress | None, *, with_blobs
     return Snapshot(archive, manifest, damaged)
 
 
+def blobs_of(archive: Path, progress: Progress | None) -> Iterator[tuple[int, Iterator[bytes]]]:
+    """The blobs in an archive that `unpack` has verified: bytes of each, and these in parts.
+
+    Parameters
+    ----------
+    archive : see `unpack`
+    progress : told of bytes done and bytes in all
+
+    Raises
+    ------
+    DamagedSnapshot : it is not what was verified.
+    """
+    with archive.open("rb") as file:
+        total = os.fstat(file.fileno()).st_size
+        reader = ArchiveReader(
+            file, archive, lambda done: None if progress is None else progress(done, total)
+        )
+        while (member := reader.next()) is not None:
+            name, size = member
+            chunks = reader.content(size)
+            if name.startswith(BLOBS):
+                yield size, chunks
+            for _ in chunks:  # to its end, whoever has read how much
+                pass
+
+
 def _manifest(reader: ArchiveReader, archive: Path) -> Manifest:
     try:
         member = reader.next()

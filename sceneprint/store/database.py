@@ -7,15 +7,22 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, event, make_url
+from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, event
 from sqlalchemy.exc import ArgumentError
 
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
-from sceneprint.store.faults import explained
+from sceneprint.store.faults import explained, shown
+from sceneprint.store.postgres import (
+    MIGRATION_S,
+    configure,
+    connect_options,
+    database_url,
+    open_postgres,
+)
 from sceneprint.store.revisions import known_revisions, migration_config, revision_of
 from sceneprint.store.sealed import Sealed, sealed_file
 from sceneprint.store.sqlite import (
@@ -25,6 +32,9 @@ from sceneprint.store.sqlite import (
     configure_sealed,
     configure_sqlite,
 )
+
+if TYPE_CHECKING:
+    import psycopg
 
 #: Alembic keeps the migration that runs in a variable of its module.
 _migrating = threading.Lock()
@@ -41,15 +51,29 @@ class Database:
 
     def __init__(self, engine: Engine, sealed: Sealed | None = None) -> None:
         self._engine, self._sealed = engine, sealed
-        # of SQLite's writers of this process one asks for its lock, and the others wait here:
-        # each of them would keep a connection from the readers
+        # what a transaction sees is one state on both: in SQLite any does
+        self._readers = engine if self.is_sqlite else engine.execution_options(
+            isolation_level="REPEATABLE READ", postgresql_readonly=True
+        )  # fmt: skip
+        # of the writers of this process one asks for the turn, and the others wait here: each of
+        # them would keep a connection from the readers
         self._turn = threading.Lock()
         self._held = False  # by another process, for longer than anybody should wait
 
     @property
+    def dialect(self) -> str:
+        """Which database it is: `sqlite` or `postgresql`."""
+        return self._engine.dialect.name
+
+    @property
     def is_sqlite(self) -> bool:
-        """Whether one writer at a time holds the whole database."""
-        return self._engine.dialect.name == "sqlite"
+        """Whether it is a file of this machine, of which one writer at a time holds the whole."""
+        return self.dialect == "sqlite"
+
+    @property
+    def shown(self) -> str:
+        """Which database it is, to be told: without a password."""
+        return shown(self._engine.url)
 
     @property
     def read_only(self) -> bool:
@@ -70,19 +94,22 @@ class Database:
     def read(self) -> Iterator[Connection]:
         """A transaction that sees one state and changes nothing."""
         before = None if self._sealed is None else self._sealed.state()
-        with explained(self._engine), self._engine.connect() as connection:
+        with self.explained(), self._readers.connect() as connection:
             yield connection
             if self._sealed is not None:
                 self._sealed.check(before)
 
     @contextmanager
-    def write(self, *, unchecked: bool = False) -> Iterator[Connection]:
+    def write(self, *, unchecked: bool = False, turn: bool = True) -> Iterator[Connection]:
         """A transaction that is committed at the end, or leaves no trace where it raises.
 
         Parameters
         ----------
         unchecked : let SQLite not look whether rows that others refer to are there: tables can be
-            made anew then
+            made anew then. PostgreSQL has no such haste then, as to wait for a turn or to answer
+        turn : whether others wait until it is committed. Without it, on PostgreSQL, only rows may
+            be touched that are held against others, and no event may be told; SQLite has no
+            writers but in turn
 
         Raises
         ------
@@ -93,19 +120,22 @@ class Database:
         UnusableStore : it cannot be written for another reason.
         """
         self.require_writable()
-        if not self.is_sqlite:
-            with explained(self._engine), self._engine.begin() as connection:
+        if not turn and not self.is_sqlite:
+            with self.explained(), self._engine.begin() as connection:
                 yield connection
             return
-        if not self._turn.acquire(timeout=HELD_S if self._held else BUSY_S):
+        wait_s = HELD_S if self._held else BUSY_S
+        if unchecked and not self.is_sqlite:
+            wait_s = MIGRATION_S
+        if not self._turn.acquire(timeout=wait_s):
             raise StoreLocked(
-                f"{self._engine.url!r}: other writers of this process have waited for long, and "
+                f"{self.shown}: other writers of this process have waited for long, and "
                 "nothing was stored. Come back later."
             )
         try:
-            with explained(self._engine), self._engine.connect() as connection:
-                options: dict[str, Any] = {"sceneprint_write": HELD_S if self._held else BUSY_S}
-                if unchecked:
+            with self.explained(), self._engine.connect() as connection:
+                options: dict[str, Any] = {"sceneprint_write": wait_s}
+                if unchecked and self.is_sqlite:
                     options["sceneprint_unchecked"] = True
                     connection.detach()  # nobody else gets a connection that does not look
                 writing = connection.execution_options(**options)
@@ -118,19 +148,63 @@ class Database:
         finally:
             self._turn.release()
 
+    def explained(self) -> AbstractContextManager[None]:
+        """Within it, what the database or its driver raises is told in our words."""
+        return explained(self._engine)
+
+    def driver_connection(self) -> psycopg.Connection[Any]:
+        """A connection to PostgreSQL that commits each statement at once, for whom it is opened.
+
+        What lasts as long as a connection does, such as LISTEN and locks of a session, needs one
+        that nobody else is given. Who asked closes it, and asks within `explained`.
+
+        Raises
+        ------
+        UnusableStore : the server cannot be reached.
+        """
+        import psycopg
+
+        with self.explained():
+            args, given = self._engine.dialect.create_connect_args(self._engine.url)
+            options = {**connect_options(self._engine.url), **given}
+            found = psycopg.connect(*args, **options, autocommit=True)
+            configure(found)
+        return found
+
     def close(self) -> None:
         """Give all connections back."""
         self._engine.dispose()
 
 
 def is_there(url: str) -> bool:
-    """Whether the database of a URL is a file that is there."""
+    """Whether the database of a URL is a file that is there, or a server's that has a schema.
+
+    Raises
+    ------
+    UnusableStore : the server cannot be asked.
+    """
     try:
-        parsed = make_url(url)
-    except (ArgumentError, ValueError):
+        parsed = database_url(url)
+    except (UnusableStore, ArgumentError, ValueError):
         return False  # opening it says why
-    place = parsed.database if parsed.get_backend_name() == "sqlite" else None
-    return place is not None and Path(place).is_file()
+    if parsed.get_backend_name() == "sqlite":
+        return parsed.database is not None and Path(parsed.database).is_file()
+    database = reach_database(url)
+    try:
+        with database.read() as connection:
+            return revision_of(connection) is not None
+    finally:
+        database.close()
+
+
+def reach_database(url: str) -> Database:
+    """A database as it is: no schema is made or looked at, and a server is not yet asked.
+
+    Raises
+    ------
+    UnusableStore : the URL is none of a database that is known.
+    """
+    return _reached(url)[0]
 
 
 def open_database(url: str) -> Database:
@@ -148,15 +222,7 @@ def open_database(url: str) -> Database:
     ReadOnlyStore : it may be read alone, and an earlier version wrote it.
     NewerSchema : a later version of sceneprint wrote it; nothing is touched.
     """
-    try:
-        database, engine = _opened(make_url(url))
-    # ValueError: a port that is no number. The URL may hold a password
-    except (ArgumentError, ImportError, ValueError) as error:
-        raise UnusableStore(
-            f"{url.partition(':')[0]!r} is no database that can be opened ({error}). Set "
-            "SCENEPRINT_DATABASE_URL to an SQLAlchemy URL, or leave it out for SQLite in the "
-            "data folder."
-        ) from error
+    database, engine = _reached(url)
     try:
         _migrate(database, engine)
     except BaseException:
@@ -165,9 +231,22 @@ def open_database(url: str) -> Database:
     return database
 
 
+def _reached(given: str) -> tuple[Database, Engine]:
+    try:
+        return _opened(database_url(given))
+    # what is no number where a port should be may be half of a password: nothing is repeated
+    except (ArgumentError, ImportError, ValueError) as error:
+        raise UnusableStore(
+            f"{given.partition(':')[0]!r:.80} begins no URL of a database that can be opened. Set "
+            "SCENEPRINT_DATABASE_URL to one, such as postgresql+psycopg://user:password@host/name "
+            "(what is special in a password written as %40), or leave it out for SQLite in the "
+            "data folder."
+        ) from (error if isinstance(error, ImportError) else None)
+
+
 def _opened(url: URL) -> tuple[Database, Engine]:
     if url.get_backend_name() != "sqlite":
-        engine = create_engine(url, pool_pre_ping=True)
+        engine = open_postgres(url)
         return Database(engine), engine
     path, sealed = sealed_file(url), None
     if path is not None:
@@ -191,7 +270,7 @@ def _migrate(database: Database, engine: Engine) -> None:
         return
     if database.read_only:
         raise ReadOnlyStore(
-            f"{engine.url!r} has schema {current}, this version needs {head}, and the file is "
+            f"{shown(engine.url)} has schema {current}, this version needs {head}, and the file is "
             "read-only. Open it once where it may be written, or use the version that wrote it."
         )
     with database.write(unchecked=True) as connection:  # another process may have been first
@@ -210,7 +289,7 @@ def _require_whole(connection: Connection, engine: Engine) -> None:
     """What `unchecked` did not look at, looked at in the end."""
     if connection.exec_driver_sql("PRAGMA foreign_key_check").first() is not None:
         raise UnusableStore(
-            f"{engine.url!r}: rows refer to others that are not there, so it is not brought to "
+            f"{shown(engine.url)}: rows refer to others that are not there, so it is not brought to "
             "the schema of this version, and nothing was changed. Run `sceneprint fsck` of the "
             "version that wrote it."
         )
@@ -220,7 +299,7 @@ def _current(connection: Connection, known: frozenset[str], engine: Engine) -> s
     current = revision_of(connection)
     if current is not None and current not in known:
         raise NewerSchema(
-            f"{engine.url!r} has schema {current}, which this version of sceneprint does not "
+            f"{shown(engine.url)} has schema {current}, which this version of sceneprint does not "
             "know: a later one wrote it. Use that version, or another data folder."
         )
     return current

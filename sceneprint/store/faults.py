@@ -1,6 +1,6 @@
 """What a fault of the machine means for the store, and what to do about it.
 
-OSError | error of SQLite  -->  StoreFull, ReadOnlyStore, StoreLocked or UnusableStore
+OSError | error of SQLite or PostgreSQL  -->  StoreFull, ReadOnlyStore, StoreLocked or UnusableStore
 """
 
 from __future__ import annotations
@@ -8,12 +8,13 @@ from __future__ import annotations
 import errno
 import shutil
 import sqlite3
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sqlalchemy import Engine
-from sqlalchemy.exc import DBAPIError, OperationalError
+from sqlalchemy import URL, Engine
+from sqlalchemy.exc import DBAPIError, OperationalError, TimeoutError
 
 from sceneprint.errors import ReadOnlyStore, StoreFull, StoreLocked, UnusableStore
 
@@ -38,23 +39,60 @@ def unusable(what: str, error: OSError) -> UnusableStore:
     return UnusableStore(f"{text} Check the folder and its permissions.")
 
 
+def shown(url: URL) -> str:
+    """Which database a URL is of, to be told: without a password, wherever the URL has it."""
+    if url.get_backend_name() == "sqlite":
+        return repr(url)
+    named = url.query.get("host", ())
+    hosts = [url.host] if url.host else [named] if isinstance(named, str) else list(named)
+    if url.port and url.host:
+        hosts = [f"{url.host}:{url.port}"]
+    of = f"{url.username}@" if url.username else ""
+    return f"postgresql://{of}{','.join(hosts)}/{url.database or ''}"
+
+
 @contextmanager
 def explained(engine: Engine) -> Iterator[None]:
     """Say which database a fault is about, of what kind it is, and what to do."""
     try:
         yield
-    except OperationalError as error:
-        raise _of_database(engine, error) from error
     except DBAPIError as error:
+        known = _of_sqlite if engine.dialect.name == "sqlite" else _of_server
+        found = known(engine.url, error)
+        if found is None:
+            raise
+        raise found from error
+    except TimeoutError as error:
+        raise StoreLocked(
+            f"{shown(engine.url)}: all connections that a process may have are in use. Come back "
+            "later."
+        ) from error
+    except Exception as error:
+        if not _is_of_driver(error):
+            raise
+        found = told(engine.url, error, isinstance(error, sys.modules["psycopg"].OperationalError))
+        if found is None:
+            raise
+        raise found from error
+
+
+def _is_of_driver(error: Exception) -> bool:
+    """Whether psycopg raised it itself, over a connection that is not SQLAlchemy's."""
+    driver = sys.modules.get("psycopg")  # a process on SQLite never loads it
+    return driver is not None and isinstance(error, driver.Error)
+
+
+def _of_server(url: URL, error: DBAPIError) -> UnusableStore | None:
+    broken = isinstance(error, OperationalError) or error.connection_invalidated
+    return told(url, error.orig, broken)
+
+
+def _of_sqlite(url: URL, error: DBAPIError) -> UnusableStore | None:
+    if not isinstance(error, OperationalError):
         if "malformed" in str(error.orig) or "not a database" in str(error.orig):
-            raise UnusableStore(
-                f"{engine.url!r}: {_said(error)}. Restore the data folder from a copy."
-            ) from error
-        raise
-
-
-def _of_database(engine: Engine, error: OperationalError) -> UnusableStore:
-    what = f"{engine.url!r}: {_said(error)}."
+            return UnusableStore(f"{url!r}: {_said(error)}. Restore the data folder from a copy.")
+        return None
+    what = f"{url!r}: {_said(error)}."
     code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF  # without what it adds in detail
     if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
         return StoreLocked(
@@ -65,7 +103,7 @@ def _of_database(engine: Engine, error: OperationalError) -> UnusableStore:
         return ReadOnlyStore(
             f"{what} The database or its folder is read-only. Make both writable, and start again."
         )
-    no_room = code == sqlite3.SQLITE_IOERR and _no_room(engine.url.database)
+    no_room = code == sqlite3.SQLITE_IOERR and _no_room(url.database)
     if code == sqlite3.SQLITE_FULL or no_room:
         return StoreFull(f"{what} Nothing was stored. Free some space on its disk.")
     return UnusableStore(
@@ -85,3 +123,59 @@ def _no_room(path: str | None) -> bool:
 def _said(error: DBAPIError) -> str:
     """What the database said, on one line: it may quote the statement that made a table."""
     return " ".join(str(error.orig).split())
+
+
+#: What faults of PostgreSQL mean, by their SQLSTATE or by what it begins with, longest first.
+_MEANT: dict[str, tuple[type[UnusableStore], str]] = {
+    "55P03": (
+        StoreLocked,
+        "Another process has been writing for long, and nothing was stored. Come back later; "
+        "`SELECT a.pid, a.client_addr, a.state, a.query FROM pg_stat_activity a JOIN pg_locks l "
+        "USING (pid) WHERE l.locktype = 'advisory' AND l.granted` says who it is.",
+    ),
+    "40": (StoreLocked, "Another transaction was in the way, and nothing was stored. Come back."),
+    "53100": (StoreFull, "Nothing was stored. Free some space on the disk of the server."),
+    "53300": (
+        UnusableStore,
+        "The server has as many connections as it may. Raise its max_connections, or run fewer "
+        "processes; it is tried again.",
+    ),
+    "53": (UnusableStore, "The server lacks what it needs. Look into its log."),
+    "25006": (
+        ReadOnlyStore,
+        "The server is a standby, or is set to be read alone. Name the one that writes in "
+        "SCENEPRINT_DATABASE_URL, or all with `target_session_attrs=read-write`.",
+    ),
+    "25P03": (UnusableStore, "This transaction was silent for long, and nothing was stored."),
+    "57014": (UnusableStore, "The server took too long, and nothing was stored. Come back later."),
+    "57": (UnusableStore, "The server was stopped, or is starting. It is tried again."),
+    "08": (UnusableStore, "The connection was lost. See that the server runs; it is tried again."),
+    "28": (UnusableStore, "Check user and password in SCENEPRINT_DATABASE_URL, and pg_hba.conf."),
+    "3D000": (UnusableStore, "Make the database, or name another in SCENEPRINT_DATABASE_URL."),
+    "42501": (UnusableStore, "The user must own the database's tables: grant what is missing."),
+    "58": (UnusableStore, "The server has trouble with its files. Look into its log."),
+    "XX001": (UnusableStore, "The server's files are damaged. Restore a snapshot or a backup."),
+    "XX002": (UnusableStore, "An index of the server is damaged. REINDEX the database."),
+}
+
+
+def told(url: URL, error: object, broken: bool) -> UnusableStore | None:
+    """A fault of PostgreSQL in our words; None where it is a mistake of whoever asked.
+
+    Parameters
+    ----------
+    url : of the database
+    error : of psycopg
+    broken : whether it is of a kind that no other statement would have been spared
+    """
+    state = getattr(error, "sqlstate", None) or ""
+    kind, what = _MEANT.get(state) or _MEANT.get(state[:2]) or (UnusableStore, "")
+    if not what:
+        if not broken:
+            return None
+        what = (
+            "See that the server runs and can be reached from here, and that "
+            "SCENEPRINT_DATABASE_URL is right; it is tried again."
+        )
+    said = " ".join(str(error).split()).rstrip(".")
+    return kind(f"{shown(url)}: {said:.400}. {what}")

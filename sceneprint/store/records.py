@@ -22,6 +22,11 @@ class MapRow:
     next_model_id: str | None
     revision: int
     created_at: float
+    quota_frames: int | None = None
+    quota_bytes: int | None = None
+    retention_days: float | None = None
+    used_frames: int = 0
+    used_bytes: int = 0
 
 
 @dataclass(frozen=True)

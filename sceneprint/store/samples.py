@@ -38,7 +38,9 @@ def add_sample(connection: Connection, kind: str, process: str, data: dict[str, 
     old = (
         select(samples.c.number)
         .where(samples.c.kind == kind, samples.c.at < now - KEPT_S)
+        .order_by(samples.c.number)
         .limit(_SWEPT)
+        .with_for_update(skip_locked=True)  # writers of samples wait for no turn, nor each other
     )
     connection.execute(delete(samples).where(samples.c.number.in_(old)))
     connection.execute(insert(samples).values(at=now, process=process, kind=kind, data=data))

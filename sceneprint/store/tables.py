@@ -22,6 +22,17 @@ from sqlalchemy import (
     Text,
     UniqueConstraint,
 )
+from sqlalchemy.types import TypeEngine
+
+#: Numbers: SQLite's have 64 bits anyway, and only what it calls INTEGER numbers rows there.
+WHOLE = BigInteger().with_variant(Integer, "sqlite")
+#: Texts in the order of their code points, as in SQLite, whatever the server's language is.
+TEXT = Text().with_variant(Text(collation="C"), "postgresql")
+
+
+def _string(length: int) -> TypeEngine[str]:
+    return String(length).with_variant(String(length, collation="C"), "postgresql")
+
 
 metadata = MetaData(
     naming_convention={
@@ -35,8 +46,8 @@ metadata = MetaData(
 models = Table(
     "models",
     metadata,
-    Column("id", String(64), primary_key=True),
-    Column("name", String(64), nullable=False),
+    Column("id", _string(64), primary_key=True),
+    Column("name", _string(64), nullable=False),
     Column("content", LargeBinary, nullable=False),  # the model file: a node needs no other copy
     Column("created_at", Float, nullable=False),
 )
@@ -44,46 +55,52 @@ models = Table(
 maps = Table(
     "maps",
     metadata,
-    Column("number", Integer, primary_key=True),
-    Column("name", String(63), nullable=False, unique=True),
-    Column("title", String(200)),
-    Column("model_id", String(64), ForeignKey("models.id"), nullable=False),
-    Column("next_model_id", String(64)),  # its frames are being signed with this one as well
+    Column("number", WHOLE, primary_key=True),
+    Column("name", _string(63), nullable=False, unique=True),
+    Column("title", _string(200)),
+    Column("model_id", _string(64), ForeignKey("models.id"), nullable=False),
+    Column("next_model_id", _string(64)),  # its frames are being signed with this one as well
     # counts what changes for searching; set on a frame in the commit that indexes or deletes it
-    Column("revision", Integer, nullable=False),
+    Column("revision", WHOLE, nullable=False),
     Column("created_at", Float, nullable=False),
+    Column("quota_frames", BigInteger),  # null: as many frames as there is room for
+    Column("quota_bytes", BigInteger),  # of their uploads
+    Column("retention_days", Float),  # after which a frame is deleted; null: never
+    # what it holds: frames that are neither deleted nor redundant, and bytes of their uploads
+    Column("used_frames", BigInteger, nullable=False, server_default="0"),
+    Column("used_bytes", BigInteger, nullable=False, server_default="0"),
     sqlite_autoincrement=True,
 )
 
 frames = Table(
     "frames",
     metadata,
-    Column("number", Integer, primary_key=True),
-    Column("id", String(64), nullable=False),  # one that is deleted may give it up to another
-    Column("map_number", Integer, ForeignKey("maps.number"), nullable=False),
-    Column("state", String(16), nullable=False),
-    Column("reason", Text),
-    Column("content_id", String(64)),  # null when deleted: the same frame may come again
-    Column("blob", String(64), nullable=False),
-    Column("bytes", Integer, nullable=False),
+    Column("number", WHOLE, primary_key=True),
+    Column("id", _string(64), nullable=False),  # one that is deleted may give it up to another
+    Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
+    Column("state", _string(16), nullable=False),
+    Column("reason", TEXT),
+    Column("content_id", _string(64)),  # null when deleted: the same frame may come again
+    Column("blob", _string(64), nullable=False),
+    Column("bytes", WHOLE, nullable=False),
     Column("intrinsics", JSON, nullable=False),  # JSON's null of a cloud
     Column("depth_scale", Float, nullable=False),
     Column("depth_along_ray", Boolean, nullable=False),
-    Column("robot", String(128)),
-    Column("session", String(128)),
+    Column("robot", _string(128)),
+    Column("session", _string(128)),
     Column("captured_at", Float),
     Column("tags", JSON, nullable=False),
-    Column("pose_parent", String(128)),
+    Column("pose_parent", _string(128)),
     Column("pose", JSON(none_as_null=True)),  # T_parent_sensor, 4 rows of 4
     Column("pose_x", Float),  # its translation, metres, to be searched for
     Column("pose_y", Float),
     Column("pose_z", Float),
-    Column("base_frame", String(128)),
+    Column("base_frame", _string(128)),
     Column("base", JSON(none_as_null=True)),  # T_base_sensor, 4 rows of 4
     Column("novelty", Float),  # kept only if the nearest frame is farther, as a share of d0
     Column("received_at", Float, nullable=False),
     Column("indexed_at", Float),
-    Column("revision", Integer),
+    Column("revision", WHOLE),
     Column("cloud", JSON(none_as_null=True)),  # what its points are; null: it is a depth image
     UniqueConstraint("map_number", "id"),
     Index(None, "map_number", "content_id"),
@@ -105,24 +122,29 @@ frames = Table(
     Index(None, "blob"),
     sqlite_autoincrement=True,
 )
+#: The oldest frames of a map that are still there: rows of deleted ones stay for ever.
+Index(
+    "ix_frames_aging", frames.c.map_number, frames.c.received_at,
+    sqlite_where=frames.c.state != "deleted", postgresql_where=frames.c.state != "deleted",
+)  # fmt: skip
 
 #: `frames.tags` once more, a row each, to be searched for.
 frame_tags = Table(
     "frame_tags",
     metadata,
-    Column("frame_number", Integer, ForeignKey("frames.number"), primary_key=True),
-    Column("tag", String(128), primary_key=True),
+    Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
+    Column("tag", _string(128), primary_key=True),
     Index(None, "tag", "frame_number"),
 )
 
 signatures = Table(
     "signatures",
     metadata,
-    Column("frame_number", Integer, ForeignKey("frames.number"), primary_key=True),
-    Column("model_id", String(64), ForeignKey("models.id"), primary_key=True),
+    Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
+    Column("model_id", _string(64), ForeignKey("models.id"), primary_key=True),
     Column("vector", LargeBinary, nullable=False),
     Column("checksum", BigInteger, nullable=False),  # CRC-32 of the vector
-    Column("geometry", String(64), nullable=False),  # blob of the artifact
+    Column("geometry", _string(64), nullable=False),  # blob of the artifact
     Column("n_patches", JSON, nullable=False),
     Column("n_pairs", JSON, nullable=False),
     Index(None, "geometry"),
@@ -131,25 +153,25 @@ signatures = Table(
 jobs = Table(
     "jobs",
     metadata,
-    Column("number", Integer, primary_key=True),
-    Column("id", String(32), nullable=False, unique=True),
-    Column("kind", String(16), nullable=False),
-    Column("frame_number", Integer, ForeignKey("frames.number")),  # null: of no single frame
-    Column("map_number", Integer, ForeignKey("maps.number")),  # null: of no map
-    Column("model_id", String(64)),  # to sign with; null: the map's own
+    Column("number", WHOLE, primary_key=True),
+    Column("id", _string(32), nullable=False, unique=True),
+    Column("kind", _string(16), nullable=False),
+    Column("frame_number", WHOLE, ForeignKey("frames.number")),  # null: of no single frame
+    Column("map_number", WHOLE, ForeignKey("maps.number")),  # null: of no map
+    Column("model_id", _string(64)),  # to sign with; null: the map's own
     Column("data", JSON(none_as_null=True)),  # what was asked for, by the kind
     Column("progress", JSON(none_as_null=True)),  # done, total, and how the next slice goes on
     Column("result", JSON(none_as_null=True)),  # what came of it, in short
-    Column("state", String(16), nullable=False),
-    Column("priority", Integer, nullable=False),
-    Column("attempts", Integer, nullable=False),
-    Column("failures", Integer, nullable=False),  # of the attempts, those that broke down
-    Column("token", Integer, nullable=False),  # fencing: grows with every claim
+    Column("state", _string(16), nullable=False),
+    Column("priority", WHOLE, nullable=False),
+    Column("attempts", WHOLE, nullable=False),
+    Column("failures", WHOLE, nullable=False),  # of the attempts, those that broke down
+    Column("token", WHOLE, nullable=False),  # fencing: grows with every claim
     Column("run_after", Float, nullable=False),
     Column("leased_until", Float),
-    Column("worker", String(128)),
-    Column("error", Text),
-    Column("traceback", Text),
+    Column("worker", _string(128)),
+    Column("error", TEXT),
+    Column("traceback", TEXT),
     Column("created_at", Float, nullable=False),
     Column("started_at", Float),
     Column("finished_at", Float),
@@ -165,8 +187,8 @@ Index("ix_jobs_claimed", jobs.c.state, jobs.c.priority.desc(), jobs.c.attempts, 
 job_items = Table(
     "job_items",
     metadata,
-    Column("job_number", Integer, ForeignKey("jobs.number"), primary_key=True),
-    Column("number", Integer, primary_key=True),
+    Column("job_number", WHOLE, ForeignKey("jobs.number"), primary_key=True),
+    Column("number", WHOLE, primary_key=True),
     Column("data", JSON, nullable=False),
 )
 
@@ -174,20 +196,20 @@ job_items = Table(
 job_files = Table(
     "job_files",
     metadata,
-    Column("job_number", Integer, ForeignKey("jobs.number"), primary_key=True),
-    Column("name", String(64), primary_key=True),
-    Column("blob", String(64), nullable=False),
+    Column("job_number", WHOLE, ForeignKey("jobs.number"), primary_key=True),
+    Column("name", _string(64), primary_key=True),
+    Column("blob", _string(64), nullable=False),
     Column("bytes", BigInteger, nullable=False),
-    Column("media_type", String(64), nullable=False),
+    Column("media_type", _string(64), nullable=False),
     Index(None, "blob"),
 )
 
 keys = Table(
     "keys",
     metadata,
-    Column("id", String(32), primary_key=True),
-    Column("name", String(128), nullable=False, unique=True),
-    Column("digest", String(64), nullable=False, unique=True),  # SHA-256 of the secret
+    Column("id", _string(32), primary_key=True),
+    Column("name", _string(128), nullable=False, unique=True),
+    Column("digest", _string(64), nullable=False, unique=True),  # SHA-256 of the secret
     Column("grants", JSON, nullable=False),  # scope by name of a map, "*" for all
     Column("created_at", Float, nullable=False),
     Column("expires_at", Float),
@@ -196,12 +218,12 @@ keys = Table(
 events = Table(
     "events",
     metadata,
-    Column("number", Integer, primary_key=True),
+    Column("number", WHOLE, primary_key=True),
     Column("at", Float, nullable=False),
-    Column("kind", String(32), nullable=False),
-    Column("map", String(63)),
-    Column("frame_id", String(64)),
-    Column("job_id", String(32)),
+    Column("kind", _string(32), nullable=False),
+    Column("map", _string(63)),
+    Column("frame_id", _string(64)),
+    Column("job_id", _string(32)),
     Column("data", JSON, nullable=False),
     Index(None, "map", "number"),
     sqlite_autoincrement=True,
@@ -211,9 +233,9 @@ events = Table(
 idempotency = Table(
     "idempotency",
     metadata,
-    Column("actor", String(128), primary_key=True),  # name of the caller's key, or ""
-    Column("key", String(255), primary_key=True),
-    Column("fingerprint", String(64), nullable=False),  # of route and payload
+    Column("actor", _string(128), primary_key=True),  # name of the caller's key, or ""
+    Column("key", _string(255), primary_key=True),
+    Column("fingerprint", _string(64), nullable=False),  # of route and payload
     Column("data", JSON, nullable=False),  # ids of what was made
     Column("created_at", Float, nullable=False),
     Index(None, "created_at"),
@@ -223,14 +245,14 @@ idempotency = Table(
 audit = Table(
     "audit",
     metadata,
-    Column("number", Integer, primary_key=True),
+    Column("number", WHOLE, primary_key=True),
     Column("at", Float, nullable=False),
-    Column("actor", String(128), nullable=False),
-    Column("address", String(64)),
-    Column("action", String(64), nullable=False),
-    Column("map", String(63)),
-    Column("target", String(128)),
-    Column("request_id", String(64)),
+    Column("actor", _string(128), nullable=False),
+    Column("address", _string(64)),
+    Column("action", _string(64), nullable=False),
+    Column("map", _string(63)),
+    Column("target", _string(128)),
+    Column("request_id", _string(64)),
     Column("data", JSON, nullable=False),
     sqlite_autoincrement=True,
 )
@@ -239,19 +261,38 @@ audit = Table(
 samples = Table(
     "samples",
     metadata,
-    Column("number", Integer, primary_key=True),
+    Column("number", WHOLE, primary_key=True),
     Column("at", Float, nullable=False),
-    Column("process", String(128), nullable=False),
-    Column("kind", String(16), nullable=False),
+    Column("process", _string(128), nullable=False),
+    Column("kind", _string(16), nullable=False),
     Column("data", JSON, nullable=False),
     Index(None, "kind", "at"),
     sqlite_autoincrement=True,
+)
+
+#: Names of maps that are gone: the last event of each, and the quota that the next one inherits.
+former_maps = Table(
+    "former_maps",
+    metadata,
+    Column("name", _string(63), primary_key=True),
+    Column("number", BigInteger, nullable=False),  # of the event
+    Column("quota_frames", BigInteger),
+    Column("quota_bytes", BigInteger),
+    Index(None, "number"),
+)
+
+#: Blobs of what was deleted, until somebody has seen that they are removed.
+doomed = Table(
+    "doomed",
+    metadata,
+    Column("blob", _string(64), primary_key=True),
+    Column("at", Float, nullable=False),
 )
 
 #: Made with the database, and never told: see `seals`.
 secrets = Table(
     "secrets",
     metadata,
-    Column("name", String(32), primary_key=True),
+    Column("name", _string(32), primary_key=True),
     Column("value", LargeBinary, nullable=False),
 )

@@ -14,6 +14,7 @@ from sceneprint.engine import work as working
 from sceneprint.errors import CannotRetry, InvalidRequest, JobOver, UnknownJob
 from sceneprint.schemas import FrameState, JobState
 from sceneprint.store import listing
+from sceneprint.store.clock import read_clock
 from sceneprint.store.records import JobRow
 from sceneprint.store.tables import jobs
 
@@ -25,6 +26,12 @@ WorkOff = Callable[[Engine], list[JobState | None]]
 def row(engine: Engine, job_id: str) -> JobRow:
     with engine.store.database.read() as connection:
         return listing.find_job(connection, job_id)
+
+
+def due(engine: Engine) -> float:
+    found = engine.due_in_s()
+    assert found is not None
+    return found
 
 
 def claimed(engine: Engine) -> working.Work:
@@ -261,15 +268,16 @@ def test_a_job_that_signs_again_leaves_the_frame_as_it_is(
 
 
 def test_when_there_is_something_to_do_next(empty: Engine, uploads: Any) -> None:
-    assert empty.next_due() is None
+    assert empty.due_in_s() is None
     for one in uploads[:3]:
         empty.add_frame("hall", one.data, one.meta)
     running = claimed(empty).claim.job
     with empty.store.database.write() as connection:
-        connection.execute(update(jobs).values(run_after=300.0))
-        connection.execute(update(jobs).where(jobs.c.number == 3).values(run_after=200.0))
-    assert empty.next_due() == 200.0
+        start = read_clock(connection)
+        connection.execute(update(jobs).values(run_after=start + 300.0))
+        connection.execute(update(jobs).where(jobs.c.number == 3).values(run_after=start + 200.0))
+    assert 100.0 < due(empty) <= 200.0
     with empty.store.database.write() as connection:
         changed = update(jobs).where(jobs.c.number == running.number)
-        connection.execute(changed.values(leased_until=100.0, run_after=1.0))
-    assert empty.next_due() == 100.0
+        connection.execute(changed.values(leased_until=start + 100.0, run_after=1.0))
+    assert 0.0 < due(empty) <= 100.0

@@ -1,0 +1,121 @@
+"""`make fleet`: a fleet on one machine, parts of it killed at random, and what was lost.
+
+`python -m benchmarks.fleet --page docs/reliability.md` puts the figures into the page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from benchmarks.fleet.driving import FleetFigures, Plan, drive
+from benchmarks.machine import describe_machine
+from benchmarks.pages import put_between
+from sceneprint.cli.signals import ended_by_signals
+
+BEGIN, END = "<!-- fleet:begin -->", "<!-- fleet:end -->"
+
+
+def table(figures: FleetFigures) -> list[str]:
+    """The figures as lines of Markdown."""
+    plan, found = figures.plan, figures.found
+    standby = "an asynchronous" if plan.asynchronous else "a synchronous"
+    blobs = "an object store" if plan.objects else "a shared folder"
+    lines = [
+        f"### {plan.robots} robots for {plan.seconds:.0f} s, {standby} standby",
+        "",
+        f"PostgreSQL with {standby} standby, {plan.services} services, {plan.workers} workers, "
+        f"blobs in {blobs}; {plan.robots} robots send {plan.rate:g} frames a second each. SIGKILL "
+        "of " + ", ".join(f"{n} of {name}" for name, n in sorted(figures.kills.items())) + ".",
+        "",
+        "| | |",
+        "|---|--:|",
+        f"| frames acknowledged | {found.acknowledged} |",
+        f"| of them indexed, or in a state that says why not | {found.indexed}, {found.stated} |",
+        f"| of the indexed, found by a query of themselves | {found.found} |",
+        f"| **lost** | **{figures.lost}** |",
+    ]
+    if plan.asynchronous:
+        lines.append(
+            f"| acknowledged, and not received by the standby when its primary died: missing, of "
+            f"those that only the dead primary has | {len(found.missing)}, {figures.window} |"
+        )
+    lines += [
+        f"| **stored twice; there, and nobody was told; half-written, by `sceneprint fsck`** | "
+        f"**{found.doubled}, {found.strangers}, {figures.damaged}** |",
+        f"| files that nothing refers to (fsck removes them) | {figures.leftovers} |",
+        f"| events of frames that were not heard, or heard twice | "
+        f"{found.unheard}, {found.heard_twice} |",
+        f"| answers and lists that differ between the services | {found.disagreeing} |",
+        f"| queries answered, requests sent again, errors | {figures.answers.total()}, "
+        f"{figures.repeated}, {len(figures.faults)} |",
+        "",
+        "| killed | longest that a robot had no answer, s |",
+        "|---|--:|",
+        *(
+            f"| {victim} | {', '.join(f'{one:.1f}' for one in sorted(waits))} |"
+            for victim, waits in sorted(figures.outages.items())
+        ),
+        "",
+    ]
+    for one in figures.promotions:
+        back = ", ".join(f"{seconds:.1f}" for seconds in one.resumed.values())
+        lines.append(
+            f"Primary dead for {one.promoted - one.killed:.1f} s until the standby was promoted; "
+            f"each service answered {back} s after that."
+        )
+    return [*lines, ""]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run it; exit code 1 where anything was lost, doubled, half there or wrong."""
+    plan = Plan()
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=plan.seconds)
+    parser.add_argument("--robots", type=int, default=plan.robots)
+    parser.add_argument("--rate", type=float, default=plan.rate, help="frames a second of each")
+    parser.add_argument("--kills", type=int, default=plan.kills, help="of services and workers")
+    parser.add_argument("--promotions", type=int, default=plan.promotions, help="of the standby")
+    parser.add_argument("--seed", type=int, default=plan.seed)
+    parser.add_argument("--services", type=int, default=plan.services)
+    parser.add_argument("--workers", type=int, default=plan.workers)
+    parser.add_argument("--objects", action="store_true", help="blobs in an object store")
+    parser.add_argument(
+        "--asynchronous", action="store_true",
+        help="the standby need not have what is acknowledged, and is cut off for a while first",
+    )  # fmt: skip
+    parser.add_argument("--data", type=Path, help="folder of recordings; default: synthetic rooms")
+    parser.add_argument("--page", type=Path, help="whose figures to replace")
+    parser.add_argument("--keep", type=Path, help="new folder for data and logs, left there")
+    options = vars(parser.parse_args(arguments))
+    page, keep = options.pop("page"), options.pop("keep")
+    plan = replace(plan, **options)
+    with (
+        ended_by_signals(),
+        tempfile.TemporaryDirectory(prefix="sceneprint-fleet-", ignore_cleanup_errors=True) as made,
+    ):
+        folder = Path(made)
+        if keep is not None:
+            keep.mkdir(parents=True)
+            folder = keep
+        figures = drive(folder, plan)
+    for line in figures.faults[:20]:
+        print(line, file=sys.stderr)
+    machine = describe_machine()
+    when = (
+        f"Measured {datetime.now(UTC):%Y-%m-%d} on {machine.processor}, "
+        f"{machine.cores} processors, within {figures.seconds:.0f} s; `make fleet`."
+    )
+    lines = ["", when, "", *table(figures)]
+    print("\n".join(lines))
+    if page is not None:
+        put_between(page, BEGIN, END, lines)
+    return 0 if figures.sound else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,231 @@
+"""One run of the fleet: robots, a saboteur, and what came of it.
+
+drive(folder, Plan)  -->  FleetFigures
+"""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+from tqdm import tqdm
+
+from benchmarks.fleet.checking import Found, await_idle, check
+from benchmarks.fleet.doors import Diary, Doors, Wait
+from benchmarks.fleet.fleet import Fleet
+from benchmarks.fleet.recordings import Shot, recordings, walks
+from benchmarks.fleet.robots import Ledger, Listener, Robot
+from benchmarks.fleet.saboteur import Kill, Promotion, Saboteur, schedule
+from sceneprint.client import Client
+from sceneprint.errors import SceneprintError
+
+#: The map that most robots share; every so many robots have one of their own.
+MAP, MODEL, OWN = "fleet", "compact", 4
+#: Seconds that a robot may take to have its last frame acknowledged.
+PATIENCE_S = 240.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is run.
+
+    Parameters
+    ----------
+    seconds : for which the robots walk
+    robots : how many
+    rate : frames a second of each
+    kills, promotions : of services and workers, and of the primary
+    seed : of victims and moments
+    services, workers : processes
+    asynchronous : the standby does not have to have received what is acknowledged
+    objects : blobs are in an object store
+    data : folder of recordings; None: synthetic rooms
+    """
+
+    seconds: float = 120.0
+    robots: int = 8
+    rate: float = 1.0
+    kills: int = 20
+    promotions: int = 2
+    seed: int = 0
+    services: int = 2
+    workers: int = 4
+    asynchronous: bool = False
+    objects: bool = False
+    data: Path | None = None
+
+    @property
+    def frames(self) -> int:
+        """The most that a robot sends."""
+        return int(self.seconds * self.rate) + 1
+
+
+@dataclass
+class FleetFigures:
+    """What came of it.
+
+    Parameters
+    ----------
+    plan : that was run
+    found : what is there in the end
+    kills : by victim
+    outages : by victim, for each kill the longest that a robot was without an answer, seconds
+    promotions : of the standby
+    answers : queries by status
+    repeated : requests that were sent again
+    faults : answers that should not be, and errors in any log that are not of an outage
+    damaged, leftovers : findings of `sceneprint fsck`
+    lost : acknowledged frames that are not there, beyond those that a standby had not received
+    window : acknowledged frames that the standbys had not received
+    seconds : of all
+    """
+
+    plan: Plan
+    found: Found
+    kills: Counter[str]
+    outages: dict[str, list[float]]
+    promotions: Sequence[Promotion]
+    answers: Counter[str]
+    repeated: int
+    faults: list[str]
+    damaged: int
+    leftovers: int
+    lost: int
+    window: int
+    seconds: float
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing was lost, doubled, half there or wrong."""
+        found = self.found
+        there = found.acknowledged - len(found.missing)
+        wrong = (
+            self.lost, found.stuck, found.doubled, found.strangers, found.heard_twice,
+            found.disagreeing, self.damaged, len(self.faults), found.indexed - found.found,
+            there - found.indexed - found.stated,
+        )  # fmt: skip
+        tried = found.acknowledged > 0 and self.window == len(found.missing)
+        return tried and not any(wrong) and (self.plan.asynchronous or not found.unheard)
+
+
+def drive(folder: Path, plan: Plan) -> FleetFigures:
+    """Run a fleet in an empty folder; nothing of it runs afterwards."""
+    begun = time.monotonic()
+    with recordings(plan.data, plan.robots * plan.frames) as data:
+        walked = walks(data, plan.robots, plan.frames)
+    fleet = Fleet(
+        folder, plan.services, plan.workers, synchronous=not plan.asynchronous,
+        objects=plan.objects,
+    )  # fmt: skip
+    try:
+        return _driven(fleet, plan, walked, begun)
+    finally:
+        fleet.end()
+
+
+def _driven(fleet: Fleet, plan: Plan, walked: list[list[Shot]], begun: float) -> FleetFigures:
+    rng = random.Random(plan.seed)
+    ledger, diary, stop = Ledger(), Diary(), threading.Event()
+    key = fleet.begin()
+    with ExitStack() as opened:
+        clients = [opened.enter_context(Client(url, key)) for url in fleet.urls]
+        robots, listeners = _crowd(fleet, plan, walked, clients[0], ledger, diary, stop)
+        probe = clients[0].upload(MAP, walked[0][0].png, walked[0][0].meta, wait_s=60)
+        clients[0].delete_frame(MAP, probe.frame_id)
+        saboteur = Saboteur(fleet, lambda url: _answers(url, key), rng, plan.asynchronous)
+        bar = opened.enter_context(tqdm(total=plan.seconds, unit="s", disable=None, leave=False))
+        telling = threading.Thread(target=_tell, args=(bar, ledger, stop), daemon=True)
+        walking = time.monotonic()
+        for one in (*listeners, *robots, telling):
+            one.start()
+        try:
+            due = schedule(plan.seconds, plan.kills, plan.promotions, rng)
+            saboteur.run(due, bar.set_postfix_str)
+            stop.wait(max(walking + plan.seconds - time.monotonic(), 0.0))
+        finally:
+            stop.set()
+        for robot in robots:
+            robot.join(PATIENCE_S)
+            if robot.is_alive():
+                diary.fault(f"{robot.name} does not come to its end")
+        await_idle(clients[0])
+        found = check(ledger.kept, clients, listeners)
+        for listener in listeners:
+            listener.stop()
+        fleet.stop()
+        leftovers, damaged = fleet.fsck()
+    unreceived = {name for one in saboteur.promotions for name in one.unreceived}
+    window = {one.frame_id for one in ledger.kept} & unreceived
+    return FleetFigures(
+        plan=plan,
+        found=found,
+        kills=Counter(one.victim for one in saboteur.kills),
+        outages=outages(saboteur.kills, diary.waits),
+        promotions=saboteur.promotions,
+        answers=ledger.answers,
+        repeated=diary.repeated,
+        faults=diary.faults,
+        damaged=damaged,
+        leftovers=leftovers,
+        lost=len(found.missing - window),
+        window=len(window),
+        seconds=time.monotonic() - begun,
+    )
+
+
+def _crowd(
+    fleet: Fleet, plan: Plan, walked: list[list[Shot]], client: Client, ledger: Ledger,
+    diary: Diary, stop: threading.Event,
+) -> tuple[list[Robot], list[Listener]]:  # fmt: skip
+    """Robots with keys and maps, and who hears the events of each map."""
+    robots = []
+    maps = dict.fromkeys(
+        f"{MAP}-{i}" if i % OWN == OWN - 1 else MAP for i in range(plan.robots)
+    )
+    for name in maps:
+        client.create_map(name, model=MODEL)
+    for i, walk in enumerate(walked):
+        name = f"{MAP}-{i}" if i % OWN == OWN - 1 else MAP
+        secret = client.create_key(f"robot-{i}", {name: "write"}).secret
+        doors = Doors(fleet.urls, secret, diary, first=i)
+        robots.append(Robot(f"robot-{i}", name, walk, plan.rate, doors, ledger, diary, stop))
+    listeners = []
+    for i, name in enumerate(maps):
+        secret = client.create_key(f"listener-{i}", {name: "read"}).secret
+        listeners.append(Listener(name, Doors(fleet.urls, secret, diary, first=i)))
+    return robots, listeners
+
+
+def _answers(url: str, key: str) -> bool:
+    """Whether a service answers something that only the database knows."""
+    return httpx.get(
+        f"{url}/v1/maps/{MAP}/frames", params={"limit": 1}, timeout=5, trust_env=False,
+        headers={"Authorization": f"Bearer {key}"},
+    ).is_success  # fmt: skip
+
+
+def _tell(bar: tqdm[None], ledger: Ledger, stop: threading.Event) -> None:
+    while not stop.wait(1.0):
+        bar.set_description(f"{len(ledger.kept)} acknowledged")
+        bar.update(1)
+
+
+def outages(kills: Sequence[Kill], waits: Sequence[Wait]) -> dict[str, list[float]]:
+    """For each kill the longest wait that it fell into, or that began before the next kill."""
+    found: dict[str, list[float]] = {}
+    for i, kill in enumerate(kills):
+        until = kills[i + 1].at if i + 1 < len(kills) else float("inf")
+        longest = max(
+            (one.answered - max(one.begun, kill.at) for one in waits
+             if one.begun < until and one.answered > kill.at),
+            default=0.0,
+        )  # fmt: skip
+        found.setdefault(kill.victim, []).append(longest)
+    return found

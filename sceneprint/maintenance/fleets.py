@@ -1,0 +1,146 @@
+"""A snapshot put into the store of a fleet: PostgreSQL for the rows, and wherever blobs are kept.
+
+archive  --restore_to_fleet-->  an empty database with all rows, and every blob
+
+All is verified before anything is written; blobs are durable before the first row, and the rows
+are one transaction. Whoever is killed half way leaves an empty database, which is restored into
+again.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+
+from sqlalchemy import URL
+
+from sceneprint.errors import SnapshotError
+from sceneprint.maintenance.accepting import check_acceptable
+from sceneprint.maintenance.copies import open_copy
+from sceneprint.maintenance.importing import check_empty, copy_into, take_secrets
+from sceneprint.maintenance.manifests import DATABASE
+from sceneprint.maintenance.snapshots import Progress, Snapshot
+from sceneprint.maintenance.staging import full_disk_explained, staging
+from sceneprint.maintenance.unpacking import blobs_of, unpack
+from sceneprint.settings import Settings
+from sceneprint.store import Blobs
+from sceneprint.store.database import Database, open_database, reach_database
+from sceneprint.writing import make_folder
+
+#: Blobs that are written at once, and bytes above which one goes alone and in parts.
+_AT_ONCE, _LARGE = 8, 8 << 20
+_STAGING = ".restoring-"
+
+
+def restore_to_fleet(
+    archive: Path, settings: Settings, progress: Progress | None = None
+) -> Snapshot:
+    """Put all of a snapshot into an empty database and where blobs are kept, or no row of it.
+
+    Parameters
+    ----------
+    archive : of `take_snapshot`
+    settings : whose database is PostgreSQL; its schema is made where there is none
+    progress : told of bytes done and bytes in all; the archive is read twice
+
+    Raises
+    ------
+    SnapshotError : the archive is none, or damaged; the database holds something or is in use; or
+        there is something in the archive that PostgreSQL cannot hold.
+    UnusableStore : database or blobs cannot be reached or written.
+    NewerSchema : a later version wrote the archive, or made the database.
+    """
+    tell: Progress = progress or (lambda _done, _total: None)
+    _check_folder(settings)
+    before = reach_database(settings.database)
+    try:
+        _check_target(before)
+    finally:
+        before.close()
+    make_folder(settings.data_dir)
+    with full_disk_explained(settings.data_dir), staging(settings.data_dir, _STAGING) as made:
+        snapshot = unpack(
+            archive, made, lambda done, total: tell(done, 2 * total), with_blobs=False
+        )
+        path = made / DATABASE
+        _bring_here(path)
+        with open_copy(path) as file:
+            check_acceptable(file)
+            database = open_database(settings.database)
+            try:
+                _fill(
+                    database, file, settings, archive,
+                    lambda done, total: tell(total + done, 2 * total),
+                )  # fmt: skip
+            finally:
+                database.close()
+    return snapshot
+
+
+def _check_folder(settings: Settings) -> None:
+    """See that the folder of blobs is not that of an embedded store.
+
+    Either would remove blobs that only the other refers to.
+    """
+    path = settings.data_dir / DATABASE
+    if path.exists():
+        raise SnapshotError(
+            f"{path} is the database of another store, whose blobs lie beside it. Name another "
+            "folder with --data."
+        )
+
+
+def _check_target(database: Database) -> None:
+    """See that the database holds nothing, and that nobody has it open, as far as it can tell."""
+    with database.read() as connection:
+        check_empty(connection)
+        others = connection.exec_driver_sql(
+            "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database()"
+            " AND application_name = 'sceneprint' AND pid <> pg_backend_pid()"
+        ).scalar_one()
+    if others:
+        raise SnapshotError(
+            f"{database.shown} is in use: {others} connections of sceneprint. Stop its services "
+            "and workers, and try again."
+        )
+
+
+def _bring_here(path: Path) -> None:
+    """Bring a database of an earlier version to the schema of this one."""
+    url = URL.create("sqlite", database=str(path))
+    open_database(url.render_as_string(hide_password=False)).close()
+
+
+def _fill(
+    database: Database, file: sqlite3.Connection, settings: Settings, archive: Path, tell: Progress
+) -> None:
+    with database.write() as connection:  # who keeps the blobs may ask whose they are
+        check_empty(connection)
+        take_secrets(connection, file)
+    blobs = Blobs(settings.blob_dir)
+    with blobs.kept():
+        _put_all(blobs, blobs_of(archive, tell))
+        with database.write() as connection:
+            copy_into(connection, file)
+
+
+def _put_all(blobs: Blobs, members: Iterator[tuple[int, Iterator[bytes]]]) -> None:
+    """Keep blobs, a few at once: each waits for its disk, or for the network."""
+    waiting: set[Future[str]] = set()
+    with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="put") as pool:
+        for size, chunks in members:
+            if size > _LARGE:
+                with blobs.incoming() as blob:
+                    for chunk in chunks:
+                        blob.write(chunk)
+                    blob.keep()
+                continue
+            waiting.add(pool.submit(blobs.put, b"".join(chunks)))
+            if len(waiting) >= 2 * _AT_ONCE:
+                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                for one in done:
+                    one.result()
+        for one in waiting:
+            one.result()

@@ -1,0 +1,124 @@
+"""The product on PostgreSQL, unchanged: a folder on PYTHONPATH that tests and their children have.
+
+`Settings(data_dir=X)` without a database URL means SQLite in X. With this it means a database of
+PostgreSQL for X, made when somebody first connects to it, as the file would be. A copy of the
+folder gets a copy of the database: a file in it says which one is its own. See tests/conftest.py.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import secrets
+import sys
+from collections.abc import Callable, Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+#: Whether all this is so, and the URL of the server, without a database.
+SWITCH, SERVER = "SCENEPRINT_TEST_DATABASE", "SCENEPRINT_TEST_SERVER"
+#: What stands in for a name of a database until somebody connects.
+PREFIX = "folder:"
+#: In a data folder: its database, and the folder that it was made for.
+MARK = ".database"
+#: The database that new ones are copied from.
+TEMPLATE = "sceneprint_template"
+
+
+def url_of(folder: Path) -> str:
+    """URL of the database of a data folder."""
+    from sqlalchemy import make_url
+
+    url = make_url(os.environ[SERVER]).set(database=f"{PREFIX}{folder.absolute()}")
+    return url.render_as_string(hide_password=False)
+
+
+def database_of(folder: Path, execute: Callable[[str], object]) -> str:
+    """Name of the database of a data folder, which is made where there is none."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / MARK).open("a+") as mark:
+        fcntl.flock(mark, fcntl.LOCK_EX)
+        mark.seek(0)
+        name, _, place = mark.read().partition("\n")
+        if place == str(folder.resolve()):
+            return name
+        made = f"f{secrets.token_hex(8)}"
+        execute(f'CREATE DATABASE "{made}" TEMPLATE "{name or TEMPLATE}"')
+        execute(f"INSERT INTO folders VALUES ('{made}', '{folder.absolute()}')")
+        mark.truncate(0)
+        mark.write(f"{made}\n{folder.resolve()}")
+        return made
+
+
+def _mend_settings(module: ModuleType) -> None:
+    from pydantic import SecretStr
+
+    settings = module.Settings
+    init, copy = settings.__init__, settings.model_copy
+
+    def begin(self: Any, *args: Any, **given: Any) -> None:
+        init(self, *args, **given)
+        if self.database_url is None:
+            self.__dict__["database_url"] = SecretStr(url_of(self.data_dir))
+
+    def copied(self: Any, *, update: Any = None, deep: bool = False) -> Any:
+        other = copy(self, update=update, deep=deep)
+        if "data_dir" in (update or {}) and "database_url" not in (update or {}):
+            other.__dict__["database_url"] = SecretStr(url_of(other.data_dir))
+        return other
+
+    settings.__init__, settings.model_copy = begin, copied
+
+
+def _mend_psycopg(module: ModuleType) -> None:
+    connect = module.Connection.connect.__func__
+    parsed = module.conninfo.conninfo_to_dict
+
+    def execute(statement: str) -> None:
+        server = os.environ[SERVER].replace("+psycopg", "") + "postgres"
+        with connect(module.Connection, server, autocommit=True) as connection:
+            connection.execute(statement)
+
+    def resolved(cls: Any, conninfo: str = "", **given: Any) -> Any:
+        name = given.get("dbname") or parsed(conninfo).get("dbname") or ""
+        if name.startswith(PREFIX):
+            given["dbname"] = database_of(Path(name.removeprefix(PREFIX)), execute)
+        return connect(cls, conninfo, **given)
+
+    module.Connection.connect = classmethod(resolved)
+    module.connect = module.Connection.connect
+
+
+_MENDED = {"sceneprint.settings": _mend_settings, "psycopg": _mend_psycopg}
+
+
+class _Mending(MetaPathFinder, Loader):
+    """Mends the two modules when they are imported, and only then."""
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if name not in _MENDED:
+            return None
+        sys.meta_path.remove(self)
+        try:
+            spec = find_spec(name)
+        finally:
+            sys.meta_path.insert(0, self)
+        if spec is not None and spec.loader is not None:
+            execute = spec.loader.exec_module
+
+            def run(module: ModuleType) -> None:
+                execute(module)
+                _MENDED[name](module)
+
+            spec.loader.exec_module = run  # type: ignore[method-assign]
+        return spec
+
+
+if os.environ.get(SWITCH) == "postgresql":
+    sys.meta_path.insert(0, _Mending())
