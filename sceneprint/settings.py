@@ -7,7 +7,7 @@ import os
 import re
 from pathlib import Path
 from typing import Annotated, Literal
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 import platformdirs
 from pydantic import Field, SecretStr, ValidationInfo, field_validator
@@ -158,14 +158,27 @@ class Settings(BaseSettings):
         return url.render_as_string(hide_password=False)
 
     @property
+    def blobs(self) -> Path | str:
+        """Where uploads and geometry artifacts are kept: a folder, or a URL."""
+        given = "" if self.blob_url is None else self.blob_url.get_secret_value()
+        return given if given and not given.startswith("file:") else self.blob_dir
+
+    @property
     def blob_dir(self) -> Path:
-        """Folder of uploads and geometry artifacts."""
-        return self.data_dir / "blobs"
+        """Folder of uploads and geometry artifacts, where they are in one."""
+        return self._blob_root / "blobs"
 
     @property
     def query_dir(self) -> Path:
         """Folder of answers that can be looked at afterwards. Deleting it loses only those."""
-        return self.data_dir / "queries"
+        return self._blob_root / "queries"
+
+    @property
+    def _blob_root(self) -> Path:
+        given = "" if self.blob_url is None else self.blob_url.get_secret_value()
+        if given.startswith("file:"):
+            return Path(unquote(urlsplit(given).path))
+        return self.data_dir
 
     @property
     def snapshot_dir(self) -> Path:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, BinaryIO
 
 from fastapi import Request, Response
@@ -41,7 +40,9 @@ def files(
     }  # fmt: skip
 
 
-def send_file(request: Request, path: Path, media_type: str, tag: str, name: str) -> Response:
+def send_file(
+    request: Request, open_file: Callable[[], BinaryIO], media_type: str, tag: str, name: str
+) -> Response:
     """A file, or the one range of it that the request asks for (RFC 9110, section 14).
 
     It is opened at once: that it is removed meanwhile changes nothing.
@@ -49,7 +50,7 @@ def send_file(request: Request, path: Path, media_type: str, tag: str, name: str
     Parameters
     ----------
     request : with Range, If-Range and If-None-Match
-    path : of the file
+    open_file : gives the file, which can be sought in
     media_type, tag, name : of its content; its ETag; what to call it when it is saved
 
     Raises
@@ -59,7 +60,7 @@ def send_file(request: Request, path: Path, media_type: str, tag: str, name: str
     headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Accept-Ranges": "bytes"}
     if is_known(request, tag):
         return Response(None, 304, headers)
-    file = path.open("rb")
+    file = open_file()
     size = file.seek(0, 2)
     first, last = _wanted(request, tag, size)
     if first > last or first >= size > 0:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import uvicorn
 
 from sceneprint.descriptors import raise_descriptors
-from sceneprint.engine import Engine
+from sceneprint.engine.opening import open_engine
 from sceneprint.errors import UnusableStore
 from sceneprint.settings import Settings
 from service.app import create_app
@@ -59,7 +59,8 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     ------
     UnusableStore, NewerSchema : the store cannot be opened, or the address not listened on.
     """
-    with Engine(settings) as engine:  # uvicorn would make a traceback of what cannot be opened
+    # uvicorn would make a traceback of what cannot be opened
+    with open_engine(settings) as engine:
         read_only = engine.store.database.read_only
     if read_only:
         log.warning(

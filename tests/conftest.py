@@ -10,13 +10,17 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from sqlalchemy import Connection, NullPool, create_engine
 
 from benchmarks.fleet.postgres import NoServer, Server
+from benchmarks.fleet.s3 import ObjectServer
 from sceneprint.cli.demo_building import write_building
 from sceneprint.geometry.bins import TableLayout
 from sceneprint.geometry.hierarchy import HierarchyParameters
@@ -26,6 +30,7 @@ from sceneprint.geometry.segmentation import SegmentationParameters
 from sceneprint.geometry.surroundings import Compression, SurroundingsParameters
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer
+from sceneprint.settings import Settings
 from sceneprint.store import open_database
 from sceneprint.synth import synthesise_room
 from sceneprint.types import Frame
@@ -135,6 +140,49 @@ def postgres_url(postgres: Server) -> Iterator[str]:
     name = f"t{secrets.token_hex(6)}"
     yield postgres.create(name, TEMPLATE)
     postgres.drop(name)
+
+
+@pytest.fixture(scope="session")
+def truth() -> Callable[[Path], AbstractContextManager[Connection]]:
+    """A transaction on the database of a data folder, past all that is ours."""
+
+    @contextmanager
+    def opened(folder: Path) -> Iterator[Connection]:
+        url = Settings(data_dir=folder, database_url=None).database
+        patience = {"timeout": 30} if url.startswith("sqlite") else {}
+        engine = create_engine(url, poolclass=NullPool, connect_args=patience)
+        with engine.begin() as connection:
+            yield connection
+
+    return opened
+
+
+@pytest.fixture(scope="session")
+def rows(
+    truth: Callable[[Path], AbstractContextManager[Connection]],
+) -> Callable[[Path, str], list[tuple[Any, ...]]]:
+    """What the database of a data folder answers to a question."""
+
+    def ask(folder: Path, asked: str) -> list[tuple[Any, ...]]:
+        with truth(folder) as connection:
+            return [tuple(row) for row in connection.exec_driver_sql(asked)]
+
+    return ask
+
+
+@pytest.fixture(scope="session")
+def object_server() -> Iterator[ObjectServer]:
+    """A server of the S3 protocol, of this process."""
+    with ObjectServer() as server:
+        yield server
+
+
+@pytest.fixture
+def bucket(object_server: ObjectServer, monkeypatch: pytest.MonkeyPatch) -> str:
+    """URL of a new bucket; the environment says where it is, also to child processes."""
+    for name, value in object_server.env.items():
+        monkeypatch.setenv(name, value)
+    return object_server.bucket(f"t{secrets.token_hex(6)}")
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

@@ -6,7 +6,7 @@ import sys
 
 from pydantic import ValidationError
 
-from sceneprint.engine import Engine
+from sceneprint.engine.opening import open_engine
 from sceneprint.errors import SceneprintError
 from sceneprint.logs import log_as_json
 from sceneprint.settings import Settings
@@ -18,7 +18,7 @@ def main() -> int:
     log_as_json()
     try:
         settings = Settings()
-        with Engine(settings) as engine:  # what is wrong is said once, and not by every worker
+        with open_engine(settings) as engine:  # what is wrong is said once, and not by every worker
             engine.store.database.require_writable()
         run(settings)
     except (SceneprintError, ValidationError) as error:

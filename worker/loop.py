@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import logging
+import math
 import multiprocessing
 import os
 import random
-import socket
 import time
 
 from sceneprint.descriptors import raise_descriptors
 from sceneprint.engine import Engine
-from sceneprint.errors import SceneprintError
+from sceneprint.engine.opening import open_engine
+from sceneprint.errors import SceneprintError, StoreAway
 from sceneprint.logs import log_as_json, of_request
 from sceneprint.maintenance.shelf import LONGEST_S as SNAPSHOT_S
 from sceneprint.maintenance.shelf import SNAPSHOT, snapshot_handler
 from sceneprint.settings import Settings
-from sceneprint.store.bell import Listener
+from sceneprint.store.bell import Listening, process_name
 from worker.limits import Stop, limit_memory
 from worker.traces import Trace
 
@@ -50,7 +51,16 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
     raise_descriptors()
     trace.watch()
     stop = Stop()
-    with Engine(settings) as engine, engine.bell.listen() as listener:
+
+    def may_go_on(seconds: float) -> bool:
+        stop.wait(seconds)
+        return not stop.asked and os.getppid() == parent
+
+    try:  # without an end: its place would be given to another that waits
+        opened = open_engine(settings, math.inf, may_go_on)
+    except StoreAway:
+        return
+    with opened as engine, engine.bell.listen() as listener:
         engine.warm()
         engine.tasks.register(SNAPSHOT, snapshot_handler(settings), SNAPSHOT_S)
         limit_memory(settings.worker_bytes)
@@ -74,9 +84,9 @@ class Worker:
     listener : of the engine's bell
     """
 
-    def __init__(self, engine: Engine, listener: Listener, trace: Trace, stop: Stop) -> None:
+    def __init__(self, engine: Engine, listener: Listening, trace: Trace, stop: Stop) -> None:
         self._engine, self._listener, self._trace, self._stop = engine, listener, trace, stop
-        self.name = f"{socket.gethostname()}:{os.getpid()}"
+        self.name = process_name()
         self.unsound = False  # an error came that nobody raised on purpose
         # frames first: where publishing kills every worker, each still signs for a while
         self._upkeep_at = time.monotonic() + UPKEEP_S

@@ -70,9 +70,7 @@ def await_idle(client: Client) -> None:
     raise RuntimeError(f"jobs are left after {PATIENCE_S:g} s: {client.status().jobs}")
 
 
-def check(
-    kept: Sequence[Kept], clients: Sequence[Client], listeners: Sequence[Listener]
-) -> Found:
+def check(kept: Sequence[Kept], clients: Sequence[Client], listeners: Sequence[Listener]) -> Found:
     """Look every acknowledged frame up, everywhere."""
     maps = sorted({one.map_name for one in kept})
     lists = [{name: list(client.frames(name)) for name in maps} for client in clients]
@@ -106,9 +104,7 @@ def check(
 
 
 def _plain(lists: dict[str, list[Frame]]) -> dict[str, dict[str, str]]:
-    return {
-        name: {one.frame_id: one.state for one in frames} for name, frames in lists.items()
-    }
+    return {name: {one.frame_id: one.state for one in frames} for name, frames in lists.items()}
 
 
 def _ranked(client: Client, map_name: str, shot: Shot, k: int) -> list[tuple[str, float]]:
@@ -120,9 +116,7 @@ def _ranked(client: Client, map_name: str, shot: Shot, k: int) -> list[tuple[str
 
 def _found(client: Client, kept: Sequence[Kept]) -> int:
     """How many frames are their own nearest."""
-    return sum(
-        (one.frame_id, 0) in _ranked(client, one.map_name, one.shot, 2) for one in kept
-    )
+    return sum((one.frame_id, 0) in _ranked(client, one.map_name, one.shot, 2) for one in kept)
 
 
 def _disagree(clients: Sequence[Client], kept: Kept) -> bool:

@@ -1,4 +1,4 @@
-"""The addresses of a fleet's service, as one that keeps a robot waiting for as long as none answers.
+"""The addresses of a fleet's service, of which one answers unless none does.
 
 Doors.ask  --each address in turn-->  the first answer that is not "come back"
 """

@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
@@ -21,10 +21,9 @@ from benchmarks.fleet.checking import Found, await_idle, check
 from benchmarks.fleet.doors import Diary, Doors, Wait
 from benchmarks.fleet.fleet import Fleet
 from benchmarks.fleet.recordings import Shot, recordings, walks
-from benchmarks.fleet.robots import Ledger, Listener, Robot
+from benchmarks.fleet.robots import Ledger, Listener, Robot, asked
 from benchmarks.fleet.saboteur import Kill, Promotion, Saboteur, schedule
 from sceneprint.client import Client
-from sceneprint.errors import SceneprintError
 
 #: The map that most robots share; every so many robots have one of their own.
 MAP, MODEL, OWN = "fleet", "compact", 4
@@ -137,9 +136,8 @@ def _driven(fleet: Fleet, plan: Plan, walked: list[list[Shot]], begun: float) ->
     with ExitStack() as opened:
         clients = [opened.enter_context(Client(url, key)) for url in fleet.urls]
         robots, listeners = _crowd(fleet, plan, walked, clients[0], ledger, diary, stop)
-        probe = clients[0].upload(MAP, walked[0][0].png, walked[0][0].meta, wait_s=60)
-        clients[0].delete_frame(MAP, probe.frame_id)
-        saboteur = Saboteur(fleet, lambda url: _answers(url, key), rng, plan.asynchronous)
+        probe = walked[0][0]
+        saboteur = Saboteur(fleet, lambda url: _answers(url, key, probe), rng, plan.asynchronous)
         bar = opened.enter_context(tqdm(total=plan.seconds, unit="s", disable=None, leave=False))
         telling = threading.Thread(target=_tell, args=(bar, ledger, stop), daemon=True)
         walking = time.monotonic()
@@ -186,9 +184,7 @@ def _crowd(
 ) -> tuple[list[Robot], list[Listener]]:  # fmt: skip
     """Robots with keys and maps, and who hears the events of each map."""
     robots = []
-    maps = dict.fromkeys(
-        f"{MAP}-{i}" if i % OWN == OWN - 1 else MAP for i in range(plan.robots)
-    )
+    maps = dict.fromkeys(f"{MAP}-{i}" if i % OWN == OWN - 1 else MAP for i in range(plan.robots))
     for name in maps:
         client.create_map(name, model=MODEL)
     for i, walk in enumerate(walked):
@@ -203,11 +199,11 @@ def _crowd(
     return robots, listeners
 
 
-def _answers(url: str, key: str) -> bool:
-    """Whether a service answers something that only the database knows."""
-    return httpx.get(
-        f"{url}/v1/maps/{MAP}/frames", params={"limit": 1}, timeout=5, trust_env=False,
-        headers={"Authorization": f"Bearer {key}"},
+def _answers(url: str, key: str, shot: Shot) -> bool:
+    """Whether a service answers a query."""
+    return httpx.post(
+        f"{url}/v1/maps/{MAP}/queries", headers={"Authorization": f"Bearer {key}"}, timeout=5,
+        trust_env=False, **asked(shot, k="1", stages="retrieve", keep="false"),
     ).is_success  # fmt: skip
 
 

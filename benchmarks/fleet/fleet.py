@@ -7,21 +7,24 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import httpx
 
 from benchmarks.fleet.doors import PAUSE_S
 from benchmarks.fleet.pair import Pair
+from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.soak.load import Part, free_port
-from sceneprint.engine import Engine
-from sceneprint.settings import Settings
 
 #: Seconds for all service processes to begin, on a machine that is busy with much else.
 PATIENCE_S = 180.0
 #: Settings of every process: keys are asked for, what a killed worker held is soon another's, and
 #: indexes are published.
-SETTINGS = {"require_keys": True, "lease_s": 5, "tail_frames": 100, "requests_per_s": 0}
+SETTINGS = {
+    "SCENEPRINT_REQUIRE_KEYS": "1", "SCENEPRINT_LEASE_S": "5", "SCENEPRINT_TAIL_FRAMES": "100",
+    "SCENEPRINT_REQUESTS_PER_S": "0",
+}  # fmt: skip
 
 
 class Fleet:
@@ -42,18 +45,25 @@ class Fleet:
         (folder / "database").mkdir()
         self.pair = Pair(folder / "database", synchronous=synchronous)
         self._sizes = services, workers
-        self._shared: dict[str, object] = {}
-        self.services: list[Part] = []
-        self.workers: list[Part] = []
+        self._objects = ObjectServer() if objects else None
+        self._shared: dict[str, str] = {}
+        self.services: list[Process] = []
+        self.workers: list[Process] = []
         self.urls: list[str] = []
 
     def begin(self) -> str:
         """Start all; the key of who may do everything."""
         n_services, n_workers = self._sizes
         self.pair.begin()
-        self._shared = {**SETTINGS, "database_url": self.pair.url}
-        with Engine(Settings(**self._settings(0))) as engine:
-            secret = engine.create_key("fleet").secret
+        blobs = f"file://{self._folder / 'blobs'}"
+        if self._objects is not None:
+            self._objects.start()
+            blobs = f"{self._objects.bucket('fleet')}/blobs"
+            self._shared = self._objects.env
+        self._shared = self._shared | SETTINGS | {
+            "SCENEPRINT_DATABASE_URL": self.pair.url, "SCENEPRINT_BLOB_URL": blobs
+        }  # fmt: skip
+        secret = self._told("keys", "--create", "fleet").split()[-1]
         for host in range(n_services):
             port = free_port()
             self.urls.append(f"http://127.0.0.1:{port}")
@@ -76,13 +86,7 @@ class Fleet:
         RuntimeError : it could not look.
         """
         report = self._folder / "fsck.json"
-        environment = os.environ | _environment(self._settings(0))
-        command = [sys.executable, "-m", "sceneprint", "fsck", "--grace", "0", "--json"]
-        done = subprocess.run(
-            [*command, str(report)], env=environment, capture_output=True, text=True, check=False
-        )
-        if not report.exists():
-            raise RuntimeError(f"sceneprint fsck ended with {done.returncode}: {done.stderr}")
+        self._told("fsck", "--grace", "0", "--json", str(report))
         findings = json.loads(report.read_text())["findings"]
         left = sum(one["severity"] == "leftover" for one in findings)
         return left, len(findings) - left
@@ -101,20 +105,34 @@ class Fleet:
         for part in (*self.workers, *self.services):
             part.kill()
         self.pair.end()
+        if self._objects is not None:
+            self._objects.kill()
 
-    def _part(self, name: str, command: list[str], host: int) -> Part:
-        log = self._folder / f"{name}.log"
-        return Part(name, ["sceneprint", *command], log, **self._settings(host))
+    def _part(self, name: str, command: list[str], host: int) -> Process:
+        arguments = ["sceneprint", *command, "--data", str(self._folder / f"host-{host + 1}")]
+        return Process(name, arguments, self._folder / f"{name}.log", self._shared)
 
-    def _settings(self, host: int) -> dict[str, object]:
-        own = {
-            "data_dir": self._folder / "shared", "index_dir": self._folder / f"index-{host + 1}"
-        }  # fmt: skip
-        return self._shared | own
+    def _told(self, *command: str) -> str:
+        """What a command prints that ends by itself, on the first host."""
+        done = subprocess.run(
+            [sys.executable, "-m", "sceneprint", *command, "--data", str(self._folder / "host-1")],
+            env=os.environ | self._shared, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        if done.returncode not in (0, 1):  # 1: there are findings
+            raise RuntimeError(
+                f"sceneprint {command[0]} ended with {done.returncode}: {done.stderr}"
+            )
+        return done.stdout
 
 
-def _environment(settings: dict[str, object]) -> dict[str, str]:
-    return {f"SCENEPRINT_{name.upper()}": str(value) for name, value in settings.items()}
+class Process(Part):
+    """A part whose environment has more than settings."""
+
+    def __init__(
+        self, name: str, arguments: list[str], log: Path, environment: Mapping[str, str]
+    ) -> None:
+        super().__init__(name, arguments, log)
+        self._environment |= environment
 
 
 def await_service(url: str) -> None:

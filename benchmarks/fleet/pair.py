@@ -1,6 +1,6 @@
 """Two PostgreSQL servers, of which one follows the other and takes its place.
 
-Pair.begin  -->  primary, standby  --kill_primary-->  standby  --promote-->  primary  --renew-->  both
+primary, standby  --kill_primary-->  standby  --promote-->  primary  --renew-->  primary, standby
 """
 
 from __future__ import annotations

@@ -8,9 +8,10 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from itertools import cycle
+from typing import Any
 
 import httpx
 
@@ -122,7 +123,7 @@ class Robot(threading.Thread):
             self._ledger.answers[Answer.model_validate_json(response.content).status] += 1
 
 
-def asked(shot: Shot, **options: str) -> dict[str, object]:
+def asked(shot: Shot, **options: str) -> dict[str, Any]:
     """Arguments of a request that asks where a frame was taken."""
     sent = form(shot.png, shot.meta.model_copy(update={"pose": None}))
     sent["data"].update(options)
@@ -155,10 +156,8 @@ class Listener(threading.Thread):
         place = Place("0")  # all that is kept
         with self._doors:
             for client in cycle(self._doors.clients):
-                try:
+                with suppress(httpx.TransportError):  # it was killed, or is not there yet
                     self._listen(client, place)
-                except httpx.TransportError:
-                    pass
                 if self._ending.wait(PAUSE_S):
                     return
 

@@ -16,8 +16,7 @@ from dataclasses import dataclass, field
 
 import httpx
 
-from benchmarks.fleet.fleet import Fleet, await_service
-from benchmarks.soak.load import Part
+from benchmarks.fleet.fleet import Fleet, Process, await_service
 
 #: How often each is killed, in proportion: the process that signs, as well as who keeps it.
 VICTIMS = {"service": 3, "worker": 2, "signing process": 2}
@@ -114,7 +113,7 @@ class Saboteur:
         with suppress(ProcessLookupError):
             os.kill(signing[0], signal.SIGKILL)
 
-    def _again(self, part: Part, victim: str) -> None:
+    def _again(self, part: Process, victim: str) -> None:
         self.kills.append(Kill(victim, time.monotonic()))
         part.kill()
         time.sleep(self.rng.uniform(*AWAY_S))
@@ -145,9 +144,7 @@ class Saboteur:
         unreceived = pair.unreceived()
         for one in watching:
             one.join()
-        self.promotions.append(
-            Promotion(stalled, killed, promoted, resumed, frozenset(unreceived))
-        )
+        self.promotions.append(Promotion(stalled, killed, promoted, resumed, frozenset(unreceived)))
         pair.renew()
 
     def _watch(self, url: str, promoted: float, resumed: dict[str, float]) -> None:

@@ -50,7 +50,7 @@ def upgrade() -> None:
             "WHERE state = 'deleted'"
         ).bindparams(now=time.time())
     )
-    living = sa.text("state <> 'deleted'")
+    living = sa.text("state != 'deleted'")
     op.create_index(
         "ix_frames_aging", "frames", ["map_number", "received_at"],
         sqlite_where=living, postgresql_where=living,

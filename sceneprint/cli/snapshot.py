@@ -20,6 +20,8 @@ from sceneprint.cli.signals import ended_by_signals
 
 if TYPE_CHECKING:
     from sceneprint.maintenance.snapshots import Snapshot
+    from sceneprint.schemas.snapshots import SnapshotFile
+    from sceneprint.settings import Settings
 
 #: Damaged blobs that are named one by one.
 _SHOWN = 10
@@ -32,17 +34,19 @@ def add_to(commands: Any) -> None:
     command = commands.add_parser(
         "snapshot",
         help="write all that must not be lost into one archive, while the service runs",
-        description="Write one state of the data folder into an archive: database and blobs. "
+        description="Write one state of the store into an archive: database and blobs. "
         "The service and its workers may go on. Search indexes are not in it, as they are made "
         "anew. Exit code 1 where a blob was missing or damaged and could not be taken along. "
         "The archive holds all frames and the hashes of keys: keep it as you keep the folder.",
     )
     add_data_option(command)
+    add_database_option(command)
     command.add_argument(
         "--out",
         type=Path,
         metavar="FILE",
-        help="archive to write, or its folder (default: sceneprint-TIME.tar here)",
+        help="archive to write, or its folder (default: where SCENEPRINT_SNAPSHOT_URL says, else "
+        "sceneprint-TIME.tar here)",
     )
     command.add_argument(
         "--url",
@@ -68,10 +72,64 @@ def run(options: argparse.Namespace) -> int:
     start = time.perf_counter()
     if options.url is not None:
         return _fetched(options, path)
+    settings = named_database(options)
+    if options.out is None and settings.snapshot_url is not None:
+        return _shelved(settings)
     with ended_by_signals(), shown_progress("snapshot") as progress:
-        taken = take_snapshot(settings_of(options), path, progress)
+        taken = take_snapshot(settings, path, progress)
     print(f"{one_line(str(path))}: {contents(taken)} in {time.perf_counter() - start:.1f} s")
     return 1 if name_damaged(taken, "Run `sceneprint fsck` to see what can be done.") else 0
+
+
+def add_database_option(command: argparse.ArgumentParser) -> None:
+    """`--database`."""
+    command.add_argument(
+        "--database",
+        metavar="URL",
+        help="such as postgresql://user@host/name (default: SCENEPRINT_DATABASE_URL, else SQLite "
+        "in the data folder); a password comes from that variable, or PGPASSWORD",
+    )
+
+
+def named_database(options: argparse.Namespace) -> Settings:
+    """Settings of the environment, and the database that `--database` names.
+
+    Raises
+    ------
+    InvalidRequest : its URL has a password, which everybody on the machine could see.
+    """
+    from pydantic import SecretStr
+    from sqlalchemy import make_url
+    from sqlalchemy.exc import ArgumentError
+
+    from sceneprint.errors import InvalidRequest
+
+    settings = settings_of(options)
+    if options.database is None:
+        return settings
+    try:
+        told = make_url(options.database)
+        shown = told.password is not None or "password" in told.query
+    except (ArgumentError, ValueError):
+        raise InvalidRequest(
+            "--database: no URL of a database, such as postgresql://user@host/name."
+        ) from None
+    if shown:
+        raise InvalidRequest(
+            "--database: a password on the command line can be seen by everybody on this machine. "
+            "Set PGPASSWORD, or give the whole URL in SCENEPRINT_DATABASE_URL."
+        )
+    return settings.model_copy(update={"database_url": SecretStr(options.database)})
+
+
+def _shelved(settings: Settings) -> int:
+    """Take a snapshot to where those of the service are; returns 1 where blobs were lost."""
+    from sceneprint.maintenance.shelf import Shelf, new_snapshot_id
+
+    start = time.perf_counter()
+    with ended_by_signals(), shown_progress("snapshot") as progress:
+        taken = Shelf(settings).take(new_snapshot_id(), progress)
+    return _told(taken, f"snapshot {taken.snapshot_id} in {settings.snapshot_url}", start)
 
 
 def _fetched(options: argparse.Namespace, path: Path) -> int:
@@ -89,8 +147,13 @@ def _fetched(options: argparse.Namespace, path: Path) -> int:
             raise SnapshotError(f"The service took no snapshot: job {job.job_id}: {why}")
         taken = SnapshotFile.model_validate(job.result)
         client.download_snapshot(taken.snapshot_id, path)
+    return _told(taken, str(path), start)
+
+
+def _told(taken: SnapshotFile, place: str, start: float) -> int:
+    """Say what has been taken; returns 1 where blobs were lost."""
     print(
-        f"{one_line(str(path))}: {taken.maps} maps, {taken.frames} frames, {taken.blobs} blobs, "
+        f"{one_line(place)}: {taken.maps} maps, {taken.frames} frames, {taken.blobs} blobs, "
         f"{taken.bytes / 1e6:,.1f} MB in {time.perf_counter() - start:.1f} s"
     )
     if taken.damaged:

@@ -24,14 +24,14 @@ def add_to(commands: Any) -> None:
 def run(options: argparse.Namespace) -> int:
     """Work until told to stop."""
     from sceneprint.cli.signer import prepare_presets
-    from sceneprint.engine import Engine
+    from sceneprint.engine.opening import open_engine
     from sceneprint.logs import log_as_json
     from worker.supervisor import run as work
 
     settings = settings_of(options)
-    with Engine(settings) as engine:  # what is wrong is said once, and not by every worker
-        engine.store.database.require_writable()
     log_as_json()  # from the first line on
+    with open_engine(settings) as engine:  # what is wrong is said once, and not by every worker
+        engine.store.database.require_writable()
     prepare_presets(settings, logging.getLogger(__name__).info)
     work(settings)
     return 0

@@ -108,7 +108,7 @@ class EmbeddedSnapshots:
 
     def fetch_snapshot(self, snapshot_id: str, file: BinaryIO) -> None:
         """Write the bytes of one to a file."""
-        with self._shelf.path(snapshot_id).open("rb") as archive:
+        with self._shelf.open(snapshot_id) as archive:
             shutil.copyfileobj(archive, file, 1 << 20)
 
     def delete_snapshot(self, snapshot_id: str) -> None:

@@ -12,6 +12,8 @@ from sceneprint.engine.again import Again
 from sceneprint.engine.associating import Associating
 from sceneprint.engine.associations import Associations
 from sceneprint.engine.audit import Audit
+from sceneprint.engine.choosing import Choosing
+from sceneprint.engine.coding import Coding
 from sceneprint.engine.imports import Imports
 from sceneprint.engine.inspecting import Inspection
 from sceneprint.engine.kept import KeptQueries
@@ -23,9 +25,10 @@ from sceneprint.engine.readers import Readers
 from sceneprint.engine.reconstructions import Reconstructions
 from sceneprint.engine.reencoding import Reencoding
 from sceneprint.engine.signers import Signers
+from sceneprint.engine.sweeping import sweep_deleted
 from sceneprint.engine.tasks import Tasks
 from sceneprint.engine.upkeep import Upkeep
-from sceneprint.engine.uploads import Uploads, sweep_deleted
+from sceneprint.engine.uploads import Uploads
 from sceneprint.engine.warming import warm
 from sceneprint.engine.wire import tell_map
 from sceneprint.errors import ModelError
@@ -38,6 +41,7 @@ from sceneprint.store import maps as stored_maps
 from sceneprint.store import open_store
 from sceneprint.store.associations import ASSOCIATE
 from sceneprint.store.bell import Bell
+from sceneprint.store.notices import Notices
 from sceneprint.store.reencoding import models_of
 
 log = logging.getLogger(__name__)
@@ -59,20 +63,27 @@ class Administration:
         from threadpoolctl import threadpool_limits
 
         self.settings = settings
-        self.store = open_store(settings.database, settings.blob_dir)
+        replica = settings.replica_url
+        self.store = open_store(
+            settings.database, settings.blobs,
+            None if replica is None else replica.get_secret_value(), settings.replica_lag_s,
+        )  # fmt: skip
         self.signers = Signers(self.store.database, settings.cache_dir)
         self._upkeep = Upkeep(
             self.store, self.signers, settings.indexes, settings.tail_frames, settings.scrub_s
         )
         self._reencoding = Reencoding(self.store, self._upkeep)
-        self._readers = Readers(self.signers, settings.indexes)
+        choosing = Choosing(settings.shortlist, settings.purge_s)
+        self._readers = Readers(self.signers, settings.indexes, choosing)
+        self._coding = Coding(self.store.database, choosing)
         self.kept = KeptQueries(settings.query_dir, settings.query_s, settings.query_bytes)
         self.inspection = Inspection(self.store, self.signers, self.kept)
         self.queries = Queries(self.store, self.signers, self._readers, self.kept)
         self.again = Again(self.store, self.kept, self.queries)
         # threads of the service work side by side, and sums have one order: the same bytes always
         self._limits = threadpool_limits(1)
-        self.bell = Bell(settings.bell_dir)
+        server = not self.store.database.is_sqlite
+        self.bell = Notices(self.store.database) if server else Bell(settings.bell_dir)
         self.uploads = Uploads(self.store, self.bell, settings.concurrency)
         self.tasks = Tasks(self.store, self.bell)
         self.imports = Imports(self.store, self.tasks, self.uploads, settings.import_bytes)
@@ -88,7 +99,8 @@ class Administration:
     def close(self) -> None:
         """Give back what was opened."""
         self._limits.restore_original_limits()
-        self.store.database.close()
+        self.bell.close()
+        self.store.close()
 
     def warm(self) -> None:
         """Load code and tables of every model in use before the first request needs them."""

@@ -26,6 +26,7 @@ from sceneprint.store import Store
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.records import MapRow
+from sceneprint.store.replica import asked
 from sceneprint.store.signatures import stored_vector
 
 
@@ -137,7 +138,7 @@ class Again:
                     )
             return self._queries.answer(rows, _ready(kept, query), query, deadline)
 
-        return steadily(self._store, maps, ask)
+        return asked(self._store.replica, lambda: steadily(self._store, maps, ask))
 
     def _check_same(self, kept: Kept, named: NamedFrame) -> None:
         """Frames that are deleted give up their ids; one of the same content signs the same."""

@@ -26,6 +26,7 @@ from sceneprint.models import Model
 from sceneprint.schemas import Answer, AnswerStatus, Counts, FrameName, OfMap, Query
 from sceneprint.store import Store
 from sceneprint.store.frames import frames_of
+from sceneprint.store.replica import behind_s
 
 
 @dataclass
@@ -59,10 +60,10 @@ def answer(
     ------
     UnknownFrame : there is none of the id that is to be explained.
     """
-    for place in places:
-        sign_again(store, place.row, sorted(place.view.damaged), place.row.model_id)
     clock = _Clock({"prepare": round(asked.prepare_ms, 2)})
     searched = search_maps(store, places, asked, query, model)
+    for place in places:
+        sign_again(store, place.row, sorted(place.view.damaged), place.row.model_id)
     ranking, wanted = searched.ranking, wanted_of(query)
     clock.stage("retrieve")
     among, selection, scales = None, None, None
@@ -77,7 +78,7 @@ def answer(
     tried = validated(store, searched, chosen, asked.geometry, query, deadline, p)
     clock.stage("validate")
     shown = range(len(ranking)) if query.explain else chosen
-    with store.database.read() as connection:
+    with store.queried.read() as connection:
         rows = frames_of(connection, ranking.indices[list(shown)].tolist())
     matches = [one for one in tried.matches if one.index in rows]  # the rest was deleted meanwhile
     names = {place.row.number: place.row.name for place in places}
@@ -116,6 +117,7 @@ def answer(
         kind=asked.kind,
         per_map=per_map if len(places) > 1 else None,
         deadline_reached=tried.late,
+        replica_behind_s=behind_s(),
         explanations=explanations,
         explained_frame=explained,
     )
@@ -149,8 +151,7 @@ def _sum(counts: Sequence[Counts]) -> Counts:
 
 
 def _generation(place: Place) -> int:
-    generation = place.view.generation
-    return 0 if generation is None else generation.number
+    return place.view.number
 
 
 def _name(asked: Asked) -> FrameName | None:

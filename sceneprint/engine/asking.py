@@ -104,7 +104,7 @@ def ask_stored(store: Store, map_name: str, frame_id: str, query: Query) -> Aske
     """
     start = time.perf_counter()
     try:
-        with store.database.read() as connection:
+        with store.queried.read() as connection:
             row = find_map(connection, map_name)
             frame = find_frame(connection, row, frame_id)
             vector = stored_vector(connection, frame.number, row.model_id)
@@ -127,7 +127,7 @@ def ask_stored(store: Store, map_name: str, frame_id: str, query: Query) -> Aske
             artifact = store.blobs.get(blobs[frame.number])
             geometry = read_geometry(artifact)
         except (DamagedBlob, UnreadableGeometry):
-            with store.database.read() as connection:
+            with store.queried.read() as connection:
                 if not refers_to(connection, blobs[frame.number]):
                     raise UnknownFrame(
                         f"Frame {frame_id} of map {map_name!r} was deleted while it was asked for."

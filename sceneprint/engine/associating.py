@@ -15,7 +15,8 @@ import numpy as np
 from sceneprint.artifacts import read_geometry
 from sceneprint.engine.concluding import conclude
 from sceneprint.engine.healing import sign_again
-from sceneprint.engine.readers import Readers, View
+from sceneprint.engine.readers import Readers
+from sceneprint.engine.shortlists import Shortlist
 from sceneprint.engine.sides import Plan, eligible, runs_of
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.slices import Outcome, Task
@@ -23,8 +24,6 @@ from sceneprint.engine.validating import thresholds
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
 from sceneprint.geometry.diversity import diversify
 from sceneprint.geometry.retrieval import Ranking, pairwise_distances, ranking_size, similarity
-from sceneprint.index import search, signatures_of
-from sceneprint.index.keys import Keys
 from sceneprint.matches import Match, associate
 from sceneprint.models import Model
 from sceneprint.schemas.associations import NewAssociation
@@ -107,16 +106,16 @@ class Associating:
             if alive:  # damaged, and made again behind this
                 sign_again(self._store, row, [number], row.model_id)
             return [], None
-        among = _known(view, among)
-        hits = search(
-            np.frombuffer(vectors[number], np.uint8), view.generation, view.tail,
-            ranking_size(len(among)), dead=view.dead, among=among, exact=True,
+        among = among[view.has(among)]
+        hits = view.search(
+            np.frombuffer(vectors[number], np.uint8), ranking_size(len(among)), dead=view.dead,
+            among=among, exact=True,
         )  # fmt: skip
         if not len(hits):
             return [], 0
         shares = similarity(hits.distances, model.unrelated_distance)
         ranking = Ranking(hits.keys.astype(np.intp), hits.distances, shares)
-        distances = pairwise_distances(signatures_of(hits.keys, view.generation, view.tail))
+        distances = pairwise_distances(view.signatures(hits.keys))
         chosen = diversify(ranking.distances, distances, asked.candidates).indices.tolist()
         matches = associate(
             geometry, ranking, chosen, lambda key: opened.geometry(row, key), asked.k,
@@ -133,7 +132,7 @@ class Associating:
         ]
         return edges, len(matches)
 
-    def _view(self, of: MapRow) -> tuple[MapRow, Model, View]:
+    def _view(self, of: MapRow) -> tuple[MapRow, Model, Shortlist]:
         """The map as it is now: frames of it may be deleted, and its model may change.
 
         Raises
@@ -148,7 +147,8 @@ class Associating:
                 if row.number != of.number:
                     raise unknown_map(of.name)
                 if row.model_id == model.id:
-                    return row, model, self._readers.view(connection, row)
+                    views = self._readers.views(connection, self._store.database, [row])
+                    return row, model, views[0]
 
 
 class _Opened:
@@ -175,14 +175,6 @@ class _Opened:
         while len(self._held) > _OPENED:
             self._held.popitem(last=False)
         return self._held[key]
-
-
-def _known(view: View, numbers: Keys) -> Keys:
-    """Those of some frames that a view has."""
-    known = view.tail.places.of(numbers) >= 0
-    if view.generation is not None:
-        known |= view.generation.places.of(numbers) >= 0
-    return numbers[known & ~np.isin(numbers, list(view.dead))]
 
 
 def _item(number: int, match: Match) -> dict[str, Any]:

@@ -10,9 +10,9 @@ from sqlalchemy import Connection
 from sceneprint.engine.cursors import opened, row_of
 from sceneprint.engine.posegraphs import pose_graph, tell_graph
 from sceneprint.engine.sides import runs_of
+from sceneprint.engine.sweeping import sweep_deleted
 from sceneprint.engine.tasks import Tasks
 from sceneprint.engine.transforms import transform
-from sceneprint.engine.uploads import sweep_deleted
 from sceneprint.engine.wire import sensor_frame, when
 from sceneprint.errors import NotIndexed, UnknownJob
 from sceneprint.graphs import information_of

@@ -24,6 +24,7 @@ from sceneprint.schemas import Comparison, FrameMeta, FrameName, NamedFrame, Que
 from sceneprint.store import Store
 from sceneprint.store.maps import model_names
 from sceneprint.store.records import MapRow
+from sceneprint.store.replica import asked
 
 #: A frame that is stored, or sent: its bytes and what is known of it.
 Side = NamedFrame | tuple[bytes, FrameMeta]
@@ -50,17 +51,18 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
 
     def ask(rows: list[MapRow]) -> Similarity:
         signer = _signer(store, signers, rows, how)
-        asked = []
+        ready = []
         for side in sides:
             if isinstance(side, NamedFrame):
-                asked.append(ask_stored(store, side.map, side.frame_id, query))
+                ready.append(ask_stored(store, side.map, side.frame_id, query))
             else:
-                asked.append(ask_upload(*side, signer, query))
-        check_model(asked[0].model_id, asked[1].model_id)
-        return _compared(asked[0], asked[1], signer, how)
+                ready.append(ask_upload(*side, signer, query))
+        check_model(ready[0].model_id, ready[1].model_id)
+        return _compared(ready[0], ready[1], signer, how)
 
     names = [side.map for side in sides if isinstance(side, NamedFrame)]
-    return steadily(store, list(dict.fromkeys(names)), ask)
+    maps = list(dict.fromkeys(names))
+    return asked(store.replica, lambda: steadily(store, maps, ask))
 
 
 def _compared(a: Asked, b: Asked, signer: Signer, how: Comparison) -> Similarity:
@@ -94,7 +96,7 @@ def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Compari
     """What signs the uploads: with the model of the stored frames, if there are any."""
     if not rows:
         return signers.of(read_model(how.model or PRESETS[0]))
-    with store.database.read() as connection:
+    with store.queried.read() as connection:
         names = model_names(connection)
     told = [f"{row.name} has {model_label(names[row.model_id], row.model_id)}" for row in rows]
     if len({row.model_id for row in rows}) > 1:

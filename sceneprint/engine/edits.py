@@ -19,7 +19,7 @@ from sceneprint.errors import InvalidRequest, PreconditionFailed, UnknownFrame
 from sceneprint.schemas import Frame, FrameMeta, FrameState, Map
 from sceneprint.schemas.edits import FrameEdit, MapEdit
 from sceneprint.store import Store
-from sceneprint.store.editing import write_frame, write_title
+from sceneprint.store.editing import write_frame, write_map
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.records import FrameRow
@@ -74,7 +74,10 @@ def edit_frame(
 def edit_map(
     store: Store, map_name: str, patch: Mapping[str, Any], if_match: Collection[str] | None = None
 ) -> Map:
-    """Change the title of a map; parameters and errors as of `edit_frame`."""
+    """Change title, quotas and retention of a map; parameters and errors as of `edit_frame`.
+
+    Who may set a quota, the caller has seen to.
+    """
     try:
         change = MapEdit.model_validate(dict(patch))
     except ValidationError as error:
@@ -82,8 +85,7 @@ def edit_map(
     with store.database.write() as connection:
         row = find_map(connection, map_name)
         _check_tag(f"Map {row.name!r}", map_tag(row), if_match)
-        if "title" in change.model_fields_set:
-            row = write_title(connection, row, change.title)
+        row = write_map(connection, row, change.model_dump(include=change.model_fields_set))
         return tell_map(connection, row)
 
 

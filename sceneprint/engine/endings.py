@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection
 
-from sceneprint.engine.uploads import sweep
+from sceneprint.engine.sweeping import sweep
 from sceneprint.errors import FrameError, LostLease, SceneprintError, UnusableStore
 from sceneprint.schemas import FrameState, JobState
 from sceneprint.store import Store, queue

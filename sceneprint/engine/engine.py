@@ -11,9 +11,10 @@ from sceneprint.engine import work as working
 from sceneprint.engine.administration import Administration
 from sceneprint.engine.browsing import list_frames
 from sceneprint.engine.endings import Work, put_back
-from sceneprint.engine.readers import View
 from sceneprint.engine.slices import Task
-from sceneprint.engine.uploads import Upload, sweep_deleted
+from sceneprint.engine.sweeping import sweep_deleted
+from sceneprint.engine.uploads import Upload
+from sceneprint.engine.views import View
 from sceneprint.engine.wire import tell_frames
 from sceneprint.errors import BusyIndex
 from sceneprint.models import Model
@@ -185,6 +186,7 @@ class Engine(Administration):
         """
         self._reencoding.run()
         published = self._upkeep.run()
+        self._coding.run()
         self.operations.tidy()
         self.imports.tidy()
         return published

@@ -20,8 +20,9 @@ from sceneprint.engine.cursors import row_of
 from sceneprint.engine.jobs import get_job
 from sceneprint.engine.members import next_of, steps_of, take
 from sceneprint.engine.slices import Outcome, Swept, Task
+from sceneprint.engine.sweeping import sweep_deleted
 from sceneprint.engine.tasks import Tasks
-from sceneprint.engine.uploads import Uploads, sweep_deleted
+from sceneprint.engine.uploads import Uploads
 from sceneprint.errors import SceneprintError, UnreadableArchive, UnusableStore
 from sceneprint.schemas import Job, Page
 from sceneprint.schemas.ingest import ImportItem, ImportOptions
@@ -205,7 +206,7 @@ class Imports:
     @contextmanager
     def _opened(self, file: JobFile, name: str) -> Iterator[Archive]:
         try:
-            opened = self._store.blobs.path(file.blob).open("rb")
+            opened = self._store.blobs.open(file.blob)
         except FileNotFoundError as error:
             raise UnreadableArchive(
                 "The archive is gone from the store. Send it once more."

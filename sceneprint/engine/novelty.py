@@ -14,10 +14,9 @@ import numpy as np
 from sqlalchemy import Connection
 
 from sceneprint.engine.readers import Readers
-from sceneprint.engine.searching import WHOLE
+from sceneprint.engine.searching import compares_all
 from sceneprint.errors import LostLease, UnknownMap
 from sceneprint.geometry.retrieval import distances
-from sceneprint.index import search
 from sceneprint.models import Model
 from sceneprint.store import Database
 from sceneprint.store.frames import frame_of
@@ -71,10 +70,8 @@ def look(database: Database, readers: Readers, row: MapRow, made: StoredSignatur
             raise LostLease(str(error)) from error
         if now.number != row.number or now.model_id != made.model_id:
             return None
-        view = readers.view(connection, now)
-    hits = search(
-        _vector(made), view.generation, view.tail, 1, dead=view.dead, exact=view.size <= WHOLE
-    )
+        (view,) = readers.views(connection, database, [now])
+    hits = view.search(_vector(made), 1, dead=view.dead, exact=compares_all(view, view.size))
     if len(hits) == 0:
         return Look(view.revision, None)
     return Look(view.revision, Near(int(hits.keys[0]), int(hits.distances[0])))

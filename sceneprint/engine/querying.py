@@ -31,6 +31,7 @@ from sceneprint.schemas.options import MOST_MAPS
 from sceneprint.store import Store
 from sceneprint.store.maps import find_map, list_maps, model_names, unknown_map
 from sceneprint.store.records import MapRow
+from sceneprint.store.replica import asked
 
 
 class Queries:
@@ -71,7 +72,7 @@ class Queries:
             signer = self._signers(rows[0].model_id)
             return self.answer(rows, ask_upload(data, meta, signer, query), query, deadline)
 
-        return steadily(self._store, maps, ask)
+        return asked(self._store.replica, lambda: steadily(self._store, maps, ask))
 
     def stored(
         self, maps: Sequence[str], frame: NamedFrame, query: Query, since: float | None = None
@@ -82,18 +83,20 @@ class Queries:
         def ask(rows: list[MapRow]) -> Answer:
             self._check_models(rows)
             self._signers(rows[0].model_id)  # while no connection is held: a crowd would hold all
-            asked = ask_stored(self._store, frame.map, frame.frame_id, query)
-            return self.answer(rows[: len(maps)], asked, query, deadline)
+            ready = ask_stored(self._store, frame.map, frame.frame_id, query)
+            return self.answer(rows[: len(maps)], ready, query, deadline)
 
         home = [] if frame.map in maps else [frame.map]
-        return steadily(self._store, [*maps, *home], ask)
+        names = [*maps, *home]
+        return asked(self._store.replica, lambda: steadily(self._store, names, ask))
 
     def answer(
         self, asked_of: Sequence[MapRow], asked: Asked, query: Query, deadline: Deadline
     ) -> Answer:
         """Answer from the maps as they are now; ModelMismatch where one has switched meanwhile."""
-        places = []
-        with self._store.database.read() as connection:
+        rows = []
+        database = self._store.queried
+        with database.read() as connection:
             for one in asked_of:
                 row = find_map(connection, one.name)
                 if row.number != one.number:
@@ -101,7 +104,9 @@ class Queries:
                         f"Map {row.name!r} was deleted and made anew while it was asked. Ask again."
                     )
                 check_model(asked.model_id, row.model_id)
-                places.append(Place(row, self._readers.view(connection, row)))
+                rows.append(row)
+            views = self._readers.views(connection, database, rows)
+        places = [Place(row, view) for row, view in zip(rows, views, strict=True)]
         for place in places:
             check_model(place.view.model_id, asked.model_id)
         model = self._signers(asked.model_id).model
@@ -152,7 +157,7 @@ class Queries:
     def _check_models(self, rows: Sequence[MapRow]) -> None:
         if len({row.model_id for row in rows}) == 1:
             return
-        with self._store.database.read() as connection:
+        with self._store.queried.read() as connection:
             names = model_names(connection)
         told = {row.name: model_label(names[row.model_id], row.model_id) for row in rows}
         which = ", ".join(f"{name} has {model}" for name, model in told.items())

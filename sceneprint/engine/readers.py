@@ -11,19 +11,25 @@ import re
 import threading
 import time
 from collections import OrderedDict
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from sqlalchemy import Connection, select
 
+from sceneprint.engine.choosing import Choosing
 from sceneprint.engine.growing import Growing
+from sceneprint.engine.shortlists import WHOLE, Shortlist
 from sceneprint.engine.signers import Signers
-from sceneprint.index import Generation, Tail, newest, newest_number
+from sceneprint.engine.views import View
+from sceneprint.index import Generation, newest, newest_number
+from sceneprint.store import Database
 from sceneprint.store.events import holds_anchor
 from sceneprint.store.records import MapRow
+from sceneprint.store.replica import require_primary
 from sceneprint.store.signatures import Change, changes_since, count_indexed
 from sceneprint.store.tables import maps
+from sceneprint.store.vectors import count_newer
 
 log = logging.getLogger(__name__)
 
@@ -36,30 +42,6 @@ _LOOK_S = 1.0
 VERIFIED_BYTES = 256 << 20
 #: Seconds between two looks for maps that are held and no longer there.
 _TIDY_S = 10.0
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A map as of one revision.
-
-    Parameters
-    ----------
-    model_id : of the model that made all signatures
-    revision : of the map
-    generation : of its index, or None
-    tail : frames newer than it
-    dead : frames of both that are deleted
-    size : frames that can be found
-    damaged : frames that were passed over, as their signature is damaged
-    """
-
-    model_id: str
-    revision: int
-    generation: Generation | None
-    tail: Tail
-    dead: frozenset[int]
-    size: int
-    damaged: frozenset[int] = frozenset()
 
 
 def index_folder(indexes: Path, row: MapRow) -> Path:
@@ -78,9 +60,12 @@ def is_index_folder(name: str) -> bool:
 
 def trusted(connection: Connection, row: MapRow, found: Generation | None) -> Generation | None:
     """A generation, unless the database was put back to a state before it, and went on."""
-    if found is None or found.revision > row.revision:
+    if found is None:
         return None
-    return found if holds_anchor(connection, found.anchor) else None
+    if found.revision <= row.revision and holds_anchor(connection, found.anchor):
+        return found
+    require_primary("the state of an index")
+    return None
 
 
 class Reader:
@@ -109,9 +94,23 @@ class Reader:
         """Memory of the tail."""
         return self._tail.bytes_held
 
+    def lacks(self, connection: Connection, row: MapRow) -> int | None:
+        """How many frames it has yet to read; None: with these it would hold too many."""
+        view = self._view
+        newer = max(row.revision - view.revision, 0)
+        if len(view.tail) + newer > WHOLE:
+            newer = count_newer(connection, row.number, view.revision, WHOLE + 1)
+        return newer if len(view.tail) + newer <= WHOLE else None
+
+    def is_outdated(self) -> bool:
+        """Whether there is an index that this reader does not use."""
+        return newest_number(self._folder) not in (None, self._view.number, self._unsound)
+
     def view(self, connection: Connection, row: MapRow) -> View:
         """The map as of the row's revision, or later."""
         behind = self._view.revision < row.revision
+        if self._view.revision > row.revision:
+            require_primary("what is held of a map")
         # who only looks for a newer generation waits for nobody
         if (behind or self._is_time()) and self._lock.acquire(blocking=behind):
             try:
@@ -206,17 +205,63 @@ class Readers:
     ----------
     signers : see Signers
     indexes : folder of all indexes
+    choosing : which maps are searched in the database; none where it is not given
     """
 
-    def __init__(self, signers: Signers, indexes: Path) -> None:
+    def __init__(self, signers: Signers, indexes: Path, choosing: Choosing | None = None) -> None:
         self._signers, self._indexes = signers, indexes
+        self.choosing = choosing or Choosing("local")
+        self._database, self._history = signers.database, signers.database.history
         self._lock = threading.Lock()
         self._open: OrderedDict[str, tuple[tuple[int, str], Reader]] = OrderedDict()
         self._tidied = time.monotonic()
 
+    def views(
+        self, connection: Connection, database: Database, rows: Sequence[MapRow]
+    ) -> list[Shortlist]:
+        """Maps of one model as of their rows' revisions, or later, each where it is searched best.
+
+        Parameters
+        ----------
+        connection : a reading transaction of `database`
+        rows : of the maps, one or more
+        """
+        found: dict[int, Shortlist] = {}
+        if self.choosing.is_possible(connection):
+            asked = self._others(connection, rows)
+            length = self._signers(rows[0].model_id).model.signature_bytes if asked else 0
+            found.update(self.choosing.stored(connection, database, asked, length))
+        return [found.get(row.number) or self.view(connection, row) for row in rows]
+
+    def _others(self, connection: Connection, rows: Sequence[MapRow]) -> list[MapRow]:
+        """Maps of which this node would have to read much before it could search them."""
+        if self.choosing.setting == "database":
+            return list(rows)
+        others, left = [], WHOLE
+        for row in rows:
+            reader = self._reader(connection, row)
+            lacking = reader.lacks(connection, row)
+            if lacking is None and reader.is_outdated():
+                self.forget(row.name)  # it was asked long ago: another begins with the newest index
+                lacking = self._reader(connection, row).lacks(connection, row)
+            if lacking is None or lacking > left:
+                others.append(row)
+            else:
+                left -= lacking
+        return others
+
     def view(self, connection: Connection, row: MapRow) -> View:
-        """A map as of the row's revision, or later."""
+        """A map as of the row's revision, or later, on this node."""
+        reader = self._reader(connection, row)
+        if self._is_time_to_tidy():
+            self.tidy(connection)
+        return reader.view(connection, row)
+
+    def _reader(self, connection: Connection, row: MapRow) -> Reader:
         with self._lock:
+            if self._history != self._database.history:  # revisions may be of other frames now
+                self._history = self._database.history
+                self._open.clear()
             held, reader = self._open.get(row.name, (None, None))
             wanted = (row.number, row.model_id)
             if reader is None or held != wanted:  # made anew, or signed with another model
@@ -228,10 +273,11 @@ class Readers:
             # the one that was asked longest ago first, and never the one that is asked now
             while len(self._open) > 1 and self._bytes_held() > HELD_BYTES:
                 self._open.popitem(last=False)
-            is_time = time.monotonic() - self._tidied >= _TIDY_S
-        if is_time:
-            self.tidy(connection)
-        return reader.view(connection, row)
+            return reader
+
+    def _is_time_to_tidy(self) -> bool:
+        with self._lock:
+            return time.monotonic() - self._tidied >= _TIDY_S
 
     def _bytes_held(self) -> int:
         return sum(reader.bytes_held for _, reader in self._open.values())
@@ -248,6 +294,7 @@ class Readers:
         """
         asked = select(maps.c.name, maps.c.number, maps.c.model_id)
         there = {row.name: (row.number, row.model_id) for row in connection.execute(asked)}
+        self.choosing.remembered.tidy()
         with self._lock:
             self._tidied = time.monotonic()
             for name in [name for name, (held, _) in self._open.items() if there.get(name) != held]:

@@ -17,8 +17,8 @@ from sceneprint.artifacts import read_geometry
 from sceneprint.engine.fusing import View, fused
 from sceneprint.engine.kept import Kept
 from sceneprint.engine.slices import Outcome, Swept, Task
+from sceneprint.engine.sweeping import sweep_deleted
 from sceneprint.engine.tasks import Tasks
-from sceneprint.engine.uploads import sweep_deleted
 from sceneprint.engine.wire import when
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnreadableGeometry
 from sceneprint.geometry.rigid import inverse

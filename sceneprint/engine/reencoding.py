@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from sceneprint.engine.readers import trusted
+from sceneprint.engine.sweeping import sweep
 from sceneprint.engine.upkeep import Upkeep
-from sceneprint.engine.uploads import sweep
 from sceneprint.engine.wire import model_label, tell_map
 from sceneprint.errors import (
     BusyIndex,

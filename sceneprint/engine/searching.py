@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.engine.asking import Asked
-from sceneprint.engine.readers import View
+from sceneprint.engine.shortlists import WHOLE, Shortlist
+from sceneprint.engine.stored import Stored, search_stored
 from sceneprint.geometry.retrieval import Ranking, ranking_size, similarity
-from sceneprint.index import Hits, is_compared, search, signatures_of
+from sceneprint.index import Hits
 from sceneprint.index.keys import Keys
 from sceneprint.models import Model
 from sceneprint.schemas import Filter, Query
@@ -23,16 +25,13 @@ from sceneprint.store.filters import passing
 from sceneprint.store.records import MapRow
 from sceneprint.types import Bytes
 
-#: Frames up to which a map is compared whole: a shortlist saves next to nothing there.
-WHOLE = 4000
-
 
 @dataclass(frozen=True, eq=False)
 class Place:
     """A map that is asked: its row, and its frames as of one revision."""
 
     row: MapRow
-    view: View
+    view: Shortlist
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +87,17 @@ class Searched:
         """Stored signatures (r, D) of R."""
         keys = self.ranking.indices.astype(np.int64)
         first = self.parts[0].place.view
-        if len(self.parts) == 1:
-            return signatures_of(keys, first.generation, first.tail)
-        rows = np.empty((len(keys), first.tail.signatures.shape[1]), np.uint8)
-        for number, part in enumerate(self.parts):
-            own = np.flatnonzero(self.owners == number)
-            view = part.place.view
-            if len(own):
-                rows[own] = signatures_of(keys[own], view.generation, view.tail)
+        if len(self.parts) == 1 or not len(keys):
+            return first.signatures(keys)
+        order = np.argsort(self.owners, kind="stable")
+        edges = np.searchsorted(self.owners[order], np.arange(len(self.parts) + 1))
+        found: list[Bytes] = [
+            self.parts[i].place.view.signatures(keys[order[a:b]])
+            for i, (a, b) in enumerate(pairwise(edges.tolist()))
+            if a < b
+        ]
+        rows = np.empty((len(keys), found[0].shape[1]), np.uint8)
+        rows[order] = np.concatenate(found)
         return rows
 
 
@@ -113,7 +115,7 @@ def search_maps(
     """
     parts = tuple(_part(store, place, asked, query) for place in places)
     size = ranking_size(sum(part.passed for part in parts))
-    hits = tuple(_searched(asked.vector, part, size) for part in parts)
+    hits = _searched(asked.vector, parts, size, query.exact)
     keys = np.concatenate([one.keys for one in hits])
     found = np.concatenate([one.distances for one in hits])
     owners = np.repeat(np.arange(len(parts)), [len(one) for one in hits])
@@ -124,35 +126,48 @@ def search_maps(
                     owners[first], size)  # fmt: skip
 
 
+def compares_all(view: Shortlist, passed: int) -> bool:
+    """Whether so few frames of a map are compared whole; the database, which sends each, decides
+    that itself.
+    """
+    return view.kind == "local" and passed <= WHOLE
+
+
 def is_shortlisted(searched: Searched, asked: Asked, part: Part, number: int) -> bool:
     """Whether the search compared a frame with the query, or its shortlist missed it."""
-    view = part.place.view
-    return is_compared(
-        asked.vector, view.generation, view.tail, searched.size, number, dead=part.dead,
-        among=part.among, exact=part.exact,
-    )  # fmt: skip
+    return part.place.view.is_compared(
+        asked.vector, searched.size, number, dead=part.dead, among=part.among, exact=part.exact
+    )
 
 
 def rank_among_all(searched: Searched, asked: Asked, number: int, distance: int) -> int:
     """The rank, from 1, of a distance among all frames that pass, each compared exactly."""
-    nearer = 0
-    for part in searched.parts:
-        view = part.place.view
-        hits = search(
-            asked.vector, view.generation, view.tail, max(part.passed, 1), dead=part.dead,
-            among=part.among, exact=True,
-        )  # fmt: skip
-        before = (hits.distances == distance) & (hits.keys < number)
-        nearer += int(((hits.distances < distance) | before).sum())
-    return nearer + 1
+    return 1 + sum(
+        part.place.view.nearer(asked.vector, number, distance, dead=part.dead, among=part.among)
+        for part in searched.parts
+    )
 
 
-def _searched(vector: Bytes, part: Part, size: int) -> Hits:
-    view = part.place.view
-    return search(
-        vector, view.generation, view.tail, size, dead=part.dead, among=part.among,
-        exact=part.exact,
+def _searched(vector: Bytes, parts: Sequence[Part], size: int, exact: bool) -> tuple[Hits, ...]:
+    """Hits of each part: of those in the database by one statement for all."""
+    stored = [(part.place.view, part) for part in parts if isinstance(part.place.view, Stored)]
+    among = [part.among for _, part in stored if part.among is not None]
+    found = iter(
+        search_stored(
+            [view for view, _ in stored], vector, size,
+            dead=frozenset().union(*(part.dead for _, part in stored)),
+            among=among if among else None, exact=exact,
+        )
+        if stored else ()
     )  # fmt: skip
+    return tuple(
+        next(found)
+        if isinstance(part.place.view, Stored)
+        else part.place.view.search(
+            vector, size, dead=part.dead, among=part.among, exact=part.exact
+        )
+        for part in parts
+    )
 
 
 def _part(store: Store, place: Place, asked: Asked, query: Query) -> Part:
@@ -164,15 +179,14 @@ def _part(store: Store, place: Place, asked: Asked, query: Query) -> Part:
     if query.filter is not None:
         among = _among(store, place, dead, asked, query.filter)
     passed = size if among is None else len(among)
-    return Part(place, dead, among, size, query.exact or passed <= WHOLE)
+    return Part(place, dead, among, size, query.exact or compares_all(view, passed))
 
 
 def _among(store: Store, place: Place, dead: frozenset[int], asked: Asked, wanted: Filter) -> Keys:
     """Frames of a view that pass a filter; the database may be newer or older than the view."""
     view = place.view
-    with store.database.read() as connection:
+    with store.queried.read() as connection:
         numbers = passing(connection, place.row.number, wanted, asked.taken)
-    known = view.tail.places.of(numbers) >= 0
-    if view.generation is not None:
-        known |= view.generation.places.of(numbers) >= 0
-    return numbers[known & ~np.isin(numbers, list(dead))]
+    if isinstance(view, Stored):  # what passes is found, or was deleted since
+        return numbers[~np.isin(numbers, list(dead))]
+    return numbers[view.has(numbers) & ~np.isin(numbers, list(dead))]

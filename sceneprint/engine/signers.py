@@ -21,7 +21,7 @@ class Signers:
     """
 
     def __init__(self, database: Database, cache_dir: Path) -> None:
-        self._database, self._cache_dir = database, cache_dir
+        self.database, self._cache_dir = database, cache_dir
         self._lock = threading.Lock()
         self._open: dict[str, Signer] = {}
 
@@ -34,7 +34,7 @@ class Signers:
         """
         with self._lock:  # building a table takes seconds: once is enough
             if model_id not in self._open:
-                with self._database.read() as connection:
+                with self.database.read() as connection:
                     content = model_content(connection, model_id)
                 model = parse_model(content, f"model {model_id[:12]}")
                 self._open[model_id] = open_signer(model, self._cache_dir)

@@ -178,9 +178,9 @@ class Statistics:
             )
 
     def workers(self, connection: Connection, now: float) -> list[WorkerSeen]:
-        """Processes that wait for jobs on this machine, and those that have one in hand."""
+        """Processes that wait for jobs, of SQLite on this machine, and those that have one in hand."""
         busy = at_work(connection, now)
-        names = sorted({*self._bell.listeners(), *busy})
+        names = sorted({*self._bell.listeners(connection), *busy})
         return [WorkerSeen(name=name, job_id=busy.get(name)) for name in names]
 
     def sizes(self) -> Sizes:

@@ -30,7 +30,7 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
     UnknownMap : one of them is none.
     Busy : a map switched again and again.
     """
-    with store.database.read() as connection:
+    with store.queried.read() as connection:
         rows = [find_map(connection, name) for name in maps]
     for _ in range(TRIES):
         try:
@@ -67,7 +67,7 @@ def check_model(one: str, other: str) -> None:
 def _other_models(store: Store, rows: Sequence[MapRow]) -> list[MapRow] | None:
     """The maps where one of them has another model by now, or None."""
     try:
-        with store.database.read() as connection:
+        with store.queried.read() as connection:
             now = [find_map(connection, row.name) for row in rows]
     except UnknownMap:
         return None

@@ -26,4 +26,6 @@ def frame_tag(frame: FrameRow) -> str:
 
 def map_tag(row: MapRow) -> str:
     """Stands for all of a map that can be edited."""
-    return tag_of("map", row.name, row.title)
+    limits = row.quota_frames, row.quota_bytes, row.retention_days
+    # as it was where there are none: a tag that somebody holds outlives the upgrade
+    return tag_of("map", row.name, row.title, *(() if limits == (None,) * 3 else limits))

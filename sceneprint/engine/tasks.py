@@ -17,7 +17,7 @@ from typing import Any
 
 from sceneprint.engine.leases import renewed
 from sceneprint.engine.slices import Handler, Outcome, Swept, Task
-from sceneprint.engine.uploads import sweep_deleted
+from sceneprint.engine.sweeping import sweep_deleted
 from sceneprint.engine.wire import tell_job
 from sceneprint.errors import (
     Conflict,

@@ -8,7 +8,6 @@ When an upload is answered, nothing can lose it. The disk is waited for by many 
 from __future__ import annotations
 
 import hashlib
-import logging
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -21,24 +20,28 @@ from sceneprint.engine.frames import columns, content_id, read_upload
 from sceneprint.engine.healing import take_upload, without_loss
 from sceneprint.engine.replaying import Outcome, kept_of, replayed, told
 from sceneprint.engine.standing import being_signed, is_tried_again, standing
-from sceneprint.errors import FrameConflict, SceneprintError, StoreError, UnknownMap, UnusableStore
-from sceneprint.schemas import Added, FrameMeta
+from sceneprint.engine.sweeping import sweep, sweep_deleted
+from sceneprint.errors import (
+    FrameConflict,
+    QuotaExceeded,
+    SceneprintError,
+    StoreError,
+    UnknownMap,
+    UnusableStore,
+)
+from sceneprint.schemas import Added, FrameMeta, FrameState
 from sceneprint.schemas.ingest import check_frame_id
 from sceneprint.store import Store
 from sceneprint.store.bell import Bell
 from sceneprint.store.events import tell
-from sceneprint.store.frames import add_frame, refers_to, renew_frame
+from sceneprint.store.frames import add_frame, renew_frame
 from sceneprint.store.grouping import Grouping
 from sceneprint.store.idempotency import Once
 from sceneprint.store.maps import find_map
 from sceneprint.store.novelty import loosen
 from sceneprint.store.queue import enqueue
+from sceneprint.store.quotas import require_room
 from sceneprint.store.records import MapRow
-
-log = logging.getLogger(__name__)
-
-#: Blobs that are removed in one transaction: writers wait meanwhile.
-SWEPT_AT_ONCE = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +109,7 @@ class Uploads:
         InvalidRequest : a frame id that is none; or see `read_upload`.
         FrameError : see `read_upload`.
         FrameConflict : the frame is there with other content or metadata.
+        QuotaExceeded : the map's quota has no room for one more; nothing was taken.
         IdempotencyConflict : see `Once`.
         UnusableStore : the disk is full, or the database cannot be written; nothing was taken.
         """
@@ -173,6 +177,8 @@ class Uploads:
             with self._store.database.read() as connection:
                 row = find_map(connection, map_name)
                 frame = standing(connection, row, ready.content, ready.known, ready.upload.frame_id)
+                if frame is None:  # what has no room is not even written to the disk
+                    require_room(connection, row, len(ready.upload.data))
                 if frame is None or is_tried_again(frame.state):
                     return None
                 if being_signed(frame.state) and frame.novelty is not None:
@@ -213,8 +219,10 @@ class Uploads:
             left.clear()
             written = {i: _stored(connection, row, one, left) for i, one in todo.items()}
             outcomes = [written.get(i, one) for i, one in enumerate(known)]
-            if once is not None:
-                once.keep(connection, kept_of([one for one in outcomes if one is not None]))
+            came = [one for one in outcomes if one is not None]
+            # what had no room may have it when it is sent again
+            if once is not None and not any(isinstance(one.error, QuotaExceeded) for one in came):
+                once.keep(connection, kept_of(came))
             return outcomes, False
 
         while True:
@@ -256,6 +264,12 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
         loosen(connection, frame.number, upload.if_novel)
         left.append(ready.blob)
         return Outcome(told(connection, frame))
+    if frame is None or frame.state == FrameState.REDUNDANT:  # a failed one is counted already
+        try:
+            require_room(connection, row, len(upload.data))
+        except QuotaExceeded as error:
+            left.append(ready.blob)
+            return Outcome(None, error=error)
     of_blob = {"blob": ready.blob, "bytes": len(upload.data), "novelty": upload.if_novel}
     if frame is None:
         values = {"content_id": ready.content, **of_blob, **ready.known}
@@ -267,28 +281,3 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
     tell(connection, "frame.received", row.name, frame.id, job.id)
     added = Added(frame_id=frame.id, job_id=job.id, state=frame.state, reason=None)
     return Outcome(added, new=True)
-
-
-def sweep(store: Store, blobs: list[str]) -> None:
-    """Remove blobs that nothing refers to any more.
-
-    In writing transactions, so that no upload comes to refer to one in between, and short ones.
-    While a snapshot is being taken they stay, as it may refer to them: `sceneprint fsck` removes
-    them later.
-    """
-    for start in range(0, len(blobs), SWEPT_AT_ONCE):
-        with store.database.write() as connection, store.blobs.removing() as allowed:
-            if not allowed:
-                log.info("blobs left for fsck", extra={"blobs": len(blobs) - start})
-                return
-            for blob in blobs[start : start + SWEPT_AT_ONCE]:
-                if not refers_to(connection, blob):
-                    store.blobs.remove(blob)
-
-
-def sweep_deleted(store: Store, blobs: list[str]) -> None:
-    """As `sweep`, after a deletion that took effect already and is not to be refused any more."""
-    try:
-        sweep(store, blobs)
-    except UnusableStore as error:
-        log.warning("blobs left for fsck", extra={"blobs": len(blobs), "error": str(error)})

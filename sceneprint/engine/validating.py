@@ -94,7 +94,7 @@ def validated(
     if geometry is None:
         return Validated(chosen, [], {}, NOT_ASKED, deadline.reached)
     ranking, model_id = searched.ranking, searched.parts[0].place.row.model_id
-    with store.database.read() as connection:
+    with store.queried.read() as connection:
         blobs = geometry_blobs(connection, ranking.indices[list(chosen)].tolist(), model_id)
     unreadable: dict[int, str] = {}
 

@@ -21,7 +21,6 @@ from sceneprint.engine.wire import sensor_of
 from sceneprint.errors import DamagedBlob, UnknownFrame, UnreadableGeometry
 from sceneprint.geometry.retrieval import distances, similarity
 from sceneprint.geometry.validation import Validation
-from sceneprint.index import signatures_of
 from sceneprint.models import Model
 from sceneprint.pipeline import validate
 from sceneprint.schemas import ExplainedFrame, FrameState, Query
@@ -72,7 +71,7 @@ def why(asking: Asking, frame_id: str) -> ExplainedFrame:
             validation=None, transform=None, lost_at=absent[0], reason=absent[1],
         )  # fmt: skip
     view, number = part.place.view, np.array([row.number], np.int64)
-    stored = signatures_of(number, view.generation, view.tail)
+    stored = view.signatures(number)
     distance = distances(asking.asked.vector, stored)
     rank = rank_among_all(asking.searched, asking.asked, row.number, int(distance[0]))
     at = np.flatnonzero(asking.searched.ranking.indices == row.number).tolist()
@@ -80,7 +79,8 @@ def why(asking: Asking, frame_id: str) -> ExplainedFrame:
     shortlisted = is_shortlisted(asking.searched, asking.asked, part, row.number)
     selected = bool(at) and at[0] in asking.tried.chosen
     validation, T = _aligned(asking, part, row)
-    lost, reason = _lost(asking, row, rank, passes, shortlisted, bool(at), selected)
+    proposer = "the index" if view.kind == "local" else "pgvector in the database"
+    lost, reason = _lost(asking, row, rank, passes, shortlisted, bool(at), selected, proposer)
     early = lost not in (None, "validation")
     if early and validation is not None and validation.status != "skipped":
         reason += f"; aligned for this all the same, it is {figures(validation)}"
@@ -110,7 +110,7 @@ def _found(asking: Asking, frame_id: str) -> tuple[Part, FrameRow]:
     """The frame, and what is searched of its map: the first that has one which can be found."""
     parts, own = asking.searched.parts, asking.asked.frame
     held, missing = [], None
-    with asking.store.database.read() as connection:
+    with asking.store.queried.read() as connection:
         for part in parts:
             try:
                 held.append((part, find_frame(connection, part.place.row, frame_id)))
@@ -138,17 +138,14 @@ def _absent(asking: Asking, part: Part, row: FrameRow) -> tuple[Lost, str] | Non
     if row.number in view.damaged:
         return "state", "its signature is damaged, and is made again from its upload"
     number = np.array([row.number], np.int64)
-    held = view.tail.places.of(number)[0] >= 0
-    if view.generation is not None:
-        held = held or view.generation.places.of(number)[0] >= 0
-    if not held or row.number in view.dead:
+    if not view.has(number)[0]:
         return "state", "it was indexed while the query ran. Ask again"
     return None
 
 
 def _lost(
     asking: Asking, row: FrameRow, rank: int, passes: bool, shortlisted: bool, ranked: bool,
-    selected: bool,
+    selected: bool, proposer: str,
 ) -> tuple[Lost | None, str]:  # fmt: skip
     """Where, and why in words."""
     size, tried = len(asking.searched.ranking), asking.tried
@@ -156,7 +153,7 @@ def _lost(
         return "filter", "it does not pass the filter"
     if not shortlisted:
         return "shortlist", (
-            f"the index did not propose it, though it has rank {rank}: ask with `exact`"
+            f"{proposer} did not propose it, though it has rank {rank}: ask with `exact`"
         )
     if not ranked:
         return "ranking", f"it has rank {rank}, and {size} frames are ranked"
@@ -190,7 +187,7 @@ def _aligned(
         if not asking.deadline.allows():
             return ToldValidation(status="skipped", reason="the deadline came before it"), None
         model_id = part.place.row.model_id
-        with asking.store.database.read() as connection:
+        with asking.store.queried.read() as connection:
             blob = geometry_blobs(connection, [row.number], model_id).get(row.number)
         if blob is None:
             return ToldValidation(status="skipped", reason="it was deleted meanwhile"), None

@@ -84,6 +84,11 @@ def tell_map(connection: Connection, row: MapRow) -> Map:
         created_at=when(row.created_at),
         revision=row.revision,
         frames=count_frames(connection, row.number),
+        used_frames=row.used_frames,
+        used_bytes=row.used_bytes,
+        quota_frames=row.quota_frames,
+        quota_bytes=row.quota_bytes,
+        retention_days=row.retention_days,
         etag=map_tag(row),
     )
 

@@ -24,8 +24,15 @@ from sceneprint.engine.novelty import Stale, judge, look
 from sceneprint.engine.readers import Readers
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.slices import Task
-from sceneprint.engine.uploads import sweep
-from sceneprint.errors import DamagedBlob, FrameError, LostLease, SceneprintError, UnusableStore
+from sceneprint.engine.sweeping import sweep
+from sceneprint.errors import (
+    DamagedBlob,
+    FrameError,
+    LostLease,
+    SceneprintError,
+    StoreAway,
+    UnusableStore,
+)
 from sceneprint.pipeline import prepare
 from sceneprint.schemas import FrameState, JobState
 from sceneprint.store import Store, deaths, queue
@@ -41,6 +48,10 @@ from sceneprint.store.signatures import (
 )
 
 log = logging.getLogger(__name__)
+
+#: Seconds that a result waits for a server that is away, and between two tries. Less than a worker
+#: has that is told to stop.
+AWAY_S, AGAIN_S = 12.0, 0.5
 
 
 def claim(store: Store, worker: str, lease_s: float) -> Work | Task | None:
@@ -112,7 +123,7 @@ def run(
     try:
         with renewed(store, work.claim, lease_s, longest_s):
             made = _sign(store, signers, work)
-            gone = _store(store, signers, readers, work, made)
+            gone = _store_patiently(store, signers, readers, work, made)
         state = JobState.SUCCEEDED
     except LostLease as error:
         log.warning("lease lost", extra=about(work, error=str(error)))
@@ -153,6 +164,23 @@ def _sign(store: Store, signers: Signers, work: Work) -> StoredSignature:
     )
 
 
+def _store_patiently(
+    store: Store, signers: Signers, readers: Readers, work: Work, made: StoredSignature
+) -> list[str]:
+    """As `_store`, while another server takes the place of one that fell.
+
+    Where the fall hid that it was committed, the lease is found to be over: it took effect once.
+    """
+    until = time.monotonic() + AWAY_S
+    while True:
+        try:
+            return _store(store, signers, readers, work, made)
+        except StoreAway:
+            if time.monotonic() > until:
+                raise
+            time.sleep(AGAIN_S)
+
+
 def _store(
     store: Store, signers: Signers, readers: Readers, work: Work, made: StoredSignature
 ) -> list[str]:
@@ -163,7 +191,8 @@ def _store(
     blobs : that a frame refers to no more which was not to be kept: its map has the place
     """
     if work.again:
-        return _store_again(store, work, made)
+        return _store_again(store, readers, work, made)
+    coded = readers.choosing.coded(store.database, made.model_id, made.vector)
     while True:
         seen = None
         if work.frame.novelty is not None:
@@ -183,13 +212,14 @@ def _store(
             if not store.blobs.holds(made.geometry):  # nothing referred to it until now
                 raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
             index_frame(connection, work.frame, made)
+            readers.choosing.keep(connection, work.frame.number, coded)
             if row.next_model_id is not None:
                 enqueue_all(connection, row, [work.frame.number])
             tell_of(connection, "frame.indexed", work)
             return []
 
 
-def _store_again(store: Store, work: Work, made: StoredSignature) -> list[str]:
+def _store_again(store: Store, readers: Readers, work: Work, made: StoredSignature) -> list[str]:
     """Signature and artifact of an indexed frame, beside those of another model or in the place
     of damaged ones, and the end of the job in one commit.
 
@@ -198,6 +228,7 @@ def _store_again(store: Store, work: Work, made: StoredSignature) -> list[str]:
     blobs : that the frame refers to no more
     """
     number = work.frame.number
+    coded = readers.choosing.coded(store.database, made.model_id, made.vector)
     with store.database.write() as connection:
         queue.finish(connection, work.claim, JobState.SUCCEEDED)
         row = map_of(connection, work.frame.map_number)
@@ -208,5 +239,6 @@ def _store_again(store: Store, work: Work, made: StoredSignature) -> list[str]:
             raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
         before = geometry_blobs(connection, [number], made.model_id).values()
         replace_signature(connection, work.frame, made)
+        readers.choosing.keep(connection, number, coded, anew=True)
         tell_of(connection, "frame.reencoded", work)
         return [blob for blob in before if blob != made.geometry]

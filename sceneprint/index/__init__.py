@@ -9,7 +9,7 @@ distances. The database is the truth: deleting the folder loses nothing but the 
 it again.
 """
 
-from sceneprint.index.codes import Code, fit_code
+from sceneprint.index.codes import Code, draw, fit_code, read_code, write_code
 from sceneprint.index.generations import Generation, newest, newest_number
 from sceneprint.index.publishing import publish
 from sceneprint.index.scrubbing import scrub
@@ -24,14 +24,17 @@ __all__ = [
     "Hits",
     "Segment",
     "Tail",
+    "draw",
     "fit_code",
     "is_compared",
     "newest",
     "newest_number",
     "open_segment",
     "publish",
+    "read_code",
     "scrub",
     "search",
     "signatures_of",
+    "write_code",
     "write_segment",
 ]

@@ -61,7 +61,7 @@ def check_uploads(folder: Folder) -> Iterator[Finding]:
                 f"{condition}-upload", one.what, "note" if known else "damage",
                 "known: " + means if known else means,
                 None if known else _would(one, condition),
-                map=one.map, frame_id=one.frame_id, path=folder.store.blobs.path(one.digest),
+                map=one.map, frame_id=one.frame_id, path=folder.store.blobs.place(one.digest),
                 repair=None if known else partial(_repair_upload, folder, one),
             )  # fmt: skip
 
@@ -85,7 +85,7 @@ def check_artifacts(folder: Folder) -> Iterator[Finding]:
             yield Finding(
                 f"{condition}-artifact", one.what, "note" if known else "damage", means,
                 None if known else f"{move}have it made again from the upload",
-                map=one.map, frame_id=one.frame_id, path=folder.store.blobs.path(one.digest),
+                map=one.map, frame_id=one.frame_id, path=folder.store.blobs.place(one.digest),
                 repair=None if known else partial(_repair_artifact, folder, one),
             )  # fmt: skip
 

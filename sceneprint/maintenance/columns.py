@@ -21,7 +21,7 @@ from sqlalchemy import JSON, Boolean, Column, Float, LargeBinary, String, Table
 
 #: Values of a row, as a driver gives them.
 Row = Sequence[Any]
-#: Rows that are held at once; one of those with bytes in it may have 125,000 of them, a model 700 kB.
+#: Rows that are held at once; a signature may have 125,000 bytes, a model 700,000.
 _BLOCK, _BLOCK_OF_BYTES = 1000, 100
 
 

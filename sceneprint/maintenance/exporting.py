@@ -71,8 +71,8 @@ def copy_server(database: Database, to: Path, written: Written) -> None:
 
 def rows_of_server(connection: Connection, form: Form, *, hashed: bool = False) -> Iterator[Row]:
     """All rows of a table, in the order of their keys; a block of them at a time."""
-    streamed = connection.execution_options(stream_results=True)
-    with closing(streamed.exec_driver_sql(form.of_server(hashed=hashed))) as found:
+    asked, streamed = form.of_server(hashed=hashed), {"stream_results": True}
+    with closing(connection.exec_driver_sql(asked, execution_options=streamed)) as found:
         while block := found.fetchmany(form.block):
             yield from block
 

@@ -51,7 +51,7 @@ class Finding:
     would: str | None = None
     map: str | None = None
     frame_id: str | None = None
-    path: Path | None = None
+    path: Path | str | None = None
     repair: Callable[[], str] | None = field(default=None, compare=False, repr=False)
 
 

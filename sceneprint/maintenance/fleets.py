@@ -10,13 +10,14 @@ again.
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import closing
 from pathlib import Path
 
 from sqlalchemy import URL
 
-from sceneprint.errors import SnapshotError
+from sceneprint.errors import DamagedSnapshot, SnapshotError
 from sceneprint.maintenance.accepting import check_acceptable
 from sceneprint.maintenance.copies import open_copy
 from sceneprint.maintenance.importing import check_empty, copy_into, take_secrets
@@ -25,7 +26,7 @@ from sceneprint.maintenance.snapshots import Progress, Snapshot
 from sceneprint.maintenance.staging import full_disk_explained, staging
 from sceneprint.maintenance.unpacking import blobs_of, unpack
 from sceneprint.settings import Settings
-from sceneprint.store import Blobs
+from sceneprint.store import Blobs, open_blobs
 from sceneprint.store.database import Database, open_database, reach_database
 from sceneprint.writing import make_folder
 
@@ -84,7 +85,9 @@ def _check_folder(settings: Settings) -> None:
 
     Either would remove blobs that only the other refers to.
     """
-    path = settings.data_dir / DATABASE
+    if not isinstance(settings.blobs, Path):
+        return  # it is marked with whose it is
+    path = settings.blob_dir.with_name(DATABASE)
     if path.exists():
         raise SnapshotError(
             f"{path} is the database of another store, whose blobs lie beside it. Name another "
@@ -119,28 +122,31 @@ def _fill(
     with database.write() as connection:  # who keeps the blobs may ask whose they are
         check_empty(connection)
         take_secrets(connection, file)
-    blobs = Blobs(settings.blob_dir)
-    with blobs.kept():
-        _put_all(blobs, blobs_of(archive, tell))
+    blobs = open_blobs(settings.blobs, database, make=True)
+    with closing(blobs), blobs.kept():
+        _put_all(blobs, archive, tell)
         with database.write() as connection:
             copy_into(connection, file)
 
 
-def _put_all(blobs: Blobs, members: Iterator[tuple[int, Iterator[bytes]]]) -> None:
-    """Keep blobs, a few at once: each waits for its disk, or for the network."""
-    waiting: set[Future[str]] = set()
+def _put_all(blobs: Blobs, archive: Path, tell: Progress) -> None:
+    """Keep all blobs, a few at once: each waits for its disk, or for the network."""
+    waiting: dict[Future[str], str] = {}
+
+    def kept(done: Iterable[Future[str]]) -> None:
+        for one in [*done]:
+            if one.result() != waiting.pop(one):
+                raise DamagedSnapshot(f"{archive} was changed while it was restored. Try again.")
+
     with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="put") as pool:
-        for size, chunks in members:
+        for digest, size, chunks in blobs_of(archive, tell):
             if size > _LARGE:
                 with blobs.incoming() as blob:
                     for chunk in chunks:
                         blob.write(chunk)
                     blob.keep()
                 continue
-            waiting.add(pool.submit(blobs.put, b"".join(chunks)))
+            waiting[pool.submit(blobs.put, b"".join(chunks))] = digest
             if len(waiting) >= 2 * _AT_ONCE:
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                for one in done:
-                    one.result()
-        for one in waiting:
-            one.result()
+                kept(wait(waiting, return_when=FIRST_COMPLETED).done)
+        kept(waiting)

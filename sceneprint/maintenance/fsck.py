@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 from sqlalchemy import select
 
@@ -20,6 +21,7 @@ from sceneprint.maintenance.blobs import check_artifacts, check_uploads
 from sceneprint.maintenance.files import check_files
 from sceneprint.maintenance.findings import Finding, Folder, Progress, is_of_rows
 from sceneprint.maintenance.generations import check_indexes
+from sceneprint.maintenance.keeping import opened_blobs, require_folder
 from sceneprint.maintenance.products import check_products
 from sceneprint.maintenance.rows import check_rows
 from sceneprint.maintenance.signatures import check_signatures
@@ -27,8 +29,7 @@ from sceneprint.maintenance.tables import check_tables
 from sceneprint.maintenance.truth import FATAL, check_database, check_models, damaged_database
 from sceneprint.schemas import FrameState
 from sceneprint.settings import Settings
-from sceneprint.store import Database, Store, open_store
-from sceneprint.store.blobs import Blobs
+from sceneprint.store import Blobs, Database, Store, open_store
 from sceneprint.store.looking import look_at
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames
@@ -134,25 +135,22 @@ def _outcome(finding: Finding, repair: bool, trusted: bool) -> Outcome:
 @contextmanager
 def _opened(settings: Settings, *, repair: bool) -> Iterator[Store]:
     # before anything is made: a disk that is not mounted is not a folder that has lost all
-    if not settings.blob_dir.is_dir():
-        raise UnusableStore(
-            f"{settings.blob_dir}: there is no such folder. Name the data folder with --data, see "
-            "that its disk is mounted, or restore a snapshot."
-        )
-    if repair:
-        with look_at(settings.database) as database:  # a repair makes no database
-            _check_blobs(database, settings)
-        store = open_store(settings.database, settings.blob_dir)
-        try:
-            yield store
-        finally:
-            store.database.close()
-        return
-    with look_at(settings.database) as database:
-        yield Store(database, Blobs(settings.blob_dir, make=False))
+    if isinstance(settings.blobs, Path):
+        require_folder(settings.blobs)
+    # a repair makes no database
+    with look_at(settings.database) as database, opened_blobs(settings, database) as blobs:
+        if not repair:
+            yield Store(database, blobs)
+            return
+        _check_blobs(database, blobs, settings.blobs)
+    store = open_store(settings.database, settings.blobs)
+    try:
+        yield store
+    finally:
+        store.close()
 
 
-def _check_blobs(database: Database, settings: Settings) -> None:
+def _check_blobs(database: Database, blobs: Blobs, place: Path | str) -> None:
     """See that a folder without a single blob is not taken for the loss of all.
 
     Raises
@@ -164,8 +162,8 @@ def _check_blobs(database: Database, settings: Settings) -> None:
         refers = select(frames.c.number).where(frames.c.state.not_in(kept)).limit(1)
         if connection.execute(refers).first() is None:
             return
-    if next(Blobs(settings.blob_dir, make=False).digests(), None) is None:
+    if next(blobs.digests(), None) is None:
         raise UnusableStore(
-            f"{settings.blob_dir}: not one upload is there, and nothing was changed. See that its "
+            f"{place}: not one upload is there, and nothing was changed. See that its "
             "disk is mounted, or restore a snapshot."
         )

@@ -85,9 +85,7 @@ def check_empty(connection: Connection) -> None:
 
 def _write(connection: Connection, form: Form, rows: Iterator[Row]) -> None:
     driver: Any = connection.connection.cursor()
-    with driver as cursor, cursor.copy(
-        f"COPY {form.table.name} ({form.names}) FROM STDIN"
-    ) as copy:
+    with driver as cursor, cursor.copy(f"COPY {form.table.name} ({form.names}) FROM STDIN") as copy:
         for row in rows:
             copy.write_row(form.for_server(row))
 

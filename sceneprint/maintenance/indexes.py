@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from sqlalchemy import Connection
 
     from sceneprint.engine import Engine
-    from sceneprint.engine.readers import View
+    from sceneprint.engine.views import View
     from sceneprint.store.records import MapRow
 
 #: Neighbours by which recall is told, and farther ones whose distance tells how hard it is.

@@ -39,7 +39,7 @@ def check_products(folder: Folder) -> Iterator[Finding]:
         yield Finding(
             f"{condition}-job-file", f"{one.name} of job {one.id} ({one.kind})", "damage",
             "it cannot be given out, nor gone on with", f"{move}forget it: begin the job anew",
-            map=one.map, path=folder.store.blobs.path(one.blob),
+            map=one.map, path=folder.store.blobs.place(one.blob),
             repair=partial(_repair, folder, one.job_number, one.name, one.blob),
         )  # fmt: skip
 

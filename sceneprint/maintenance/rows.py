@@ -9,7 +9,7 @@ from functools import partial
 from sqlalchemy import Connection, delete, insert, select, update
 
 from sceneprint.engine.healing import is_known_loss, without_loss
-from sceneprint.engine.uploads import sweep
+from sceneprint.engine.sweeping import sweep
 from sceneprint.maintenance.findings import Finding, Folder, each
 from sceneprint.maintenance.repairs import GONE, sign_from_upload
 from sceneprint.schemas import FrameState, JobState

@@ -1,8 +1,6 @@
-"""Snapshots that are taken over the service: a few, in a folder of the data folder.
+"""Snapshots that are taken over the service: a few, beside the data or in an object store.
 
-    job of kind snapshot  --snapshot_handler-->  ID.tar, ID.json
-
-An archive counts when its record lies beside it, which is written last.
+job of kind snapshot  --snapshot_handler-->  an archive and its record (see racks)
 """
 
 from __future__ import annotations
@@ -10,20 +8,25 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
+import secrets
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
+from typing import BinaryIO
 
 from pydantic import ValidationError
 
 from sceneprint.engine.slices import Outcome, Task
 from sceneprint.errors import SnapshotError, UnknownSnapshot, UnusableStore
-from sceneprint.maintenance.snapshots import take_snapshot
+from sceneprint.maintenance.racks import Rack, open_rack
+from sceneprint.maintenance.snapshots import Progress, take_snapshot
+from sceneprint.maintenance.staging import check_room, staging
 from sceneprint.schemas.snapshots import SnapshotFile
 from sceneprint.settings import Settings
-from sceneprint.writing import make_folder, sync_folder, write_durable
+from sceneprint.writing import make_folder
 
 log = logging.getLogger(__name__)
 
@@ -33,11 +36,12 @@ SNAPSHOT = "snapshot"
 LONGEST_S = 6 * 3600.0
 #: Seconds after which an archive without a record is of a worker that died.
 _ABANDONED_S = 3600.0
+_STAGING = ".taking-"
 _ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{8}")
 
 
 class Shelf:
-    """The folder of snapshots of a data folder.
+    """The snapshots of a data folder, or of a fleet.
 
     Parameters
     ----------
@@ -45,38 +49,62 @@ class Shelf:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._settings, self._folder = settings, settings.snapshot_dir
+        self._settings = settings
+
+    @cached_property
+    def _rack(self) -> Rack:
+        return open_rack(self._settings)
 
     def list(self) -> tuple[SnapshotFile, ...]:
         """All snapshots, the newest first."""
         found = []
-        for path in self._folder.glob("*.json"):
+        for name, _ in self._rack.ids("json"):
             with suppress(UnknownSnapshot):  # removed meanwhile, or no record of ours
-                found.append(self.find(path.stem))
+                found.append(self.find(name))
         return tuple(sorted(found, key=lambda one: one.snapshot_id, reverse=True))
 
     def find(self, snapshot_id: str) -> SnapshotFile:
         """A snapshot; UnknownSnapshot where there is none."""
-        if _ID.fullmatch(snapshot_id) and self._archive(snapshot_id).is_file():
+        if is_snapshot_id(snapshot_id) and self._rack.holds(snapshot_id):
             with suppress(OSError, ValidationError):
-                return SnapshotFile.model_validate_json(self._record(snapshot_id).read_bytes())
+                return SnapshotFile.model_validate_json(self._rack.record(snapshot_id))
         raise _unknown(snapshot_id)
 
-    def path(self, snapshot_id: str) -> Path:
-        """The archive of a snapshot; UnknownSnapshot where there is none."""
-        return self._archive(self.find(snapshot_id).snapshot_id)
+    def open(self, snapshot_id: str) -> BinaryIO:
+        """An archive as a file that can be sought in; UnknownSnapshot where there is none."""
+        self.find(snapshot_id)
+        try:
+            return self._rack.open(snapshot_id)
+        except FileNotFoundError as error:  # removed meanwhile
+            raise _unknown(snapshot_id) from error
+
+    @contextmanager
+    def local(self, snapshot_id: str, folder: Path) -> Iterator[Path]:
+        """The archive as a file of this machine, in the end perhaps no more.
+
+        Parameters
+        ----------
+        snapshot_id : UnknownSnapshot where there is none
+        folder : in which it may be put meanwhile; made where missing
+        """
+        found = self.find(snapshot_id)
+        make_folder(folder)
+        with staging(folder, _STAGING, 0o700) as place:
+            check_room(place, found.bytes, "the snapshot")
+            yield self._rack.local(snapshot_id, place)
 
     def delete(self, snapshot_id: str) -> None:
         """Remove a snapshot; UnknownSnapshot where there is none."""
         self.find(snapshot_id)
-        self._remove(snapshot_id)
+        self._rack.remove(snapshot_id)
 
-    def take(self, snapshot_id: str) -> SnapshotFile:
+    def take(self, snapshot_id: str, progress: Progress | None = None) -> SnapshotFile:
         """Take a snapshot, and remove the oldest of those that are too many.
 
         Parameters
         ----------
         snapshot_id : that it gets; one of that id that is there already is left as it is
+        progress : told of bytes done and bytes in all
 
         Raises
         ------
@@ -84,31 +112,31 @@ class Shelf:
         """
         with suppress(UnknownSnapshot):
             return self.find(snapshot_id)
+        place = self._settings.snapshot_dir
         try:
-            make_folder(self._folder)
-            self._folder.chmod(0o700)  # archives have all frames, and the hashes of keys
-            archive = self._archive(snapshot_id)
-            archive.unlink(missing_ok=True)  # of a worker that died before its record
-            taken = take_snapshot(self._settings, archive)
-            with archive.open("rb") as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-            made = SnapshotFile(
-                snapshot_id=snapshot_id,
-                created_at=taken.manifest.created_at,
-                bytes=archive.stat().st_size,
-                sha256=digest,
-                maps=taken.manifest.maps,
-                frames=taken.manifest.n_frames,
-                blobs=taken.manifest.blobs.count,
-                damaged=len(taken.damaged),
-            )
-            write_durable(self._record(snapshot_id), made.model_dump_json().encode())
+            make_folder(place)
+            # archives have all frames, and the hashes of keys
+            with staging(place, _STAGING, 0o700) as folder:
+                taken = take_snapshot(self._settings, folder / "archive", progress)
+                with taken.path.open("rb") as file:
+                    digest = hashlib.file_digest(file, "sha256").hexdigest()
+                made = SnapshotFile(
+                    snapshot_id=snapshot_id,
+                    created_at=taken.manifest.created_at,
+                    bytes=taken.path.stat().st_size,
+                    sha256=digest,
+                    maps=taken.manifest.maps,
+                    frames=taken.manifest.n_frames,
+                    blobs=taken.manifest.blobs.count,
+                    damaged=len(taken.damaged),
+                )
+                self._rack.put(snapshot_id, taken.path, made.model_dump_json().encode())
             self._tidy()
         except UnusableStore as error:  # in the words of a snapshot: another try finds the same
             raise SnapshotError(str(error)) from error
         except OSError as error:
             raise SnapshotError(
-                f"{self._folder}: no snapshot can be written ({error.strerror or error}). See "
+                f"{place}: no snapshot can be written ({error.strerror or error}). See "
                 "that the service may write there."
             ) from error
         return made
@@ -117,23 +145,25 @@ class Shelf:
         """Remove what is too much, and archives that nobody will finish."""
         for one in self.list()[self._settings.snapshots_kept :]:
             log.info("snapshot removed", extra={"snapshot": one.snapshot_id})
-            self._remove(one.snapshot_id)
-        for path in self._folder.glob("*.tar"):
-            with suppress(FileNotFoundError):
-                old = path.stat().st_mtime + _ABANDONED_S < time.time()
-                if old and _ID.fullmatch(path.stem) and not self._record(path.stem).exists():
-                    path.unlink()
+            self._rack.remove(one.snapshot_id)
+        known = {name for name, _ in self._rack.ids("json")}
+        for name, written_at in self._rack.ids("tar"):
+            if (
+                written_at + _ABANDONED_S < time.time()
+                and is_snapshot_id(name)
+                and name not in known
+            ):
+                self._rack.remove(name)
 
-    def _remove(self, snapshot_id: str) -> None:
-        self._record(snapshot_id).unlink(missing_ok=True)
-        self._archive(snapshot_id).unlink(missing_ok=True)
-        sync_folder(self._folder)
 
-    def _archive(self, snapshot_id: str) -> Path:
-        return self._folder / f"{snapshot_id}.tar"
+def is_snapshot_id(given: str) -> bool:
+    """Whether it can be the id of a snapshot that was taken over the service."""
+    return _ID.fullmatch(given) is not None
 
-    def _record(self, snapshot_id: str) -> Path:
-        return self._folder / f"{snapshot_id}.json"
+
+def new_snapshot_id() -> str:
+    """An id for a snapshot that is taken now, and not by a job."""
+    return f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(4)}"
 
 
 def snapshot_handler(settings: Settings) -> Callable[[Task, float], Outcome]:

@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Text, delete, func, select, type_coerce
 from sqlalchemy.exc import DBAPIError
 
 from sceneprint.engine.healing import PRIORITY
-from sceneprint.engine.uploads import sweep
+from sceneprint.engine.sweeping import sweep
 from sceneprint.maintenance.findings import Finding, Folder, each
 from sceneprint.maintenance.repairs import GONE, quarantine_bytes, sign_from_upload
 from sceneprint.models import Model

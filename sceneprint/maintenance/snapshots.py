@@ -36,7 +36,7 @@ from sceneprint.maintenance.manifests import (
 )
 from sceneprint.maintenance.staging import check_room, full_disk_explained, put_new, staging
 from sceneprint.settings import Settings
-from sceneprint.store import Blobs as BlobFolder
+from sceneprint.store import FolderBlobs as BlobFolder
 
 #: Bytes done, and bytes in all.
 Progress = Callable[[int, int], None]
@@ -89,9 +89,7 @@ def take_snapshot(settings: Settings, path: Path, progress: Progress | None = No
         return _taken_of(source, blobs, path, progress or (lambda _done, _total: None))
 
 
-def _taken_of(
-    source: copies.Source, blobs: BlobFolder, path: Path, progress: Progress
-) -> Snapshot:
+def _taken_of(source: copies.Source, blobs: BlobFolder, path: Path, progress: Progress) -> Snapshot:
     folder = path.absolute().parent
     with (
         full_disk_explained(path),

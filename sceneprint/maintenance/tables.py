@@ -8,9 +8,10 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from sceneprint.maintenance.files import PART, WRITING_S, changed_at
+from sceneprint.maintenance.files import WRITING_S, changed_at
 from sceneprint.maintenance.findings import Finding, Folder
 from sceneprint.models.tables import is_sound_table
+from sceneprint.store.folders import PART
 
 _TABLE = re.compile(r"table-v\d+-[0-9a-f]{64}\.bin")
 

@@ -26,7 +26,7 @@ from sceneprint.types import Bytes
 
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
-    from sceneprint.engine.readers import View
+    from sceneprint.engine.views import View
 
 #: Memory that the choice of a number of frames may take: 8 bytes for each kept one and each frame.
 CHOICE_BYTES = 2 << 30

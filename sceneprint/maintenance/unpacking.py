@@ -69,8 +69,8 @@ def unpack(archive: Path, folder: Path, progress: Progress | None, *, with_blobs
     return Snapshot(archive, manifest, damaged)
 
 
-def blobs_of(archive: Path, progress: Progress | None) -> Iterator[tuple[int, Iterator[bytes]]]:
-    """The blobs in an archive that `unpack` has verified: bytes of each, and these in parts.
+def blobs_of(archive: Path, progress: Progress) -> Iterator[tuple[str, int, Iterator[bytes]]]:
+    """The blobs in an archive that `unpack` has verified: digest, size, and bytes in parts.
 
     Parameters
     ----------
@@ -83,14 +83,12 @@ def blobs_of(archive: Path, progress: Progress | None) -> Iterator[tuple[int, It
     """
     with archive.open("rb") as file:
         total = os.fstat(file.fileno()).st_size
-        reader = ArchiveReader(
-            file, archive, lambda done: None if progress is None else progress(done, total)
-        )
+        reader = ArchiveReader(file, archive, lambda done: progress(done, total))
         while (member := reader.next()) is not None:
             name, size = member
             chunks = reader.content(size)
             if name.startswith(BLOBS):
-                yield size, chunks
+                yield name.removeprefix(BLOBS), size, chunks
             for _ in chunks:  # to its end, whoever has read how much
                 pass
 

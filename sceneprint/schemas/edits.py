@@ -8,6 +8,7 @@ from pydantic import AwareDatetime, Field
 
 from sceneprint.schemas.base import Given, Label
 from sceneprint.schemas.frames import GivenBase, GivenPose
+from sceneprint.schemas.maps import Days, Quota
 
 
 class FrameEdit(Given):
@@ -42,3 +43,20 @@ class MapEdit(Given):
     title: Annotated[str, Field(max_length=200)] | None = Field(
         default=None, description="For people."
     )
+    quota_frames: Quota | None = Field(
+        default=None,
+        description="Most frames that it may hold; what is there beyond it stays. Only the "
+        "operator sets it: `admin` for `*`.",
+    )
+    quota_bytes: Quota | None = Field(
+        default=None, description="Most bytes of uploads that it may hold; as `quota_frames`."
+    )
+    retention_days: Days | None = Field(
+        default=None,
+        description="Days after which a frame is deleted, for good, counted from when it was "
+        "received. Workers delete what is older within minutes.",
+    )
+
+
+#: Fields of a map that are not its own administrators' to set, but the operator's.
+OPERATORS = frozenset(("quota_frames", "quota_bytes"))

@@ -27,6 +27,15 @@ Preset = Annotated[
 ]
 
 
+#: Most that a quota can say: JavaScript knows no larger whole number.
+MOST_QUOTA = 2**53 - 1
+#: Longest retention, days: a hundred years.
+MOST_DAYS = 36_525.0
+Quota = Annotated[int, Field(ge=0, le=MOST_QUOTA)]
+Days = Annotated[float, Field(gt=0, le=MOST_DAYS)]
+_INHERITED = "left out: as a map of this name had that was deleted."
+
+
 class NewMap(Given):
     """A map to make."""
 
@@ -40,6 +49,20 @@ class NewMap(Given):
         description="The model that signs its frames, until `sceneprint reencode` changes it: "
         "`paper` or, a tenth as large, `compact` for rooms; `lidar` for the "
         "ranges of a LiDAR.",
+    )
+    quota_frames: Quota | None = Field(
+        default=None,
+        description="Most frames that it may hold; null: as many as there is room for; "
+        f"{_INHERITED} Only the operator sets it: `admin` for `*`.",
+    )
+    quota_bytes: Quota | None = Field(
+        default=None,
+        description="Most bytes of uploads that it may hold, as they were sent; as `quota_frames`.",
+    )
+    retention_days: Days | None = Field(
+        default=None,
+        description="Days after which a frame is deleted, counted from when it was received; "
+        "null: never.",
     )
 
 
@@ -72,6 +95,18 @@ class Map(Told):
     created_at: datetime
     revision: int = Field(description="Grows with every frame that is indexed or deleted.")
     frames: dict[str, int] = Field(description="How many frames are in each state.")
+    used_frames: int = Field(
+        default=0, description="Frames that count for the quota: neither deleted nor redundant."
+    )
+    used_bytes: int = Field(
+        default=0,
+        description="Bytes of their uploads, as they were sent; not what is made of them.",
+    )
+    quota_frames: int | None = Field(default=None, description="Null: no quota.")
+    quota_bytes: int | None = Field(default=None, description="Null: no quota.")
+    retention_days: float | None = Field(
+        default=None, description="Days after which a frame is deleted; null: never."
+    )
     etag: str | None = Field(
         default=None,
         description="Stands for what PATCH can change: sent in If-Match, with quotes around it, "

@@ -1,4 +1,4 @@
-"""The truth: one database with maps, frames, signatures and jobs, and a folder of blobs.
+"""The truth: one database with maps, frames, signatures and jobs, and blobs.
 
 Everything else on disk is a cache of this. Functions take the connection of a transaction, so
 that what belongs together is committed together; `Store` opens both parts.
@@ -6,16 +6,34 @@ that what belongs together is committed together; `Store` opens both parts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from sqlalchemy import make_url
+from sqlalchemy.exc import ArgumentError
+
+from sceneprint.errors import StoreAway, UnusableStore
 from sceneprint.store.blobs import Blobs
 from sceneprint.store.database import Database, is_there, open_database
+from sceneprint.store.faults import unusable
+from sceneprint.store.folders import FolderBlobs
+from sceneprint.store.locks import FileLocks, Locks
+from sceneprint.store.object_blobs import ObjectBlobs
+from sceneprint.store.objects import open_objects
+from sceneprint.store.replica import Replica, current
 from sceneprint.store.sealed import is_sealed
 from sceneprint.store.seals import Seals
+from sceneprint.store.session_locks import SessionLocks
+from sceneprint.writing import make_folder
 
-__all__ = ["Blobs", "Database", "Store", "open_database", "open_store"]
+__all__ = [
+    "Blobs", "Database", "FolderBlobs", "Store", "open_blobs", "open_database", "open_store",
+]  # fmt: skip
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,14 +42,30 @@ class Store:
 
     database: Database
     blobs: Blobs
+    replica: Replica | None = None
+
+    @property
+    def queried(self) -> Database:
+        """What the query in hand is answered from: a replica, or `database`; see `asked`."""
+        near = current()
+        return self.database if near is None else near.database
 
     @cached_property
     def seals(self) -> Seals:
         """What numbers of its rows look like from outside."""
         return Seals(self.database)
 
+    def close(self) -> None:
+        """Give back all connections."""
+        if self.replica is not None:
+            self.replica.close()
+        self.blobs.close()
+        self.database.close()
 
-def open_store(url: str, blobs: Path) -> Store:
+
+def open_store(
+    url: str, blobs: Path | str, replica_url: str | None = None, replica_lag_s: float = 0.0
+) -> Store:
     """Open both, made where both are missing.
 
     The folder of a database that is there is never made: its disk is not mounted, and what was
@@ -40,12 +74,78 @@ def open_store(url: str, blobs: Path) -> Store:
     Parameters
     ----------
     url : of the database
-    blobs : folder
+    blobs : folder, or URL of an object store
+    replica_url, replica_lag_s : see Replica; it need not be there
 
     Raises
     ------
-    UnusableStore, NewerSchema : see `open_database`.
+    UnusableStore, NewerSchema : see `open_database`, `open_blobs` and Replica.
     """
+    opened = _open_store(url, blobs)
+    if replica_url is None:
+        return opened
+    try:
+        return replace(opened, replica=Replica(opened.database, replica_url, replica_lag_s))
+    except BaseException:
+        opened.close()
+        raise
+
+
+def _open_store(url: str, blobs: Path | str) -> Store:
     new = not is_sealed(url) and not is_there(url)
-    kept = Blobs(blobs, make=new)  # the data folder is made with it
-    return Store(open_database(url), kept)
+    if isinstance(blobs, Path):
+        kept = FolderBlobs(blobs, make=new)  # the data folder is made with it
+        return Store(open_database(url), kept)
+    if new:
+        _make_folder_of(url)
+    database = open_database(url)
+    try:
+        return Store(database, open_blobs(blobs, database))
+    except BaseException:
+        database.close()
+        raise
+
+
+def open_blobs(blobs: Path | str, database: Database, *, make: bool = False) -> Blobs:
+    """Open the blobs that a database refers to.
+
+    An object store that is away is no error yet: what is asked of it is refused while it is.
+
+    Parameters
+    ----------
+    blobs : folder, or URL of an object store
+    database : whose they are
+    make : a folder that is missing
+
+    Raises
+    ------
+    UnusableStore : they cannot be opened, or are another database's.
+    """
+    if isinstance(blobs, Path):
+        return FolderBlobs(blobs, make=make)
+    objects = open_objects(blobs)
+    locks: Locks
+    if database.file is not None:
+        locks = FileLocks(database.file.with_name(f"{database.file.name}-blobs"), make=True)
+    elif database.is_sqlite:
+        raise UnusableStore("Blobs in an object store need a database that is kept: name a file.")
+    else:
+        locks = SessionLocks(database)
+    found = ObjectBlobs(objects, locks, lambda: Seals(database).owner)
+    try:
+        found.claim(anew=not database.read_only)
+    except StoreAway as error:
+        log.warning("the object store is away", extra={"error": str(error)})
+    return found
+
+
+def _make_folder_of(url: str) -> None:
+    """The folder of a new SQLite file; opening it says what is wrong with any other URL."""
+    with suppress(ArgumentError, ValueError):
+        parsed = make_url(url)
+        if parsed.get_backend_name() == "sqlite" and parsed.database:
+            folder = Path(parsed.database).absolute().parent
+            try:
+                make_folder(folder)
+            except OSError as error:
+                raise unusable(f"{folder}: the folder cannot be made", error) from error

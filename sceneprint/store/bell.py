@@ -1,4 +1,5 @@
-"""The bell: who commits a job wakes the workers that wait, as SQLite tells nobody.
+"""The bell: who commits a job wakes the workers that wait, as SQLite tells nobody (`notices`: a
+server does).
 
 Every waiting worker makes a FIFO in a folder, and who rings writes one byte to each. It is a hint
 and never the truth: where none can be made, or the other is on another machine, workers look
@@ -16,6 +17,9 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Protocol
+
+from sqlalchemy import Connection
 
 #: Seconds after which a FIFO that nobody reads is removed, and between two signs of life.
 STALE_S, ALIVE_S = 300.0, 60.0
@@ -23,6 +27,35 @@ STALE_S, ALIVE_S = 300.0, 60.0
 DEAF_S = 0.25
 #: Longest wait that the system knows of, milliseconds.
 MOST_MS = 2**31 - 1
+#: Characters of a host's name that its processes are called by, the last ones: a server cuts
+#: names of connections, and clouds name hosts alike at their beginning.
+HOST = 44
+
+
+class Listening(Protocol):
+    """Who has asked to be woken."""
+
+    def wait(self, timeout_s: float, *others: int) -> bool:
+        """Until it rings, one of other descriptors is readable, or the time is over.
+
+        Returns
+        -------
+        whether it rang
+        """
+
+
+def process_name() -> str:
+    """What this process is called among those of all hosts: `host:pid`."""
+    return f"{socket.gethostname()[-HOST:]}:{os.getpid()}"
+
+
+def wait_for(timeout_s: float, *descriptors: int) -> set[int]:
+    """Those of some descriptors that are readable, waited for so long; negative ones are none."""
+    waiting = select.poll()
+    for descriptor in descriptors:
+        if descriptor >= 0:
+            waiting.register(descriptor, select.POLLIN)
+    return {one for one, _ in waiting.poll(min(max(1e3 * timeout_s, 0.0), MOST_MS))}
 
 
 class Bell:
@@ -45,8 +78,13 @@ class Bell:
         for name in names:
             self._ring(self._folder / name)
 
-    def listeners(self) -> list[str]:
-        """Host and process id, as `host:pid`, of every process of this machine that listens."""
+    def listeners(self, connection: Connection | None = None) -> list[str]:
+        """Host and process id, as `host:pid`, of every process of this machine that listens.
+
+        Parameters
+        ----------
+        connection : of the database, where there is one at hand: a server knows who listens
+        """
         try:
             names = sorted(os.listdir(self._folder))  # noqa: PTH208
         except OSError:
@@ -55,13 +93,16 @@ class Bell:
         return [":".join(name.rsplit("-", 2)[:2]) for name in read]
 
     @contextmanager
-    def listen(self) -> Iterator[Listener]:
+    def listen(self) -> Iterator[Listening]:
         """Be woken from now on; what is rung before the wait begins ends it at once."""
         listener = Listener(self._folder)
         try:
             yield listener
         finally:
             listener.close()
+
+    def close(self) -> None:
+        """Ring no more."""
 
     def _is_read(self, path: Path) -> bool:
         """Whether somebody has a FIFO open: one that was left behind cannot be written to."""
@@ -94,7 +135,7 @@ class Listener:
     """One FIFO, open; made by `Bell.listen`."""
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
+        self._path = folder / f"{process_name().replace(':', '-')}-{uuid.uuid4().hex[:8]}"
         self._fifo = -1
         self._alive = 0.0
         self._open()
@@ -108,12 +149,7 @@ class Listener:
         """
         if self._fifo < 0:
             timeout_s = min(timeout_s, DEAF_S)
-        waiting = select.poll()
-        for descriptor in (self._fifo, *others):
-            if descriptor >= 0:
-                waiting.register(descriptor, select.POLLIN)
-        found = waiting.poll(min(max(1e3 * timeout_s, 0.0), MOST_MS))
-        rung = any(descriptor == self._fifo for descriptor, _ in found)
+        rung = self._fifo in wait_for(timeout_s, self._fifo, *others)
         if rung:
             with suppress(BlockingIOError):
                 while os.read(self._fifo, 4096):

@@ -1,55 +1,55 @@
 """Blobs: bytes kept under the SHA-256 of their content, durable before anything refers to them.
 
 bytes  --put-->  digest  --get-->  the same bytes, or an error
+
+In a folder (folders.py), or in an object store (object_blobs.py).
 """
 
 from __future__ import annotations
 
-import fcntl
-import hashlib
-import os
 import re
-import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal, Protocol
 
-from sceneprint.errors import DamagedBlob, UnusableStore
-from sceneprint.store.faults import unusable
 from sceneprint.store.incoming import IncomingBlob
-from sceneprint.writing import make_folder, sync_folder, write_durable
-
-_DIGEST = re.compile(r"[0-9a-f]{64}")
 
 #: What a blob is found to be.
 Condition = Literal["sound", "missing", "damaged"]
+DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
-class Blobs:
-    """A folder of blobs, in 256 folders by their first two digits.
+def require_digest(given: str) -> None:
+    """ValueError for what is no digest: it must not become part of a path or a key."""
+    if not DIGEST.fullmatch(given):
+        raise ValueError(f"{given!r} is no digest")
+
+
+@dataclass(frozen=True)
+class BlobEntry:
+    """What lies where blobs are kept.
 
     Parameters
     ----------
-    folder : made where missing
-    make : whether it is
-
-    Raises
-    ------
-    UnusableStore : it cannot be made.
+    place : file or key, for people
+    digest : of the blob that it is; None where it is none
+    changed_at : seconds since 1970
+    unfinished : whether a writer writes it, or has left it
     """
 
-    def __init__(self, folder: Path, *, make: bool = True) -> None:
-        self._folder = folder
-        self._durable: set[str] = set()  # folders in it that this process has synced it for
-        try:
-            if make:
-                make_folder(folder)
-        except OSError as error:
-            raise unusable(f"{folder}: the folder cannot be made", error) from error
+    place: str
+    digest: str | None
+    changed_at: float
+    unfinished: bool = False
+
+
+class Blobs(Protocol):
+    """Where blobs are kept; safe to share between threads."""
 
     def put(self, data: bytes) -> str:
-        """Keep bytes; when this returns they survive the loss of power.
+        """Keep bytes; when this returns nothing that the store promises to survive loses them.
 
         Returns
         -------
@@ -57,21 +57,11 @@ class Blobs:
 
         Raises
         ------
-        StoreFull : the disk is full; nothing is left behind.
+        StoreFull : there is no room; nothing is left behind.
         UnusableStore : it may not be written, or is not there.
         """
-        digest = hashlib.sha256(data).hexdigest()
-        path = self._path(digest)
-        try:  # also where it is there: that one may be damaged, not yet durable, or being removed
-            new = self._made(path.parent)
-            write_durable(path, data, folder_is_new=new)
-        except OSError as error:
-            raise unusable(f"{self._folder}: a blob cannot be written", error) from error
-        self._durable.add(path.parent.name)
-        return digest
 
-    @contextmanager
-    def incoming(self) -> Iterator[IncomingBlob]:
+    def incoming(self) -> AbstractContextManager[IncomingBlob]:
         """Take a blob in parts, such as one that does not fit into memory.
 
         What is not kept by the end of it is removed.
@@ -80,34 +70,6 @@ class Blobs:
         ------
         StoreFull, UnusableStore : as `put`, also from `write` and `keep`.
         """
-        part = self._folder / f".{secrets.token_hex(6)}.part"
-        what = f"{self._folder}: a blob cannot be written"
-        try:
-            file = part.open("xb", buffering=0)
-        except OSError as error:
-            raise unusable(what, error) from error
-        try:
-            with file:
-                yield IncomingBlob(file, what, lambda digest: self._keep(part, digest))
-        finally:
-            with suppress(OSError):
-                part.unlink(missing_ok=True)
-
-    def _keep(self, part: Path, digest: str) -> None:
-        """Give a file that is written and synced the name of its content."""
-        path = self._path(digest)
-        self._made(path.parent)
-        os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
-        sync_folder(path.parent)
-        sync_folder(self._folder)
-
-    def _made(self, folder: Path) -> bool:
-        """See that a folder is there; whether it may not be durable yet."""
-        try:
-            folder.mkdir()
-        except FileExistsError:
-            return folder.name not in self._durable
-        return True
 
     def get(self, digest: str) -> bytes:
         """The bytes of a digest, checked against it.
@@ -115,75 +77,42 @@ class Blobs:
         Raises
         ------
         DamagedBlob : they are missing, or others than were stored.
+        UnusableStore : the store is away.
         """
-        try:
-            data = self._path(digest).read_bytes()
-        except OSError as error:
-            raise DamagedBlob(
-                f"The blob {digest[:12]} cannot be read ({error.strerror}). Restore the data "
-                "folder from a copy, or delete the frame and upload it again."
-            ) from error
-        if hashlib.sha256(data).hexdigest() != digest:
-            raise DamagedBlob(
-                f"The blob {digest[:12]} is damaged: its content has another hash. Restore the "
-                "data folder from a copy, or delete the frame and upload it again."
-            )
-        return data
 
-    def holds(self, digest: str) -> bool:
-        """Whether there is a blob of that digest."""
-        return self._path(digest).exists()
-
-    def size(self, digest: str) -> int | None:
-        """Bytes of a blob as it lies there, unchecked; None where it is missing."""
-        try:
-            return self._path(digest).stat().st_size
-        except OSError:
-            return None
-
-    @contextmanager
-    def kept(self) -> Iterator[None]:
-        """See that no blob is removed meanwhile; waits for who is removing some.
-
-        The folder itself is the lock, so that there is none to make or to clear away; the kernel
-        releases that of a process that dies, however it dies.
+    def open(self, digest: str) -> BinaryIO:
+        """A blob as a file that can be sought in, unchecked; FileNotFoundError where it is missing.
 
         Raises
         ------
-        UnusableStore : the folder cannot be locked.
+        OSError, UnusableStore : it cannot be read, now or later.
         """
-        try:
-            descriptor = self._lock(fcntl.LOCK_SH)
-        except OSError as error:
-            raise UnusableStore(
-                f"{self._folder}: the folder cannot be locked ({error.strerror}). Stop the "
-                "service and copy the data folder as it is."
-            ) from error
-        try:
-            yield
-        finally:
-            os.close(descriptor)
 
-    @contextmanager
-    def removing(self) -> Iterator[bool]:
+    def holds(self, digest: str) -> bool:
+        """Whether there is a blob of that digest."""
+
+    def size(self, digest: str) -> int | None:
+        """Bytes of a blob as it lies there, unchecked; None where it is missing."""
+
+    def kept(self) -> AbstractContextManager[None]:
+        """See that no blob is removed meanwhile; waits for who is removing some.
+
+        The lock of a process that dies is free at once, however it dies.
+
+        Raises
+        ------
+        UnusableStore : it cannot be locked.
+        """
+
+    def removing(self) -> AbstractContextManager[bool]:
         """Hold the right to remove blobs; False where somebody needs them kept, or removes some.
 
         Ask for it within a writing transaction: removers then come one after the other, and leave
         room between them for who waits in `kept`.
         """
-        try:
-            descriptor = self._lock(fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:  # held by another, or there are no locks: what stays does no harm
-            yield False
-            return
-        try:
-            yield True
-        finally:
-            os.close(descriptor)
 
     def remove(self, digest: str) -> None:
         """Forget a blob that nothing refers to; only within `removing`."""
-        self._path(digest).unlink(missing_ok=True)
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
         """Whether a blob is as it was stored; read in parts, so that memory is bounded.
@@ -195,24 +124,8 @@ class Blobs:
 
         Raises
         ------
-        UnusableStore : it may not be read by this user.
+        UnusableStore : it may not be read by this user, or the store is away.
         """
-        if not _DIGEST.fullmatch(digest):
-            return "missing"
-        try:
-            with self._path(digest).open("rb") as file:
-                if quick or hashlib.file_digest(file, "sha256").hexdigest() == digest:
-                    return "sound"
-        except FileNotFoundError:
-            return "missing"
-        except PermissionError as error:
-            raise UnusableStore(
-                f"{self._path(digest)}: may not be read. Run it as the user who owns the data "
-                "folder."
-            ) from error
-        except OSError:  # the disk cannot read it, or a folder has its name
-            pass
-        return "damaged"
 
     def quarantine(self, digest: str, folder: Path) -> Path | None:
         """Move what lies under a digest out of the way, durably; None where there is nothing.
@@ -220,41 +133,25 @@ class Blobs:
         Parameters
         ----------
         digest : of a blob that was found damaged; only within `removing`
-        folder : to move it to, of the same file system; made where missing
+        folder : to move it to; made where missing
         """
-        path, place = self._path(digest), folder / f"blob-{digest}"
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            os.replace(path, place)  # noqa: PTH105  (the one call that is atomic by contract)
-        except FileNotFoundError:
-            return None
-        for each in (folder, folder.parent, path.parent):
-            sync_folder(each)
-        return place
 
-    def path(self, digest: str) -> Path:
+    def place(self, digest: str) -> str:
         """Where a blob lies, for people to look at."""
-        return self._folder / digest[:2] / digest
 
     def digests(self) -> Iterator[str]:
         """All blobs, in no order."""
-        for folder in self._folder.iterdir():
-            if folder.is_dir():
-                for name in os.listdir(folder):  # noqa: PTH208  (a path for each would cost)
-                    if _DIGEST.fullmatch(name):
-                        yield name
 
-    def _lock(self, how: int) -> int:
-        # of this call alone: flock then keeps out other threads as well as other processes
-        descriptor = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            fcntl.flock(descriptor, how)
-        except BaseException:
-            os.close(descriptor)
-            raise
-        return descriptor
+    def entries(self) -> Iterator[BlobEntry]:
+        """All that lies where blobs are kept, in no order."""
 
-    def _path(self, digest: str) -> Path:
-        if not _DIGEST.fullmatch(digest):
-            raise ValueError(f"{digest!r} is no digest")
-        return self._folder / digest[:2] / digest
+    def check(self) -> None:
+        """See that it answers, at the cost of one short request at most.
+
+        Raises
+        ------
+        UnusableStore : it does not.
+        """
+
+    def close(self) -> None:
+        """Give back what it holds open."""

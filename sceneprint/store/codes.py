@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, text
 from sqlalchemy.exc import DBAPIError
 
+from sceneprint.store.postgres import CODES, LOCKS
 from sceneprint.types import Floats32
 
 #: The first pgvector that goes on looking where a filter leaves too few.
@@ -32,8 +33,9 @@ GRAPH_FROM = 10_000
 LINKS, LOOKED_AT = 16, 64
 #: Most that a search of the graph keeps in sight: what pgvector allows.
 _MOST_SIGHT = 1000
-#: Times that a step in the graph costs of comparing one code: measured, see docs/performance.md.
-_STEP_COST = 6.0
+#: Times that a frame looked at in the graph costs of one that is compared in passing: measured,
+#: 3.5 to 4.6 us and 0.35 us.
+_STEP_COST = 12.0
 #: What 16 bits hold, and a little less.
 _LARGEST = 60_000.0
 
@@ -85,6 +87,12 @@ class Fit:
 
 
 # the extension and the tables
+
+
+def take_turn(connection: Connection) -> bool:
+    """Whether this transaction is the one that fits and fills; until its end no other is."""
+    asked = text("SELECT pg_try_advisory_xact_lock(:locks, :codes)")
+    return bool(connection.execute(asked, {"locks": LOCKS, "codes": CODES}).scalar_one())
 
 
 def can_have(connection: Connection) -> bool:
@@ -201,7 +209,6 @@ def add_graph(connection: Connection, fit: Fit) -> bool:
     """Link the codes of a fit that is not asked yet, if they are many; may take minutes."""
     if count_codes(connection, fit) < GRAPH_FROM:
         return False
-    connection.execute(text("SET LOCAL statement_timeout = 0"))
     connection.execute(
         text(
             f"CREATE INDEX IF NOT EXISTS ix_{fit.table}_code ON {fit.table} USING hnsw "
@@ -232,19 +239,18 @@ def drop_fit(connection: Connection, number: int) -> None:
     connection.execute(text("DELETE FROM code_fits WHERE number = :n"), {"n": number})
 
 
-def drop_leftovers(connection: Connection, models: Collection[str]) -> list[int]:
-    """Forget fits that were replaced for long, lost their tables, or are of models no map has."""
+def leftovers(connection: Connection, models: Collection[str]) -> list[int]:
+    """Numbers of fits that were replaced for long, lost their tables, or whose model no map has."""
+    if not _is_there(connection):
+        return []
     found = connection.execute(
         text(
             "SELECT number FROM code_fits WHERE to_regclass('codes_' || number) IS NULL "
-            "OR retired_at < :since OR model_id <> ALL(:models)"
+            "OR retired_at < :since OR model_id <> ALL(CAST(:models AS varchar[]))"
         ),
         {"since": time.time() - KEPT_S, "models": list(models)},
     )
-    numbers = list(found.scalars())
-    for number in numbers:
-        drop_fit(connection, number)
-    return numbers
+    return list(found.scalars())
 
 
 # codes
@@ -254,18 +260,28 @@ def _text(code: Floats32) -> str:
     return "[" + ",".join(f"{x:.5g}" for x in np.clip(code, -_LARGEST, _LARGEST).tolist()) + "]"
 
 
-def put_codes(connection: Connection, fit: Fit, codes: Mapping[int, Floats32]) -> None:
-    """Keep codes of frames by their numbers, of those that are indexed, in place of older ones.
+def put_codes(
+    connection: Connection, fit: Fit, codes: Mapping[int, Floats32], *, anew: bool = False
+) -> None:
+    """Keep codes of frames by their numbers, of those that are indexed.
 
     Each frame is held until the commit, so that none that is being deleted gets one.
+
+    Parameters
+    ----------
+    connection : of a writing transaction, in its turn or not
+    fit : that made them
+    codes : (d,) each
+    anew : in place of those that are there, of signatures that were made again
     """
+    change = "UPDATE SET code = EXCLUDED.code" if anew else "NOTHING"
     if codes:
         connection.execute(
             text(
                 f"INSERT INTO {fit.table} (frame_number, map_number, code) "
                 "SELECT number, map_number, CAST(:code AS halfvec) FROM frames "
                 "WHERE number = :n AND state = 'indexed' FOR SHARE "
-                "ON CONFLICT (frame_number) DO UPDATE SET code = EXCLUDED.code"
+                f"ON CONFLICT (frame_number) DO {change}"
             ),
             [{"n": number, "code": _text(codes[number])} for number in sorted(codes)],
         )
@@ -322,7 +338,29 @@ def uncoded(
         ),
         {"fit": fit.number, "maps": list(map_numbers), "most": limit},
     )
-    return {number: of_map for number, of_map in found}
+    return {row[0]: row[1] for row in found}
+
+
+def without_code(
+    connection: Connection, fit: Fit, map_numbers: Sequence[int], after: int, limit: int
+) -> list[int]:
+    """The next indexed frames of maps that have a signature, and no code; by number."""
+    found = connection.execute(
+        text(
+            "SELECT f.number FROM frames f "
+            "JOIN signatures s ON s.frame_number = f.number AND s.model_id = :model "
+            f"LEFT JOIN {fit.table} c ON c.frame_number = f.number "
+            "WHERE f.number > :after AND f.state = 'indexed' AND c.frame_number IS NULL "
+            "AND f.map_number = ANY(CAST(:maps AS bigint[])) ORDER BY f.number LIMIT :most"
+        ),
+        {"model": fit.model_id, "after": after, "maps": list(map_numbers), "most": limit},
+    )
+    return list(found.scalars())
+
+
+def forget_complete(connection: Connection, fit: Fit) -> None:
+    """Have all frames looked at again: which of them have no code."""
+    connection.execute(text("DELETE FROM code_maps WHERE fit_number = :fit"), {"fit": fit.number})
 
 
 def set_complete(connection: Connection, fit: Fit, map_number: int, revision: int) -> None:
@@ -343,7 +381,7 @@ def complete_up_to(connection: Connection, fit: Fit) -> dict[int, int]:
         text("SELECT map_number, revision FROM code_maps WHERE fit_number = :fit"),
         {"fit": fit.number},
     )
-    return {number: revision for number, revision in found}
+    return {row[0]: row[1] for row in found}
 
 
 # search
@@ -408,13 +446,14 @@ def _by_graph(connection: Connection, fit: Fit, count: int, asked: int) -> bool:
     if found is None:
         return False
     there = max(float(found), asked)
-    return _STEP_COST * LINKS * count * there / asked < asked
+    return _STEP_COST * count * there / asked < asked
 
 
 def _steer(connection: Connection, count: int) -> None:
     """Have the graph asked, and asked on until there are enough: a filter leaves few of the first.
 
-    The order in which they come is no matter, so none is dropped for coming late.
+    In any order, as exact distances decide: pgvector's `strict_order` drops what comes late, of
+    the ten nearest up to two (one map of fifty asked).
     """
     sight = min(max(count, 40), _MOST_SIGHT)
     connection.execute(

@@ -21,7 +21,9 @@ from sceneprint.store.postgres import (
     configure,
     connect_options,
     database_url,
+    history_of,
     open_postgres,
+    require_kept,
 )
 from sceneprint.store.revisions import known_revisions, migration_config, revision_of
 from sceneprint.store.sealed import Sealed, sealed_file
@@ -59,6 +61,20 @@ class Database:
         # them would keep a connection from the readers
         self._turn = threading.Lock()
         self._held = False  # by another process, for longer than anybody should wait
+        self._history: str | None = None
+        if not self.is_sqlite:
+            event.listen(engine, "connect", self._note_history)
+
+    @property
+    def history(self) -> str | None:
+        """Which line of history a server writes, as of the last connection to it: another where a
+        standby was promoted, which may lack what was committed last. Then nothing that is held in
+        memory can be taken to be a part of it.
+        """
+        return self._history
+
+    def _note_history(self, connection: Any, _record: object) -> None:
+        self._history = history_of(connection) or self._history
 
     @property
     def dialect(self) -> str:
@@ -74,6 +90,12 @@ class Database:
     def shown(self) -> str:
         """Which database it is, to be told: without a password."""
         return shown(self._engine.url)
+
+    @property
+    def file(self) -> Path | None:
+        """Its file; None of a server, and of what is in memory."""
+        name = self._engine.url.database if self.is_sqlite else None
+        return Path(name).absolute() if name and name != ":memory:" else None
 
     @property
     def read_only(self) -> bool:
@@ -142,6 +164,8 @@ class Database:
                 with writing.begin():
                     self._held = False
                     yield writing
+                if not self.is_sqlite:
+                    require_kept(writing)
         except StoreLocked:
             self._held = True
             raise
@@ -289,8 +313,8 @@ def _require_whole(connection: Connection, engine: Engine) -> None:
     """What `unchecked` did not look at, looked at in the end."""
     if connection.exec_driver_sql("PRAGMA foreign_key_check").first() is not None:
         raise UnusableStore(
-            f"{shown(engine.url)}: rows refer to others that are not there, so it is not brought to "
-            "the schema of this version, and nothing was changed. Run `sceneprint fsck` of the "
+            f"{shown(engine.url)}: rows refer to others that are not there, so it is not brought "
+            "to the schema of this version, and nothing was changed. Run `sceneprint fsck` of the "
             "version that wrote it."
         )
 

@@ -43,10 +43,12 @@ def write_frame(
     return frame_of(connection, frame.number)
 
 
-def write_title(connection: Connection, row: MapRow, title: str | None) -> MapRow:
-    """Change the title of a map."""
-    if title == row.title:
+def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) -> MapRow:
+    """Change columns of a map: title, quotas, retention."""
+    changed = {name: new for name, new in values.items() if getattr(row, name) != new}
+    if not changed:
         return row
-    connection.execute(update(maps).where(maps.c.number == row.number).values(title=title))
-    tell(connection, "map.edited", row.name, fields=["title"])
+    connection.execute(update(maps).where(maps.c.number == row.number).values(**changed))
+    # not what they are: who may read the map sees it there
+    tell(connection, "map.edited", row.name, fields=sorted(changed))
     return find_map(connection, row.name)

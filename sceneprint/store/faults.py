@@ -6,6 +6,7 @@ OSError | error of SQLite or PostgreSQL  -->  StoreFull, ReadOnlyStore, StoreLoc
 from __future__ import annotations
 
 import errno
+import re
 import shutil
 import sqlite3
 import sys
@@ -14,9 +15,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sqlalchemy import URL, Engine
-from sqlalchemy.exc import DBAPIError, OperationalError, TimeoutError
+from sqlalchemy.exc import DBAPIError, OperationalError
+from sqlalchemy.exc import TimeoutError as AllInUse
 
-from sceneprint.errors import ReadOnlyStore, StoreFull, StoreLocked, UnusableStore
+from sceneprint.errors import ReadOnlyStore, StoreAway, StoreFull, StoreLocked, UnusableStore
 
 #: Free space below which a write that failed is taken to have failed for want of it, bytes.
 NO_ROOM = 1 << 20
@@ -62,7 +64,7 @@ def explained(engine: Engine) -> Iterator[None]:
         if found is None:
             raise
         raise found from error
-    except TimeoutError as error:
+    except AllInUse as error:
         raise StoreLocked(
             f"{shown(engine.url)}: all connections that a process may have are in use. Come back "
             "later."
@@ -83,7 +85,8 @@ def _is_of_driver(error: Exception) -> bool:
 
 
 def _of_server(url: URL, error: DBAPIError) -> UnusableStore | None:
-    broken = isinstance(error, OperationalError) or error.connection_invalidated
+    connecting = error.statement is None  # what psycopg says of a URL is a mistake of the URL
+    broken = isinstance(error, OperationalError) or error.connection_invalidated or connecting
     return told(url, error.orig, broken)
 
 
@@ -125,7 +128,7 @@ def _said(error: DBAPIError) -> str:
     return " ".join(str(error.orig).split())
 
 
-#: What faults of PostgreSQL mean, by their SQLSTATE or by what it begins with, longest first.
+#: What faults of PostgreSQL mean, by their SQLSTATE or by what it begins with, or by their class.
 _MEANT: dict[str, tuple[type[UnusableStore], str]] = {
     "55P03": (
         StoreLocked,
@@ -136,7 +139,7 @@ _MEANT: dict[str, tuple[type[UnusableStore], str]] = {
     "40": (StoreLocked, "Another transaction was in the way, and nothing was stored. Come back."),
     "53100": (StoreFull, "Nothing was stored. Free some space on the disk of the server."),
     "53300": (
-        UnusableStore,
+        StoreAway,
         "The server has as many connections as it may. Raise its max_connections, or run fewer "
         "processes; it is tried again.",
     ),
@@ -148,15 +151,26 @@ _MEANT: dict[str, tuple[type[UnusableStore], str]] = {
     ),
     "25P03": (UnusableStore, "This transaction was silent for long, and nothing was stored."),
     "57014": (UnusableStore, "The server took too long, and nothing was stored. Come back later."),
-    "57": (UnusableStore, "The server was stopped, or is starting. It is tried again."),
-    "08": (UnusableStore, "The connection was lost. See that the server runs; it is tried again."),
+    "57": (StoreAway, "The server was stopped, or is starting. It is tried again."),
+    "08": (StoreAway, "The connection was lost. See that the server runs; it is tried again."),
     "28": (UnusableStore, "Check user and password in SCENEPRINT_DATABASE_URL, and pg_hba.conf."),
     "3D000": (UnusableStore, "Make the database, or name another in SCENEPRINT_DATABASE_URL."),
+    "URL": (UnusableStore, "Correct SCENEPRINT_DATABASE_URL."),
     "42501": (UnusableStore, "The user must own the database's tables: grant what is missing."),
     "58": (UnusableStore, "The server has trouble with its files. Look into its log."),
     "XX001": (UnusableStore, "The server's files are damaged. Restore a snapshot or a backup."),
     "XX002": (UnusableStore, "An index of the server is damaged. REINDEX the database."),
 }
+#: What is no good until somebody changes it, of what is said when a connection is opened.
+_REFUSALS = {
+    r"database .+ does not exist": "3D000",
+    r"authentication failed|no pg_hba\.conf entry|role .+ does not exist|no password": "28000",
+    r"bad value for|invalid (connection option|.+ value|integer value|port number)": "URL",
+}
+_AWAY = (
+    "See that the server runs and can be reached from here, and that SCENEPRINT_DATABASE_URL is "
+    "right; it is tried again."
+)
 
 
 def told(url: URL, error: object, broken: bool) -> UnusableStore | None:
@@ -168,14 +182,15 @@ def told(url: URL, error: object, broken: bool) -> UnusableStore | None:
     error : of psycopg
     broken : whether it is of a kind that no other statement would have been spared
     """
-    state = getattr(error, "sqlstate", None) or ""
-    kind, what = _MEANT.get(state) or _MEANT.get(state[:2]) or (UnusableStore, "")
-    if not what:
-        if not broken:
-            return None
-        what = (
-            "See that the server runs and can be reached from here, and that "
-            "SCENEPRINT_DATABASE_URL is right; it is tried again."
-        )
     said = " ".join(str(error).split()).rstrip(".")
+    state = getattr(error, "sqlstate", None) or (_state_of(said) if broken else "")
+    kind, what = _MEANT.get(state) or _MEANT.get(state[:2]) or (StoreAway, _AWAY)
+    if what == _AWAY and not broken:
+        return None
     return kind(f"{shown(url)}: {said:.400}. {what}")
+
+
+def _state_of(said: str) -> str:
+    """The SQLSTATE of what a server said that let nobody in: libpq does not tell it."""
+    known = (state for pattern, state in _REFUSALS.items() if re.search(pattern, said))
+    return next(known, "")

@@ -7,12 +7,12 @@ import uuid
 from collections.abc import Iterable
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, delete, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, func, insert, select, update
 
 from sceneprint.errors import UnknownFrame
 from sceneprint.schemas import FrameState
-from sceneprint.store.events import tell
-from sceneprint.store.maps import next_revision
+from sceneprint.store.deleting import delete_frames
+from sceneprint.store.quotas import ROOMLESS, count_on
 from sceneprint.store.records import FrameRow, MapRow, frame_row
 from sceneprint.store.tables import frame_tags, frames, job_files, signatures
 
@@ -44,6 +44,7 @@ def add_frame(
             **values, **place,
         )
     )  # fmt: skip
+    count_on(connection, map_number, 1, values["bytes"])
     row = _one(connection, (frames.c.map_number == map_number) & (frames.c.id == frame_id))
     named = [{"frame_number": row.number, "tag": tag} for tag in sorted(set(row.tags))]
     if named:
@@ -53,6 +54,7 @@ def add_frame(
 
 def renew_frame(connection: Connection, number: int, values: dict[str, Any]) -> FrameRow:
     """Take a frame that failed as received once more, with its upload as it came now."""
+    _weigh(connection, number, values["bytes"])
     connection.execute(
         update(frames)
         .where(frames.c.number == number)
@@ -72,6 +74,7 @@ def renew_upload(
     blob, size : of the upload
     reason : that is left of the frame's
     """
+    _weigh(connection, number, size)
     connection.execute(
         update(frames).where(frames.c.number == number).values(blob=blob, bytes=size, reason=reason)
     )
@@ -156,6 +159,8 @@ def set_state(
     connection: Connection, number: int, state: FrameState, reason: str | None = None
 ) -> None:
     """Move a frame to a state in which it is not searched; a deleted frame stays deleted."""
+    if state == FrameState.REDUNDANT:
+        _weigh(connection, number, None)
     connection.execute(
         update(frames)
         .where(frames.c.number == number, frames.c.state != FrameState.DELETED)
@@ -164,7 +169,7 @@ def set_state(
 
 
 def delete_frame(connection: Connection, row: MapRow, frame: FrameRow) -> list[str]:
-    """Take a frame out of all searches and forget what was made of it.
+    """Take a frame out of all searches and forget what was made of it, and known of it.
 
     The row stays, so that every reader learns of it.
 
@@ -178,19 +183,7 @@ def delete_frame(connection: Connection, row: MapRow, frame: FrameRow) -> list[s
     """
     if frame.state == FrameState.DELETED:
         raise UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted before.")
-    own = signatures.c.frame_number == frame.number
-    blobs = [frame.blob, *connection.execute(select(signatures.c.geometry).where(own)).scalars()]
-    connection.execute(delete(signatures).where(own))
-    connection.execute(
-        update(frames)
-        .where(frames.c.number == frame.number)
-        .values(
-            state=FrameState.DELETED, content_id=None,
-            revision=next_revision(connection, row.number),
-        )
-    )  # fmt: skip
-    tell(connection, "frame.deleted", row.name, frame.id)
-    return blobs
+    return delete_frames(connection, row, [frame.number])
 
 
 def refers_to(connection: Connection, blob: str) -> bool:
@@ -221,6 +214,19 @@ def _free(connection: Connection, map_number: int, frame_id: str) -> None:
         )
         .values(id=uuid.uuid4().hex)
     )
+
+
+def _weigh(connection: Connection, number: int, size: int | None) -> None:
+    """Count what a frame takes from now on: bytes of its upload; None: it takes no room any more.
+
+    One that is deleted stays so.
+    """
+    asked = select(frames.c.map_number, frames.c.state, frames.c.bytes)
+    map_number, state, before = connection.execute(asked.where(frames.c.number == number)).one()
+    counted, counts = state not in ROOMLESS, size is not None
+    if state != FrameState.DELETED:
+        more = int(counts) - int(counted)
+        count_on(connection, map_number, more, (size or 0) - (before if counted else 0))
 
 
 def _one(connection: Connection, condition: ColumnElement[bool]) -> FrameRow:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Callable
 from io import FileIO
 from typing import BinaryIO
@@ -18,7 +17,7 @@ class IncomingBlob:
     ----------
     file : that it is written to
     what : to say where that fails
-    keep : gives the file its name
+    keep : makes it durable under its digest
     """
 
     def __init__(self, file: BinaryIO | FileIO, what: str, keep: Callable[[str], None]) -> None:
@@ -42,7 +41,6 @@ class IncomingBlob:
         """End it; when this returns it survives the loss of power. Returns its digest."""
         digest = self._hashed.hexdigest()
         try:
-            os.fsync(self._file.fileno())
             self._keep(digest)
         except OSError as error:
             raise unusable(self._what, error) from error

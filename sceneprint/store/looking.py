@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from sqlalchemy import URL, Engine, create_engine, event, make_url
+from sqlalchemy import URL, Engine, create_engine, event
 from sqlalchemy.exc import ArgumentError
 
 from sceneprint.errors import NewerSchema, UnusableStore
 from sceneprint.store.database import Database
+from sceneprint.store.faults import shown
+from sceneprint.store.postgres import database_url, open_postgres
 from sceneprint.store.revisions import known_revisions, revision_of
 
 
@@ -35,16 +37,18 @@ def look_at(url: str) -> Iterator[Database]:
     NewerSchema : a later version of sceneprint wrote it.
     """
     try:
-        parsed = make_url(url)
+        parsed = database_url(url)
     except (ArgumentError, ValueError) as error:  # what is in it may be half of a password
         raise UnusableStore(
             "The database's URL is none of SQLAlchemy's. Check SCENEPRINT_DATABASE_URL."
         ) from error
     path = _file_of(parsed) if parsed.get_backend_name() == "sqlite" else None
-    if path is None:
+    if path is not None:
+        engine, alone = _opened(parsed, path)
+    elif parsed.get_backend_name() == "sqlite":
         engine, alone = create_engine(parsed), False
     else:
-        engine, alone = _opened(parsed, path)
+        engine, alone = open_postgres(parsed), False  # of which `read` alone is asked
     before = None if path is None else _state(path)
     database = Database(engine)
     try:
@@ -94,13 +98,13 @@ def _check_schema(database: Database, engine: Engine) -> None:
         found = revision_of(connection)
     if found is not None and found not in known:
         raise NewerSchema(
-            f"{engine.url!r} has schema {found}, which this version of sceneprint does not know: "
-            "a later one wrote it. Use that version, or another data folder."
+            f"{shown(engine.url)} has schema {found}, which this version of sceneprint does not "
+            "know: a later one wrote it. Use that version, or another data folder."
         )
     if found != head:
         raise UnusableStore(
-            f"{engine.url!r} has schema {found}, and this version works with {head}. Any other "
-            "use of it, such as `sceneprint serve`, brings it there."
+            f"{shown(engine.url)} has schema {found}, and this version works with {head}. Any "
+            "other use of it, such as `sceneprint serve`, brings it there."
         )
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 
 from sqlalchemy import Connection, delete, func, insert, select, update
 
 from sceneprint.errors import UnknownMap
+from sceneprint.store.deleting import doom_found
 from sceneprint.store.events import tell
+from sceneprint.store.former import inherited, remember
 from sceneprint.store.records import MapRow, map_row
 from sceneprint.store.tables import (
     frame_tags,
@@ -54,13 +57,26 @@ def list_maps(connection: Connection) -> list[MapRow]:
     ]
 
 
-def add_map(connection: Connection, name: str, title: str | None, model_id: str) -> MapRow:
-    """Make a map; its name must be free."""
+def add_map(
+    connection: Connection, name: str, title: str | None, model_id: str,
+    limits: Mapping[str, float | None] | None = None,
+) -> MapRow:  # fmt: skip
+    """Make a map; its name must be free.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    name, title, model_id : of the map
+    limits : `quota_frames`, `quota_bytes`, `retention_days`, where they are given; quotas that are
+        not are those of the map that had this name before: whoever may delete a map and make it
+        anew does not get rid of its quota
+    """
     connection.execute(
         insert(maps).values(
-            name=name, title=title, model_id=model_id, revision=0, created_at=time.time()
+            name=name, title=title, model_id=model_id, revision=0, created_at=time.time(),
+            **(inherited(connection, name) | dict(limits or {})),
         )
-    )
+    )  # fmt: skip
     tell(connection, "map.created", name)
     return find_map(connection, name)
 
@@ -101,6 +117,7 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
         select(job_files.c.blob).where(job_files.c.job_number.in_(of_map)),
     )
     referred = sorted({blob for one in asked for blob in connection.execute(one).scalars()})
+    doom_found(connection, *asked)
     connection.execute(delete(signatures).where(signatures.c.frame_number.in_(own)))
     for made in (job_items, job_files):
         connection.execute(delete(made).where(made.c.job_number.in_(of_map)))
@@ -109,6 +126,7 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     connection.execute(delete(frames).where(frames.c.map_number == row.number))
     connection.execute(delete(maps).where(maps.c.number == row.number))
     tell(connection, "map.deleted", row.name)
+    remember(connection, row)
     return referred
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 from urllib.parse import unquote, urlsplit
 
-from sceneprint.errors import StoreFull, UnusableStore
+from sceneprint.errors import StoreAway, StoreFull, UnusableStore
 from sceneprint.store.ranges import RangeFile
 from sceneprint.writing import make_folder, sync_folder
 
@@ -43,6 +43,7 @@ VARIABLES = {
     "s3": "AWS_", "s3a": "AWS_", "gs": "GOOGLE_", "az": "AZURE_", "azure": "AZURE_",
     "abfs": "AZURE_", "abfss": "AZURE_", "file": "", "memory": "",
 }  # fmt: skip
+_ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
 _REFUSED = ("PermissionDeniedError", "UnauthenticatedError")
 _NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|bucket does not exist")
 _FULL = re.compile(r"\b507\b|StorageFull|QuotaExceeded|InsufficientStorage", re.IGNORECASE)
@@ -259,7 +260,7 @@ class Objects:
 
         until, said = self._away
         if time.monotonic() < until:
-            raise self._fault(what, said)
+            raise self._fault(what, said, StoreAway)
         try:
             yield
         except FileNotFoundError as error:
@@ -286,10 +287,13 @@ class Objects:
             )
         if not re.match(r"4\d\d ", said) and self._folder is None:
             self._away = (time.monotonic() + AWAY_S, said)
+            return self._fault(what, said, StoreAway)
         return self._fault(what, said)
 
-    def _fault(self, what: str, said: str) -> UnusableStore:
-        return UnusableStore(
+    def _fault(
+        self, what: str, said: str, kind: type[UnusableStore] = UnusableStore
+    ) -> UnusableStore:
+        return kind(
             f"{self.url}: {what} ({said}). See that the store is there and can be reached from "
             f"here, and that its settings in the environment ({self._variables or 'none'}) are "
             "right."
@@ -358,6 +362,12 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
             "pip install obstore"
         ) from error
     kind, url = url.partition(":")[0].lower(), url.rstrip("/")
+    plain = [name for name in _ENDPOINTS if os.environ.get(name, "").startswith("http://")]
+    if kind.startswith("s3") and plain and not _allows_http():
+        raise UnusableStore(
+            f"{plain[0]} names a server without TLS. Set AWS_ALLOW_HTTP=true where nobody can "
+            "listen in between, or give it as https://."
+        )
     if kind == "memory":
         memory = MemoryStore()
         return Objects(memory, memory, "memory:///")
@@ -386,17 +396,17 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
 
 
 def _client(seconds: int) -> ClientConfig:
-    # what is given here takes the place of what the library finds in the environment
-    plain = any(
-        os.environ.get(f"{begin}ALLOW_HTTP", "").lower() in ("1", "true", "yes")
-        for begin in ("AWS_", "GOOGLE_", "AZURE_")
-    )
     return {
-        "allow_http": plain,
+        "allow_http": _allows_http(),  # takes the place of what the library finds itself
         "connect_timeout": timedelta(seconds=CONNECT_S),
         "timeout": timedelta(seconds=seconds),
         "user_agent": "sceneprint",
     }
+
+
+def _allows_http() -> bool:
+    names = [f"{begin}ALLOW_HTTP" for begin in ("AWS_", "GOOGLE_", "AZURE_")]
+    return any(os.environ.get(name, "").lower() in ("1", "true", "yes") for name in names)
 
 
 def _retries() -> RetryConfig:

@@ -13,12 +13,15 @@ from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, 
 from sqlalchemy.engine import ExceptionContext
 
 from sceneprint.errors import UnusableStore
+from sceneprint.store.faults import shown
 from sceneprint.store.sqlite import BUSY_S
 
 #: Advisory locks are two numbers: this one, which is ours alone, and what is locked.
 LOCKS = 0x5CE7E
 #: Whose turn it is to write; uploads that are stored or removed (see `objects`).
 TURN, BLOBS = 1, 2
+#: Who fits codes and fills their tables (see `codes`).
+CODES = 7
 #: Seconds for one statement, and for a transaction in which nothing is asked: a client that fell
 #: silent must not keep the turn from all others.
 STATEMENT_S, IDLE_S = 60.0, 30.0
@@ -42,6 +45,7 @@ _CONNECT = {
 #: Drivers by what a URL begins with; the short ones are what providers hand out.
 _DRIVERS = ("postgresql", "postgres", "postgresql+psycopg")
 _OLDEST = 14
+_WARNED = "sceneprint_warned"
 
 
 def database_url(given: str) -> URL:
@@ -83,6 +87,8 @@ def open_postgres(url: URL) -> Engine:
     )
     event.listen(engine, "connect", configure)
     event.listen(engine, "begin", _begin)
+    event.listen(engine, "connect", _watch_commits)
+    event.listen(engine, "commit", _forget_warnings)
     event.listen(engine, "handle_error", _leave_standby)
     return engine
 
@@ -121,6 +127,17 @@ def configure(connection: Any, _record: object = None) -> None:
     connection.autocommit = before
 
 
+def history_of(connection: Any) -> str | None:
+    """Which line of history the server of a connection of psycopg writes; None: it is a standby."""
+    before, connection.autocommit = connection.autocommit, True
+    row = connection.execute(
+        "SELECT CASE WHEN pg_is_in_recovery() THEN NULL"
+        " ELSE left(pg_walfile_name(pg_current_wal_lsn()), 8) END"
+    ).fetchone()
+    connection.autocommit = before
+    return None if row is None else row[0]
+
+
 def allow(connection: Connection, seconds: float) -> None:
     """Let statements of this transaction, and pauses between them, take so long; 0: any time."""
     if connection.dialect.name == "postgresql":
@@ -136,7 +153,9 @@ def _begin(connection: Connection) -> None:
     wait_s: float | None = connection.get_execution_options().get("sceneprint_write")
     if wait_s is None:
         return
-    turn = f"SELECT pg_advisory_xact_lock({LOCKS}, {TURN})"
+    # a COMMIT that waits for its standby would be cut off by the limit of statements, and be
+    # acknowledged although the standby may lack it; what waits so goes on when there is one again
+    turn = f"SET LOCAL statement_timeout = 0; SELECT pg_advisory_xact_lock({LOCKS}, {TURN})"
     if wait_s == BUSY_S:
         connection.exec_driver_sql(turn)
         return
@@ -146,6 +165,38 @@ def _begin(connection: Connection) -> None:
     connection.exec_driver_sql(f"SET LOCAL lock_timeout = {after}")
     if wait_s > BUSY_S:
         allow(connection, 0)
+
+
+def require_kept(connection: Connection) -> None:
+    """See that what was committed is where a commit has to be.
+
+    Raises
+    ------
+    UnusableStore : somebody ended the wait for a standby; the server says so in passing.
+    """
+    if _WARNED in connection.info:
+        raise UnusableStore(
+            f"{shown(connection.engine.url)}: the wait for a standby was ended by "
+            "hand. What was written is there, and lost if the server falls before a standby "
+            "follows. Bring the standby back, or take it out of synchronous_standby_names."
+        )
+
+
+def _watch_commits(connection: Any, record: Any) -> None:
+    """Note warnings: a COMMIT has one only where it does not wait for its standby any more."""
+    if not hasattr(connection, "add_notice_handler"):
+        return
+
+    def warned(said: Any) -> None:
+        if said.severity_nonlocalized == "WARNING":
+            record.info[_WARNED] = True
+
+    connection.add_notice_handler(warned)
+
+
+def _forget_warnings(connection: Connection) -> None:
+    """Before a COMMIT, those of the statements before it."""
+    connection.info.pop(_WARNED, None)
 
 
 def _leave_standby(context: ExceptionContext) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from sqlalchemy import ColumnElement, Connection, delete, func, or_, select
 
 from sceneprint.store.events import Wanted, newest_number
+from sceneprint.store.former import last_event
 from sceneprint.store.tables import events, maps
 
 
@@ -56,7 +57,21 @@ def floor_of(connection: Connection, wanted: Wanted, kept: int, after: int) -> i
     if wanted.maps is None:
         return max(found.values(), default=0)
     names = set(_names(connection))
-    return max((found.get(one if one in names else None, 0) for one in wanted.maps), default=0)
+    own = [found.get(one, 0) for one in wanted.maps & names]
+    return max([*own, *_floors_of_gone(connection, wanted.maps - names, found.get(None, 0))])
+
+
+def _floors_of_gone(connection: Connection, names: Collection[str], floor: int) -> Iterator[int]:
+    """As `floor_of`, of each of some maps that are gone: 0 first, so that there is one.
+
+    Their events go together, and yet nothing is missed after the last of one's own.
+    """
+    yield 0
+    for name in names:
+        last = last_event(connection, name)
+        left = select(events.c.number).where(events.c.map == name).limit(1)
+        # the last of all that go together may be gone too: then no floor tells of them
+        yield last if connection.execute(left).first() is None else min(floor, last)
 
 
 def spent_numbers(

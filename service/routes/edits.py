@@ -9,9 +9,11 @@ from anyio import to_thread
 from fastapi import APIRouter, Depends, Request, Response
 
 from sceneprint.engine.edits import edit_frame, edit_map
+from sceneprint.engine.maps import LIMITS
 from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint.schemas import Frame, Map
-from service.access import may_admin, may_write
+from sceneprint.schemas.edits import OPERATORS
+from service.access import Asking, may_admin, may_write
 from service.bodies import media_type, read_json
 from service.conditions import expected
 from service.context import Here
@@ -62,10 +64,18 @@ async def patch_frame(
     openapi_extra=_document("MapEdit"),
     dependencies=[Depends(may_admin)],
 )
-async def patch_map(map_name: str, request: Request, here: Here, response: Response) -> Map:
-    """Change the title of a map (JSON merge patch, RFC 7396)."""
+async def patch_map(
+    map_name: str, request: Request, here: Here, asking: Asking, response: Response
+) -> Map:
+    """Change title, quotas and retention of a map (JSON merge patch, RFC 7396).
+
+    Quotas are the operator's: `quota_frames` and `quota_bytes` ask for `admin` for `*`.
+    """
     patch, tags = await _patch(request), expected(request)
+    if OPERATORS & patch.keys():
+        asking.require_every("admin")
     edited = await to_thread.run_sync(edit_map, here.engine.store, map_name, patch, tags)
+    request.state.audited = {name: getattr(edited, name) for name in LIMITS & patch.keys()}
     response.headers["ETag"] = f'"{edited.etag}"'
     return edited
 

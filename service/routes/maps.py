@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint.schemas import Map, NewMap, Page
+from sceneprint.schemas.edits import OPERATORS
 from service.access import Asking, may_admin, may_read
 from service.bodies import media_type, read_json
 from service.context import Here
@@ -40,6 +41,8 @@ async def create_map(request: Request, here: Here, asking: Asking, response: Res
         )
     new = _new(await read_json(request))
     asking.require_new(new.name)
+    if OPERATORS & new.model_fields_set:
+        asking.require_every("admin")
     made, is_new = await to_thread.run_sync(here.engine.create_map, new)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/maps/{made.name}"

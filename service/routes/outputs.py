@@ -145,10 +145,9 @@ def _upload(request: Request, here: Context, found: Output[bytes], frame_id: str
     blobs, blob = here.engine.store.blobs, found.blob or ""
     if blobs.condition(blob) == "sound":
         with suppress(FileNotFoundError):
-            path = blobs.path(blob)
-            with path.open("rb") as file:
+            with blobs.open(blob) as file:
                 kind, suffix = upload_type(file.read(HEAD))
             name = safe(f"{frame_id}.{suffix}")
-            return send_file(request, path, kind, found.tag, name)
+            return send_file(request, lambda: blobs.open(blob), kind, found.tag, name)
     found.make()  # says what is wrong with it
     raise DamagedBlob(f"The upload of frame {frame_id} was put back just now. Ask again.")

@@ -129,8 +129,9 @@ def _file(request: Request, here: Context, job_id: str, name: str) -> Response:
     if is_known(request, file.blob) or blobs.condition(file.blob) == "sound":
         with suppress(FileNotFoundError):
             return send_file(
-                request, blobs.path(file.blob), file.media_type, file.blob, f"{job_id[:12]}-{name}"
-            )
+                request, lambda: blobs.open(file.blob), file.media_type, file.blob,
+                f"{job_id[:12]}-{name}",
+            )  # fmt: skip
     here.engine.reconstructions.file(job_id, name)  # UnknownJob where it was deleted meanwhile
     raise DamagedBlob(f"{name} of reconstruction {job_id} is damaged. Reconstruct it again.")
 

@@ -47,11 +47,9 @@ def get_snapshot(snapshot_id: str, request: Request, here: Here) -> Response:
     shelf = Shelf(here.engine.settings)
     found = shelf.find(snapshot_id)
     name = f"sceneprint-{snapshot_id}.tar"
-    try:
-        return send_file(request, shelf.path(snapshot_id), "application/x-tar", found.sha256, name)
-    except FileNotFoundError:
-        shelf.find(snapshot_id)
-        raise
+    return send_file(
+        request, lambda: shelf.open(snapshot_id), "application/x-tar", found.sha256, name
+    )
 
 
 @router.delete("/{snapshot_id}", status_code=204, responses=declared(404))

@@ -127,6 +127,19 @@ def empty(make_engine: Callable[..., Engine]) -> Engine:
 
 
 @pytest.fixture(scope="session")
+def put_back() -> Callable[[Path, Path], None]:
+    """Put a data folder back from a copy, which an engine has opened, all but its indexes."""
+
+    def put(copy: Path, data: Path) -> None:
+        shutil.rmtree(copy / "index", ignore_errors=True)
+        (data / "index").rename(copy / "index")
+        shutil.rmtree(data)
+        copy.rename(data)
+
+    return put
+
+
+@pytest.fixture(scope="session")
 def ids() -> Callable[[Engine], list[str]]:
     """Ids of the frames of `hall`, as they came."""
     return lambda engine: [frame.frame_id for frame in engine.list_frames("hall").items]

@@ -16,7 +16,7 @@ from sceneprint.datasets.archives import Archive
 from sceneprint.engine import Engine, imports, members
 from sceneprint.engine import uploads as uploading
 from sceneprint.engine.slices import Task
-from sceneprint.engine.uploads import sweep
+from sceneprint.engine.sweeping import sweep
 from sceneprint.errors import LostLease, UnknownMap, UnusableStore
 from sceneprint.schemas import Job, JobState, NewMap
 from sceneprint.schemas.ingest import ImportOptions

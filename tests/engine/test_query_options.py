@@ -292,8 +292,8 @@ def test_what_the_shortlist_missed_is_said(
     engine = make_engine(tail_frames=1)
     assert engine.publish_due() == 1
     for name in ("search", "is_compared"):
-        few = partial(getattr(searching, name), shortlist=3)
-        monkeypatch.setattr(searching, name, few)
+        few = partial(getattr(views, name), shortlist=3)
+        monkeypatch.setattr(views, name, few)
     monkeypatch.setattr(searching, "ranking_size", lambda n: min(n, 3))
     monkeypatch.setattr(searching, "WHOLE", 0)
     names, held = ids(engine), set()

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import shutil
-import sqlite3
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -173,19 +171,19 @@ def test_a_map_made_anew_has_none_of_the_old_frames(
 
 
 def test_an_index_of_a_later_state_than_the_database_is_not_used(
-    data: Path, make_engine: Make, uploads: Any, more: Any
+    data: Path, make_engine: Make, uploads: Any, more: Any, put_back: Any
 ) -> None:
     """The database was put back from a copy, the index was not."""
     engine = make_engine(data, tail_frames=5)
     before = found(ask(engine, uploads))
-    with closing(sqlite3.connect(data / "sceneprint.db")) as now:
-        copy = sqlite3.connect(data / "copy.db")
-        now.backup(copy)
-        copy.close()
+    engine.close()
+    kept = Path(shutil.copytree(data, data.with_name("kept")))
+    make_engine(kept).close()
+    engine = make_engine(data, tail_frames=5)
     more(engine, 2)
     assert engine.publish_due() == 1
     engine.close()
-    (data / "copy.db").replace(data / "sceneprint.db")
+    put_back(kept, data)
     engine = make_engine(data, tail_frames=5)
     answer = ask(engine, uploads)
     assert found(answer) == before

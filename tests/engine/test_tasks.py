@@ -11,7 +11,7 @@ from sqlalchemy import select, update
 
 from sceneprint.engine import Engine
 from sceneprint.engine.slices import Outcome, Task
-from sceneprint.engine.uploads import sweep
+from sceneprint.engine.sweeping import sweep
 from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
 from sceneprint.schemas import Job, JobState, NewMap
 from sceneprint.store.associations import remove_job

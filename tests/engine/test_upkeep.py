@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import sqlite3
 from collections.abc import Callable
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,12 +21,6 @@ Make = Callable[..., Engine]
 ALL = Query(stages=("retrieve",), k=50)
 
 
-def copy(source: Path, target: Path) -> None:
-    """The database as a backup takes it."""
-    with closing(sqlite3.connect(source)) as one, closing(sqlite3.connect(target)) as other:
-        one.backup(other)
-
-
 def fill(engine: Engine, uploads: Any, work_off: Any, which: range) -> list[str]:
     added = [engine.add_frame("hall", uploads[i].data, uploads[i].meta)[0] for i in which]
     assert work_off(engine) == [JobState.SUCCEEDED] * len(which)
@@ -36,20 +28,21 @@ def fill(engine: Engine, uploads: Any, work_off: Any, which: range) -> list[str]
 
 
 def test_an_index_of_a_history_that_was_undone_is_not_believed(
-    make_engine: Make, uploads: Any, work_off: Any, tmp_path: Path
+    make_engine: Make, uploads: Any, work_off: Any, tmp_path: Path, put_back: Any
 ) -> None:
     """Put back to two frames, the database gives the numbers of the next three out again."""
-    data, kept = tmp_path / "data", tmp_path / "copy.db"
+    data, kept = tmp_path / "data", tmp_path / "kept"
     engine = make_engine(data, tail_frames=2)
     engine.create_map(NewMap(name="hall", model="compact"))
     fill(engine, uploads, work_off, range(2))
-    copy(data / "sceneprint.db", kept)
+    engine.close()
+    shutil.copytree(data, kept)
+    make_engine(kept).close()
+    engine = make_engine(data, tail_frames=2)
     fill(engine, uploads, work_off, range(2, 5))
     assert engine.publish_due() == 1
     engine.close()
-    for name in ("sceneprint.db", "sceneprint.db-wal", "sceneprint.db-shm"):
-        (data / name).unlink(missing_ok=True)
-    copy(kept, data / "sceneprint.db")
+    put_back(kept, data)
     engine = make_engine(data, tail_frames=2)
     names = fill(engine, uploads, work_off, range(5, 8))
     for name, i in zip(names, range(5, 8), strict=True):
@@ -144,7 +137,7 @@ def test_a_shortlist_is_taken_in_large_maps_alone_and_where_exactness_is_not_ask
     shutil.copytree(signed_folder, tmp_path / "data")
     engine = make_engine(tmp_path / "data", tail_frames=1)
     assert engine.publish_due() == 1
-    monkeypatch.setattr(searching, "search", partial(search, shortlist=3))
+    monkeypatch.setattr(views, "search", partial(search, shortlist=3))
     monkeypatch.setattr(searching, "ranking_size", lambda n: min(n, 3))
     monkeypatch.setattr(searching, "WHOLE", whole)
     query = Query(stages=("retrieve",), k=3, exact=exact)

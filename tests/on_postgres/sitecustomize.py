@@ -93,7 +93,26 @@ def _mend_psycopg(module: ModuleType) -> None:
     module.connect = module.Connection.connect
 
 
-_MENDED = {"sceneprint.settings": _mend_settings, "psycopg": _mend_psycopg}
+def _mend_store(module: ModuleType) -> None:
+    from sqlalchemy import make_url
+
+    there = module.is_there
+
+    def is_there(url: str) -> bool:
+        """Like that of a file: what new ones are copied from has a schema already."""
+        name = "" if url.startswith("sqlite") else make_url(url).database or ""
+        if name.startswith(PREFIX):
+            return (Path(name.removeprefix(PREFIX)) / MARK).is_file()
+        return bool(there(url))
+
+    module.is_there = is_there
+
+
+_MENDED = {
+    "psycopg": _mend_psycopg,
+    "sceneprint.settings": _mend_settings,
+    "sceneprint.store.database": _mend_store,
+}
 
 
 class _Mending(MetaPathFinder, Loader):

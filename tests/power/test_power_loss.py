@@ -23,7 +23,7 @@ from sceneprint.index import publishing as index_publishing
 from sceneprint.index.manifests import Recall
 from sceneprint.schemas import CameraIntrinsics, FrameMeta, JobState, NewMap
 from sceneprint.settings import Settings
-from sceneprint.store import Blobs
+from sceneprint.store import FolderBlobs
 from sceneprint.types import Bytes
 
 LENGTH = 64
@@ -91,7 +91,7 @@ def lost_blobs(
         contents = {hashlib.sha256(one).hexdigest(): one for one in (first, second, beside, large)}
         with recorded(root, deaf) as disk:
             promised: list[tuple[int, set[str]]] = [(0, set())]
-            blobs = Blobs(root / "data" / "blobs")
+            blobs = FolderBlobs(root / "data" / "blobs")
             for data in (large, first, second, beside, first):
                 if data is large:
                     with blobs.incoming() as part:
@@ -114,7 +114,7 @@ def lost_blobs(
             due = next(names for begun, names in reversed(promised) if begun <= step)
             if due - held.keys():
                 broken.add("a blob that is gone")
-            kept = Blobs(after_crash(tree) / "data" / "blobs")
+            kept = FolderBlobs(after_crash(tree) / "data" / "blobs")
             for digest in held:
                 if held[digest] == contents[digest]:
                     assert kept.get(digest) == contents[digest], what

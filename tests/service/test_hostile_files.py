@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import shutil
 import signal
-import sqlite3
 import subprocess
 import sys
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -110,12 +108,11 @@ def test_an_index_that_is_damaged_changes_no_answer(folder, tmp_path, begin):
         assert (found(answer.model_dump()), answer.index_generation) == (right[0], 1)
 
 
-def test_blobs_that_are_missing_cost_what_needs_them(folder, begin, small_shots, refused):
+def test_blobs_that_are_missing_cost_what_needs_them(folder, begin, small_shots, refused, rows):
     server = begin("--workers", "0", folder=folder)
     frames = [one["frame_id"] for one in server.client.get(f"{HALL}/frames").json()["items"]]
     asked = "SELECT s.geometry FROM signatures s JOIN frames f ON f.number = s.frame_number"
-    with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
-        (blob,) = database.execute(f"{asked} WHERE f.id = '{frames[0]}'").fetchone()
+    ((blob,),) = rows(folder, f"{asked} WHERE f.id = '{frames[0]}'")
     (folder / "blobs" / blob[:2] / blob).unlink()
     answer = server.client.post(f"{HALL}/queries", **small_shots[1].form()).json()
     told = {match["frame_id"]: match["validation"] for match in answer["matches"]}
@@ -138,21 +135,18 @@ def test_blobs_that_are_missing_cost_what_needs_them(folder, begin, small_shots,
     assert server.client.post(f"{HALL}/frames", **small_shots[20].form()).status_code == 202
 
 
-def test_an_upload_that_is_missing_fails_after_its_tries(folder, small_shots):
+def test_an_upload_that_is_missing_fails_after_its_tries(folder, small_shots, rows, truth):
     shot = small_shots[30]
     with opened(folder) as engine:
         added, _ = engine.add_frame("hall", shot.png, meta_of(shot))
-        with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
-            asked = f"SELECT blob FROM frames WHERE id = '{added.frame_id}'"
-            (blob,) = database.execute(asked).fetchone()
-            (folder / "blobs" / blob[:2] / blob).unlink()
-            states = []
-            for _ in range(3):
-                work = engine.claim("w")
-                assert work is not None
-                states.append(engine.run(work))
-                database.execute("UPDATE jobs SET run_after = 0")  # no test waits for the next try
-                database.commit()
+        ((blob,),) = rows(folder, f"SELECT blob FROM frames WHERE id = '{added.frame_id}'")
+        (folder / "blobs" / blob[:2] / blob).unlink()
+        states = []
+        for _ in range(3):
+            work = engine.claim("w")
+            assert work is not None
+            states.append(engine.run(work))
+            due(truth, folder)
         assert states == [JobState.QUEUED, JobState.QUEUED, JobState.DEAD]
         frame = engine.get_frame("hall", added.frame_id)
         assert frame.state == FrameState.FAILED
@@ -164,15 +158,14 @@ def test_an_upload_that_is_missing_fails_after_its_tries(folder, small_shots):
         assert engine.run(work) == JobState.SUCCEEDED
 
 
-def due(folder):
+def due(truth, folder):
     """Let the time come at which what waits may be claimed."""
-    with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
-        database.execute("UPDATE jobs SET run_after = 0")
-        database.commit()
+    with truth(folder) as connection:
+        connection.exec_driver_sql("UPDATE jobs SET run_after = 0")
 
 
 def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
-    stored, folder, tmp_path, small_shots, monkeypatch
+    stored, folder, tmp_path, small_shots, monkeypatch, rows, truth
 ):
     """The blob cannot be written, and the database can: no fault of the frame's."""
     shot = small_shots[30]
@@ -182,8 +175,7 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
         work = engine.claim("w")
         assert work is not None
         assert engine.run(work) == JobState.SUCCEEDED
-        with closing(sqlite3.connect(tmp_path / "trial" / "sceneprint.db")) as database:
-            (artifact,) = database.execute(asked).fetchone()
+        ((artifact,),) = rows(tmp_path / "trial", asked)
     with opened(folder) as engine:
         added, _ = engine.add_frame("hall", shot.png, meta_of(shot))
         place = folder / "blobs" / artifact[:2]
@@ -200,7 +192,7 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
             assert work is not None
             assert work.frame.id == other.frame_id
             assert engine.run(work) == JobState.SUCCEEDED
-        due(folder)
+        due(truth, folder)
         monkeypatch.setattr(endings, "LEFT_S", 0.0)
         for _ in range(4):  # more often than a frame may break down
             work = engine.claim("w")
@@ -216,10 +208,9 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
 
 
 @pytest.mark.parametrize("command", ["serve", "work"])
-def test_the_folder_of_a_later_version_is_left_alone(command, folder):
-    with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
-        database.execute("UPDATE alembic_version SET version_num = '9999'")
-        database.commit()
+def test_the_folder_of_a_later_version_is_left_alone(command, folder, truth):
+    with truth(folder) as connection:
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
     before = contents(folder)
     start = [BIN / "sceneprint", command, "--data", folder]
     done = subprocess.run(start, capture_output=True, text=True, timeout=90, check=False)

@@ -6,14 +6,16 @@ import hashlib
 import os
 import random
 import signal
-import sqlite3
 import threading
 import time
-from contextlib import closing, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
+from sqlalchemy.exc import OperationalError
 
 KILLS, FRAMES = 9, 36
 
@@ -51,18 +53,19 @@ class Uploader(threading.Thread):
         return True
 
 
-def rows(folder: Path, asked: str) -> list[tuple[Any, ...]]:
-    with closing(sqlite3.connect(folder / "sceneprint.db", timeout=30)) as database:
-        return database.execute(asked).fetchall()
+@pytest.fixture
+def done(rows: Callable[..., list[tuple[Any, ...]]], tmp_path: Path) -> Callable[[], int]:
+    def count() -> int:
+        with suppress(OperationalError):  # locked, or not there yet
+            return int(rows(tmp_path, "SELECT count(*) FROM jobs WHERE state = 'succeeded'")[0][0])
+        return 0
+
+    return count
 
 
-def done(folder: Path) -> int:
-    with suppress(sqlite3.OperationalError):  # locked, or not there yet
-        return int(rows(folder, "SELECT count(*) FROM jobs WHERE state = 'succeeded'")[0][0])
-    return 0
-
-
-def test_no_kill_loses_what_was_acknowledged(begin, make_map, small_shots, tmp_path, capsys, until):
+def test_no_kill_loses_what_was_acknowledged(
+    begin, make_map, small_shots, tmp_path, capsys, until, rows, done
+):
     rng = random.Random(20)
     uploader = Uploader([shot.form(robot="r1") for shot in small_shots[:FRAMES]])
     first = begin(folder=tmp_path)
@@ -86,10 +89,10 @@ def test_no_kill_loses_what_was_acknowledged(begin, make_map, small_shots, tmp_p
             until(lambda n=known + wanted: len(uploader.acknowledged) >= min(n, FRAMES))
             time.sleep(rng.uniform(0, 0.03))
         else:  # some progress, however little, or the run would never end
-            before = done(tmp_path)
+            before = done()
             received = int(rows(tmp_path, "SELECT count(*) FROM jobs")[0][0])
             goal = min(before + rng.randint(1, 8), received)
-            until(lambda n=goal: done(tmp_path) >= n)
+            until(lambda n=goal: done() >= n)
             time.sleep(rng.uniform(0, 0.15))
         os.killpg(server.process.pid, signal.SIGKILL)
         server.process.wait()

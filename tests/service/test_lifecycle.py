@@ -5,25 +5,21 @@ from __future__ import annotations
 import os
 import signal
 import socket
-import sqlite3
 import sys
-from contextlib import closing
 from datetime import datetime
 
 import pytest
 
 
-def rows(server, asked: str) -> list[tuple]:
-    with closing(sqlite3.connect(server.folder / "sceneprint.db", timeout=30)) as database:
-        return database.execute(asked).fetchall()
-
-
-def signing(server) -> bool:
-    return bool(rows(server, "SELECT 1 FROM jobs WHERE state = 'running'"))
+@pytest.fixture(scope="module")
+def signing(rows):
+    return lambda server: bool(rows(server.folder, "SELECT 1 FROM jobs WHERE state = 'running'"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_told_to_stop_it_finishes_the_frame_in_hand(begin, make_map, shots, until, number):
+def test_told_to_stop_it_finishes_the_frame_in_hand(
+    begin, make_map, shots, until, number, rows, signing
+):
     server = begin()
     server.ready()
     path = make_map(server, "hall", model="paper")
@@ -32,8 +28,8 @@ def test_told_to_stop_it_finishes_the_frame_in_hand(begin, make_map, shots, unti
     until(lambda: signing(server))
     assert server.end(number) == 0
     server.gone()
-    states = rows(server, "SELECT f.state, j.state, j.attempts FROM frames f JOIN jobs j"
-                          " ON j.frame_number = f.number ORDER BY f.number")  # fmt: skip
+    states = rows(server.folder, "SELECT f.state, j.state, j.attempts FROM frames f JOIN jobs j"
+                                 " ON j.frame_number = f.number ORDER BY f.number")  # fmt: skip
     done = [one for one in states if one == ("indexed", "succeeded", 1)]
     assert len(done) >= 1
     assert states == done + [("received", "queued", 0)] * (4 - len(done))
@@ -62,7 +58,9 @@ def test_workers_whose_service_was_killed_leave_by_themselves(begin):
     server.gone()
 
 
-def test_a_worker_that_dies_is_replaced_and_its_frame_signed(begin, make_map, shots, until):
+def test_a_worker_that_dies_is_replaced_and_its_frame_signed(
+    begin, make_map, shots, until, signing
+):
     server = begin(lease_s=1)
     server.ready()
     path = make_map(server, "hall", model="paper")
@@ -84,14 +82,13 @@ def test_a_worker_that_dies_is_replaced_and_its_frame_signed(begin, make_map, sh
 
 
 @pytest.fixture(scope="module")
-def newer(begin, tmp_path_factory):
+def newer(begin, tmp_path_factory, truth):
     """A data folder that a later version has written."""
     folder = tmp_path_factory.mktemp("newer")
     server = begin("--workers", "0", folder=folder)
     assert server.end(signal.SIGTERM) == 0
-    with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
-        database.execute("UPDATE alembic_version SET version_num = 'from the future'")
-        database.commit()
+    with truth(folder) as connection:
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = 'from the future'")
     return folder
 
 
@@ -126,6 +123,7 @@ def test_a_folder_that_cannot_be_made_is_refused_in_one_line(begin, tmp_path):
     assert line.startswith(f"sceneprint serve: {tmp_path}/file/data/blobs: the folder cannot be")
 
 
+@pytest.mark.sqlite_only("a file that is damaged")
 def test_a_file_that_is_no_database_is_refused_in_one_line(begin, tmp_path):
     (tmp_path / "sceneprint.db").write_bytes(b"not a database " * 1000)
     line = refusal(begin, folder=tmp_path)

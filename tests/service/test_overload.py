@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
-import sqlite3
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 
 import httpx
 import pytest
@@ -45,11 +44,10 @@ def test_who_comes_too_many_is_sent_away_and_may_come_back(busy, shots, refused)
     assert [line for line in busy.log() if line["level"] == "error"] == []
 
 
-def test_as_many_wait_as_may_and_not_one_more(busy, until, refused):
+def test_as_many_wait_as_may_and_not_one_more(busy, until, refused, rows):
     """One is at work for as long as the test likes: its artifact comes through a pipe."""
-    with closing(sqlite3.connect(busy.folder / "sceneprint.db")) as database:
-        asked = "SELECT f.id, s.geometry FROM signatures s JOIN frames f ON f.number = frame_number"
-        frame_id, blob = database.execute(asked).fetchone()
+    asked = "SELECT f.id, s.geometry FROM signatures s JOIN frames f ON f.number = frame_number"
+    frame_id, blob = rows(busy.folder, asked)[0]
     path = busy.folder / "blobs" / blob[:2] / blob
     content = path.read_bytes()
     path.unlink()

@@ -66,8 +66,21 @@ def race() -> Callable[..., list[Any]]:
     return run
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run a test of a database on both; those of what only SQLite has, on that alone."""
+    if "url" in metafunc.fixturenames:
+        marked = metafunc.definition.get_closest_marker("sqlite_only") is not None
+        alone = marked or "plans" in metafunc.fixturenames
+        metafunc.parametrize("url", ["sqlite"] if alone else ["sqlite", "postgresql"],
+                             indirect=True)  # fmt: skip
+
+
 @pytest.fixture
-def url(tmp_path: Path) -> str:
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """A new database; on the server it has the schema already."""
+    if request.param == "postgresql":
+        (tmp_path / "blobs").mkdir()  # that of a database that is there is not made up for
+        return str(request.getfixturevalue("postgres_url"))
     return f"sqlite:///{tmp_path / 'truth.db'}"
 
 

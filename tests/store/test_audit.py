@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from sceneprint.store import open_store
+from sceneprint.store import Store
 from sceneprint.store.audit import Change, list_changes, note
 
 
-def test_the_newest_lines_are_kept(tmp_path: Path) -> None:
-    store = open_store(f"sqlite:///{tmp_path}/a.db", tmp_path / "blobs")
+def test_the_newest_lines_are_kept(store: Store) -> None:
     with store.database.write() as connection:
         for number in range(9):
             note(connection, Change(f"a{number}", "boss", at=float(number)), kept=4)
@@ -18,11 +15,9 @@ def test_the_newest_lines_are_kept(tmp_path: Path) -> None:
     assert [(one.action, one.at) for one in found] == [
         ("a8", 8.0), ("a7", 7.0), ("a6", 6.0), ("a5", 5.0),
     ]  # fmt: skip
-    store.database.close()
 
 
-def test_lines_are_found_by_actor_and_map(tmp_path: Path) -> None:
-    store = open_store(f"sqlite:///{tmp_path}/a.db", tmp_path / "blobs")
+def test_lines_are_found_by_actor_and_map(store: Store) -> None:
     with store.database.write() as connection:
         note(connection, Change("make", "boss", map="hall", data={"n": 1}))
         note(connection, Change("make", "robot", map="yard", target="t" * 200))
@@ -44,4 +39,3 @@ def test_lines_are_found_by_actor_and_map(tmp_path: Path) -> None:
     with store.database.read() as connection:
         _, second, first = list_changes(connection, None, 9, None, None)
     assert (first.data, second.target) == ({"n": 1}, "t" * 128)
-    store.database.close()

@@ -8,23 +8,29 @@ import os
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from sceneprint.errors import DamagedBlob, ReadOnlyStore, StoreFull, UnusableStore
-from sceneprint.store import Blobs
+from sceneprint.store import Blobs, FolderBlobs
+from sceneprint.store.locks import FileLocks
+from sceneprint.store.object_blobs import MARK, ObjectBlobs
+from sceneprint.store.objects import open_objects
 
 DIGEST = hashlib.sha256(b"depth").hexdigest()
+KEY = f"blobs/{DIGEST[:2]}/{DIGEST}"
 
 NARROW = """
 import resource, sys
 from pathlib import Path
 from sceneprint.errors import UnusableStore
-from sceneprint.store import Blobs
+from sceneprint.store import FolderBlobs
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536))
-blobs = Blobs(Path(sys.argv[1]))
+blobs = FolderBlobs(Path(sys.argv[1]))
 small = blobs.put(b"s" * 65536)
 for size in (65537, 5_000_000):
     try:
@@ -36,62 +42,101 @@ print(blobs.get(small) == b"s" * 65536)
 """
 
 
-@pytest.fixture
-def blobs(tmp_path: Path) -> Blobs:
-    return Blobs(tmp_path / "blobs")
+@dataclass
+class Kept:
+    """Blobs somewhere, and what lies there by itself."""
+
+    blobs: Blobs
+    files: Callable[[], list[str]]
+    write: Callable[[str, bytes], object]
 
 
 def files(folder: Path) -> list[str]:
     return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
 
 
-def test_a_blob_lies_under_the_hash_of_its_content(blobs: Blobs, tmp_path: Path) -> None:
-    assert blobs.put(b"depth") == DIGEST
-    assert files(tmp_path) == [f"blobs/{DIGEST[:2]}/{DIGEST}"]
-    assert blobs.get(DIGEST) == b"depth"
-    empty = blobs.put(b"")
+@pytest.fixture
+def blobs(tmp_path: Path) -> FolderBlobs:
+    return FolderBlobs(tmp_path / "blobs")
+
+
+@pytest.fixture(params=["folder", "s3", "memory", "file"])
+def kept(request: pytest.FixtureRequest, tmp_path: Path) -> Kept:
+    """A new place for blobs, of each kind there is."""
+    if request.param == "folder":
+        return Kept(
+            FolderBlobs(tmp_path / "blobs"), lambda: files(tmp_path),
+            lambda key, data: (tmp_path / key).write_bytes(data),
+        )  # fmt: skip
+    url = {"memory": "memory:///", "file": f"file://{tmp_path}/objects"}.get(request.param)
+    objects = open_objects(url or f"{request.getfixturevalue('bucket')}/pre/fix")
+    locks = FileLocks(tmp_path / "lock", make=True)
+    return Kept(
+        ObjectBlobs(objects, locks, lambda: "me"),
+        lambda: sorted(one.key for one in objects.list("") if one.key != MARK),
+        objects.put,
+    )
+
+
+def test_a_blob_lies_under_the_hash_of_its_content(kept: Kept) -> None:
+    assert kept.blobs.put(b"depth") == DIGEST
+    assert kept.files() == [KEY]
+    assert kept.blobs.get(DIGEST) == b"depth"
+    assert (kept.blobs.size(DIGEST), kept.blobs.size("0" * 64)) == (5, None)
+    assert kept.blobs.place(DIGEST).endswith(f"/{KEY}")
+    empty = kept.blobs.put(b"")
     assert empty == hashlib.sha256(b"").hexdigest()
-    assert blobs.get(empty) == b""
-    assert sorted(blobs.digests()) == sorted([DIGEST, empty])
+    assert kept.blobs.get(empty) == b""
+    assert sorted(kept.blobs.digests()) == sorted([DIGEST, empty])
 
 
-def test_the_same_bytes_put_twice_are_one_file(blobs: Blobs, tmp_path: Path) -> None:
-    assert blobs.put(b"depth") == blobs.put(b"depth") == DIGEST
-    assert files(tmp_path) == [f"blobs/{DIGEST[:2]}/{DIGEST}"]
-    assert blobs.get(DIGEST) == b"depth"
+def test_the_same_bytes_put_twice_are_one(kept: Kept) -> None:
+    assert kept.blobs.put(b"depth") == kept.blobs.put(b"depth") == DIGEST
+    assert kept.files() == [KEY]
+    assert kept.blobs.get(DIGEST) == b"depth"
 
 
-@pytest.mark.parametrize("byte", [0, 2, 4])
-def test_one_flipped_bit_is_noticed(blobs: Blobs, tmp_path: Path, byte: int) -> None:
-    blobs.put(b"depth")
-    path = tmp_path / "blobs" / DIGEST[:2] / DIGEST
+@pytest.mark.parametrize("byte", [0, 4])
+def test_one_flipped_bit_is_noticed(kept: Kept, tmp_path: Path, byte: int) -> None:
+    kept.blobs.put(b"depth")
+    assert kept.blobs.condition(DIGEST) == "sound"
     data = bytearray(b"depth")
     data[byte] ^= 1
-    path.write_bytes(data)
+    kept.write(KEY, bytes(data))
     with pytest.raises(DamagedBlob, match=f"{DIGEST[:12]} is damaged"):
-        blobs.get(DIGEST)
+        kept.blobs.get(DIGEST)
+    assert kept.blobs.condition(DIGEST) == "damaged"
+    assert kept.blobs.condition(DIGEST, quick=True) == "sound"
+    with kept.blobs.removing() as allowed:
+        assert allowed
+        place = kept.blobs.quarantine(DIGEST, tmp_path / "away")
+    assert place == tmp_path / "away" / f"blob-{DIGEST}"
+    assert place.read_bytes() == bytes(data)
+    assert kept.blobs.condition(DIGEST) == kept.blobs.condition("x") == "missing"
+    with kept.blobs.removing():
+        assert kept.blobs.quarantine(DIGEST, tmp_path / "away") is None
 
 
-@pytest.mark.parametrize("left", [b"", b"dept", b"depths", b"dEpth"])
-def test_putting_the_bytes_again_mends_a_damaged_blob(
-    blobs: Blobs, tmp_path: Path, left: bytes
-) -> None:
-    blobs.put(b"depth")
-    (tmp_path / "blobs" / DIGEST[:2] / DIGEST).write_bytes(left)
-    assert blobs.put(b"depth") == DIGEST
-    assert blobs.get(DIGEST) == b"depth"
+@pytest.mark.parametrize("left", [b"", b"depths", b"dEpth"])
+def test_putting_the_bytes_again_mends_a_damaged_blob(kept: Kept, left: bytes) -> None:
+    kept.blobs.put(b"depth")
+    kept.write(KEY, left)
+    assert kept.blobs.put(b"depth") == DIGEST
+    assert kept.blobs.get(DIGEST) == b"depth"
 
 
-def test_a_missing_blob_is_said(blobs: Blobs) -> None:
-    with pytest.raises(DamagedBlob, match=r"cannot be read .No such file.*upload it again"):
-        blobs.get(DIGEST)
-    assert not blobs.holds(DIGEST)
-    blobs.put(b"depth")
-    assert blobs.holds(DIGEST)
-    blobs.remove(DIGEST)
-    assert not blobs.holds(DIGEST)
-    blobs.remove(DIGEST)  # of no consequence
-    assert list(blobs.digests()) == []
+def test_a_missing_blob_is_said(kept: Kept) -> None:
+    with pytest.raises(DamagedBlob, match=r"cannot be read .No such.*upload it again"):
+        kept.blobs.get(DIGEST)
+    with pytest.raises(FileNotFoundError):
+        kept.blobs.open(DIGEST)
+    assert not kept.blobs.holds(DIGEST)
+    kept.blobs.put(b"depth")
+    assert kept.blobs.holds(DIGEST)
+    kept.blobs.remove(DIGEST)
+    assert not kept.blobs.holds(DIGEST)
+    kept.blobs.remove(DIGEST)  # of no consequence
+    assert list(kept.blobs.digests()) == []
 
 
 @pytest.mark.parametrize(
@@ -99,13 +144,61 @@ def test_a_missing_blob_is_said(blobs: Blobs) -> None:
     ["", "../x", "../../etc/passwd", "/etc/passwd", DIGEST[:-1], DIGEST + "0", DIGEST + "\n",
      DIGEST.upper(), "/" * 64, "." * 64, DIGEST[:62] + "/x", "\0" * 64, "\u0660" * 64],
 )  # fmt: skip
-def test_nothing_but_a_digest_becomes_a_path(blobs: Blobs, given: str) -> None:
-    for call in (blobs.get, blobs.holds, blobs.remove):
-        with pytest.raises(ValueError, match="is no digest"):
-            call(given)
+def test_nothing_but_a_digest_becomes_a_path(blobs: FolderBlobs, given: str) -> None:
+    others = ObjectBlobs(open_objects("memory:///"), FileLocks(Path("/none")), lambda: "me")
+    for each in (blobs, others):
+        for call in (each.get, each.open, each.holds, each.size, each.remove):
+            with pytest.raises(ValueError, match="is no digest"):
+                call(given)
+        assert each.condition(given) == "missing"
 
 
-def test_what_others_leave_in_the_folder_is_not_listed(blobs: Blobs, tmp_path: Path) -> None:
+def test_a_blob_in_parts_is_there_whole_or_not_at_all(kept: Kept) -> None:
+    parts = [bytes([number]) * 3_000_000 for number in range(7)]  # more than a store takes at once
+    whole = b"".join(parts)
+    with pytest.raises(RuntimeError), kept.blobs.incoming() as blob:
+        blob.write(parts[0])
+        raise RuntimeError
+    assert kept.files() == []
+    with kept.blobs.incoming() as blob:
+        for part in parts:
+            blob.write(part)
+        digest = blob.keep()
+    assert digest == hashlib.sha256(whole).hexdigest()
+    assert kept.files() == [f"blobs/{digest[:2]}/{digest}"]
+    assert kept.blobs.get(digest) == whole
+    assert kept.blobs.condition(digest) == "sound"
+    with kept.blobs.open(digest) as file:
+        file.seek(2_999_990)
+        assert file.read(20) == b"\0" * 10 + b"\1" * 10
+        assert file.seek(-5, os.SEEK_END) == len(whole) - 5
+        assert file.read() == b"\6" * 5
+        assert file.read(1) == b""
+
+
+def test_what_others_leave_there_is_no_blob(kept: Kept) -> None:
+    kept.blobs.put(b"depth")
+    kept.write(f"blobs/{DIGEST[:2]}/.0123456789ab.part", b"half")
+    kept.write("blobs/readme", DIGEST.encode())
+    kept.write(f"blobs/{DIGEST[:2]}/{'0' * 64}", b"of another folder")
+    found = {Path(one.place).name: (one.digest, one.unfinished) for one in kept.blobs.entries()}
+    part = found.pop(".0123456789ab.part", None)
+    assert part in ((None, True), (None, False), None)  # an object store has no half objects
+    assert found == {
+        DIGEST: (DIGEST, False), "readme": (None, False), "0" * 64: (None, False),
+    }  # fmt: skip
+
+
+def test_who_needs_blobs_keeps_others_from_removing_them(kept: Kept) -> None:
+    with kept.blobs.kept(), kept.blobs.kept(), kept.blobs.removing() as allowed:
+        assert not allowed
+    with kept.blobs.removing() as allowed, kept.blobs.removing() as also:
+        assert (allowed, also) == (True, False)
+    with kept.blobs.removing() as allowed:
+        assert allowed
+
+
+def test_what_others_leave_in_the_folder_is_not_listed(blobs: FolderBlobs, tmp_path: Path) -> None:
     blobs.put(b"depth")
     (tmp_path / "blobs" / DIGEST[:2] / ".0123456789ab.part").write_bytes(b"half")
     (tmp_path / "blobs" / "lost+found").mkdir()
@@ -129,15 +222,15 @@ def test_a_full_disk_leaves_nothing_and_hurts_nothing(tmp_path: Path) -> None:
 
 def test_a_file_where_a_folder_should_be_is_said(tmp_path: Path) -> None:
     place = tmp_path / "blobs" / DIGEST[:2]
-    blobs = Blobs(tmp_path / "blobs")
+    blobs = FolderBlobs(tmp_path / "blobs")
     place.write_bytes(b"")  # a file where the folder should be
     with pytest.raises(UnusableStore, match="Check the folder and its permissions"):
         blobs.put(b"depth")
     with pytest.raises(UnusableStore, match=r"the folder cannot be made \(Not a directory\)"):
-        Blobs(place / "below")
+        FolderBlobs(place / "below")
 
 
-def test_a_blob_may_be_put_and_removed_at_once(blobs: Blobs, tmp_path: Path) -> None:
+def test_a_blob_may_be_put_and_removed_at_once(blobs: FolderBlobs, tmp_path: Path) -> None:
     """What removes is the sweep; an upload of the same content must not stumble over it."""
     raised: list[BaseException] = []
     over = threading.Event()
@@ -175,7 +268,7 @@ def test_a_blob_may_be_put_and_removed_at_once(blobs: Blobs, tmp_path: Path) -> 
     ],
 )
 def test_what_to_do_depends_on_what_failed(
-    blobs: Blobs,
+    blobs: FolderBlobs,
     monkeypatch: pytest.MonkeyPatch,
     number: int,
     kind: type[UnusableStore],
@@ -193,7 +286,7 @@ def test_what_to_do_depends_on_what_failed(
 
 
 def test_what_is_there_already_is_made_durable_too(
-    blobs: Blobs, monkeypatch: pytest.MonkeyPatch
+    blobs: FolderBlobs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Who put it first may have been killed between the name and its fsync."""
     blobs.put(b"depth")

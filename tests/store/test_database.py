@@ -27,8 +27,8 @@ from sceneprint.store.revisions import known_revisions, migration_config, revisi
 from sceneprint.store.tables import metadata
 
 TABLES = [
-    "audit", "events", "frame_tags", "frames", "idempotency", "job_files", "job_items", "jobs",
-    "keys", "maps", "models", "samples", "secrets", "signatures",
+    "audit", "doomed", "events", "former_maps", "frame_tags", "frames", "idempotency", "job_files",
+    "job_items", "jobs", "keys", "maps", "models", "samples", "secrets", "signatures",
 ]  # fmt: skip
 
 OPENS = """
@@ -73,6 +73,7 @@ def described(path: Path) -> set[tuple[str, ...]]:
     }
 
 
+@pytest.mark.sqlite_only("what its file says of itself")
 def test_the_migrations_make_the_tables_that_the_code_knows(store: Store, tmp_path: Path) -> None:
     with store.database.read() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
@@ -92,6 +93,7 @@ def test_opening_again_changes_nothing(url: str, store: Store, hall: MapRow) -> 
     again.close()
 
 
+@pytest.mark.sqlite_only("a file")
 def test_four_processes_may_migrate_one_empty_database_at_once(
     url: str, tmp_path: Path, race: Callable[..., list[Any]]
 ) -> None:
@@ -125,6 +127,7 @@ def test_threads_may_migrate_databases_of_their_own_at_once(tmp_path: Path) -> N
     assert all(described(tmp_path / f"{i}.db") == whole for i in range(6))
 
 
+@pytest.mark.sqlite_only("a file")
 def test_a_database_of_a_later_version_is_left_as_it_is(url: str, tmp_path: Path) -> None:
     open_database(url).close()
     path = tmp_path / "truth.db"
@@ -137,6 +140,7 @@ def test_a_database_of_a_later_version_is_left_as_it_is(url: str, tmp_path: Path
     assert [p.name for p in tmp_path.iterdir()] == ["truth.db"]
 
 
+@pytest.mark.sqlite_only("a file")
 def test_a_file_that_is_no_database_is_left_as_it_is(url: str, tmp_path: Path) -> None:
     path = tmp_path / "truth.db"
     path.write_bytes(b"my notes about the warehouse\n" * 400)
@@ -180,6 +184,7 @@ def test_a_folder_that_may_not_be_written_says_so() -> None:
     assert told[2] == "opened"  # to be read
 
 
+@pytest.mark.sqlite_only("a file")
 def test_a_damaged_page_is_said(url: str, store: Store, tmp_path: Path) -> None:
     store.database.close()
     path = tmp_path / "truth.db"

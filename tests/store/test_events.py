@@ -56,8 +56,8 @@ def work(i):
 
 
 @pytest.fixture
-def empty(tmp_path: Path) -> Store:
-    return open_store(f"sqlite:///{tmp_path / 'sceneprint.db'}", tmp_path / "blobs")
+def empty(store: Store) -> Store:
+    return store
 
 
 def fill(store: Store, count: int) -> None:
@@ -72,9 +72,8 @@ def fill(store: Store, count: int) -> None:
             )
 
 
-def test_who_reads_on_misses_nothing_of_several_writers(race, tmp_path):
-    url, blobs = f"sqlite:///{tmp_path / 'sceneprint.db'}", tmp_path / "blobs"
-    store = open_store(url, blobs)
+def test_who_reads_on_misses_nothing_of_several_writers(race, url, store, tmp_path):
+    blobs = tmp_path / "blobs"
     sure = sum(1 + n % 3 for n in range(40) if n % 7 != 3) * 3
     *_, seen = race(WRITE + READ, 4, url, blobs, sure)
     with store.database.read() as connection:

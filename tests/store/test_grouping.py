@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,15 +11,15 @@ from sqlalchemy import Connection, event, func, select
 
 from sceneprint.errors import FrameConflict, LostLease, StoreFull
 from sceneprint.logs import of_request, request_id
-from sceneprint.store import Database, open_database
+from sceneprint.store import Database, Store
 from sceneprint.store.events import tell
 from sceneprint.store.grouping import MOST, Grouping, _Waiting
 from sceneprint.store.tables import events
 
 
 @pytest.fixture
-def database(tmp_path: Path) -> Database:
-    return open_database(f"sqlite:///{tmp_path / 'x.db'}")
+def database(store: Store) -> Database:
+    return store.database
 
 
 def together(database: Database, works: list[Callable[[Connection], Any]]) -> tuple[list[Any], int]:

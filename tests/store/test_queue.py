@@ -138,6 +138,7 @@ def test_renewing_extends_the_lease_and_nothing_else(
     assert hand.take() is None
 
 
+@pytest.mark.sqlite_only("its query plans")
 def test_a_claim_is_looked_up_and_not_sorted(store: Store) -> None:
     """100,000 jobs wait while a map is signed again, and a claim holds all writers up."""
     with store.database.write() as connection:

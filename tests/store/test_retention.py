@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from pathlib import Path
 
 import pytest
 from sqlalchemy import Connection
 
-from sceneprint.store import Store, open_store
+from sceneprint.store import Store, former
 from sceneprint.store.events import Wanted, anchor_of, holds_anchor, list_events, tell
 from sceneprint.store.maps import add_map, find_map, keep_model, remove_map
 from sceneprint.store.retention import floor_of, floors, remove_events, spent_numbers
 
 
 @pytest.fixture
-def empty(tmp_path: Path) -> Store:
-    return open_store(f"sqlite:///{tmp_path / 'sceneprint.db'}", tmp_path / "blobs")
+def empty(store: Store) -> Store:
+    return store
 
 
 @pytest.fixture
@@ -71,8 +70,9 @@ def test_what_happens_elsewhere_moves_nothing(filled):
         for after in before:  # the same is missed
             assert (floor_of(connection, shop, 10, after) > after) == (after < own)
         gone = spent_numbers(connection, 10, (), 9999)
-        shops = [one for one in numbers_of(connection, "shop") if one < own]
-        assert [one for one in gone if one in numbers_of(connection, "shop")] == shops
+        shop_numbers = numbers_of(connection, "shop")
+        shops = [one for one in shop_numbers if one < own]
+        assert [one for one in gone if one in shop_numbers] == shops
         assert floor_of(connection, Wanted(), 10, 0) > own
 
 
@@ -91,3 +91,35 @@ def test_nothing_goes_of_nothing(empty):
     with empty.database.read() as connection:
         assert spent_numbers(connection, 10, (), 99) == []
         assert floor_of(connection, Wanted(), 10, 0) == 0
+
+
+def test_of_a_map_that_is_gone_nothing_is_missed_after_its_last_event(filled):
+    hall = Wanted(frozenset(("hall",)))
+    with filled.database.write() as connection:
+        remove_map(connection, find_map(connection, "hall"))
+        last = numbers_of(connection, "hall")[-1]
+        for _ in range(100):  # in others that are gone, and in none
+            tell(connection, "key.created")
+        remove_events(connection, spent_numbers(connection, 10, (), 999))
+        assert numbers_of(connection, "hall") == []
+        assert floor_of(connection, hall, 10, last - 1) > last - 1
+        assert floor_of(connection, hall, 10, last) <= last
+        assert floor_of(connection, Wanted(frozenset(("never",))), 10, 0) == 0
+        assert floor_of(connection, Wanted(frozenset()), 10, 0) == 0
+
+
+def test_names_of_maps_that_are_gone_are_bounded(filled, monkeypatch):
+    monkeypatch.setattr(former, "MOST", 3)
+    with filled.database.write() as connection:
+        lasts = {}
+        for name in ("limited", "a", "b", "c", "d"):
+            limits = {"quota_frames": 7} if name == "limited" else None
+            remove_map(connection, add_map(connection, name, None, "m" * 64, limits))
+            lasts[name] = numbers_of(connection, name)[-1]
+        known = {name: former.last_event(connection, name) for name in lasts}
+        # of the one that is forgotten it is known that it went before the oldest that is not
+        assert known == lasts | {"a": lasts["b"]}
+        for name, quota in (("limited", 7), ("b", None), ("a", None)):
+            made = add_map(connection, name, None, "m" * 64)
+            assert (made.quota_frames, made.quota_bytes) == (quota, None)
+        assert former.last_event(connection, "b") == 0  # fewer than can be remembered: none is

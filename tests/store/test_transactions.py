@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from typing import Any
 
 import pytest
-from sqlalchemy import Connection, insert, select, text, update
+from sqlalchemy import Connection, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from sceneprint.errors import StoreFull
@@ -31,6 +31,7 @@ def work(i):
 """
 
 
+@pytest.mark.sqlite_only("its own settings")
 def test_every_connection_of_the_pool_is_configured(store: Store) -> None:
     with ExitStack() as stack:
         held = [stack.enter_context(store.database.read()) for _ in range(12)]
@@ -71,6 +72,7 @@ def test_a_transaction_that_raises_leaves_nothing(
         assert next_revision(connection, hall.number) == 1
 
 
+@pytest.mark.sqlite_only("a file of so many pages")
 def test_a_full_disk_is_said_and_leaves_nothing(store: Store, hall: MapRow) -> None:
     def fill(connection: Connection) -> None:
         next_revision(connection, hall.number)
@@ -101,7 +103,7 @@ def test_a_writer_holds_what_it_has_read(store: Store, hall: MapRow) -> None:
         for _ in range(40):
             with store.database.write() as connection:
                 seen = find_map(connection, "hall").revision
-                connection.execute(text("SELECT randomblob(64)")).all()
+                connection.execute(select(events)).all()
                 connection.execute(update(maps).values(revision=seen + 1))
 
     threads = [threading.Thread(target=count) for _ in range(3)]

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import os
 import signal
-import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,14 +49,12 @@ class Crew:
         return [line for line in lines if line["message"] == message]
 
     def rows(self, asked: str) -> list[tuple[Any, ...]]:
-        with closing(sqlite3.connect(self.engine.settings.data_dir / "sceneprint.db")) as base:
-            return base.execute(asked).fetchall()
+        with self.engine.store.database.read() as connection:
+            return [tuple(row) for row in connection.exec_driver_sql(asked)]
 
     def change(self, statement: str) -> None:
-        with closing(sqlite3.connect(self.engine.settings.data_dir / "sceneprint.db")) as base:
-            base.execute("PRAGMA busy_timeout = 30000")
-            base.execute(statement)
-            base.commit()
+        with self.engine.store.database.write() as connection:
+            connection.exec_driver_sql(statement)
 
     def settled(self, map_name: str, count: int) -> None:
         """Wait until all frames of a map are indexed."""

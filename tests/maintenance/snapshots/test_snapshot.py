@@ -201,10 +201,11 @@ def test_what_cannot_be_taken(data, tmp_path, sceneprint, monkeypatch):
     refused("there is no database", tmp_path / "typo")
     said = sceneprint("snapshot", "--data", data, "--out", tmp_path / "no" / "a.tar", expect=2)
     assert "No such file or directory" in said.stderr
-    monkeypatch.setenv("SCENEPRINT_DATABASE_URL", "postgresql://u:secret@h/maps")
+    monkeypatch.setenv("SCENEPRINT_DATABASE_URL", "postgresql://u:secret@127.0.0.1:1/maps")
     said = sceneprint("snapshot", "--data", data, "--out", tmp_path / "a.tar", expect=2)
-    assert "kind postgresql" in said.stderr
+    assert "postgresql://u@127.0.0.1:1/maps: connection failed" in said.stderr
     assert "secret" not in said.stderr
+    monkeypatch.setenv("SCENEPRINT_DATABASE_URL", f"sqlite:///{tmp_path}/other.db")
     said = sceneprint("restore", tmp_path / "a.tar", "--data", tmp_path / "new", expect=2)
     assert "SCENEPRINT_DATABASE_URL is set" in said.stderr
     monkeypatch.delenv("SCENEPRINT_DATABASE_URL")

@@ -1,0 +1,301 @@
+"""What a frame, a query and a commit of a fleet cost, so that more can be reckoned on paper.
+
+`python -m benchmarks.fleet.costs [--frames N] [--model NAME] [--page docs/performance.md]`: real
+PostgreSQL, fsync on, with a synchronous standby, and the engine in this process: nothing waits for
+another but for the disk, so that what is measured is work.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from benchmarks.fleet.metering import Meter, Work, memory_of
+from benchmarks.fleet.pair import DATABASE, Pair
+from benchmarks.fleet.recordings import ROOM_FRAMES, recordings
+from benchmarks.machine import describe_machine
+from benchmarks.pages import put_between
+from sceneprint.datasets import FrameReference, find_sequences
+from sceneprint.datasets.metas import meta_of
+from sceneprint.engine import Engine
+from sceneprint.models import read_model
+from sceneprint.schemas import NewMap, Query
+from sceneprint.settings import Settings
+from sceneprint.store import codes
+from sceneprint.store.database import Database
+
+BEGIN, END = "<!-- fleet-costs:begin -->", "<!-- fleet-costs:end -->"
+MAP = "costs"
+#: Commits that are timed, and codes that are linked.
+COMMITS, CODES, DIMENSION = 300, 30_000, 128
+
+
+@dataclass
+class Costs:
+    """All that was measured.
+
+    Parameters
+    ----------
+    model, signature_bytes : that signed
+    frames : how many were uploaded and signed
+    upload, sign, query : see Work; the query has all stages, k = 5
+    tables : bytes a frame of tables with their indexes, by name
+    blobs : bytes a frame of uploads, and of geometry artifacts
+    commit_ms : p50 and p99 of the smallest write in its turn, without and with a standby
+    linked : codes a second that enter the graph (HNSW), and its bytes a code with the table
+    memory : bytes that a service and a worker have for themselves, after some work
+    """
+
+    model: str
+    signature_bytes: int
+    frames: int
+    upload: Work
+    sign: Work
+    query: Work
+    tables: Mapping[str, float]
+    blobs: tuple[float, float]
+    commit_ms: Mapping[str, tuple[float, float]]
+    linked: tuple[float, float, float] | None
+    memory: Mapping[str, int] = field(default_factory=dict)
+
+
+def measure(folder: Path, data: Path, n: int, model: str) -> Costs:
+    """Measure all of it.
+
+    Parameters
+    ----------
+    folder : empty
+    data : folder of recordings
+    n : frames
+    model : name of a preset
+    """
+    frames = _frames(data, n + 1)
+    pair = Pair(folder / "database", synchronous=True)
+    try:
+        pair.begin()
+        settings = Settings(data_dir=folder / "host", database_url=cast(Any, pair.url))
+        with Engine(settings) as engine:
+            engine.create_map(NewMap(name=MAP, model=model))
+            _through(engine, frames[:1])  # what is opened once
+            tables, blobs = _tables(pair), _blobs(engine)
+            uploaded = _upload(engine, pair, frames[1:])
+            signed = _sign(engine, pair, n)
+            grown = {name: (size - tables.get(name, 0)) / n for name, size in _tables(pair).items()}
+            kept = _blobs(engine) - blobs
+            queried = _query(engine, pair, frames[1 :: max(n // 20, 1)])
+            synchronous = _commits(engine.store.database)
+            pair.primary.execute("ALTER SYSTEM SET synchronous_standby_names = ''")
+            pair.primary.execute("SELECT pg_reload_conf()")
+            alone = _commits(engine.store.database)
+            linked = _linked(engine.store.database)
+    finally:
+        pair.end()
+    uploads = sum(frame.path.stat().st_size for frame in frames[1:])
+    return Costs(
+        model=model,
+        signature_bytes=read_model(model).signature_bytes,
+        frames=n,
+        upload=uploaded,
+        sign=signed,
+        query=queried,
+        tables={name: size for name, size in grown.items() if size >= 10},
+        blobs=(uploads / n, (kept - uploads) / n),
+        commit_ms={"alone": alone, "with a synchronous standby": synchronous},
+        linked=linked,
+        memory=memory_of(folder, frames),
+    )
+
+
+def _frames(data: Path, n: int) -> list[FrameReference]:
+    found = [
+        one for sequence in find_sequences(data) for one in sequence.frames if one.kind == "depth"
+    ]
+    return found[:n]
+
+
+def _through(engine: Engine, frames: Sequence[FrameReference]) -> None:
+    for frame in frames:
+        engine.add_frame(MAP, frame.path.read_bytes(), meta_of(frame))
+    _sign_all(engine)
+
+
+def _sign_all(engine: Engine) -> None:
+    while (work := engine.claim("costs")) is not None:
+        engine.run(work)
+
+
+def _upload(engine: Engine, pair: Pair, frames: Sequence[FrameReference]) -> Work:
+    seconds = []
+    with Meter(pair).running() as told:
+        for frame in frames:
+            data, meta = frame.path.read_bytes(), meta_of(frame)
+            begun = time.perf_counter()
+            engine.add_frame(MAP, data, meta)
+            seconds.append(time.perf_counter() - begun)
+        return told(seconds)
+
+
+def _sign(engine: Engine, pair: Pair, n: int) -> Work:
+    seconds = []
+    with Meter(pair).running() as told:
+        for _ in range(n):
+            begun = time.perf_counter()
+            work = engine.claim("costs")
+            if work is None:
+                raise RuntimeError("a job is missing")
+            engine.run(work)
+            seconds.append(time.perf_counter() - begun)
+        return told(seconds)
+
+
+def _query(engine: Engine, pair: Pair, frames: Sequence[FrameReference]) -> Work:
+    seconds = []
+    engine.query_upload(MAP, frames[0].path.read_bytes(), meta_of(frames[0]), Query())
+    with Meter(pair).running() as told:
+        for frame in frames:
+            data, meta = frame.path.read_bytes(), meta_of(frame, with_pose=False)
+            begun = time.perf_counter()
+            engine.query_upload(MAP, data, meta, Query())
+            seconds.append(time.perf_counter() - begun)
+        return told(seconds)
+
+
+def _tables(pair: Pair) -> dict[str, int]:
+    """Bytes of each table with its indexes and what is kept beside it."""
+    found = pair.primary.execute(
+        "SELECT relname, pg_total_relation_size(oid) FROM pg_class "
+        "WHERE relkind = 'r' AND relnamespace = 'public'::regnamespace",
+        DATABASE,
+    )
+    return {str(name): cast(int, size) for name, size in found}
+
+
+def _blobs(engine: Engine) -> int:
+    return sum(engine.store.blobs.size(one) or 0 for one in engine.store.blobs.digests())
+
+
+def _commits(database: Database) -> tuple[float, float]:
+    """p50 and p99 of the smallest write in its turn, milliseconds."""
+    from sqlalchemy import text
+
+    with database.write() as connection:
+        connection.execute(text("CREATE TABLE IF NOT EXISTS commits_timed (n bigint)"))
+    taken = []
+    for number in range(COMMITS):
+        begun = time.perf_counter()
+        with database.write() as connection:
+            connection.execute(text("INSERT INTO commits_timed VALUES (:n)"), {"n": number})
+        taken.append(1e3 * (time.perf_counter() - begun))
+    with database.write() as connection:
+        connection.execute(text("DROP TABLE commits_timed"))
+    p50, p99 = np.percentile(taken, (50, 99)).tolist()
+    return p50, p99
+
+
+def _linked(database: Database) -> tuple[float, float, float] | None:
+    """Codes a second that enter the graph; bytes a code of the table, and of the graph.
+
+    None where the database has no pgvector.
+    """
+    from sqlalchemy import text
+
+    # as codes are: most of their length along few axes
+    axes = np.exp(-np.arange(DIMENSION) / 40)
+    drawn = np.random.default_rng(0).normal(size=(CODES, DIMENSION)) * 40 * axes
+    with database.write(unchecked=True) as connection:
+        if codes.prepare(connection) is not None:
+            return None
+        fit = codes.add_fit(connection, "costs", "costs", b"", DIMENSION, CODES)
+        rows = [
+            {"n": i, "code": "[" + ",".join(f"{x:.5g}" for x in one) + "]"}
+            for i, one in enumerate(drawn)
+        ]
+        insert = text(f"INSERT INTO {fit.table} VALUES (:n, 0, CAST(:code AS halfvec))")
+        for i in range(0, CODES, 1000):
+            connection.execute(insert, rows[i : i + 1000])
+        size = text(f"SELECT pg_total_relation_size('{fit.table}')")
+        plain = int(connection.execute(size).scalar_one())
+        begun = time.perf_counter()
+        codes.add_graph(connection, fit)
+        seconds = time.perf_counter() - begun
+        graph = int(connection.execute(size).scalar_one()) - plain
+        codes.drop_fit(connection, fit.number)
+    return CODES / seconds, plain / CODES, graph / CODES
+
+
+def table(found: Costs) -> list[str]:
+    """The figures as lines of Markdown."""
+    lines = [
+        f"### Of a frame and a query: {found.frames} frames of 640 x 480, `{found.model}` "
+        f"({found.signature_bytes:,} bytes a signature)",
+        "",
+        "| | wall, ms | own CPU, ms | of the database, ms | in turn, ms | commits | WAL, bytes |",
+        "|---|--:|--:|--:|--:|--:|--:|",
+    ]
+    for name, one in (("upload", found.upload), ("sign", found.sign), ("query", found.query)):
+        lines.append(
+            f"| {name} | {one.wall_ms:.1f} | {one.own_ms:.1f} | {one.database_ms:.1f} | "
+            f"{one.turn_ms:.1f} | {one.commits:.1f} | {one.wal_bytes:,.0f} |"
+        )
+    rows = sum(found.tables.values())
+    told = ", ".join(
+        f"`{name}` {size:,.0f}" for name, size in sorted(found.tables.items(), key=lambda o: -o[1])
+    )
+    lines += [
+        "",
+        "| | |",
+        "|---|--:|",
+        f"| database, bytes a frame ({told}) | {rows:,.0f} |",
+        f"| blobs, bytes a frame: upload, geometry artifact | {found.blobs[0]:,.0f}, "
+        f"{found.blobs[1]:,.0f} |",
+    ]
+    for name, (p50, p99) in found.commit_ms.items():
+        lines.append(f"| smallest write in its turn, {name}: p50, p99 | {p50:.1f}, {p99:.1f} ms |")
+    if found.linked is not None:
+        rate, plain, graph = found.linked
+        lines.append(
+            f"| codes (`halfvec({DIMENSION})`): entering the graph (HNSW); bytes a frame of table, "
+            f"of graph | {rate:,.0f} a second; {plain:,.0f}, {graph:,.0f} |"
+        )
+    for name, size in sorted(found.memory.items()):
+        lines.append(f"| memory of a {name}'s own, after some work | {size / 1e6:,.0f} MB |")
+    return [*lines, ""]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=100)
+    parser.add_argument("--model", default="compact")
+    parser.add_argument("--data", type=Path, help="folder of recordings; default: synthetic rooms")
+    parser.add_argument("--page", type=Path, help="whose figures to replace")
+    options = parser.parse_args(arguments)
+    wanted = -(-(options.frames + 1) // ROOM_FRAMES)
+    with (
+        recordings(options.data, wanted * ROOM_FRAMES * 16) as data,
+        tempfile.TemporaryDirectory(prefix="sceneprint-costs-") as folder,
+    ):
+        found = measure(Path(folder), data, options.frames, options.model)
+    machine = describe_machine()
+    when = (
+        f"Measured {datetime.now(UTC):%Y-%m-%d} on {machine.processor}, {machine.cores} "
+        "processors; `python -m benchmarks.fleet.costs`."
+    )
+    lines = ["", when, "", *table(found)]
+    print("\n".join(lines))
+    if options.page is not None:
+        put_between(options.page, BEGIN, END, lines)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,150 @@
+"""Meters of work: processors, turns, commits, and the bytes of a log, between two readings.
+
+Meter(pair).running  -->  Work, each
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+from sqlalchemy import Connection
+
+from benchmarks.fleet.pair import DATABASE, Pair
+from sceneprint.cli.served import serving
+from sceneprint.client import Client
+from sceneprint.datasets import FrameReference
+from sceneprint.store.database import Database
+
+#: Ticks of a process's clock in a second.
+_TICKS = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(frozen=True)
+class Work:
+    """What something cost, each.
+
+    Parameters
+    ----------
+    wall_ms : median
+    own_ms, database_ms : of a processor, in this process and in the primary's
+    turn_ms : in which no other process could write
+    commits : that wrote
+    wal_bytes : of the primary's log
+    """
+
+    wall_ms: float
+    own_ms: float
+    database_ms: float
+    turn_ms: float
+    commits: float
+    wal_bytes: float
+
+
+class Meter:
+    """Counts what happens between two readings.
+
+    Parameters
+    ----------
+    pair : whose primary is asked
+    """
+
+    def __init__(self, pair: Pair) -> None:
+        self._pair = pair
+        self._turn_s = 0.0
+
+    @contextmanager
+    def running(self) -> Iterator[Callable[[Sequence[float]], Work]]:
+        """Measure; what is given is asked in the end, with the seconds of each thing done."""
+        write = Database.write
+        meter = self
+
+        @contextmanager
+        def timed(
+            database: Database, *, unchecked: bool = False, turn: bool = True
+        ) -> Iterator[Connection]:
+            begun = time.perf_counter()
+            with write(database, unchecked=unchecked, turn=turn) as connection:
+                yield connection
+            if turn:
+                meter._turn_s += time.perf_counter() - begun
+
+        before = self._reading()
+
+        def told(seconds: Sequence[float]) -> Work:
+            after = self._reading()
+            own, database, turn, commits, wal = (
+                (b - a) / len(seconds) for a, b in zip(before, after, strict=True)
+            )
+            return Work(
+                1e3 * statistics.median(seconds), 1e3 * own, 1e3 * database, 1e3 * turn, commits,
+                wal,
+            )  # fmt: skip
+
+        Database.write = timed  # type: ignore[method-assign]
+        try:
+            yield told
+        finally:
+            Database.write = write  # type: ignore[method-assign]
+
+    def _reading(self) -> tuple[float, float, float, float, float]:
+        primary = self._pair.primary
+        [(number, wal)] = primary.execute(
+            "SELECT pg_snapshot_xmax(pg_current_snapshot())::text::bigint, "
+            "pg_wal_lsn_diff(pg_current_wal_lsn(), '0/0')::bigint",
+            DATABASE,
+        )
+        spent = _spent(int((primary.data / "postmaster.pid").read_text().split()[0]))
+        return time.process_time(), spent, self._turn_s, cast(int, number), cast(int, wal)
+
+
+def _spent(postmaster: int) -> float:
+    """Seconds of a processor that a server's processes took, those that ended as well."""
+    ticks = 0
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:  # it ended meanwhile
+            continue
+        if path.parent.name == str(postmaster):
+            ticks += sum(int(one) for one in fields[11:15])
+        elif int(fields[1]) == postmaster:
+            ticks += int(fields[11]) + int(fields[12])
+    return ticks / _TICKS
+
+
+def memory_of(folder: Path, frames: Sequence[FrameReference]) -> dict[str, int]:
+    """Bytes that a service and its worker have for themselves, after uploads and queries."""
+    with serving(folder / "memory", workers=1) as url, Client(url) as client:
+        client.create_map("memory", model="compact")
+        added = [client.upload("memory", frame) for frame in frames[:30]]
+        client.wait([one.job_id for one in added])
+        for frame in frames[:5]:
+            client.query("memory", frame)
+        found = {}
+        for path in Path("/proc").glob("[0-9]*/cmdline"):
+            try:
+                line = path.read_bytes()
+                parent = int((path.parent / "stat").read_text().rpartition(")")[2].split()[1])
+                if str(folder / "memory").encode() in line and b"serve" in line:
+                    found["service"] = _own_bytes(path.parent)
+                elif b"spawn_main" in line and _serves(parent, folder / "memory"):
+                    found["worker"] = _own_bytes(path.parent)
+            except OSError:  # it ended meanwhile
+                continue
+    return found
+
+
+def _serves(process: int, folder: Path) -> bool:
+    return str(folder).encode() in Path(f"/proc/{process}/cmdline").read_bytes()
+
+
+def _own_bytes(process: Path) -> int:
+    lines = (process / "smaps_rollup").read_text().splitlines()
+    return sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Private_"))

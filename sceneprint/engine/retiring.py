@@ -1,0 +1,94 @@
+"""Retention: frames that are older than their map keeps them are deleted, some at a time.
+
+    maps with `retention_days`  --Retiring.run-->  frames deleted for good, each with its event
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+
+from sceneprint.engine.sweeping import sweep_deleted
+from sceneprint.errors import SceneprintError
+from sceneprint.store import Store
+from sceneprint.store.aging import DAY_S, aging_maps, count_old, old_frames
+from sceneprint.store.deleting import delete_frames
+from sceneprint.store.maps import find_map
+from sceneprint.store.records import MapRow
+
+log = logging.getLogger(__name__)
+
+#: Frames deleted in one commit: writers wait meanwhile, for some 20 ms.
+AT_ONCE = 100
+#: Seconds that one turn takes at most: frames are waiting to be signed.
+TURN_S = 2.0
+#: Seconds between two looks where nothing was left to do.
+LOOK_S = 60.0
+#: What the events say of why.
+REASON = "retention"
+
+
+class Retiring:
+    """Deletes what is too old; any number of processes may.
+
+    Parameters
+    ----------
+    store : see Store
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._next = 0.0
+
+    def run(self, now: float | None = None) -> int:
+        """Delete some of what is too old, where it is time to look; returns how many frames.
+
+        Where that cannot be written, it is logged and tried again.
+
+        Parameters
+        ----------
+        now : seconds since 1970; default: by the clock
+        """
+        if time.monotonic() < self._next:
+            return 0
+        self._next = time.monotonic() + LOOK_S
+        try:
+            with self._store.database.read() as connection:
+                rows = aging_maps(connection)
+            until, deleted = time.monotonic() + TURN_S, 0
+            for row in rows:
+                while (found := self._block(row, time.time() if now is None else now)) > 0:
+                    deleted += found
+                    if time.monotonic() > until:
+                        self._next = 0.0  # the next turn goes on
+                        return deleted
+            return deleted
+        except SceneprintError as error:
+            log.warning("old frames were not deleted", extra={"error": str(error)})
+            return 0
+
+    def _block(self, row: MapRow, now: float) -> int:
+        """Delete the oldest frames of a map, a few of them; returns how many."""
+        if row.retention_days is None:
+            return 0
+        with self._store.database.read() as connection:  # most often there is none: no lock
+            if not old_frames(connection, row.number, now - DAY_S * row.retention_days, 1):
+                return 0
+        with self._store.database.write() as connection:
+            found = find_map(connection, row.name)  # it may have been told to keep them since
+            if found.number != row.number or found.retention_days is None:
+                return 0
+            before = now - DAY_S * found.retention_days
+            numbers = old_frames(connection, found.number, before, AT_ONCE)
+            blobs = delete_frames(connection, found, numbers, REASON)
+        sweep_deleted(self._store, blobs)
+        if numbers:
+            log.info("old frames deleted", extra={"map": row.name, "frames": len(numbers)})
+        return len(numbers)
+
+
+def would_retire(store: Store, map_name: str, days: float, now: float | None = None) -> int:
+    """How many frames of a map a retention would delete at once; UnknownMap."""
+    before = (time.time() if now is None else now) - DAY_S * days
+    with store.database.read() as connection:
+        return count_old(connection, find_map(connection, map_name).number, before)

@@ -1,0 +1,75 @@
+"""Blobs that nothing refers to any more, removed."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+
+from sceneprint.errors import UnusableStore
+from sceneprint.store import Store
+from sceneprint.store.deleting import doom, doomed_blobs, settle
+from sceneprint.store.frames import refers_to
+
+log = logging.getLogger(__name__)
+
+#: Blobs that are removed in one transaction, and seconds after which it ends anyhow: writers wait
+#: meanwhile, and a store of objects may be far away.
+SWEPT_AT_ONCE, SWEPT_S = 200, 0.5
+#: Blobs of deleted frames that are looked at in one turn of a worker's upkeep.
+_LEFT_AT_ONCE = 2_000
+
+
+def sweep(store: Store, blobs: Sequence[str]) -> None:
+    """Remove blobs that nothing refers to any more.
+
+    In writing transactions, so that no upload comes to refer to one in between, and short ones.
+    While a snapshot is being taken they stay, as it may refer to them: `sweep_doomed` removes them
+    later.
+    """
+    done = 0
+    while done < len(blobs):
+        with store.database.write() as connection, store.blobs.removing() as allowed:
+            if not allowed:
+                doom(connection, blobs[done : done + SWEPT_AT_ONCE])
+                done += SWEPT_AT_ONCE
+                log.info("blobs are removed later", extra={"blobs": len(blobs)})
+                continue
+            until, block = time.monotonic() + SWEPT_S, blobs[done : done + SWEPT_AT_ONCE]
+            swept = 0
+            for blob in block:
+                if not refers_to(connection, blob):
+                    store.blobs.remove(blob)
+                swept += 1
+                if time.monotonic() > until:
+                    break
+            settle(connection, block[:swept])
+            done += swept
+
+
+def sweep_deleted(store: Store, blobs: Sequence[str]) -> None:
+    """As `sweep`, after a deletion that took effect already and is not to be refused any more."""
+    try:
+        sweep(store, blobs)
+    except UnusableStore as error:
+        log.warning("blobs left for later", extra={"blobs": len(blobs), "error": str(error)})
+
+
+def sweep_doomed(store: Store, before: float | None = None) -> int:
+    """Remove what was doomed and is still there: its process died, or a snapshot was being taken.
+
+    Parameters
+    ----------
+    store : see Store
+    before : only what was doomed before this time, seconds since 1970: of what is younger,
+        somebody may be at it
+
+    Returns
+    -------
+    swept : number of blobs that are settled
+    """
+    with store.database.read() as connection:
+        blobs = doomed_blobs(connection, _LEFT_AT_ONCE, before)
+    if blobs:
+        sweep(store, blobs)
+    return len(blobs)

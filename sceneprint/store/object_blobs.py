@@ -1,0 +1,255 @@
+"""Blobs in an object store that a fleet shares.
+
+    PREFIX/blobs/ab/abcdef...   a blob under its digest
+    PREFIX/sceneprint.json      whose they are: two databases on one prefix would sweep each other's
+
+A blob is put in one step, or in parts that are not there before the last: what was not
+acknowledged leaves nothing behind that could be read. It is put also where one is there, which may
+be damaged, or about to be removed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from sceneprint.errors import DamagedBlob, UnusableStore
+from sceneprint.store.blobs import DIGEST, BlobEntry, Condition, require_digest
+from sceneprint.store.faults import unusable
+from sceneprint.store.incoming import IncomingBlob
+from sceneprint.store.locks import Locks
+from sceneprint.store.objects import Objects
+from sceneprint.writing import sync_folder
+
+#: Under the prefix: the blobs, and the name of whom they belong to.
+FOLDER, MARK = "blobs/", "sceneprint.json"
+#: Blobs that this process has put last, of which it knows whether any can have been removed since.
+_KNOWN = 4_096
+
+
+class ObjectBlobs:
+    """Blobs under the prefix of an object store.
+
+    Parameters
+    ----------
+    objects : of the prefix
+    locks : of all that share it
+    owner : tells what the store is called that they belong to
+    """
+
+    def __init__(self, objects: Objects, locks: Locks, owner: Callable[[], str]) -> None:
+        self.objects = objects
+        self._locks, self._owner = locks, owner
+        self._claimed = False
+        self._put: OrderedDict[str, int] = OrderedDict()  # removals until then, by digest
+        self._lock = threading.Lock()
+
+    def claim(self, *, anew: bool = True) -> None:
+        """See that the prefix is this store's, and mark it where it is nobody's yet.
+
+        Parameters
+        ----------
+        anew : mark it
+
+        Raises
+        ------
+        UnusableStore : it is another's, or the object store cannot be used.
+        """
+        if self._claimed:
+            return
+        owner = self._owner()
+        data = json.dumps({"kind": "sceneprint blobs", "store": owner}).encode()
+        for _ in range(2):  # another process may be the first
+            try:
+                found = json.loads(self.objects.get(MARK))["store"]
+            except FileNotFoundError:
+                if not anew or self.objects.put(MARK, data, create=True):
+                    self._claimed = anew
+                    return
+                continue
+            except (ValueError, KeyError, TypeError):
+                found = None
+            if found != owner:
+                raise UnusableStore(
+                    f"{self.objects.url}: the blobs there are of another database, which would "
+                    "lose them to this one. Give each database a prefix of its own in "
+                    f"SCENEPRINT_BLOB_URL. If that database is gone for good, remove {MARK} there."
+                )
+            self._claimed = True
+            return
+
+    def put(self, data: bytes) -> str:
+        """Keep bytes; when this returns the store has acknowledged them. See `Blobs.put`."""
+        digest = hashlib.sha256(data).hexdigest()
+        with self._putting(digest):
+            self.objects.put(_key(digest), data)
+        return digest
+
+    @contextmanager
+    def incoming(self) -> Iterator[IncomingBlob]:
+        """Take a blob in parts; see `Blobs.incoming`.
+
+        It waits in the folder of temporary files, without a name, until its digest is known:
+        stores do not copy what is larger than 5 GB from one key to another in one step.
+        """
+        place = tempfile.gettempdir()
+        what = f"{place}: a blob cannot be written"
+        with ExitStack() as stack:
+            try:
+                file = stack.enter_context(tempfile.TemporaryFile())
+            except OSError as error:
+                raise unusable(what, error) from error
+            yield IncomingBlob(file, what, lambda digest: self._keep(file, digest))
+
+    def _keep(self, file: BinaryIO, digest: str) -> None:
+        file.flush()
+        file.seek(0)
+        with self._putting(digest):
+            self.objects.put_file(_key(digest), file)
+
+    @contextmanager
+    def _putting(self, digest: str) -> Iterator[None]:
+        self.claim()
+        before = self._locks.removals()
+        yield
+        with self._lock:
+            self._put.pop(digest, None)
+            if before is not None:
+                self._put[digest] = before
+            if len(self._put) > _KNOWN:
+                self._put.popitem(last=False)
+
+    def get(self, digest: str) -> bytes:
+        """The bytes of a digest, checked against it; see `Blobs.get`."""
+        require_digest(digest)
+        try:
+            data = self.objects.get(_key(digest))
+        except FileNotFoundError as error:
+            raise DamagedBlob(
+                f"The blob {digest[:12]} cannot be read (No such object). Restore it from a copy, "
+                "or delete the frame and upload it again."
+            ) from error
+        if hashlib.sha256(data).hexdigest() != digest:
+            raise DamagedBlob(
+                f"The blob {digest[:12]} is damaged: its content has another hash. Restore it "
+                "from a copy, or delete the frame and upload it again."
+            )
+        return data
+
+    def open(self, digest: str) -> BinaryIO:
+        """A blob as a file that can be sought in, read a part at a time; see `Blobs.open`."""
+        require_digest(digest)
+        return self.objects.open(_key(digest))
+
+    def holds(self, digest: str) -> bool:
+        """Whether there is a blob of that digest.
+
+        Asked in writing transactions, for which all others wait: where this process has put it,
+        and nothing was removed since, the database alone is asked.
+        """
+        require_digest(digest)
+        with self._lock:
+            before = self._put.get(digest)
+        if before is not None and before == self._locks.removals():
+            return True
+        return self.objects.size(_key(digest)) is not None
+
+    def size(self, digest: str) -> int | None:
+        """Bytes of a blob, unchecked; None where it is missing."""
+        require_digest(digest)
+        return self.objects.size(_key(digest))
+
+    def kept(self) -> AbstractContextManager[None]:
+        """See that no blob is removed meanwhile; see `Blobs.kept`."""
+        return self._locks.kept()
+
+    def removing(self) -> AbstractContextManager[bool]:
+        """Hold the right to remove blobs; see `Blobs.removing`."""
+        return self._locks.removing()
+
+    def remove(self, digest: str) -> None:
+        """Forget a blob that nothing refers to; only within `removing`."""
+        require_digest(digest)
+        self.claim()
+        with self._lock:
+            self._put.pop(digest, None)
+        self.objects.delete(_key(digest))
+
+    def condition(self, digest: str, *, quick: bool = False) -> Condition:
+        """Whether a blob is as it was stored; see `Blobs.condition`."""
+        if not DIGEST.fullmatch(digest):
+            return "missing"
+        size, hashed = self.objects.size(_key(digest)), hashlib.sha256()
+        if size is None:
+            return "missing"
+        if quick:
+            return "sound"
+        try:
+            for chunk in self.objects.chunks(_key(digest), size):
+                hashed.update(chunk)
+        except FileNotFoundError:  # removed meanwhile
+            return "missing"
+        return "sound" if hashed.hexdigest() == digest else "damaged"
+
+    def quarantine(self, digest: str, folder: Path) -> Path | None:
+        """Fetch what lies under a digest into a folder of this machine, durably, and remove it."""
+        require_digest(digest)
+        place = folder / f"blob-{digest}"
+        folder.mkdir(parents=True, exist_ok=True)
+        place.unlink(missing_ok=True)
+        try:
+            self.objects.get_file(_key(digest), place)
+        except FileNotFoundError:
+            with suppress(FileNotFoundError):
+                place.unlink()
+            return None
+        with place.open("rb") as file:
+            os.fsync(file.fileno())
+        for each in (folder, folder.parent):
+            sync_folder(each)
+        self.remove(digest)
+        return place
+
+    def place(self, digest: str) -> str:
+        """Where a blob lies, for people to look at."""
+        return f"{self.objects.url}/{_key(digest)}"
+
+    def digests(self) -> Iterator[str]:
+        """All blobs, a page at a time."""
+        return (one.digest for one in self.entries() if one.digest is not None)
+
+    def entries(self) -> Iterator[BlobEntry]:
+        """All objects where blobs are kept, a page at a time.
+
+        What a writer left that was killed is not among them: stores do not show the parts of an
+        object that has no end. Let the bucket's lifecycle abort those after a day.
+        """
+        for one in self.objects.list(FOLDER):
+            name = one.key.rpartition("/")[2]
+            own = DIGEST.fullmatch(name) and one.key == _key(name)
+            place = f"{self.objects.url}/{one.key}"
+            yield BlobEntry(place, name if own else None, one.changed_at)
+
+    def check(self) -> None:
+        """See that the store answers: one short request."""
+        if self.objects.size(MARK) is None and self._claimed:
+            raise UnusableStore(
+                f"{self.objects.url}: {MARK} is gone, which was there before: the bucket was "
+                "emptied or replaced. Bring its objects back."
+            )
+
+    def close(self) -> None:
+        """Give back the connections of its locks."""
+        self._locks.close()
+
+
+def _key(digest: str) -> str:
+    return f"{FOLDER}{digest[:2]}/{digest}"
