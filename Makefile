@@ -8,11 +8,12 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint kernels format bench screenshots soak siege models lock clean
+.PHONY: help demo test test-postgres lint kernels format bench screenshots soak siege models lock clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
 	@echo "make test    lint, types, import contracts and all tests"
+	@echo "make test-postgres  the tests of what stands on the database, on PostgreSQL"
 	@echo "make lint    lint, types and import contracts only"
 	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
 	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
@@ -48,6 +49,12 @@ kernels: $(STAMP)
 test: $(STAMP)
 	@$(MAKE) --no-print-directory -j2 lint kernels
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
+# What PostgreSQL does as well, on it: tests/on_postgres leads each process there.
+test-postgres: $(STAMP) kernels
+	SCENEPRINT_TEST_DATABASE=postgresql PYTHONPATH=$(CURDIR)/tests/on_postgres \
+		$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder \
+		$(addprefix tests/,store engine service client worker cli_service maintenance dashboard)
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -6,6 +6,7 @@ store (frames, jobs, indexes, disk) is the same in each of them.
 
 from __future__ import annotations
 
+import math
 import platform
 
 from prometheus_client import (
@@ -73,6 +74,12 @@ class Metrics:
         )  # fmt: skip
         self._events = self._gauge("newest_event", "Number of the newest event: grows for ever.")
         self._disk = self._gauge("disk_bytes", "Disk space taken by each part.", "part")
+        self._replica = self._gauge(
+            "replica_behind_seconds", "What is older is in the read replica; 0 without one."
+        )
+        self._replica_used = self._gauge(
+            "replica_used", "1 while queries are answered from the read replica."
+        )
         self._free = self._gauge("disk_free_bytes", "Left on the disk of the data folder.")
         self._gauge("build_info", "Version of the service.", "version", "python").labels(
             __version__, platform.python_version()
@@ -119,6 +126,10 @@ class Metrics:
         self._workers.labels("idle").set(len(figures.workers) - busy)
         self._began.set(figures.began)
         self._events.set(figures.events)
+        seen = figures.replica
+        self._replica.set(0.0 if seen is None else math.inf if seen.behind_s is None
+                          else seen.behind_s)  # fmt: skip
+        self._replica_used.set(seen is not None and seen.used)
         sizes = figures.sizes
         self._disk.labels("database").set(sizes.database or 0)
         self._disk.labels("blobs").set(sizes.blobs)

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from benchmarks.fleet.checking import Found, await_idle, check
 from benchmarks.fleet.doors import Diary, Doors, Wait
-from benchmarks.fleet.fleet import Fleet
+from benchmarks.fleet.fleet import Fleet, await_service
 from benchmarks.fleet.recordings import Shot, recordings, walks
 from benchmarks.fleet.robots import Ledger, Listener, Robot, asked
 from benchmarks.fleet.saboteur import Kill, Promotion, Saboteur, schedule
@@ -75,7 +75,7 @@ class FleetFigures:
     plan : that was run
     found : what is there in the end
     kills : by victim
-    outages : by victim, for each kill the longest that a robot was without an answer, seconds
+    outages : see `outages`
     promotions : of the standby
     answers : queries by status
     repeated : requests that were sent again
@@ -153,6 +153,8 @@ def _driven(fleet: Fleet, plan: Plan, walked: list[list[Shot]], begun: float) ->
             robot.join(PATIENCE_S)
             if robot.is_alive():
                 diary.fault(f"{robot.name} does not come to its end")
+        for url in fleet.urls:
+            await_service(url)
         await_idle(clients[0])
         found = check(ledger.kept, clients, listeners)
         for listener in listeners:
@@ -214,14 +216,18 @@ def _tell(bar: tqdm[None], ledger: Ledger, stop: threading.Event) -> None:
 
 
 def outages(kills: Sequence[Kill], waits: Sequence[Wait]) -> dict[str, list[float]]:
-    """For each kill the longest wait that it fell into, or that began before the next kill."""
+    """For each kill the longest that a robot had no answer because of it, by victim, seconds.
+
+    A wait is put down to the first kill in it, or to the last one before: what was killed then was
+    not back yet.
+    """
+    longest = [0.0] * len(kills)
+    for wait in waits:
+        within = [i for i, one in enumerate(kills) if wait.begun <= one.at <= wait.answered]
+        before = [i for i, one in enumerate(kills) if one.at < wait.begun]
+        for i in within[:1] or before[-1:]:
+            longest[i] = max(longest[i], wait.answered - max(wait.begun, kills[i].at))
     found: dict[str, list[float]] = {}
-    for i, kill in enumerate(kills):
-        until = kills[i + 1].at if i + 1 < len(kills) else float("inf")
-        longest = max(
-            (one.answered - max(one.begun, kill.at) for one in waits
-             if one.begun < until and one.answered > kill.at),
-            default=0.0,
-        )  # fmt: skip
-        found.setdefault(kill.victim, []).append(longest)
+    for kill, seconds in zip(kills, longest, strict=True):
+        found.setdefault(kill.victim, []).append(seconds)
     return found

@@ -121,6 +121,7 @@ def _spent(postmaster: int) -> float:
 
 def memory_of(folder: Path, frames: Sequence[FrameReference]) -> dict[str, int]:
     """Bytes that a service and its worker have for themselves, after uploads and queries."""
+    (folder / "memory").mkdir()
     with serving(folder / "memory", workers=1) as url, Client(url) as client:
         client.create_map("memory", model="compact")
         added = [client.upload("memory", frame) for frame in frames[:30]]

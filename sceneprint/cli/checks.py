@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 
 from sceneprint import __version__
 from sceneprint.cli.checks_database import database
+from sceneprint.cli.checks_objects import object_stores
+from sceneprint.cli.checks_server import server
 from sceneprint.cli.findings import Finding
 
 if TYPE_CHECKING:
@@ -47,7 +49,11 @@ def machine(settings: Settings) -> Iterator[Finding]:
     yield _kernels()
     yield from _tables(settings.cache_dir)
     yield from _folder(settings.data_dir)
-    yield database(settings)
+    found = database(settings)
+    yield found
+    if found.verdict != "WRONG":
+        yield from server(settings)
+    yield from object_stores(settings)
     yield _embree()
     yield _open3d()
 

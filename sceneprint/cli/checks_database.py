@@ -39,7 +39,7 @@ def database(settings: Settings) -> Finding:
     except SQLAlchemyError:
         return _wrong(f"cannot be opened (not an SQLAlchemy URL). {_CHECK}")
     try:
-        return _sqlite(settings, url) if url.get_backend_name() == "sqlite" else _server(url)
+        return _sqlite(settings, url) if url.get_backend_name() == "sqlite" else _server(settings)
     except (SQLAlchemyError, ImportError) as error:
         reason = str(getattr(error, "orig", None) or error).partition("\n")[0]
         return _wrong(f"cannot be opened ({reason}). {_CHECK}")
@@ -82,10 +82,20 @@ def _sqlite(settings: Settings, url: URL) -> Finding:
     return found
 
 
-def _server(url: URL) -> Finding:
-    from sqlalchemy import create_engine
+def _server(settings: Settings) -> Finding:
+    from sceneprint.errors import SceneprintError
+    from sceneprint.store.database import reach_database
+    from sceneprint.store.revisions import revision_of
 
-    return _schema(create_engine(url))
+    try:
+        database = reach_database(settings.database)
+        try:
+            with database.read() as connection:
+                return _compared(revision_of(connection), database.shown)
+        finally:
+            database.close()
+    except SceneprintError as error:
+        return _wrong(str(error))
 
 
 def _path_of(url: URL) -> Path | None:
@@ -100,15 +110,21 @@ def _path_of(url: URL) -> Path | None:
 
 def _schema(engine: Engine) -> Finding:
     """Compare the schema with the one of this version; the database is not touched."""
-    from sceneprint.store.revisions import known_revisions, revision_of
+    from sceneprint.store.revisions import revision_of
 
-    head, known = known_revisions()
     try:
         with engine.connect() as connection:
             found = revision_of(connection)
     finally:
         engine.dispose()
-    place = f"{engine.url!r}, schema {found}"
+    return _compared(found, repr(engine.url))
+
+
+def _compared(found: str | None, place: str) -> Finding:
+    from sceneprint.store.revisions import known_revisions
+
+    head, known = known_revisions()
+    place = f"{place}, schema {found}"
     if found == head:
         return Finding("ok", "database", place)
     if found is None or found in known:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Collection, Mapping
 from datetime import datetime
 from pathlib import Path
@@ -16,14 +17,17 @@ from sceneprint.engine.choosing import Choosing
 from sceneprint.engine.coding import Coding
 from sceneprint.engine.imports import Imports
 from sceneprint.engine.inspecting import Inspection
-from sceneprint.engine.kept import KeptQueries
+from sceneprint.engine.keeping import open_kept
 from sceneprint.engine.operations import Operations
 from sceneprint.engine.outputs import Outputs
 from sceneprint.engine.points import PointClouds
+from sceneprint.engine.purging import Purging
 from sceneprint.engine.querying import Queries
 from sceneprint.engine.readers import Readers
 from sceneprint.engine.reconstructions import Reconstructions
 from sceneprint.engine.reencoding import Reencoding
+from sceneprint.engine.retiring import Retiring
+from sceneprint.engine.shown import Standing
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.sweeping import sweep_deleted
 from sceneprint.engine.tasks import Tasks
@@ -76,7 +80,9 @@ class Administration:
         choosing = Choosing(settings.shortlist, settings.purge_s)
         self._readers = Readers(self.signers, settings.indexes, choosing)
         self._coding = Coding(self.store.database, choosing)
-        self.kept = KeptQueries(settings.query_dir, settings.query_s, settings.query_bytes)
+        self.kept = open_kept(
+            settings, self.store.blobs, lambda kept: Standing(self.store).asked(kept)
+        )
         self.inspection = Inspection(self.store, self.signers, self.kept)
         self.queries = Queries(self.store, self.signers, self._readers, self.kept)
         self.again = Again(self.store, self.kept, self.queries)
@@ -94,6 +100,11 @@ class Administration:
         self.outputs = Outputs(self.store, self.signers)
         self.points = PointClouds(self.store, self.inspection.pairs, self.kept)
         self.reconstructions = Reconstructions(self.store, self.tasks)
+        self.retiring = Retiring(self.store)
+        self.purging = Purging(
+            self.store, self._upkeep, self.kept, self.reconstructions, settings.purge_s
+        )
+        self._purged = time.monotonic()
         self.operations = Operations(self.store, settings, self.bell)
 
     def close(self) -> None:
@@ -145,9 +156,14 @@ class Administration:
         return told
 
     def forget_gone(self) -> None:
-        """Give up what is held of maps that another process deleted."""
+        """Give up what is held of maps that another process deleted, and now and then of frames."""
         with self.store.database.read() as connection:
-            self._readers.tidy(connection)
+            if time.monotonic() - self._purged < self.settings.purge_s / 2:
+                self._readers.tidy(connection)
+                return
+            self._purged = time.monotonic()
+            self._readers.purge(connection)
+        self.kept.forget(Standing(self.store).all_of)  # this node may have no worker
 
     def cancel_reencode(self, name: str) -> Map:
         """Let a map keep the model it has; see `reencoding.cancel`."""

@@ -241,7 +241,7 @@ class Coding:
 
 def _sound(connection: Connection, numbers: Collection[int], model_id: str) -> dict[int, Bytes]:
     """Signatures of frames, but for damaged ones."""
-    read = vectors.checked(connection, numbers, model_id) if numbers else []
+    read = vectors.vectors(connection, numbers, model_id) if numbers else []
     return {
         number: np.frombuffer(vector, np.uint8)
         for number, vector, checksum in read

@@ -6,6 +6,7 @@ frame, patch  --edited-->  its columns as they shall be  --edit_frame-->  frame
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -72,21 +73,25 @@ def edit_frame(
 
 
 def edit_map(
-    store: Store, map_name: str, patch: Mapping[str, Any], if_match: Collection[str] | None = None
-) -> Map:
+    store: Store, map_name: str, patch: Mapping[str, Any],
+    if_match: Collection[str] | None = None, *, dry_run: bool = False,
+) -> Map:  # fmt: skip
     """Change title, quotas and retention of a map; parameters and errors as of `edit_frame`.
 
-    Who may set a quota, the caller has seen to.
+    Who may set a quota, the caller has seen to. With `dry_run` nothing is changed, and the map told
+    as it would be.
     """
     try:
         change = MapEdit.model_validate(dict(patch))
     except ValidationError as error:
         raise _invalid(error, "The change of the map") from error
-    with store.database.write() as connection:
+    values = change.model_dump(include=change.model_fields_set)
+    with store.database.read() if dry_run else store.database.write() as connection:
         row = find_map(connection, map_name)
         _check_tag(f"Map {row.name!r}", map_tag(row), if_match)
-        row = write_map(connection, row, change.model_dump(include=change.model_fields_set))
-        return tell_map(connection, row)
+        if dry_run:
+            return tell_map(connection, replace(row, **values))
+        return tell_map(connection, write_map(connection, row, values))
 
 
 def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:

@@ -181,14 +181,19 @@ class Engine(Administration):
             return stored_frames.count_states(connection), listing.count_jobs(connection)
 
     def publish_due(self) -> int:
-        """Bring maps on to their next models, publish the indexes that have fallen behind, verify
-        a little, and remove what is no longer kept; returns how many were published.
+        """Bring maps on to their next models, delete what is too old, publish the indexes that have
+        fallen behind, verify a little, and remove what is no longer kept; returns how many indexes
+        were published.
         """
         self._reencoding.run()
+        self.retiring.run()
         published = self._upkeep.run()
         self._coding.run()
         self.operations.tidy()
         self.imports.tidy()
+        if self.purging.run() is not None:
+            with self.store.database.read() as connection:
+                self._readers.purge(connection)
         return published
 
     def rebuild_index(self, map_name: str) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 import os
 import tempfile
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -87,11 +88,11 @@ class Growing:
             kept.append(change, self._rows[place])
         return kept
 
-    def without(self, key: int) -> Growing:
-        """All but one, in arrays of their own."""
+    def without(self, keys: Collection[int]) -> Growing:
+        """All but some, in arrays of their own."""
         kept = Growing(self._rows.shape[1], self._folder, len(self))
         for other, place in self._places.items():
-            if other != key:
+            if other not in keys:
                 kept.append(Change(other, "", int(self._revisions[place]), None), self._rows[place])
         return kept
 

@@ -36,7 +36,7 @@ def create_map(store: Store, new: NewMap) -> tuple[Map, bool]:
         other = any(getattr(there, name) != value for name, value in limits.items())
         if other or (there.title, there.model_id) != (new.title, model.id):
             raise MapExists(
-                f"There is a map {new.name!r} with another title, model, quota or retention. "
+                f"There is a map {new.name!r} with another title or model, or other limits. "
                 "Use it as it is, delete it, or choose another name."
             )
         return tell_map(connection, there), False

@@ -25,6 +25,7 @@ from sceneprint.engine.views import View
 from sceneprint.index import Generation, newest, newest_number
 from sceneprint.store import Database
 from sceneprint.store.events import holds_anchor
+from sceneprint.store.maps import list_maps
 from sceneprint.store.records import MapRow
 from sceneprint.store.replica import require_primary
 from sceneprint.store.signatures import Change, changes_since, count_indexed
@@ -122,6 +123,17 @@ class Reader:
                 self._lock.release()
         return self._view
 
+    def purge(self, connection: Connection, row: MapRow) -> None:
+        """Hold no signature of a deleted frame any more, but what the newest index has of it."""
+        with self._lock:
+            if self._view.revision < row.revision:
+                self._catch_up(connection, row)
+            self._swap(connection, row)
+            gone = {number for number in self._dead if number in self._tail}
+            if gone:
+                self._tail = self._tail.without(gone)
+                self._publish(self._view.generation, self._view.revision)
+
     def _is_time(self) -> bool:
         return time.monotonic() - self._looked >= _LOOK_S
 
@@ -149,7 +161,7 @@ class Reader:
         elif self._tail.revision_of(change.number) < change.revision:
             # else an error ended the last time half way
             if change.number in self._tail:  # signed anew, as it had been damaged
-                self._tail = self._tail.without(change.number)
+                self._tail = self._tail.without({change.number})
             self._tail.append(change, np.frombuffer(change.vector, np.uint8))
             self._dead.pop(change.number, None)  # rejected by a model, and tried again by another
 
@@ -286,6 +298,17 @@ class Readers:
         """Give up what is held of a map that was deleted."""
         with self._lock:
             self._open.pop(name, None)
+
+    def purge(self, connection: Connection) -> None:
+        """Hold nothing of deleted frames any more, beyond what the newest indexes have of them."""
+        self.tidy(connection)
+        with self._lock:
+            held = list(self._open.items())
+        rows = {row.name: row for row in list_maps(connection)}
+        for name, (wanted, reader) in held:
+            row = rows.get(name)
+            if row is not None and (row.number, row.model_id) == wanted:
+                reader.purge(connection, row)
 
     def tidy(self, connection: Connection) -> None:
         """Give up what is held of maps that another process deleted, or gave another model.

@@ -16,11 +16,18 @@ from sqlalchemy import Connection
 from sceneprint.artifacts import read_geometry
 from sceneprint.engine.fusing import View, fused
 from sceneprint.engine.kept import Kept
+from sceneprint.engine.shown import Standing
 from sceneprint.engine.slices import Outcome, Swept, Task
 from sceneprint.engine.sweeping import sweep_deleted
 from sceneprint.engine.tasks import Tasks
 from sceneprint.engine.wire import when
-from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnreadableGeometry
+from sceneprint.errors import (
+    DamagedBlob,
+    InvalidRequest,
+    NotIndexed,
+    UnknownJob,
+    UnreadableGeometry,
+)
 from sceneprint.geometry.rigid import inverse
 from sceneprint.schemas import JobState, Match
 from sceneprint.schemas.reconstructions import (
@@ -33,7 +40,7 @@ from sceneprint.schemas.reconstructions import (
 from sceneprint.store import Store
 from sceneprint.store.associations import remove_job
 from sceneprint.store.listing import find_job, unknown_job
-from sceneprint.store.parts import JobFile, files_of
+from sceneprint.store.parts import JobFile, files_of, jobs_with_files
 from sceneprint.store.records import JobRow
 from sceneprint.types import Geometry
 
@@ -130,6 +137,16 @@ class Reconstructions:
             blobs = remove_job(connection, _find(connection, job_id))
         sweep_deleted(self._store, blobs)
 
+    def forget(self, standing: Standing) -> int:
+        """Remove those of which any view was deleted since: they show it; returns how many."""
+        with self._store.database.read() as connection:
+            found = jobs_with_files(connection, KIND)
+        gone = [job for job in found if not _stands(job, standing)]
+        for job in gone:
+            with suppress(UnknownJob):  # somebody else has
+                self.delete(job.id)
+        return len(gone)
+
     def _fuse(self, task: Task, until: float) -> Outcome:
         """Do it, in one slice: at most 32 views of bounded size take seconds."""
         del until
@@ -196,6 +213,12 @@ def _view(match: Match) -> View:
         raise ValueError(f"match {match.frame_id} has no transform")
     T = inverse(np.array(match.transform.matrix))
     return View(match.map, match.frame_id, match.rank, match.validation.strength, T.tolist())
+
+
+def _stands(job: JobRow, standing: Standing) -> bool:
+    data = job.data or {}
+    views = [*data["views"], *([] if data["own"] is None else [data["own"]])]
+    return all(standing.frame(one["map"], one["frame_id"], data["asked_at"]) for one in views)
 
 
 def _find(connection: Connection, job_id: str) -> JobRow:

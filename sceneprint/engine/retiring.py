@@ -1,6 +1,6 @@
 """Retention: frames that are older than their map keeps them are deleted, some at a time.
 
-    maps with `retention_days`  --Retiring.run-->  frames deleted for good, each with its event
+maps with `retention_days`  --Retiring.run-->  frames deleted for good, each with its event
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import time
 from sceneprint.engine.sweeping import sweep_deleted
 from sceneprint.errors import SceneprintError
 from sceneprint.store import Store
-from sceneprint.store.aging import DAY_S, aging_maps, count_old, old_frames
+from sceneprint.store.aging import DAY_S, aging_maps, old_frames
 from sceneprint.store.deleting import delete_frames
 from sceneprint.store.maps import find_map
 from sceneprint.store.records import MapRow
@@ -85,10 +85,3 @@ class Retiring:
         if numbers:
             log.info("old frames deleted", extra={"map": row.name, "frames": len(numbers)})
         return len(numbers)
-
-
-def would_retire(store: Store, map_name: str, days: float, now: float | None = None) -> int:
-    """How many frames of a map a retention would delete at once; UnknownMap."""
-    before = (time.time() if now is None else now) - DAY_S * days
-    with store.database.read() as connection:
-        return count_old(connection, find_map(connection, map_name).number, before)

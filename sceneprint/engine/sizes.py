@@ -4,30 +4,34 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from sqlalchemy import Connection, make_url
+from sqlalchemy import Connection, func, select
 
 from sceneprint.engine.readers import index_folder
 from sceneprint.schemas.operations import Sizes
 from sceneprint.settings import Settings
-from sceneprint.store import Store
-from sceneprint.store.growth import kept_frames, weigh
+from sceneprint.store import Blobs, Database, FolderBlobs, Store
+from sceneprint.store.growth import bytes_of_files, count_kept, kept_frames, spread_frames, weigh
 from sceneprint.store.records import MapRow
 
 #: Blobs that are measured one by one; of more, the rest is taken to be like them.
 MEASURED = 5_000
 #: Frames of one map that are; taken evenly in the order they came.
 WEIGHED = 1_000
+#: Frames of a whole store that are weighed where blobs are not files, and blobs that are asked for.
+SPREAD, ASKED = 64, 16
+_HERE = func.current_database()
 
 
-def sizes(settings: Settings) -> Sizes:
+def sizes(settings: Settings, store: Store) -> Sizes:
     """Bytes of all parts of a store."""
     free, disk = _free_of(settings.data_dir)
+    blobs = settings.blobs
     return Sizes(
-        database=_of_database(settings.database),
-        blobs=_of_blobs(settings.blob_dir),
+        database=_of_database(store.database),
+        blobs=_of_blobs(blobs) if isinstance(blobs, Path) else _of_objects(store),
         index=sum(_files_of(settings.indexes, deep=True)),
         free=free,
         disk=disk,
@@ -48,7 +52,7 @@ def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRo
     """
     numbers, total = kept_frames(connection, row.number, WEIGHED)
     weight = weigh(connection, numbers)
-    artifacts = sum(store.blobs.size(one) or 0 for one in weight.artifacts)
+    artifacts = _of_artifacts(store.blobs, weight.artifacts)
     share = max(len(numbers), 1)
     return Sizes(
         database=weight.signature_bytes * total // share,
@@ -59,12 +63,33 @@ def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRo
     )
 
 
-def _of_database(url: str) -> int | None:
-    parsed = make_url(url)
-    if parsed.get_backend_name() != "sqlite" or parsed.database is None:
+def _of_database(database: Database) -> int | None:
+    if not database.is_sqlite:
+        with database.read() as connection:
+            return int(connection.execute(select(func.pg_database_size(_HERE))).scalar_one())
+    path = database.file
+    if path is None:
         return None
-    path = Path(parsed.database)
     return sum(_size(one) for one in (path, path.with_name(path.name + "-wal")))
+
+
+def _of_objects(store: Store) -> int:
+    """Bytes of all blobs in an object store: some of the rows are weighed, and nothing is listed."""
+    with store.database.read() as connection:
+        some = spread_frames(connection, SPREAD)
+        weight = weigh(connection, some)
+        total = count_kept(connection)
+        files = bytes_of_files(connection)
+    each = (weight.upload_bytes + _of_artifacts(store.blobs, weight.artifacts)) / max(len(some), 1)
+    return int(each * total) + files
+
+
+def _of_artifacts(blobs: Blobs, artifacts: Sequence[str]) -> int:
+    """Bytes of some blobs; of many that each cost a request, a few stand for all."""
+    if isinstance(blobs, FolderBlobs) or len(artifacts) <= ASKED:
+        return sum(blobs.size(one) or 0 for one in artifacts)
+    some = artifacts[:: -(-len(artifacts) // ASKED)]
+    return sum(blobs.size(one) or 0 for one in some) * len(artifacts) // len(some)
 
 
 def _of_blobs(folder: Path) -> int:

@@ -28,6 +28,7 @@ from sceneprint.schemas.operations import (
     IndexState,
     Latency,
     Minute,
+    ReplicaSeen,
     Sizes,
     Stats,
     WorkerSeen,
@@ -35,6 +36,7 @@ from sceneprint.schemas.operations import (
 from sceneprint.settings import Settings
 from sceneprint.store import Store
 from sceneprint.store.bell import Bell
+from sceneprint.store.clock import read_clock
 from sceneprint.store.events import newest_number
 from sceneprint.store.figures import (
     at_work,
@@ -70,6 +72,7 @@ class Figures:
     indexes, workers, sizes : see Stats
     began : workers that began in the last hour
     events : number of the newest event
+    replica : see Stats
     """
 
     frames: dict[str, int]
@@ -81,6 +84,7 @@ class Figures:
     sizes: Sizes
     began: int
     events: int
+    replica: ReplicaSeen | None = None
 
 
 class Statistics:
@@ -122,7 +126,7 @@ class Statistics:
                 maps, indexes = count_maps(connection), index_states(connection, self._indexes)
                 samples = samples_since(connection, SERVICE, start)
                 oldest = oldest_waiting(connection)
-                workers = self.workers(connection, now)
+                workers = self.workers(connection)
             else:
                 frames = count_frames(connection, row.number)
                 jobs = count_jobs_of(connection, row.number)
@@ -140,6 +144,7 @@ class Statistics:
             indexes=indexes,
             workers=workers,
             bytes=taken or self.sizes(),
+            replica=self.replica() if row is None else None,
             total=Counted(**_counted(happened, range(minutes), samples)),
             minutes=_minutes(happened, samples, start, minutes),
         )
@@ -156,6 +161,14 @@ class Statistics:
                 self._figures = now, self._look()
             return self._figures[1]
 
+    def replica(self) -> ReplicaSeen | None:
+        """How the read replica does, if there is one."""
+        if self._store.replica is None:
+            return None
+        found = self._store.replica.standing()
+        behind_s = None if found.behind_s is None else round(found.behind_s, 3)
+        return ReplicaSeen(used=found.used, behind_s=behind_s)
+
     def began(self, worker: str) -> None:
         """Note that a worker has begun; where that cannot be written, nobody will know."""
         with suppress(SceneprintError), self._store.database.write(turn=False) as connection:
@@ -171,15 +184,16 @@ class Statistics:
                 maps=count_maps(connection),
                 oldest_waiting_s=0.0 if oldest is None else max(now - oldest, 0.0),
                 indexes=index_states(connection, self._indexes),
-                workers=self.workers(connection, now),
+                workers=self.workers(connection),
                 sizes=self.sizes(),
                 began=count_samples(connection, WORKER, now - HOUR_S),
                 events=newest_number(connection),
+                replica=self.replica(),
             )
 
-    def workers(self, connection: Connection, now: float) -> list[WorkerSeen]:
+    def workers(self, connection: Connection) -> list[WorkerSeen]:
         """Processes that wait for jobs, of SQLite on this machine, and those that have one in hand."""
-        busy = at_work(connection, now)
+        busy = at_work(connection, read_clock(connection))
         names = sorted({*self._bell.listeners(connection), *busy})
         return [WorkerSeen(name=name, job_id=busy.get(name)) for name in names]
 
@@ -187,7 +201,7 @@ class Statistics:
         """Bytes on the disk, measured now and then."""
         now = time.monotonic()
         if self._sizes is None or now - self._sizes[0] > MEASURED_S:
-            self._sizes = now, sizes(self._settings)
+            self._sizes = now, sizes(self._settings, self._store)
         return self._sizes[1]
 
     def _sizes_of_map(self, connection: Connection, row: MapRow) -> Sizes:

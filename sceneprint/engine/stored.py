@@ -25,6 +25,7 @@ from sceneprint.index import SHORTLIST, Code, Hits
 from sceneprint.index.keys import Keys
 from sceneprint.store import Database, codes, vectors
 from sceneprint.store.codes import Fit
+from sceneprint.store.vectors import Vector
 from sceneprint.types import Bytes
 
 #: Bytes of signatures that are read and compared at once.
@@ -115,7 +116,7 @@ class Stored:
         read: dict[int, Bytes] = {}
         if lacking:
             with self.database.read() as connection:
-                for numbers, rows in _read(self, connection, [self], lacking):
+                for _, numbers, rows in _some(connection, [self], lacking):
                     read.update(zip(numbers.tolist(), rows, strict=True))
         found = np.empty((len(keys), self.length), np.uint8)
         for i, key in enumerate(keys.tolist()):
@@ -150,28 +151,22 @@ def search_stored(
     first = views[0]
     wanted = None if among is None else np.concatenate(among)
     asked = sum(view.size for view in views) if wanted is None else len(wanted)
+    count = max(SHORTLIST, size)
     with first.database.read() as connection:
         chosen = None
-        if not exact and asked > max(SHORTLIST, size):
-            chosen = _proposed(connection, views, query, max(SHORTLIST, size), asked, wanted, dead)
-        hits = []
-        for view in views:
-            view._held.clear()
+        if not exact and asked > count:
+            chosen = _proposed(connection, views, query, count, asked, wanted, dead)
+        found = {view.map_number: _Nearest(query, size, dead) for view in views}
+        for i, view in enumerate(views):
             view._compared = chosen
-        if chosen is None:
-            for i, view in enumerate(views):
-                own = None if among is None else among[i]
-                found = _Nearest(query, size)
-                for numbers, rows in _all(view, connection, own):
-                    found.add(numbers, rows, dead)
-                hits.append(found.hits(exact=True))
-        else:
-            found_of = {view.map_number: _Nearest(query, size) for view in views}
-            for number, numbers, rows in _read_of_maps(first, connection, views, chosen.tolist()):
-                found_of[number].add(numbers, rows, dead)
-            hits = [found_of[view.map_number].hits(exact=False) for view in views]
-        if size <= _HELD:
-            _hold(connection, views, hits, size)
+            own = None if among is None else among[i]
+            for keys, rows in () if chosen is not None else _all(view, connection, own):
+                found[view.map_number].add(keys, rows)
+        if chosen is not None:
+            for number, keys, rows in _some(connection, views, chosen.tolist()):
+                found[number].add(keys, rows)
+        hits = [found[view.map_number].hits(exact=chosen is None) for view in views]
+        _hold(connection, views, hits, min(size, _HELD))
     return hits
 
 
@@ -179,10 +174,11 @@ def _hold(connection: Connection, views: Sequence[Stored], hits: Sequence[Hits],
     """Keep the signatures of the nearest of all: a later look might not find them any more."""
     keys = np.concatenate([one.keys for one in hits])
     order = np.lexsort((keys, np.concatenate([one.distances for one in hits])))
-    nearest = keys[order[:size]].tolist()
-    by_map = {view.map_number: view for view in views}
-    for number, numbers, rows in _read_of_maps(views[0], connection, views, nearest):
-        by_map[number]._held.update(zip(numbers.tolist(), rows, strict=True))
+    held: dict[int, dict[int, Bytes]] = {view.map_number: {} for view in views}
+    for number, some, rows in _some(connection, views, keys[order[:size]].tolist()):
+        held[number].update(zip(some.tolist(), rows, strict=True))
+    for view in views:
+        view._held = held[view.map_number]
 
 
 def _proposed(
@@ -207,40 +203,34 @@ def _all(view: Stored, connection: Connection, among: Keys | None) -> Iterator[t
     """All frames of a map and their signatures, block by block."""
     rows = max(BLOCK_BYTES // view.length, 1)
     for block in vectors.blocks(connection, view.map_number, view.model_id, rows, among):
-        yield _sound(view, [(number, vector, checksum) for number, vector, checksum in block])
+        yield _sound(view, block)
 
 
-def _read_of_maps(
-    first: Stored, connection: Connection, views: Sequence[Stored], numbers: Sequence[int]
+def _some(
+    connection: Connection, views: Sequence[Stored], numbers: Sequence[int]
 ) -> Iterator[tuple[int, Keys, Bytes]]:
-    """Signatures of some frames of some maps, in blocks of one map each."""
-    heads = vectors.heads(connection, numbers, [v.map_number for v in views], first.model_id)
-    by_map = {view.map_number: view for view in views}
+    """Signatures of those of some frames that are found, in blocks of one map each."""
+    first, by_map = views[0], {view.map_number: view for view in views}
+    heads = vectors.heads(connection, numbers, by_map, first.model_id)
     step = max(BLOCK_BYTES // first.length, 1)
     for start in range(0, len(heads), step):
         some = heads[start : start + step]
         known = first.remembered.get(some, first.model_id)
-        lacking = [head.number for head in some if head.number not in known]
-        read = vectors.vectors(connection, lacking, first.model_id) if lacking else {}
+        lacking = {head.number: head for head in some if head.number not in known}
+        if lacking:
+            read = vectors.vectors(connection, lacking, first.model_id)
+            first.remembered.put({lacking[n]: vector for n, vector, _ in read}, first.model_id)
+            known |= {number: vector for number, vector, _ in read}
         for number in sorted({head.map_number for head in some}):
-            own = [head for head in some if head.map_number == number]
-            keys, rows = _sound(
-                by_map[number],
-                [(h.number, known.get(h.number, read.get(h.number, b"")), h.checksum)
-                 for h in own],
-            )  # fmt: skip
-            yield number, keys, rows
-        first.remembered.put({h: read[h.number] for h in some if h.number in read}, first.model_id)
+            own = [
+                (head.number, known[head.number], head.checksum)
+                for head in some
+                if head.map_number == number
+            ]
+            yield number, *_sound(by_map[number], own)
 
 
-def _read(
-    first: Stored, connection: Connection, views: Sequence[Stored], numbers: Sequence[int]
-) -> Iterator[tuple[Keys, Bytes]]:
-    for _, keys, rows in _read_of_maps(first, connection, views, numbers):
-        yield keys, rows
-
-
-def _sound(view: Stored, read: Sequence[tuple[int, bytes, int]]) -> tuple[Keys, Bytes]:
+def _sound(view: Stored, read: Sequence[Vector]) -> tuple[Keys, Bytes]:
     """Those whose bytes are what was stored; the others are noted."""
     kept = []
     for number, vector, checksum in read:
@@ -255,16 +245,16 @@ def _sound(view: Stored, read: Sequence[tuple[int, bytes, int]]) -> tuple[Keys, 
 class _Nearest:
     """The nearest frames of one map among those that come by."""
 
-    def __init__(self, query: Bytes, size: int) -> None:
+    def __init__(self, query: Bytes, size: int, dead: frozenset[int]) -> None:
         self._query, self._size = query, size
+        self._dead = np.fromiter(dead, np.int64, len(dead))
         self._keys, self._found, self._count = np.empty(0, np.int64), np.empty(0, np.int64), 0
 
-    def add(self, keys: Keys, rows: Bytes, dead: frozenset[int]) -> None:
-        alive = ~np.isin(keys, list(dead))
-        keys, rows = keys[alive], rows[alive]
-        self._count += len(keys)
-        keys = np.concatenate([self._keys, keys])
-        found = np.concatenate([self._found, distances(self._query, rows)])
+    def add(self, keys: Keys, rows: Bytes) -> None:
+        alive = np.flatnonzero(~np.isin(keys, self._dead))
+        self._count += len(alive)
+        keys = np.concatenate([self._keys, keys[alive]])
+        found = np.concatenate([self._found, distances(self._query, rows, rows=alive)])
         first = np.lexsort((keys, found))[: self._size]
         self._keys, self._found = keys[first], found[first]
 

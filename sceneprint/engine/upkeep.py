@@ -17,7 +17,7 @@ from sceneprint.engine.readers import index_folder, is_index_folder, trusted
 from sceneprint.engine.scrubbing import Scrubber
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import BusyIndex, InvalidRequest, SceneprintError, UnknownMap
-from sceneprint.index import Generation, newest, newest_number, publish
+from sceneprint.index import Generation, clear, manifests, newest, newest_number, publish
 from sceneprint.store import Store
 from sceneprint.store.events import anchor_of
 from sceneprint.store.maps import find_map, list_maps
@@ -128,8 +128,38 @@ class Upkeep:
             count_gone(connection, row.number, since) > self._tail_frames
         )
 
+    def purge(self, row: MapRow) -> bool:
+        """Leave no byte of a deleted frame in the index of a map; whether anything was done.
+
+        Raises
+        ------
+        UnknownMap : the map is gone, and with it soon its index.
+        OSError : it cannot be written; what was there stays.
+        """
+        folder = index_folder(self._indexes, row)
+        listed = manifests(folder)
+        if not listed:
+            return False
+        length = self._signers(row.model_id).model.signature_bytes
+        with self._store.database.read() as connection:
+            now = find_map(connection, row.name)
+            if now.number != row.number:
+                return False
+            found = newest(folder, row.model_id, length)
+            gone = deleted_since(connection, row.number, 0 if found is None else found.revision)
+            empty = count_indexed(connection, row.number, 0) == 0
+            older = len(listed) > 1 and count_gone(connection, row.number, 0) > 0
+        if empty:
+            return clear(folder)
+        if found is None:
+            return False  # it is made anew when the map has grown long
+        in_use = len(found) - int((found.places.of(np.fromiter(gone, np.int64)) >= 0).sum())
+        if sum(map(len, found.segments)) > in_use:
+            return self._publish(row, anyway=True, clean=True) is not None
+        return older and clear(folder, but=found.number)
+
     def _publish(
-        self, row: MapRow, *, anyway: bool = False, anew: bool = False
+        self, row: MapRow, *, anyway: bool = False, anew: bool = False, clean: bool = False
     ) -> Generation | None:
         signer = self._signers(row.model_id)  # before a connection is held: it takes one itself
         damaged: list[int] = []
@@ -163,6 +193,7 @@ class Upkeep:
                 previous=previous,
                 drop=deleted_since(connection, now.number, since),
                 anchor=anchor_of(connection, now.name),
+                clean=clean,
             )
         sign_again(self._store, now, damaged, now.model_id)
         if generation is None:

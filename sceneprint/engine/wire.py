@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -23,6 +24,7 @@ from sceneprint.schemas import (
     Vector,
 )
 from sceneprint.schemas.frames import Kind
+from sceneprint.store.aging import DAY_S, count_old
 from sceneprint.store.listing import jobs_of
 from sceneprint.store.maps import count_frames, model_names
 from sceneprint.store.records import FrameRow, JobRow, MapRow
@@ -89,8 +91,15 @@ def tell_map(connection: Connection, row: MapRow) -> Map:
         quota_frames=row.quota_frames,
         quota_bytes=row.quota_bytes,
         retention_days=row.retention_days,
+        overdue=None if row.retention_days is None else _overdue(connection, row),
         etag=map_tag(row),
     )
+
+
+def _overdue(connection: Connection, row: MapRow) -> int:
+    """Frames that a map has kept for longer than it should."""
+    before = time.time() - DAY_S * (row.retention_days or 0.0)
+    return count_old(connection, row.number, before)
 
 
 def tell_frames(connection: Connection, row: MapRow, found: list[FrameRow]) -> list[Frame]:

@@ -11,7 +11,8 @@ it again.
 
 from sceneprint.index.codes import Code, draw, fit_code, read_code, write_code
 from sceneprint.index.generations import Generation, newest, newest_number
-from sceneprint.index.publishing import publish
+from sceneprint.index.manifests import manifests
+from sceneprint.index.publishing import clear, publish
 from sceneprint.index.scrubbing import scrub
 from sceneprint.index.search import SHORTLIST, Hits, is_compared, search
 from sceneprint.index.segments import Segment, open_segment, write_segment
@@ -24,9 +25,11 @@ __all__ = [
     "Hits",
     "Segment",
     "Tail",
+    "clear",
     "draw",
     "fit_code",
     "is_compared",
+    "manifests",
     "newest",
     "newest_number",
     "open_segment",

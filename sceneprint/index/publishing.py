@@ -26,6 +26,8 @@ from sceneprint.types import Floats32
 
 #: A code is fitted anew when the map has this many times the frames that it had at the last fit.
 GROWTH = 2
+#: Frames up to which a code is fitted anew where nothing of a deleted one may be left.
+REFITTED = 4 * SAMPLE
 
 
 def publish(
@@ -78,7 +80,9 @@ def publish(
         listed = manifests(folder)
         kept = remaining(folder, previous, drop, clean=clean)
         draft = append(folder, kept, blocks, drop)
-        code, coarse, fitted_on = _codes(draft, previous, seed)
+        # of few frames, their mean is what each of them looks like
+        anew = clean and len(draft.rows) <= REFITTED
+        code, coarse, fitted_on = _codes(draft, None if anew else previous, seed)
         generation = Generation(
             number=listed[0][0] + 1 if listed else 1,
             revision=revision,
@@ -96,6 +100,17 @@ def publish(
             listed = [each for each in listed if each[0] == previous.number]
         _clean(folder, {own, *(path for _, path in listed[: 0 if clean else 1])})
         return generation
+
+
+def clear(folder: Path, but: int | None = None) -> bool:
+    """Remove all generations of a folder, or all but one; False where somebody is building there.
+
+    Readers that hold them go on undisturbed.
+    """
+    with building(folder) as mine:
+        if mine:
+            _clean(folder, {path for number, path in manifests(folder) if number == but})
+        return mine
 
 
 def _overtaken(folder: Path, previous: Generation | None) -> bool:

@@ -185,9 +185,19 @@ def counts(connection: sqlite3.Connection) -> dict[str, Any]:
 
 def referred(connection: sqlite3.Connection) -> Iterator[str]:
     """Digests of all blobs that have to be there, each once, in order."""
-    every = f"{_USES} UNION ALL {_USES_OF_JOBS}" if _has_job_files(connection) else _USES
-    for (digest,) in connection.execute(f"SELECT DISTINCT digest FROM ({every}) ORDER BY digest"):
+    asked = f"SELECT DISTINCT digest FROM ({_every(connection)}) ORDER BY digest"
+    for (digest,) in connection.execute(asked):
         yield digest
+
+
+def _every(connection: sqlite3.Connection) -> str:
+    return f"{_USES} UNION ALL {_USES_OF_JOBS}" if _has_job_files(connection) else _USES
+
+
+def count_referred(connection: sqlite3.Connection) -> int:
+    """How many they are."""
+    asked = f"SELECT count(DISTINCT digest) FROM ({_every(connection)})"
+    return int(connection.execute(asked).fetchone()[0])
 
 
 def uses(connection: sqlite3.Connection, digest: str) -> tuple[Use, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -23,6 +24,8 @@ from sceneprint.store.tables import frames, models
 Severity = Literal["damage", "leftover", "note"]
 #: Called with what is being looked at, how much of it is done, and how much there is.
 Progress = Callable[[str, int, int], None]
+#: What PostgreSQL says of pages and of indexes that are damaged.
+_DAMAGED = ("XX001", "XX002")
 #: Frames that are read in one transaction.
 BLOCK = 256
 
@@ -147,4 +150,11 @@ def each(
 
 def is_of_rows(error: Exception) -> bool:
     """Whether an error came of what is stored in the database, and not of the machine."""
-    return not isinstance(error, UnusableStore) or isinstance(error.__cause__, DBAPIError)
+    if not isinstance(error, UnusableStore):
+        return True
+    cause = error.__cause__
+    if not isinstance(cause, DBAPIError):
+        return False
+    return isinstance(cause.orig, sqlite3.Error) or (
+        getattr(cause.orig, "sqlstate", None) in _DAMAGED
+    )

@@ -32,7 +32,7 @@ def opened_blobs(settings: Settings, database: Database | None = None) -> Iterat
         return
     reached = database or reach_database(settings.database)
     try:
-        blobs = open_blobs(place, reached)
+        blobs = open_blobs(place, reached, claim=False)
         try:
             yield blobs
         finally:

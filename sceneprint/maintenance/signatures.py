@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
-from sqlalchemy import Connection, Text, delete, func, select, type_coerce
+from sqlalchemy import Connection, Text, cast, delete, func, select
 from sqlalchemy.exc import DBAPIError
 
 from sceneprint.engine.healing import PRIORITY
@@ -78,7 +78,7 @@ def _stored(folder: Folder, connection: Connection, numbers: list[int]) -> list[
             frames.c.number, frames.c.id, maps.c.name, signatures.c.model_id,
             signatures.c.model_id == maps.c.model_id,
             signatures.c.vector, signatures.c.checksum,
-            type_coerce(signatures.c.n_patches, Text), type_coerce(signatures.c.n_pairs, Text),
+            cast(signatures.c.n_patches, Text), cast(signatures.c.n_pairs, Text),
         )
         .join(frames, frames.c.number == signatures.c.frame_number)
         .join(maps, maps.c.number == frames.c.map_number)

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
 
-from sceneprint.errors import DamagedBlob, SnapshotError, UnusableStore
+from sceneprint.errors import SnapshotError, UnusableStore
 from sceneprint.maintenance import copies
 from sceneprint.maintenance.archives import ArchiveWriter, chunks_of
+from sceneprint.maintenance.keeping import opened_blobs
 from sceneprint.maintenance.manifests import (
     BLOBS,
     DAMAGED,
@@ -35,8 +35,9 @@ from sceneprint.maintenance.manifests import (
     manifest_bytes,
 )
 from sceneprint.maintenance.staging import check_room, full_disk_explained, put_new, staging
+from sceneprint.maintenance.taking import Untaken, taken, total_bytes
 from sceneprint.settings import Settings
-from sceneprint.store import FolderBlobs as BlobFolder
+from sceneprint.store import Blobs as Store
 
 #: Bytes done, and bytes in all.
 Progress = Callable[[int, int], None]
@@ -80,16 +81,11 @@ def take_snapshot(settings: Settings, path: Path, progress: Progress | None = No
     with copies.open_source(settings.database) as source:
         if path.exists():
             raise _taken(path)
-        if not settings.blob_dir.is_dir():  # a disk that is not mounted is not made up for
-            raise UnusableStore(
-                f"{settings.blob_dir}: there is no such folder. See that its disk is mounted, or "
-                "run `sceneprint fsck`."
-            )
-        blobs = BlobFolder(settings.blob_dir, make=False)
-        return _taken_of(source, blobs, path, progress or (lambda _done, _total: None))
+        with opened_blobs(settings) as blobs:
+            return _taken_of(source, blobs, path, progress or (lambda _done, _total: None))
 
 
-def _taken_of(source: copies.Source, blobs: BlobFolder, path: Path, progress: Progress) -> Snapshot:
+def _taken_of(source: copies.Source, blobs: Store, path: Path, progress: Progress) -> Snapshot:
     folder = path.absolute().parent
     with (
         full_disk_explained(path),
@@ -109,9 +105,8 @@ def _taken_of(source: copies.Source, blobs: BlobFolder, path: Path, progress: Pr
         source.copy(database, written)
         with copies.open_copy(database) as copy:
             draft = _draft(copy, source.place, begun, database.stat().st_size)
-            total = draft.database.bytes + sum(
-                blobs.size(digest) or 0 for digest in copies.referred(copy)
-            )
+            count = copies.count_referred(copy)
+            total = draft.database.bytes + total_bytes(blobs, copies.referred(copy), count)
             check_room(folder, total, "the snapshot")  # room for the copy is taken already
             archive = workplace / "archive"
             with archive.open("xb") as file:
@@ -152,7 +147,7 @@ def _draft(copy: sqlite3.Connection, source: str, begun: datetime, size: int) ->
 
 def _write(
     writer: ArchiveWriter, draft: Manifest, database: Path, copy: sqlite3.Connection,
-    blobs: BlobFolder,
+    blobs: Store,
 ) -> tuple[Manifest, list[LostBlob]]:  # fmt: skip
     """All members; the manifest's place is kept until its content is known."""
     writer.add(MANIFEST, MANIFEST_BYTES, iter([bytes(MANIFEST_BYTES)]))
@@ -165,16 +160,13 @@ def _write(
 
     writer.add(DATABASE, draft.database.bytes, hashing())
     damaged, count, size = [], 0, 0
-    for digest in copies.referred(copy):
-        try:
-            data = blobs.get(digest)
-        except DamagedBlob:
-            of = copies.uses(copy, digest)
-            why: Literal["missing", "damaged"] = "damaged" if blobs.holds(digest) else "missing"
-            damaged.append(LostBlob(digest=digest, why=why, of=of))
+    for one in taken(blobs, copies.referred(copy)):
+        if isinstance(one, Untaken):
+            of = copies.uses(copy, one.digest)
+            damaged.append(LostBlob(digest=one.digest, why=one.why, of=of))
             continue
-        writer.add(BLOBS + digest, len(data), iter([data]))
-        count, size = count + 1, size + len(data)
+        writer.add(BLOBS + one.digest, one.size, one.chunks)
+        count, size = count + 1, size + one.size
     lines = "".join(one.model_dump_json(exclude_none=True) + "\n" for one in damaged).encode()
     writer.add(DAMAGED, len(lines), iter([lines]))
     manifest = draft.model_copy(

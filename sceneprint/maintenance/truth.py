@@ -14,6 +14,7 @@ from sqlalchemy import select, text, update
 from sceneprint.errors import UnreadableModel, UnusableStore
 from sceneprint.maintenance.findings import Finding, Folder, is_of_rows
 from sceneprint.maintenance.repairs import GONE
+from sceneprint.maintenance.servers import check_server
 from sceneprint.models import PRESETS, parse_model, read_model, write_model
 from sceneprint.store.tables import models
 
@@ -28,9 +29,10 @@ _RESTORE = (
 
 
 def check_database(folder: Folder) -> Iterator[Finding]:
-    """What SQLite says of its file, and rows that refer to none."""
+    """What the database says of its own file, and rows that refer to none."""
     database = folder.store.database
     if not database.is_sqlite:
+        yield from check_server(folder, _RESTORE)
         return
     subject = "database"
     folder.progress(subject, 0, 2)
@@ -58,7 +60,7 @@ def check_database(folder: Folder) -> Iterator[Finding]:
 
 
 def damaged_database(message: str) -> Finding:
-    """The finding that SQLite cannot read all of its file, or finds it contradict itself."""
+    """The finding that the database cannot read all of its files, or finds them contradict."""
     return Finding("damaged-database", "the database", "damage", message, _RESTORE)
 
 

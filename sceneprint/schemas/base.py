@@ -14,6 +14,10 @@ Label = Annotated[
 ]
 
 
+#: What people write about something: no database has a text with NUL.
+Note = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00]*$")]
+
+
 class Given(BaseModel):
     """A record that a caller sends: unknown fields are errors, as they would have no effect."""
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import AwareDatetime, Field
 
-from sceneprint.schemas.base import Given, Label
+from sceneprint.schemas.base import Given, Label, Note
 from sceneprint.schemas.frames import GivenBase, GivenPose
 from sceneprint.schemas.maps import Days, Quota
 
@@ -40,9 +40,7 @@ class FrameEdit(Given):
 class MapEdit(Given):
     """What to change of a map: what is left out stays, null removes."""
 
-    title: Annotated[str, Field(max_length=200)] | None = Field(
-        default=None, description="For people."
-    )
+    title: Note | None = Field(default=None, description="For people.")
     quota_frames: Quota | None = Field(
         default=None,
         description="Most frames that it may hold; what is there beyond it stays. Only the "

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field, StringConstraints, WithJsonSchema
 
 from sceneprint.models import PRESETS
-from sceneprint.schemas.base import Given, Told
+from sceneprint.schemas.base import Given, Note, Told
 
 #: A map's name: an immutable slug.
 Slug = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,62}$")]
@@ -43,7 +43,7 @@ class NewMap(Given):
         description="Lower-case letters, digits, - and _, up to 63; never changes.",
         examples=["warehouse-2"],
     )
-    title: str | None = Field(default=None, max_length=200, description="For people.")
+    title: Note | None = Field(default=None, description="For people.")
     model: Preset = Field(
         default="paper",
         description="The model that signs its frames, until `sceneprint reencode` changes it: "
@@ -106,6 +106,10 @@ class Map(Told):
     quota_bytes: int | None = Field(default=None, description="Null: no quota.")
     retention_days: float | None = Field(
         default=None, description="Days after which a frame is deleted; null: never."
+    )
+    overdue: int | None = Field(
+        default=None,
+        description="Frames that are older, and deleted next; null without `retention_days`.",
     )
     etag: str | None = Field(
         default=None,

@@ -72,6 +72,16 @@ class WorkerSeen(Told):
     job_id: str | None = Field(description="What it is at.")
 
 
+class ReplicaSeen(Told):
+    """The read replica, as the process that answers sees it."""
+
+    used: bool = Field(description="Whether queries are answered from it; its log says why not.")
+    behind_s: float | None = Field(
+        description="What was stored or deleted so many seconds ago, or earlier, is in it; null: "
+        "not known."
+    )
+
+
 class Latency(Told):
     """Times within which so many of the answers came, seconds; right to a tenth."""
 
@@ -124,9 +134,14 @@ class Stats(Told):
         description="Of the maps that changed most; 200 at most, those with the longest tail first."
     )
     workers: list[WorkerSeen] | None = Field(
-        description="On this machine, and elsewhere where at a job. Null where a map was asked for."
+        description="On every host of a PostgreSQL database; of SQLite on this machine. Null where "
+        "a map was asked for."
     )
     bytes: Sizes = Field(description="On the disk; measured at most twice a minute.")
+    replica: ReplicaSeen | None = Field(
+        default=None,
+        description="Null where there is none, or a map was asked for.",
+    )
     total: Counted = Field(description="All minutes together.")
     minutes: list[Minute] = Field(description="The oldest first; the last is not over yet.")
 

@@ -106,7 +106,9 @@ def _open_store(url: str, blobs: Path | str) -> Store:
         raise
 
 
-def open_blobs(blobs: Path | str, database: Database, *, make: bool = False) -> Blobs:
+def open_blobs(
+    blobs: Path | str, database: Database, *, make: bool = False, claim: bool = True
+) -> Blobs:
     """Open the blobs that a database refers to.
 
     An object store that is away is no error yet: what is asked of it is refused while it is.
@@ -116,6 +118,7 @@ def open_blobs(blobs: Path | str, database: Database, *, make: bool = False) -> 
     blobs : folder, or URL of an object store
     database : whose they are
     make : a folder that is missing
+    claim : mark a prefix of an object store that is nobody's yet; else it is looked at alone
 
     Raises
     ------
@@ -133,7 +136,7 @@ def open_blobs(blobs: Path | str, database: Database, *, make: bool = False) -> 
         locks = SessionLocks(database)
     found = ObjectBlobs(objects, locks, lambda: Seals(database).owner)
     try:
-        found.claim(anew=not database.read_only)
+        found.claim(anew=claim and not database.read_only)
     except StoreAway as error:
         log.warning("the object store is away", extra={"error": str(error)})
     return found

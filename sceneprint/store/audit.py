@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, delete, insert, select
+from sqlalchemy import Connection, String, delete, insert, select
 
 from sceneprint.store.tables import audit
 
@@ -41,14 +41,22 @@ class Change:
     number: int = 0
 
 
+#: Columns whose texts may be whatever somebody asked for.
+_TEXTS = ("actor", "address", "action", "map", "target", "request_id")
+
+
+def _cut(name: str, text: str | None) -> str | None:
+    """As much of a text as its column takes."""
+    kind = audit.c[name].type
+    return text if text is None or not isinstance(kind, String) else text[: kind.length]
+
+
 def note(connection: Connection, change: Change, kept: int = KEPT) -> None:
     """Add a line; the oldest go where there are too many."""
     added = connection.execute(
         insert(audit).values(
-            at=time.time() if change.at is None else change.at, actor=change.actor,
-            address=change.address, action=change.action, map=change.map,
-            target=None if change.target is None else change.target[:128],
-            request_id=change.request_id, data=change.data or {},
+            at=time.time() if change.at is None else change.at, data=change.data or {},
+            **{name: _cut(name, getattr(change, name)) for name in _TEXTS},
         )
     ).inserted_primary_key  # fmt: skip
     assert added is not None

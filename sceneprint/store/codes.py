@@ -330,11 +330,13 @@ def uncoded(
     """Some indexed frames of maps that have no code: their numbers, and those of their maps."""
     found = connection.execute(
         text(
-            "SELECT f.number, f.map_number FROM frames f "
-            "LEFT JOIN code_maps w ON w.fit_number = :fit AND w.map_number = f.map_number "
-            f"LEFT JOIN {fit.table} c ON c.frame_number = f.number "
-            "WHERE f.map_number = ANY(CAST(:maps AS bigint[])) AND f.state = 'indexed' "
-            "AND f.revision > COALESCE(w.revision, 0) AND c.frame_number IS NULL LIMIT :most"
+            # map by map, by its index over revisions: the planner is not asked to find that out
+            "SELECT f.number, f.map_number FROM unnest(CAST(:maps AS bigint[])) AS m (number) "
+            "CROSS JOIN LATERAL (SELECT number, map_number FROM frames "
+            "WHERE map_number = m.number AND state = 'indexed' AND revision > COALESCE((SELECT "
+            "revision FROM code_maps WHERE fit_number = :fit AND map_number = m.number), 0) "
+            f"AND NOT EXISTS (SELECT 1 FROM {fit.table} c WHERE c.frame_number = frames.number) "
+            "LIMIT :most) f LIMIT :most"
         ),
         {"fit": fit.number, "maps": list(map_numbers), "most": limit},
     )
@@ -415,7 +417,7 @@ def nearest(
         values["barred"] = barred
     graph = _by_graph(connection, fit, count, asked)
     # an order that no index has makes PostgreSQL compare all that the conditions leave
-    order = "code <-> CAST(:code AS halfvec)" + ("" if graph else " + 0")
+    order = "code <-> CAST(:code AS halfvec)" if graph else "(code <-> CAST(:code AS halfvec)) + 0"
     if graph:
         _steer(connection, count)
     found = connection.execute(

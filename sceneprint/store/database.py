@@ -33,6 +33,7 @@ from sceneprint.store.sqlite import (
     begin_sqlite,
     configure_sealed,
     configure_sqlite,
+    shrink_log,
 )
 
 if TYPE_CHECKING:
@@ -171,6 +172,17 @@ class Database:
             raise
         finally:
             self._turn.release()
+
+    def shrink_log(self) -> bool:
+        """Leave nothing of what was deleted in SQLite's log; False where that has to wait."""
+        if not self.is_sqlite or self.read_only:
+            return True
+        with self.explained():
+            connection = self._engine.raw_connection()
+            try:
+                return shrink_log(connection.driver_connection)
+            finally:
+                connection.close()
 
     def explained(self) -> AbstractContextManager[None]:
         """Within it, what the database or its driver raises is told in our words."""

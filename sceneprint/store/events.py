@@ -123,9 +123,9 @@ def list_events(
 ) -> list[EventRow]:  # fmt: skip
     """Events between two numbers, neither of them included.
 
-    SQLite gives the numbers in the order of the commits: writers are one at a time, and a number
-    is given within the writer's turn. So who has read up to one number never misses a smaller one.
-    On another database two writers may commit in another order than they took their numbers.
+    Numbers are in the order of the commits: writers are one at a time (see `Database.write`), and a
+    number is given within the writer's turn. So who has read up to one number never misses a
+    smaller one.
     """
     order = events.c.number.desc() if newest_first else events.c.number
     asked = select(events).where(events.c.number > after).order_by(order).limit(limit)

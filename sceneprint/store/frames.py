@@ -11,6 +11,7 @@ from sqlalchemy import ColumnElement, Connection, func, insert, select, update
 
 from sceneprint.errors import UnknownFrame
 from sceneprint.schemas import FrameState
+from sceneprint.store.blocks import blocks
 from sceneprint.store.deleting import delete_frames
 from sceneprint.store.quotas import ROOMLESS, count_on
 from sceneprint.store.records import FrameRow, MapRow, frame_row
@@ -54,7 +55,7 @@ def add_frame(
 
 def renew_frame(connection: Connection, number: int, values: dict[str, Any]) -> FrameRow:
     """Take a frame that failed as received once more, with its upload as it came now."""
-    _weigh(connection, number, values["bytes"])
+    _weigh(connection, number, FrameState.RECEIVED, values["bytes"])
     connection.execute(
         update(frames)
         .where(frames.c.number == number)
@@ -74,7 +75,7 @@ def renew_upload(
     blob, size : of the upload
     reason : that is left of the frame's
     """
-    _weigh(connection, number, size)
+    _weigh(connection, number, None, size)
     connection.execute(
         update(frames).where(frames.c.number == number).values(blob=blob, bytes=size, reason=reason)
     )
@@ -147,12 +148,13 @@ def frame_of(connection: Connection, number: int) -> FrameRow:
 
 def frames_of(connection: Connection, numbers: Iterable[int]) -> dict[int, FrameRow]:
     """Frames by their numbers; those that are gone are left out."""
-    found = connection.execute(
-        select(frames).where(
-            frames.c.number.in_(list(numbers)), frames.c.state != FrameState.DELETED
-        )
-    ).mappings()
-    return {row["number"]: frame_row(row) for row in found}
+    found: dict[int, FrameRow] = {}
+    for some in blocks(numbers):
+        rows = connection.execute(
+            select(frames).where(frames.c.number.in_(some), frames.c.state != FrameState.DELETED)
+        ).mappings()
+        found |= {row["number"]: frame_row(row) for row in rows}
+    return found
 
 
 def set_state(
@@ -160,7 +162,7 @@ def set_state(
 ) -> None:
     """Move a frame to a state in which it is not searched; a deleted frame stays deleted."""
     if state == FrameState.REDUNDANT:
-        _weigh(connection, number, None)
+        _weigh(connection, number, state, None)
     connection.execute(
         update(frames)
         .where(frames.c.number == number, frames.c.state != FrameState.DELETED)
@@ -216,17 +218,25 @@ def _free(connection: Connection, map_number: int, frame_id: str) -> None:
     )
 
 
-def _weigh(connection: Connection, number: int, size: int | None) -> None:
-    """Count what a frame takes from now on: bytes of its upload; None: it takes no room any more.
+def _weigh(
+    connection: Connection, number: int, state: FrameState | None, size: int | None
+) -> None:
+    """Count what a frame takes from now on.
 
-    One that is deleted stays so.
+    Parameters
+    ----------
+    connection : of a writing transaction
+    number : of the frame
+    state : that it comes to; None: it stays as it is
+    size : bytes of its upload; None: as they are
     """
     asked = select(frames.c.map_number, frames.c.state, frames.c.bytes)
-    map_number, state, before = connection.execute(asked.where(frames.c.number == number)).one()
-    counted, counts = state not in ROOMLESS, size is not None
-    if state != FrameState.DELETED:
-        more = int(counts) - int(counted)
-        count_on(connection, map_number, more, (size or 0) - (before if counted else 0))
+    map_number, old, before = connection.execute(asked.where(frames.c.number == number)).one()
+    if old == FrameState.DELETED:
+        return  # and stays so
+    was, is_now = old not in ROOMLESS, (state or old) not in ROOMLESS
+    after = before if size is None else size
+    count_on(connection, map_number, is_now - was, is_now * after - was * before)
 
 
 def _one(connection: Connection, condition: ColumnElement[bool]) -> FrameRow:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, func, select
 
 from sceneprint.schemas import FrameState
-from sceneprint.store.tables import frames, signatures
+from sceneprint.store.tables import frames, job_files, signatures
 
 _OTHERS = tuple(state for state in FrameState if state != FrameState.INDEXED)
 #: Frames in these states have no upload any more.
@@ -84,6 +84,38 @@ def kept_frames(connection: Connection, map_number: int, most: int) -> tuple[lis
     step = max(-(-total // most), 1)
     asked = select(listed.c.number).where(listed.c.place % step == 0)
     return list(connection.execute(asked.order_by(listed.c.number)).scalars()), total
+
+
+def spread_frames(connection: Connection, most: int) -> list[int]:
+    """Numbers of frames of all maps whose uploads are kept, from the first to the newest.
+
+    Parameters
+    ----------
+    connection : of the database
+    most : numbers; fewer where those next to each other were deleted
+    """
+    ends = select(func.min(frames.c.number), func.max(frames.c.number))
+    first, last = connection.execute(ends).one()
+    if first is None:
+        return []
+    # by number, each found in the index: counting all frames off would read them all
+    wanted = {first + (last - first) * place // max(most - 1, 1) for place in range(most)}
+    found = []
+    for number in sorted(wanted):
+        near = select(frames.c.number).where(frames.c.number >= number, frames.c.state.in_(_KEPT))
+        found.append(connection.execute(near.order_by(frames.c.number).limit(1)).scalar())
+    return sorted({one for one in found if one is not None})
+
+
+def count_kept(connection: Connection) -> int:
+    """How many frames of all maps have their uploads."""
+    asked = select(func.count()).where(frames.c.state.in_(_KEPT))
+    return int(connection.execute(asked).scalar_one())
+
+
+def bytes_of_files(connection: Connection) -> int:
+    """Bytes of the archives, meshes and others that are of jobs."""
+    return int(connection.execute(select(func.sum(job_files.c.bytes))).scalar() or 0)
 
 
 def weigh(connection: Connection, numbers: Sequence[int]) -> Weighed:

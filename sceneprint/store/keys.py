@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, Select, delete, insert, select
-from sqlalchemy.exc import IntegrityError
 
 from sceneprint.errors import Conflict, UnknownKey
 from sceneprint.schemas.keys import Scope
@@ -48,16 +47,15 @@ def create_key(
     ------
     Conflict : there is a key of that name.
     """
+    if connection.execute(select(keys.c.id).where(keys.c.name == name)).first() is not None:
+        raise Conflict(f"There is a key named {name!r}. Choose another name.")
     secret = PREFIX + secrets.token_urlsafe(32)  # 256 random bits: no slow hash is needed
-    try:
-        connection.execute(
-            insert(keys).values(
-                id=uuid.uuid4().hex, name=name, digest=_digest(secret), grants=dict(grants),
-                created_at=time.time(), expires_at=expires_at,
-            )
-        )  # fmt: skip
-    except IntegrityError as error:
-        raise Conflict(f"There is a key named {name!r}. Choose another name.") from error
+    connection.execute(
+        insert(keys).values(
+            id=uuid.uuid4().hex, name=name, digest=_digest(secret), grants=dict(grants),
+            created_at=time.time(), expires_at=expires_at,
+        )
+    )  # fmt: skip
     tell(connection, "key.created", name=name)
     return secret
 

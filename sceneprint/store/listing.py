@@ -9,6 +9,7 @@ from sqlalchemy import Connection, func, select
 
 from sceneprint.errors import UnknownJob
 from sceneprint.schemas import JobState
+from sceneprint.store.blocks import blocks
 from sceneprint.store.records import JobRow, job_row
 from sceneprint.store.tables import frames, jobs, maps
 
@@ -113,12 +114,15 @@ def last_of(
 
 def jobs_of(connection: Connection, frame_numbers: list[int]) -> dict[int, JobRow]:
     """The latest job of each frame that is to have it indexed, not those that sign it again."""
-    rows = connection.execute(
-        select(jobs)
-        .where(jobs.c.frame_number.in_(frame_numbers), jobs.c.kind == "sign")
-        .order_by(jobs.c.number)
-    ).mappings()
-    return {row["frame_number"]: job_row(row) for row in rows}
+    found: dict[int, JobRow] = {}
+    for some in blocks(frame_numbers):
+        rows = connection.execute(
+            select(jobs)
+            .where(jobs.c.frame_number.in_(some), jobs.c.kind == "sign")
+            .order_by(jobs.c.number)
+        ).mappings()
+        found |= {row["frame_number"]: job_row(row) for row in rows}
+    return found
 
 
 def count_jobs(connection: Connection) -> dict[str, int]:

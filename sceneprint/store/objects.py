@@ -204,17 +204,23 @@ class Objects:
             raise FileNotFoundError(key)
         return RangeFile.buffered(size, lambda start, length: self.part(key, start, length))
 
-    def size(self, key: str) -> int | None:
-        """Bytes of an object; None where there is none."""
+    def look(self, key: str) -> Found | None:
+        """What is under a key; None where there is nothing."""
         import obstore
 
         with self._explained(f"{key} cannot be looked at"):
             try:
-                return obstore.head(self._small, key)["size"]
+                one = obstore.head(self._small, key)
             except FileNotFoundError as error:
                 if _NO_BUCKET.search(str(error)):
                     raise
                 return None
+        return Found(key, one["size"], one["last_modified"].timestamp())
+
+    def size(self, key: str) -> int | None:
+        """Bytes of an object; None where there is none."""
+        found = self.look(key)
+        return None if found is None else found.size
 
     def list(self, prefix: str) -> Iterator[Found]:
         """All objects whose keys lie below a prefix, a page at a time, in the store's order."""

@@ -9,6 +9,7 @@ from typing import Any
 from sqlalchemy import Connection, delete, func, insert, select
 
 from sceneprint.schemas import JobState
+from sceneprint.store.records import JobRow, job_row
 from sceneprint.store.tables import job_files, job_items, jobs
 
 #: Rows that are inserted at once.
@@ -82,6 +83,13 @@ def files_of(connection: Connection, job_number: int) -> dict[str, JobFile]:
         row["name"]: JobFile(row["name"], row["blob"], row["bytes"], row["media_type"])
         for row in connection.execute(asked).mappings()
     }
+
+
+def jobs_with_files(connection: Connection, kind: str) -> list[JobRow]:
+    """Jobs of a kind that have any file, the oldest first."""
+    having = select(job_files.c.job_number)
+    asked = select(jobs).where(jobs.c.number.in_(having), jobs.c.kind == kind)
+    return [job_row(row) for row in connection.execute(asked.order_by(jobs.c.number)).mappings()]
 
 
 def given_up(connection: Connection, kind: str, name: str, before: float) -> list[int]:

@@ -7,6 +7,7 @@ given are in the order of the commits.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
@@ -114,6 +115,7 @@ def configure(connection: Any, _record: object = None) -> None:
             f"{encoding}. Version {_OLDEST} or later is needed, and a database made with "
             "ENCODING 'UTF8'."
         )
+    connection.adapters.register_dumper(str, _texts())
     before, connection.autocommit = connection.autocommit, True
     connection.execute(
         "SELECT set_config('lock_timeout', %s, false), set_config('statement_timeout', %s, false),"
@@ -136,6 +138,25 @@ def history_of(connection: Any) -> str | None:
     ).fetchone()
     connection.autocommit = before
     return None if row is None else row[0]
+
+
+@cache
+def _texts() -> type[Any]:
+    """How texts are handed over: PostgreSQL has none with NUL, and nothing is found by such a one.
+
+    What is stored has none, see schemas; of what is only noted, such as whom a request was about,
+    another character takes its place.
+    """
+    from psycopg.types.string import StrDumperUnknown
+
+    class Texts(StrDumperUnknown):
+        """Texts without NUL."""
+
+        def dump(self, obj: str) -> Any:
+            """As bytes."""
+            return super().dump(obj.replace("\0", "\ufffd") if "\0" in obj else obj)
+
+    return Texts
 
 
 def allow(connection: Connection, seconds: float) -> None:

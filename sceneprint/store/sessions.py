@@ -104,7 +104,7 @@ def count_run(connection: Connection, map_number: int, run: Run) -> list[Counted
         select(frames.c.robot, frames.c.pose_parent, func.count())
         .where(*_of_session(map_number, run))
         .group_by(frames.c.robot, frames.c.pose_parent)
-        .order_by(frames.c.robot, frames.c.pose_parent)
+        .order_by(frames.c.robot.nulls_first(), frames.c.pose_parent.nulls_first())
     )
     return [Counted(*row) for row in found]
 

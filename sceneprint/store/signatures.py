@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import time
-import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from zlib import crc32
 
 from sqlalchemy import Connection, delete, func, insert, select, update
 
 from sceneprint.errors import DamagedSignature
 from sceneprint.schemas import FrameState
+from sceneprint.store.blocks import blocks
 from sceneprint.store.maps import next_revision
 from sceneprint.store.records import FrameRow, MapRow
 from sceneprint.store.tables import frames, maps, signatures
@@ -68,7 +69,7 @@ def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) 
     connection.execute(
         insert(signatures).values(
             frame_number=frame.number, model_id=made.model_id, vector=made.vector,
-            checksum=zlib.crc32(made.vector), geometry=made.geometry,
+            checksum=crc32(made.vector), geometry=made.geometry,
             n_patches=list(made.n_patches), n_pairs=list(made.n_pairs),
         )
     )  # fmt: skip
@@ -93,7 +94,7 @@ def replace_signature(connection: Connection, frame: FrameRow, made: StoredSigna
     """
     own = (signatures.c.frame_number == frame.number) & (signatures.c.model_id == made.model_id)
     values = {
-        "vector": made.vector, "checksum": zlib.crc32(made.vector), "geometry": made.geometry,
+        "vector": made.vector, "checksum": crc32(made.vector), "geometry": made.geometry,
         "n_patches": list(made.n_patches), "n_pairs": list(made.n_pairs),
     }  # fmt: skip
     known = connection.execute(select(signatures.c.vector, signatures.c.checksum).where(own))
@@ -145,7 +146,7 @@ def _change(
 ) -> Change:  # fmt: skip
     if state != FrameState.INDEXED:
         return Change(number, frame_id, revision, None, deleted=True)
-    sound = vector is not None and zlib.crc32(vector) == checksum
+    sound = vector is not None and crc32(vector) == checksum
     return Change(number, frame_id, revision, vector if sound else None)
 
 
@@ -187,12 +188,15 @@ def count_gone(connection: Connection, map_number: int, revision: int) -> int:
 
 def geometry_blobs(connection: Connection, numbers: Iterable[int], model_id: str) -> dict[int, str]:
     """Blobs of the geometry artifacts of frames."""
-    rows = connection.execute(
-        select(signatures.c.frame_number, signatures.c.geometry).where(
-            signatures.c.frame_number.in_(list(numbers)), signatures.c.model_id == model_id
+    found: dict[int, str] = {}
+    for some in blocks(numbers):
+        rows = connection.execute(
+            select(signatures.c.frame_number, signatures.c.geometry).where(
+                signatures.c.frame_number.in_(some), signatures.c.model_id == model_id
+            )
         )
-    )
-    return {row.frame_number: row.geometry for row in rows}
+        found |= {row.frame_number: row.geometry for row in rows}
+    return found
 
 
 def stored_vector(connection: Connection, number: int, model_id: str) -> bytes | None:
@@ -209,7 +213,7 @@ def stored_vector(connection: Connection, number: int, model_id: str) -> bytes |
     ).first()
     if found is None:
         return None
-    if zlib.crc32(found.vector) != found.checksum:
+    if crc32(found.vector) != found.checksum:
         raise DamagedSignature(
             "The signature of the frame is damaged: its checksum does not fit. It is made again "
             "from its upload while a worker runs; `sceneprint fsck` says whether that can be done."
@@ -231,9 +235,12 @@ def stored_signatures(
     connection: Connection, numbers: Iterable[int], model_id: str
 ) -> dict[int, bytes]:
     """Signatures of frames; those that have none, or a damaged one, are left out."""
-    found = connection.execute(
-        select(signatures.c.frame_number, signatures.c.vector, signatures.c.checksum).where(
-            signatures.c.frame_number.in_(list(numbers)), signatures.c.model_id == model_id
+    found: dict[int, bytes] = {}
+    for some in blocks(numbers):
+        rows = connection.execute(
+            select(signatures.c.frame_number, signatures.c.vector, signatures.c.checksum).where(
+                signatures.c.frame_number.in_(some), signatures.c.model_id == model_id
+            )
         )
-    )
-    return {n: bytes(vector) for n, vector, checksum in found if zlib.crc32(vector) == checksum}
+        found |= {n: bytes(vector) for n, vector, checksum in rows if crc32(vector) == checksum}
+    return found

@@ -8,6 +8,8 @@ from sqlalchemy import Connection
 
 #: Seconds a writer waits for another, and waits after somebody has waited so long in vain.
 BUSY_S, HELD_S = 10.0, 0.1
+#: Seconds for which emptying the log waits for readers: writers wait for it meanwhile.
+SHRINKING_S = 0.5
 
 
 def configure_sqlite(connection: Any, _record: Any) -> None:
@@ -17,10 +19,24 @@ def configure_sqlite(connection: Any, _record: Any) -> None:
         "journal_mode = WAL",
         "synchronous = FULL",  # a commit that was acknowledged survives the power
         "foreign_keys = ON",
+        "secure_delete = ON",  # what is deleted is written over, in pages that are given up too
         f"busy_timeout = {_milliseconds(BUSY_S)}",
         "cache_size = -32000",
     ):
         connection.execute(f"PRAGMA {pragma}").close()
+
+
+def shrink_log(connection: Any) -> bool:
+    """Empty the log when all that is in it is in the file; False where somebody is in the way.
+
+    Else pages as they once were stay in it for as long as nothing is written over them.
+    """
+    connection.execute(f"PRAGMA busy_timeout = {_milliseconds(SHRINKING_S)}").close()
+    try:
+        busy, _, _ = connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+    finally:
+        connection.execute(f"PRAGMA busy_timeout = {_milliseconds(BUSY_S)}").close()
+    return not busy
 
 
 def configure_sealed(connection: Any, _record: Any) -> None:

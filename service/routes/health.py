@@ -7,6 +7,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, Field
 
 from sceneprint import __version__
+from sceneprint.schemas.operations import ReplicaSeen
 from sceneprint.store.events import newest_number
 from service.access import Guest, reads_every
 from service.context import Here
@@ -30,6 +31,9 @@ class Readiness(Health):
         description="How many are in each state; null for who may not read all maps."
     )
     jobs: dict[str, int] | None = Field(description="As `frames`.")
+    replica: str | None = Field(
+        default=None, description="What queries are answered from, where there is a read replica."
+    )
 
 
 @router.head("/healthz", include_in_schema=False)  # as balancers ask
@@ -40,7 +44,7 @@ async def healthz() -> Health:
 
 
 @router.head("/readyz", include_in_schema=False)
-@router.get("/readyz", responses=declared())
+@router.get("/readyz", responses=declared(), response_model_exclude_defaults=True)
 def readyz(here: Here, asking: Guest) -> Readiness:
     """Answers while the database does; 503 while it does not. No key is asked for."""
     frames = jobs = None
@@ -55,7 +59,16 @@ def readyz(here: Here, asking: Guest) -> Readiness:
         read_only=here.engine.store.database.read_only,
         frames=frames,
         jobs=jobs,
+        replica=_replica(here.engine.operations.statistics.replica()),
     )
+
+
+def _replica(seen: ReplicaSeen | None) -> str | None:
+    if seen is None:
+        return None
+    if not seen.used:
+        return "the replica is not used: queries are answered from the database itself"
+    return f"queries are answered from a replica, which is at most {seen.behind_s:.1f} s behind"
 
 
 @router.get(

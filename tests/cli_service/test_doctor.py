@@ -151,7 +151,7 @@ def test_looking_at_a_database_changes_nothing(tmp_path: Path) -> None:
         ("sqlite:///file:x?mode=memory&uri=true", "WRONG", "is in memory"),
         ("postgresql://me:p@ss:hidden@host/db", "WRONG", "its port is no number"),
         ("nonsense", "WRONG", "not an SQLAlchemy URL"),
-        ("nosuch://host/db", "WRONG", "cannot be opened (Can't load plugin"),
+        ("nosuch://host/db", "WRONG", "'nosuch' is no database that is known"),
     ],
 )
 def test_addresses_of_databases(

@@ -112,7 +112,7 @@ def test_a_frame_signed_anew_is_found_once_with_its_new_signature() -> None:
     tail.append(Change(7, "", 1, None), np.full(4, 1, np.uint8))
     tail.append(Change(8, "", 2, None), np.full(4, 2, np.uint8))
     handed_out = tail.tail()
-    other = tail.without(7)
+    other = tail.without({7})
     other.append(Change(7, "", 3, None), np.full(4, 3, np.uint8))
     assert (tail.revision_of(7), other.revision_of(7), other.revision_of(9)) == (1, 3, 0)
     np.testing.assert_array_equal(other.tail().keys, [8, 7])

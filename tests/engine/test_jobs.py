@@ -274,10 +274,10 @@ def test_when_there_is_something_to_do_next(empty: Engine, uploads: Any) -> None
     running = claimed(empty).claim.job
     with empty.store.database.write() as connection:
         start = read_clock(connection)
-        connection.execute(update(jobs).values(run_after=start + 300.0))
-        connection.execute(update(jobs).where(jobs.c.number == 3).values(run_after=start + 200.0))
-    assert 100.0 < due(empty) <= 200.0
+        connection.execute(update(jobs).values(run_after=start + 50.0))
+        connection.execute(update(jobs).where(jobs.c.number == 3).values(run_after=start + 40.0))
+    assert 20.0 < due(empty) <= 40.0
     with empty.store.database.write() as connection:
         changed = update(jobs).where(jobs.c.number == running.number)
-        connection.execute(changed.values(leased_until=start + 100.0, run_after=1.0))
-    assert 0.0 < due(empty) <= 100.0
+        connection.execute(changed.values(leased_until=start + 20.0, run_after=1.0))
+    assert 0.0 < due(empty) <= 20.0

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.engine import kept as module
+from sceneprint.engine import kept_folder as module
 from sceneprint.engine.kept import Kept, KeptQueries
+from sceneprint.engine.kept_folder import KeptFolder
 from sceneprint.errors import UnknownQuery
 from sceneprint.schemas import Answer, Counts, Query, SeveralQuery
 from sceneprint.store.filters import Taken
@@ -46,7 +47,7 @@ def there(folder: Path) -> set[str]:
 
 
 def test_an_answer_comes_back_as_it_was(tmp_path: Path) -> None:
-    queries = KeptQueries(tmp_path / "new", 60.0, 1 << 20)
+    queries = KeptFolder(tmp_path / "new", 60.0, 1 << 20)
     asked = Query(k=2, seed=9, validation={"evidence": 0.35}, filter={"robot": "r1"})
     for one in (made(query=asked), replace(made(), geometry=None), replace(made(), geometry=b"")):
         assert queries.keep(one)
@@ -76,7 +77,7 @@ def test_an_answer_comes_back_as_it_was(tmp_path: Path) -> None:
     "name", ["", ".", "..", "../secret", "a" * 31, "A" * 32, "g" * 32, "a" * 32 + "\n", "b" * 32]
 )
 def test_no_other_name_is_opened(tmp_path: Path, name: str) -> None:
-    queries = KeptQueries(tmp_path / "kept", 60.0, 1 << 20)
+    queries = KeptFolder(tmp_path / "kept", 60.0, 1 << 20)
     one = made()
     assert queries.keep(one)
     data = (tmp_path / "kept" / one.answer.query_id).read_bytes()
@@ -88,7 +89,7 @@ def test_no_other_name_is_opened(tmp_path: Path, name: str) -> None:
 
 
 def test_every_damaged_byte_is_noticed(tmp_path: Path) -> None:
-    queries = KeptQueries(tmp_path, 60.0, 1 << 20)
+    queries = KeptFolder(tmp_path, 60.0, 1 << 20)
     one = made(50)
     assert queries.keep(one)
     path = tmp_path / one.answer.query_id
@@ -106,7 +107,7 @@ def test_every_damaged_byte_is_noticed(tmp_path: Path) -> None:
 
 
 def test_what_is_old_is_not_found_and_goes(tmp_path: Path) -> None:
-    queries = KeptQueries(tmp_path, 60.0, 1 << 20)
+    queries = KeptFolder(tmp_path, 60.0, 1 << 20)
     old, young, new = made(), made(), made()
     assert queries.keep(old)
     assert queries.keep(young)
@@ -118,13 +119,13 @@ def test_what_is_old_is_not_found_and_goes(tmp_path: Path) -> None:
     with pytest.raises(UnknownQuery):
         queries.find(old.answer.query_id)
     assert queries.find(young.answer.query_id).answer == young.answer
-    assert KeptQueries(tmp_path, 60.0, 1 << 20).keep(new)  # another process looks at once
+    assert KeptFolder(tmp_path, 60.0, 1 << 20).keep(new)  # another process looks at once
     assert there(tmp_path) == {young.answer.query_id, new.answer.query_id, ".begun.part"}
 
 
 def test_the_oldest_go_when_there_is_no_room(tmp_path: Path) -> None:
     most = 20_500
-    queries = KeptQueries(tmp_path, 3600.0, most)
+    queries = KeptFolder(tmp_path, 3600.0, most)
     names = []
     for age in range(60, 0, -1):
         one = made(1000)
@@ -137,12 +138,12 @@ def test_the_oldest_go_when_there_is_no_room(tmp_path: Path) -> None:
     assert 8 <= len(left) <= 20
     assert not queries.keep(made(most))  # would push out all, and not fit
     assert there(tmp_path) == left
-    assert not KeptQueries(tmp_path, 3600.0, 0).keep(made(1))
+    assert not KeptFolder(tmp_path, 3600.0, 0).keep(made(1))
 
 
 def test_two_processes_share_the_room(tmp_path: Path) -> None:
     most = 100_000
-    both = [KeptQueries(tmp_path, 3600.0, most) for _ in range(2)]
+    both = [KeptFolder(tmp_path, 3600.0, most) for _ in range(2)]
     for turn in range(180):
         assert both[turn % 2].keep(made(1000))
         # each puts at most 16 there before it looks at what the other did
@@ -151,7 +152,7 @@ def test_two_processes_share_the_room(tmp_path: Path) -> None:
 
 def test_their_number_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MOST_QUERIES", 40)
-    queries = KeptQueries(tmp_path, 3600.0, 1 << 30)
+    queries = KeptFolder(tmp_path, 3600.0, 1 << 30)
     for _ in range(100):
         assert queries.keep(made(1))
     assert 20 <= len(there(tmp_path)) <= 40 + 16
@@ -159,7 +160,7 @@ def test_their_number_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_a_folder_that_cannot_be_written_costs_nothing(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
-    queries = KeptQueries(tmp_path / "file" / "kept", 60.0, 1 << 20)
+    queries = KeptFolder(tmp_path / "file" / "kept", 60.0, 1 << 20)
     one = made()
     assert not queries.keep(one)
     with pytest.raises(UnknownQuery):

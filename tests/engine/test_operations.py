@@ -138,7 +138,7 @@ def test_indexes_and_sizes_are_told(data, make_engine):
     assert index.recall == IndexRecall(  # compared whole
         share=1, near=10, sample=0, shortlist=500, frames=indexed
     )
-    told = measuring.sizes(engine.settings)
+    told = measuring.sizes(engine.settings, engine.store)
     assert told.index == sum(p.stat().st_size for p in (data / "index").rglob("*") if p.is_file())
     assert told.blobs == sum(p.stat().st_size for p in (data / "blobs").rglob("*") if p.is_file())
     assert told.database is not None
@@ -154,9 +154,9 @@ def test_many_blobs_are_measured_by_a_part_of_them(make_engine, monkeypatch):
         path = engine.settings.blob_dir / digest[:2] / digest
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(bytes(1001))
-    assert measuring.sizes(engine.settings).blobs == 600 * 1001
+    assert measuring.sizes(engine.settings, engine.store).blobs == 600 * 1001
     monkeypatch.setattr(measuring, "MEASURED", 150)
-    assert measuring.sizes(engine.settings).blobs == pytest.approx(600 * 1001, rel=0.25)
+    assert measuring.sizes(engine.settings, engine.store).blobs == pytest.approx(600 * 1001, rel=0.25)
 
 
 def test_samples_are_forgotten_after_two_hours(make_engine):

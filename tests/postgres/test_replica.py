@@ -33,9 +33,12 @@ def pair(
 
 @pytest.fixture
 def store(
-    pair: tuple[Server, Server], postgres_url: str, tmp_path: Path, until: Callable[..., Any]
-) -> Iterator[Store]:
+    pair: tuple[Server, Server], postgres_url: str, tmp_path: Path, until: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Store]:  # fmt: skip
     """A store whose replica has caught up."""
+    monkeypatch.setattr(replica, "AGAIN_S", 0.05)
+    monkeypatch.setattr(replica, "EVERY_S", 0.05)
     name = postgres_url.rpartition("/")[2]
     opened = open_store(postgres_url, tmp_path / "blobs", pair[1].url(name), 30.0)
     assert opened.replica is not None
@@ -140,16 +143,16 @@ def test_what_is_held_of_the_primary_is_not_mixed_with_an_older_state(store: Sto
 
 
 def test_it_is_asked_only_while_it_is_near_by_the_log_and_not_by_a_clock(
-    pair: tuple[Server, Server], postgres_url: str, until: Callable[..., Any]
-) -> None:
+    pair: tuple[Server, Server], postgres_url: str, until: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(replica, "AGAIN_S", 0.05)  # its database is not there at first
     name = postgres_url.rpartition("/")[2]
     primary = open_database(postgres_url)
     ours = Replica(primary, pair[1].url(name), 0.2)
-    ours.measure()
     until(lambda: ours.near())  # nothing is written: it has all, however long ago that was
     held(pair, True)
     try:
-        ours.measure()
         at = time.monotonic()
         with primary.write() as connection:
             tell(connection, "map.created", "one")
@@ -203,10 +206,8 @@ def test_one_of_an_older_schema_is_not_used(
 
 
 def test_one_that_falls_is_left_at_once_and_comes_back(
-    store: Store, pair: tuple[Server, Server], until: Callable[..., Any],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    monkeypatch.setattr(replica, "AGAIN_S", 0.2)
+    store: Store, pair: tuple[Server, Server], until: Callable[..., Any]
+) -> None:
     pair[1].kill()
     for _ in range(3):
         assert asked(store.replica, lambda: maps_of(store.queried)) == ["hall"]

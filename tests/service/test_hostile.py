@@ -20,6 +20,7 @@ from sceneprint.cli import checks
 from sceneprint.engine import Engine
 from sceneprint.schemas import FrameMeta, NewMap
 from sceneprint.settings import Settings
+from sceneprint.store.postgres import allow
 
 BIN = Path(sys.executable).parent
 #: Largest file that a process may write from now on, where no disk can be mounted: less than the
@@ -112,6 +113,7 @@ def tree(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.sqlite_only("the disk of uploads is that of the database")
 def test_a_full_disk_takes_nothing_and_costs_nothing(
     narrow, make_map, shots, small_shots, refused, until, tmp_path
 ):
@@ -178,10 +180,11 @@ def test_another_process_that_keeps_writing_stops_uploads_alone(kept, small_shot
     def upload(i: int) -> object:
         return kept.client.post(f"{path}/frames", **small_shots[i].form())
 
-    with closing(sqlite3.connect(kept.folder / "sceneprint.db", timeout=30)) as writer:
-        writer.execute("PRAGMA busy_timeout = 30000")
-        writer.isolation_level = None
-        writer.execute("BEGIN IMMEDIATE")
+    with (
+        Engine(Settings(data_dir=kept.folder, database_url=None)) as other,
+        other.store.database.write() as writing,
+    ):
+        allow(writing, 0)
         with ThreadPoolExecutor(4) as pool:
             sent = [pool.submit(upload, i) for i in (8, 9, 10, 11)]
             until(lambda: any(one.done() for one in sent))
@@ -197,7 +200,6 @@ def test_another_process_that_keeps_writing_stops_uploads_alone(kept, small_shot
         refused(upload(11), 503, "store-locked", "nothing was taken")
         deleted = kept.client.delete(f"{path}/frames/none")
         refused(deleted, 503, "store-locked")
-        writer.execute("ROLLBACK")
     assert kept.client.get("/readyz").json()["frames"] == {"indexed": 3}
     assert [upload(i).status_code for i in (8, 9, 10)] == [202, 202, 202]
     until(lambda: kept.client.get("/readyz").json()["frames"] == {"indexed": 6})

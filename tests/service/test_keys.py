@@ -79,6 +79,7 @@ def test_on_this_machine_alone_no_key_is_asked_for(served):
     assert served.client.get("/v1/maps", headers={"Authorization": "Bearer no"}).status_code == 200
 
 
+@pytest.mark.sqlite_only("the files of the database are in the data folder")
 def test_the_secret_is_in_no_file_and_no_line(wide, secret):
     wide.client.get("/v1/maps", headers={"Authorization": f"Bearer {secret}"})
     bare = secret.removeprefix("sp_").encode()

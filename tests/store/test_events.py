@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import insert, select
 
 from sceneprint.schemas.events import KINDS
-from sceneprint.store import Store, open_store
+from sceneprint.store import Store
 from sceneprint.store.events import Wanted, list_events, newest_seen
 from sceneprint.store.figures import count_events
 from sceneprint.store.maps import add_map, keep_model
@@ -77,7 +77,8 @@ def test_who_reads_on_misses_nothing_of_several_writers(race, url, store, tmp_pa
     sure = sum(1 + n % 3 for n in range(40) if n % 7 != 3) * 3
     *_, seen = race(WRITE + READ, 4, url, blobs, sure)
     with store.database.read() as connection:
-        rows = connection.execute(select(events.c.number, events.c.frame_id)).all()
+        asked = select(events.c.number, events.c.frame_id).order_by(events.c.number)
+        rows = connection.execute(asked).all()
     assert [list(row) for row in rows] == seen
     assert len(seen) == sure
     for i in range(3):  # each writer's own in its order

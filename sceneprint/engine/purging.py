@@ -1,0 +1,127 @@
+"""No byte of a deleted frame is left, some time after it was deleted: what deleting it left behind.
+
+A deletion takes the frame's rows and blobs at once. Left are blobs of a process that died half way,
+surfaces and answers that the frame is part of, this node's indexes and what readers hold of it, and
+pages and log of SQLite. On PostgreSQL dead rows are VACUUM's.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from sceneprint.engine.kept import KeptQueries
+from sceneprint.engine.reconstructions import Reconstructions
+from sceneprint.engine.shown import Standing
+from sceneprint.engine.sweeping import sweep_doomed
+from sceneprint.engine.upkeep import Upkeep
+from sceneprint.errors import SceneprintError, UnknownJob, UnknownMap
+from sceneprint.store import Store
+from sceneprint.store.maps import list_maps
+from sceneprint.store.records import MapRow
+
+log = logging.getLogger(__name__)
+
+#: Seconds for which a deletion is left to whoever began it.
+_YOUNG_S = 60.0
+#: Times that making an index anew takes, for which its map is left in peace afterwards: of a large
+#: one it costs hours, and a deletion an hour would keep a worker at it for ever.
+PAUSE = 10.0
+
+
+@dataclass(frozen=True)
+class Purged:
+    """What was removed.
+
+    Parameters
+    ----------
+    blobs : that were doomed, and left behind
+    answers, reconstructions : that showed what is gone
+    indexes : that were made anew or removed
+    """
+
+    blobs: int
+    answers: int
+    reconstructions: int
+    indexes: int
+
+
+class Purging:
+    """Removes what deletions leave behind on this node; any number of processes may.
+
+    Parameters
+    ----------
+    store, upkeep, kept, reconstructions : of the engine
+    purge_s : seconds after which nothing may be left
+    """
+
+    def __init__(
+        self, store: Store, upkeep: Upkeep, kept: KeptQueries, reconstructions: Reconstructions,
+        purge_s: float,
+    ) -> None:  # fmt: skip
+        self._store, self._upkeep, self._kept = store, upkeep, kept
+        self._reconstructions = reconstructions
+        self._every_s = purge_s / 2  # what is deleted just after a look is gone in time too
+        self._next = time.monotonic() + self._every_s
+        self._rest: dict[int, float] = {}  # by number of a map: when its index may be made again
+
+    def run(self) -> Purged | None:
+        """Remove what is left, where it is time; what goes wrong is logged and tried again."""
+        if time.monotonic() < self._next:
+            return None
+        self._next = time.monotonic() + self._every_s
+        return self._all(time.time() - min(_YOUNG_S, self._every_s), self._rested)
+
+    def now(self) -> Purged:
+        """Remove all that is left at once.
+
+        Raises
+        ------
+        StoreError, OSError : as it cannot be removed; the rest is.
+        """
+        failed: list[Exception] = []
+        found = self._all(None, lambda _: True, failed)
+        if failed:
+            raise failed[0]
+        return found
+
+    def _rested(self, row: MapRow) -> bool:
+        return time.monotonic() >= self._rest.get(row.number, 0.0)
+
+    def _all(
+        self, before: float | None, wanted: Callable[[MapRow], bool],
+        failed: list[Exception] | None = None,
+    ) -> Purged:  # fmt: skip
+        def tried(do: Callable[[], int]) -> int:
+            try:
+                return do()
+            except (UnknownMap, UnknownJob):
+                return 0  # deleted meanwhile: the next time
+            except (SceneprintError, OSError, ValueError) as error:
+                log.error("not all was purged", extra={"error": str(error)})
+                if failed is not None:
+                    failed.append(error)
+                return 0
+
+        standing = Standing(self._store)
+        with self._store.database.read() as connection:
+            rows = [row for row in list_maps(connection) if wanted(row)]
+        found = Purged(
+            blobs=tried(lambda: sweep_doomed(self._store, before)),
+            reconstructions=tried(lambda: self._reconstructions.forget(standing)),
+            answers=tried(lambda: self._kept.forget(standing.all_of)),
+            indexes=sum(tried(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]
+        )
+        self._store.database.shrink_log()
+        return found
+
+    def _index(self, row: MapRow) -> int:
+        start = time.monotonic()
+        done = self._upkeep.purge(row)
+        took = time.monotonic() - start
+        if done:
+            log.info("index purged", extra={"map": row.name, "seconds": round(took, 1)})
+            self._rest[row.number] = time.monotonic() + PAUSE * took
+        return int(done)

@@ -1,0 +1,63 @@
+"""Whether what was made of frames and maps still stands, or one of them was deleted since."""
+
+from __future__ import annotations
+
+from sqlalchemy import select
+
+from sceneprint.engine.kept import Kept
+from sceneprint.schemas import FrameState
+from sceneprint.store import Store
+from sceneprint.store.tables import frames, maps
+
+
+class Standing:
+    """Looks frames and maps up, once each: of one moment, so make a new one for the next.
+
+    Parameters
+    ----------
+    store : see Store
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._maps: dict[str, float | None] = {}  # when they were made, seconds since 1970
+        self._frames: dict[tuple[str, str], float | None] = {}  # when they were received
+
+    def asked(self, kept: Kept) -> bool:
+        """Whether the maps that were asked and the frame that was looked up are still those."""
+        frame = kept.answer.frame
+        return all(self.map(name, kept.at) for name in kept.answer.maps) and (
+            frame is None or self.frame(frame.map, frame.frame_id, kept.at)
+        )
+
+    def all_of(self, kept: Kept) -> bool:
+        """Whether all frames that an answer shows are still there too."""
+        matches = kept.answer.matches
+        return self.asked(kept) and all(self.frame(m.map, m.frame_id, kept.at) for m in matches)
+
+    def map(self, name: str, at: float) -> bool:
+        """Whether a map is there that was there at that time, seconds since 1970."""
+        if name not in self._maps:
+            with self._store.database.read() as connection:
+                asked = select(maps.c.created_at).where(maps.c.name == name)
+                self._maps[name] = connection.execute(asked).scalar()
+        made = self._maps[name]
+        return made is not None and made <= at
+
+    def frame(self, map_name: str, frame_id: str, at: float) -> bool:
+        """Whether a frame is there that was there at that time."""
+        place = map_name, frame_id
+        if place not in self._frames:
+            with self._store.database.read() as connection:
+                asked = (
+                    select(frames.c.received_at)
+                    .join(maps, maps.c.number == frames.c.map_number)
+                    .where(
+                        maps.c.name == map_name,
+                        frames.c.id == frame_id,
+                        frames.c.state != FrameState.DELETED,
+                    )
+                )
+                self._frames[place] = connection.execute(asked).scalar()
+        received = self._frames[place]
+        return received is not None and received <= at

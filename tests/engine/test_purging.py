@@ -1,0 +1,157 @@
+"""A deleted frame leaves no byte of itself: its bytes are looked for in every file and every table.
+
+First they are found in each place where they may be; then it is deleted, and they are in none.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sqlalchemy import inspect, text
+
+from sceneprint.engine import Engine
+from sceneprint.engine.uploads import Upload
+from sceneprint.errors import UnknownJob, UnknownQuery
+from sceneprint.schemas import NewMap, Query
+from sceneprint.schemas.reconstructions import NewReconstruction
+from sceneprint.store.editing import write_frame
+from sceneprint.store.frames import find_frame
+from sceneprint.store.maps import find_map
+from sceneprint.store.signatures import geometry_blobs, stored_vector
+
+#: Bytes of a piece that is looked for, and pieces of each thing.
+PIECE, MANY = 24, 40
+
+
+def pieces(data: bytes, others: list[bytes]) -> list[bytes]:
+    """Parts of some bytes that tell them from others: even over their length."""
+    found = []
+    for start in np.linspace(0, len(data) - PIECE, 8 * MANY).astype(int).tolist():
+        piece = data[start : start + PIECE]
+        if len(set(piece)) > PIECE // 3 and not any(piece in other for other in others):
+            found.append(piece)
+    assert len(found) > MANY // 2
+    return found[:: max(len(found) // MANY, 1)]
+
+
+def files(folder: Path) -> Iterator[tuple[str, bytes]]:
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            yield str(path.relative_to(folder)), path.read_bytes()
+
+
+def rows(engine: Engine) -> Iterator[tuple[str, bytes]]:
+    """All tables of a server's database, those of codes with them, as bytes and as text."""
+    if engine.store.database.is_sqlite:
+        return  # it is one of the files
+    with engine.store.database.read() as connection:
+        for table in inspect(connection).get_table_names():
+            told = connection.execute(text(f'SELECT t::text FROM "{table}" t')).scalars()
+            for row in told:
+                raw = b"".join(map(bytes.fromhex, re.findall(r'x([0-9a-f]{40,})', row)))
+                yield f"table {table}", row.encode() + raw
+
+
+def places(engine: Engine, folder: Path, wanted: list[bytes]) -> set[str]:
+    """Kinds of files, and tables, in which any of some pieces is."""
+    found = set()
+    for name, data in (*files(folder), *rows(engine)):
+        if any(piece in data for piece in wanted):
+            kind = name.removeprefix("data/").partition("/")[0].removesuffix("-wal")
+            found.add(f"{kind} {Path(name).suffix}" if kind == "index" else kind)
+    return found
+
+
+@pytest.fixture
+def lived_in(make_engine, store_url, uploads, work_off, tmp_path):
+    """A map whose index was published twice."""
+    engine = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2)
+    engine.create_map(NewMap(name="hall", model="compact"))
+    for one in uploads[:6]:
+        meta = one.meta.model_copy(update={"tags": ["by-the-door"], "session": "one-morning"})
+        engine.uploads.add("hall", Upload(one.data, meta))
+        if one in (uploads[2], uploads[5]):
+            work_off(engine)
+            assert engine.publish_due() == 1
+    return engine
+
+
+@pytest.fixture
+def secret(lived_in, ids, uploads):
+    """What of the first frame is looked for."""
+    engine = lived_in
+    with engine.store.database.read() as connection:
+        row = find_map(connection, "hall")
+        numbers = [find_frame(connection, row, name).number for name in ids(engine)]
+        vectors = [stored_vector(connection, n, row.model_id) or b"" for n in numbers]
+        blobs = geometry_blobs(connection, numbers, row.model_id)
+    artifacts = [engine.store.blobs.get(blobs[n]) for n in numbers]
+    generation = engine._upkeep.newest(row)
+    assert generation is not None and len(generation) == len(numbers)
+    codes = generation.coarse.index.reconstruct_n(0, len(numbers)).astype(np.uint8)
+    place = int(generation.places.of(np.array(numbers[:1]))[0])
+    return {
+        "upload": pieces(uploads[0].data, [one.data for one in uploads[1:]]),
+        "signature": pieces(vectors[0], vectors[1:]),
+        "artifact": pieces(artifacts[0], artifacts[1:]),
+        "code": [codes[place].tobytes()],
+        "tag": [b"by-the-door"],
+    }
+
+
+def asked(engine: Engine, frame_id: str, uploads) -> tuple[str, str, str]:
+    """Ids of an answer that was made from a frame, of one that shows it, and of a surface."""
+    options = Query(stages="retrieve,diversify,validate", seed=1)
+    own = engine.query_frame("hall", frame_id, options)
+    other = engine.query_upload("hall", uploads[1].data, uploads[1].meta, options)
+    assert frame_id in {match.frame_id for match in other.matches}
+    fused = engine.reconstructions.begin(engine.kept.find(own.query_id), NewReconstruction())
+    return own.query_id, other.query_id, fused.job_id
+
+
+def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
+    engine, frame_id = lived_in, ids(lived_in)[0]
+    own, shows, fused = asked(engine, frame_id, uploads)
+    truth = "sceneprint.db" if engine.store.database.is_sqlite else "table signatures"
+    found = {what: places(engine, tmp_path, wanted) for what, wanted in secret.items()}
+    assert found["upload"] == {"blobs"}
+    assert found["signature"] == {truth, "queries", "index .segment"}
+    assert found["artifact"] == {"blobs", "queries"}
+    assert found["code"] == {"index .faiss"}
+
+    with engine.store.database.write() as connection:  # of the others, which stay
+        row = find_map(connection, "hall")
+        for name in ids(engine)[1:]:
+            write_frame(connection, row, find_frame(connection, row, name), {"tags": []})
+    engine.delete_frame("hall", frame_id)
+    assert places(engine, tmp_path, secret["upload"]) == set()
+    with pytest.raises(UnknownQuery):
+        engine.inspection.answer(own)
+    assert engine.inspection.answer(shows).query_id == shows
+    purged = engine.purging.now()
+    assert (purged.answers, purged.reconstructions, purged.indexes) == (2, 1, 1)
+    for what, wanted in secret.items():
+        assert places(engine, tmp_path, wanted) == set(), what
+    with pytest.raises(UnknownQuery):
+        engine.inspection.answer(shows)
+    with pytest.raises(UnknownJob):
+        engine.reconstructions.find(fused)
+    # the others are found as before
+    told = engine.query_upload("hall", uploads[4].data, uploads[4].meta, Query(seed=1))
+    assert told.matches[0].frame_id == ids(engine)[3]
+    assert engine.purging.now().indexes == 0
+
+
+def test_no_byte_of_a_map_is_left(lived_in, secret, ids, uploads, tmp_path):
+    engine, frame_id = lived_in, ids(lived_in)[0]
+    asked(engine, frame_id, uploads)
+    engine.delete_map("hall")
+    engine.publish_due()
+    engine.purging.now()
+    for what, wanted in secret.items():
+        assert places(engine, tmp_path, wanted) == set(), what
+    assert list(engine.store.blobs.digests()) == []

@@ -1,0 +1,168 @@
+"""Quotas: what a map may hold, counted exactly whatever becomes of its frames and whoever sends."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+from sqlalchemy import select
+
+from sceneprint.engine.edits import edit_map
+from sceneprint.engine.uploads import Upload
+from sceneprint.errors import InvalidRequest, MapExists, QuotaExceeded
+from sceneprint.schemas import FrameState, NewMap
+from sceneprint.store import frames as stored
+from sceneprint.store.idempotency import Once
+from sceneprint.store.maps import find_map
+from sceneprint.store.quotas import Use, counted_anew, use_of
+from sceneprint.store.tables import frames
+
+
+def used(engine) -> Use:
+    """What `hall` says that it holds, and what it does hold."""
+    told = engine.get_map("hall")
+    with engine.store.database.read() as connection:
+        number = find_map(connection, "hall").number
+        assert use_of(connection, number) == counted_anew(connection, number)
+    return Use(told.used_frames, told.used_bytes)
+
+
+def limit(engine, **limits) -> None:
+    edit_map(engine.store, "hall", limits)
+
+
+def test_a_map_takes_what_its_quota_allows(empty, uploads):
+    a, b, c, d, *_ = uploads
+    limit(empty, quota_frames=2)
+    first, _ = empty.add_frame("hall", a.data, a.meta)
+    empty.add_frame("hall", b.data, b.meta)
+    assert used(empty) == Use(2, len(a.data) + len(b.data))
+    with pytest.raises(QuotaExceeded, match=r"holds 2 frames of the 2 .*PATCH /v1/maps/hall"):
+        empty.add_frame("hall", c.data, c.meta)
+    blobs = set(empty.store.blobs.digests())
+    assert len(blobs) == 2  # nothing is left of what was not taken
+    again, new = empty.add_frame("hall", a.data, a.meta)  # no new frame
+    assert (again.frame_id, new) == (first.frame_id, False)
+    empty.delete_frame("hall", first.frame_id)
+    assert used(empty) == Use(1, len(b.data))
+    batch = [Upload(one.data, one.meta) for one in (b, c, d)]
+    outcomes, _ = empty.uploads.add_all("hall", batch)
+    assert [one.new for one in outcomes] == [False, True, False]
+    assert isinstance(outcomes[2].error, QuotaExceeded)
+    assert used(empty) == Use(2, len(b.data) + len(c.data))
+    limit(empty, quota_frames=None)
+    empty.add_frame("hall", d.data, d.meta)
+
+
+def test_bytes_are_those_of_uploads(empty, uploads):
+    a, b, *_ = uploads
+    limit(empty, quota_bytes=len(a.data) + len(b.data) - 1)
+    empty.add_frame("hall", a.data, a.meta)
+    with pytest.raises(QuotaExceeded, match=f"holds {len(a.data)} bytes of uploads of the"):
+        empty.add_frame("hall", b.data, b.meta)
+    limit(empty, quota_bytes=len(a.data) + len(b.data))
+    empty.add_frame("hall", b.data, b.meta)
+    limit(empty, quota_bytes=1)  # what is there stays
+    assert used(empty) == Use(2, len(a.data) + len(b.data))
+
+
+def test_a_quota_holds_to_the_frame_whoever_sends_at_once(empty, make_engine, uploads):
+    limit(empty, quota_frames=7)
+    engines, taken, refused = [empty, make_engine()], [], []
+
+    def send(part: int) -> None:
+        for i, one in enumerate(uploads):
+            if i % 4 == part:
+                continue  # each frame is sent three times
+            try:
+                taken.append(engines[part % 2].add_frame("hall", one.data, one.meta)[1])
+            except QuotaExceeded as error:
+                refused.append(error)
+
+    threads = [threading.Thread(target=send, args=(part,)) for part in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (sum(taken), len(taken) + len(refused)) == (7, 36)
+    assert refused
+    assert used(empty).frames == 7
+
+
+def test_every_change_of_a_frame_is_counted(empty, uploads):
+    """Frames through states at random, beside a count over all of them."""
+    rng, data = np.random.default_rng(3), uploads[0]
+    empty.add_frame("hall", data.data, data.meta)
+    with empty.store.database.write() as connection:
+        row = find_map(connection, "hall")
+        [template] = connection.execute(select(frames)).mappings()
+        names = set(frames.c.keys()) - {
+            "number", "id", "map_number", "state", "received_at", "pose_x", "pose_y", "pose_z",
+        }  # fmt: skip
+        values = {name: template[name] for name in names}
+        states = set()
+        for step in range(150):
+            size, kind = int(rng.integers(1, 1000)), rng.integers(6)
+            numbers = connection.execute(select(frames.c.number)).scalars().all()
+            one = stored.frame_of(connection, int(rng.choice(numbers)))
+            if kind <= 1:
+                content = {"content_id": f"{step:064d}", "bytes": size}
+                stored.add_frame(connection, row.number, values | content)
+            elif kind == 2:
+                stored.set_state(connection, one.number, FrameState.REDUNDANT)
+            elif kind == 3 and one.state == FrameState.REDUNDANT:
+                stored.renew_frame(connection, one.number, {"bytes": size})
+            elif kind == 4:
+                stored.renew_upload(connection, one.number, "ab" * 32, size, None)
+            elif kind == 5 and one.state != FrameState.DELETED:
+                stored.delete_frame(connection, row, one)
+            states.add((int(kind), str(one.state)))
+            assert use_of(connection, row.number) == counted_anew(connection, row.number), step
+    assert {(2, "deleted"), (2, "redundant"), (3, "redundant"), (5, "redundant")} <= states
+
+
+def test_what_had_no_room_is_taken_when_it_is_sent_again(empty, uploads):
+    a, b, *_ = uploads
+    once = Once("robot", "key", "f" * 64)
+    limit(empty, quota_frames=0)
+    for _ in range(2):
+        with pytest.raises(QuotaExceeded):
+            empty.uploads.add("hall", Upload(a.data, a.meta), once)
+    limit(empty, quota_frames=1)
+    batch = [Upload(one.data, one.meta) for one in (a, b)]
+    other = Once("robot", "other", "e" * 64)
+    (first, second), again = empty.uploads.add_all("hall", batch, other)
+    assert (first.new, second.added, again) == (True, None, False)
+    limit(empty, quota_frames=2)
+    (first, second), again = empty.uploads.add_all("hall", batch, other)
+    assert (first.new, second.new, again) == (False, True, False)
+    outcomes, again = empty.uploads.add_all("hall", batch, other)
+    assert (again, [one.error for one in outcomes]) == (True, [None, None])
+
+
+def test_a_map_made_anew_has_the_quota_of_the_one_before(empty):
+    limit(empty, quota_frames=3, retention_days=2.0)
+    empty.delete_map("hall")
+    made, _ = empty.create_map(NewMap(name="hall", model="compact"))
+    assert (made.quota_frames, made.quota_bytes, made.retention_days) == (3, None, None)
+    assert empty.create_map(NewMap(name="hall", model="compact"))[1] is False
+    assert empty.create_map(NewMap(name="hall", model="compact", quota_frames=3))[1] is False
+    with pytest.raises(MapExists, match="other limits"):
+        empty.create_map(NewMap(name="hall", model="compact", quota_frames=4))
+    empty.delete_map("hall")
+    made, _ = empty.create_map(NewMap(name="hall", model="compact", quota_frames=None))
+    assert made.quota_frames is None
+
+
+def test_limits_are_looked_at_before_they_are_set(empty):
+    before = empty.get_map("hall").etag
+    for bad in ({"quota_frames": -1}, {"quota_bytes": 1.5}, {"retention_days": 0},
+                {"retention_days": float("nan")}, {"quota_frames": 2**60}):  # fmt: skip
+        with pytest.raises(InvalidRequest):
+            edit_map(empty.store, "hall", bad)
+    assert empty.get_map("hall").etag == before
+    told = edit_map(empty.store, "hall", {"quota_frames": 0, "quota_bytes": 10})
+    assert (told.quota_frames, told.quota_bytes, told.retention_days) == (0, 10, None)
+    assert told.etag != before
+    assert edit_map(empty.store, "hall", {"quota_frames": None}).quota_bytes == 10

@@ -1,0 +1,150 @@
+"""The primary is killed and its standby promoted, under a service and a worker at work."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from benchmarks.fleet.postgres import Server
+from sceneprint.datasets import write_depth_png
+from sceneprint.types import Frame
+
+#: What is promised: seconds from the promotion to the first answer, and to the first job.
+RESUMES_S = 10.0
+
+
+@dataclass
+class Fleet:
+    """A primary, its synchronous standby, and a process of ours that knows both."""
+
+    primary: Server
+    standby: Server
+    process: subprocess.Popen[str]
+    errors: Path
+    url: str = ""
+    client: httpx.Client = field(default_factory=lambda: httpx.Client(timeout=60, trust_env=False))
+
+    def log(self, message: str) -> list[dict[str, Any]]:
+        text = self.errors.read_text()
+        lines = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
+        return [line for line in lines if line["message"] == message]
+
+    def ask(self, method: str, path: str, **given: Any) -> httpx.Response:
+        return self.client.request(method, self.url + path, **given)
+
+
+@pytest.fixture(scope="module")
+def views(room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
+    """Small frames of their own content, as the parts of a form."""
+    path, found = tmp_path_factory.mktemp("png") / "a.png", []
+    for number in range(12):
+        frame, (y, x) = room_frames[number % 6], divmod(number, 4)
+        k = frame.intrinsics
+        write_depth_png(path, np.ascontiguousarray(frame.depth[y::4, x::4]), 1000.0)
+        lens = {"width": 160, "height": 120, "fx": k.fx / 4, "fy": k.fy / 4,
+                "cx": (k.cx - x) / 4, "cy": (k.cy - y) / 4}  # fmt: skip
+        meta = json.dumps({"intrinsics": lens})
+        found.append({"frame": ("a.png", path.read_bytes()), "meta": (None, meta)})
+    return found
+
+
+@pytest.fixture
+def fleet(
+    tmp_path_factory: pytest.TempPathFactory, until: Callable[..., Any]
+) -> Iterator[Fleet]:
+    """`sceneprint serve`, started before its database is there."""
+    folder = tmp_path_factory.mktemp("fleet")
+    primary = Server(folder / "primary")
+    primary.start()
+    standby = primary.standby(folder / "standby", synchronous=True)
+    primary.create("fleet")
+    primary.stop()
+    hosts = f"host=127.0.0.1:{primary.port}&host=127.0.0.1:{standby.port}"
+    url = f"postgresql+psycopg://postgres@/fleet?{hosts}&target_session_attrs=read-write"
+    settings = {"DATABASE_URL": url, "DATA_DIR": str(folder / "data"), "PORT": "0", "WORKERS": "1",
+                "LEASE_S": "4"}  # fmt: skip
+    errors = folder / "errors"
+    with errors.open("wb") as log:
+        process = subprocess.Popen(
+            [f"{Path(sys.executable).parent}/sceneprint", "serve"], stdout=subprocess.PIPE,
+            stderr=log, text=True, start_new_session=True,
+            env=os.environ | {f"SCENEPRINT_{name}": value for name, value in settings.items()},
+        )  # fmt: skip
+    made = Fleet(primary, standby, process, errors)
+    try:
+        until(lambda: made.log("the database is waited for"))
+        primary.start()
+        assert process.stdout is not None
+        told = re.match(r"sceneprint: serving (\S+)", process.stdout.readline())
+        assert told is not None, errors.read_text()
+        made.url = told[1]
+        until(lambda: made.log("worker ready"))
+        yield made
+    finally:
+        made.client.close()
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+        primary.kill()
+        standby.kill()
+
+
+def test_nothing_acknowledged_is_lost_and_all_goes_on_by_itself(
+    fleet: Fleet, views: list[Any], until: Callable[..., Any]
+) -> None:
+    assert fleet.ask("POST", "/v1/maps", json={"name": "hall", "model": "compact"}).is_success
+    kept = []
+
+    def upload(view: Any) -> httpx.Response:
+        answer = fleet.ask("POST", "/v1/maps/hall/frames", files=view)
+        if answer.status_code == 202:
+            kept.append(answer.json()["frame_id"])
+        return answer
+
+    def query(view: Any) -> httpx.Response:
+        return fleet.ask("POST", "/v1/maps/hall/queries", files=view)
+
+    for view in views[:3]:
+        assert upload(view).status_code == 202
+    until(lambda: fleet.ask("GET", "/readyz").json()["frames"] == {"indexed": 3})
+    assert query(views[0]).json()["matches"][0]["frame_id"] == kept[0]
+    for view in views[3:6]:  # which the worker may have in hand
+        assert upload(view).status_code == 202
+    fleet.primary.kill()
+    for refused in (upload(views[6]), query(views[0]), fleet.ask("GET", "/readyz")):
+        assert refused.status_code == 503
+        assert refused.headers["content-type"] == "application/problem+json"
+        assert int(refused.headers["retry-after"]) >= 1
+        assert refused.json()["type"] == "/problems/store-away"
+        assert "127.0.0.1" not in refused.json()["detail"]
+    assert fleet.ask("GET", "/healthz").status_code == 200
+    until(lambda: fleet.log("the store does not answer"))
+    fleet.standby.promote()
+    promoted = time.monotonic()
+    found = until(lambda: (answer := query(views[0])).status_code == 200 and answer)
+    answered = time.monotonic() - promoted
+    assert found.json()["matches"][0]["frame_id"] == kept[0]
+    until(lambda: upload(views[7]).status_code == 202)
+    stored = time.monotonic() - promoted
+    assert max(answered, stored) < RESUMES_S
+    until(lambda: fleet.ask("GET", "/readyz").json()["frames"] == {"indexed": len(kept)})
+    assert len(kept) == 7
+    for frame_id in kept:
+        assert fleet.ask("GET", f"/v1/maps/hall/frames/{frame_id}").json()["state"] == "indexed"
+    assert len(fleet.log("worker ready")) == 1  # it waited, and was not replaced
+    assert fleet.log("worker died") == []
+    assert fleet.process.poll() is None

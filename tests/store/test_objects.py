@@ -1,0 +1,164 @@
+"""Object stores by URL: what is refused, what is said of a store that is away, and how soon."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from benchmarks.fleet.s3 import ObjectServer
+from sceneprint.errors import StoreAway, UnusableStore
+from sceneprint.store import objects as module
+from sceneprint.store.objects import PART, check_objects, open_objects
+
+HALF_WAY = """
+import sys, time
+from sceneprint.store.objects import PART, open_objects
+
+class Slow:
+    place = 0
+    def tell(self): return self.place
+    def seek(self, offset, whence=0):
+        self.place = 8 * PART if whence == 2 else offset
+        return self.place
+    def read(self, size=-1):
+        if self.place >= 3 * PART:
+            print("half way", flush=True)
+            time.sleep(600)
+        self.place += size
+        return b"x" * size
+
+open_objects(sys.argv[1]).put_file("large", Slow())
+"""
+
+
+@pytest.mark.parametrize(
+    "given",
+    ["s3://user:pw@bucket/x", "s3://pw@bucket", "s3://bucket?access_key=pw", "s3://bucket/x#pw",
+     "s3://", "s3:///pw", "ftp://bucket", "https://pw.example/x", "", "bucket", "s3://[pw",
+     "s3://bucket/../pw", "s3://bucket/%2e%2e/pw", "s3://bucket/a\0pw", "file://", "file:///",
+     "file://host/pw", "memory://pw"],
+)  # fmt: skip
+def test_what_names_no_store_is_refused_and_not_repeated(given: str) -> None:
+    with pytest.raises(UnusableStore, match="SCENEPRINT_BLOB_URL") as caught:
+        open_objects(given)
+    assert "pw" not in str(caught.value)
+
+
+def test_a_store_without_tls_is_asked_only_where_that_is_allowed(
+    bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("AWS_ALLOW_HTTP")
+    with pytest.raises(UnusableStore, match="AWS_ALLOW_HTTP=true"):
+        open_objects(bucket)
+
+
+@pytest.mark.parametrize("kind", ["s3", "memory", "file"])
+def test_keys_are_put_listed_and_removed(
+    kind: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    url = {"memory": "memory:///", "file": f"file://{tmp_path}/some%20where"}.get(kind)
+    objects = open_objects(url or f"{request.getfixturevalue('bucket')}/pre/fix")
+    assert check_objects(objects) > 0
+    assert list(objects.list("")) == []  # nothing of the check is left
+    assert objects.put("a/1", b"one", create=True)
+    assert not objects.put("a/1", b"two", create=True)
+    assert objects.get("a/1") == b"one"
+    objects.put("a/1", b"three")
+    objects.put("b", b"")
+    assert sorted((one.key, one.size) for one in objects.list("")) == [("a/1", 5), ("b", 0)]
+    assert [one.key for one in objects.list("a/")] == ["a/1"]
+    assert (objects.get("b"), objects.open("b").read(), [*objects.chunks("b")]) == (b"", b"", [])
+    large = os.urandom(2 * PART + 7)
+    file = io.BytesIO(b"skipped" + large)
+    file.seek(7)
+    objects.put_file("c", file)
+    objects.get_file("c", tmp_path / "c")
+    assert (tmp_path / "c").read_bytes() == large == objects.get("c")
+    objects.delete("none", "a/1", "none too", "b", "c")
+    objects.delete("none")
+    assert list(objects.list("")) == []
+    for call in (objects.get, objects.open, lambda key: [*objects.chunks(key)]):
+        with pytest.raises(FileNotFoundError, match="a/1"):
+            call("a/1")
+    assert objects.look("a/1") is None
+
+
+def test_a_bucket_that_is_not_there_is_no_missing_blob(bucket: str) -> None:
+    objects = open_objects(f"{bucket}-none/x")
+    for call in (
+        lambda: objects.get("a"),
+        lambda: objects.put("a", b"x"),
+        objects.list("").__next__,
+    ):
+        with pytest.raises(UnusableStore, match=r"no such bucket|404 Not Found"):
+            call()
+
+
+def test_who_is_killed_half_way_leaves_nothing_to_be_read(bucket: str) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", HALF_WAY, bucket], stdout=subprocess.PIPE, text=True
+    ) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "half way\n"
+        child.send_signal(signal.SIGKILL)
+    objects = open_objects(bucket)
+    assert objects.look("large") is None
+    assert list(objects.list("")) == []
+
+
+@pytest.fixture
+def brittle(monkeypatch: pytest.MonkeyPatch) -> Iterator[ObjectServer]:
+    """A server of this test alone, and little patience with it."""
+    monkeypatch.setattr(module, "TRIED_S", 1)
+    monkeypatch.setattr(module, "SMALL_S", 1)
+    monkeypatch.setattr(module, "AWAY_S", 0.2)
+    with ObjectServer() as server:
+        for name, value in server.env.items():
+            monkeypatch.setenv(name, value)
+        yield server
+
+
+def test_a_server_that_falls_acknowledges_nothing(brittle: ObjectServer) -> None:
+    objects = open_objects(brittle.bucket("fragile"))
+
+    class Fatal(io.BytesIO):
+        def read(self, size: int | None = -1, /) -> bytes:
+            if self.tell() >= 3 * PART:
+                brittle.kill()
+            return super().read(size)
+
+    objects.put("before", b"x")
+    with pytest.raises(StoreAway, match="large cannot be written"):
+        objects.put_file("large", Fatal(bytes(8 * PART)))
+    with pytest.raises(StoreAway, match=r"s3://fragile: a cannot be written .*AWS_"):
+        objects.put("a", b"x")
+    brittle.start()  # it has forgotten all, as it does
+    brittle.bucket("fragile")
+    until = objects._away[0]
+    assert until > 0
+    while module.time.monotonic() < until:
+        with pytest.raises(StoreAway):  # at once
+            objects.get("a")
+    assert objects.put("a", b"x")
+    assert [one.key for one in objects.list("")] == ["a"]
+
+
+def test_a_server_that_never_answers_is_given_up(
+    monkeypatch: pytest.MonkeyPatch, bucket: str
+) -> None:
+    monkeypatch.setattr(module, "SMALL_S", 1)
+    monkeypatch.setattr(module, "TRIED_S", 1)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        place = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        monkeypatch.setenv("AWS_ENDPOINT_URL", place)
+        objects = open_objects(bucket)
+        with pytest.raises(StoreAway, match="cannot be read"):
+            objects.get("a")

@@ -1,0 +1,161 @@
+"""Blobs of a fleet: whose a prefix is, and who may remove what another is about to refer to."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import text
+
+from sceneprint.errors import UnusableStore
+from sceneprint.store import Store, open_blobs, open_database, open_store
+from sceneprint.store.object_blobs import MARK, ObjectBlobs
+from sceneprint.store.objects import open_objects
+
+HOLDS = """
+import sys, time
+from sceneprint.store import open_store
+with open_store(sys.argv[1], sys.argv[2]).blobs.kept():
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def objects_of(store: Store) -> ObjectBlobs:
+    assert isinstance(store.blobs, ObjectBlobs)
+    return store.blobs
+
+
+def test_a_prefix_belongs_to_one_database(store_url: str, bucket: str, tmp_path: Path) -> None:
+    first = open_store(store_url, f"{bucket}/mine")
+    digest = first.blobs.put(b"depth")
+    first.close()
+    again = open_store(store_url, f"{bucket}/mine/")
+    assert again.blobs.get(digest) == b"depth"
+    again.close()
+    other = f"sqlite:///{tmp_path / 'other.db'}"
+    with pytest.raises(UnusableStore, match=r"of another database.*SCENEPRINT_BLOB_URL"):
+        open_store(other, f"{bucket}/mine")
+    open_store(other, f"{bucket}/yours").close()
+    objects = open_objects(f"{bucket}/mine")
+    objects.put(MARK, b"[1]")
+    with pytest.raises(UnusableStore, match="of another database"):
+        open_store(store_url, f"{bucket}/mine")
+
+
+def test_who_only_looks_marks_nothing(store_url: str, bucket: str) -> None:
+    database = open_database(store_url)
+    blobs = open_blobs(bucket, database, claim=False)
+    assert list(open_objects(bucket).list("")) == []
+    blobs.put(b"depth")  # what writes does
+    assert open_objects(bucket).look(MARK) is not None
+    blobs.close()
+    database.close()
+
+
+def test_a_store_that_is_away_is_opened_and_claimed_later(
+    tmp_path: Path, bucket: str, monkeypatch: pytest.MonkeyPatch, object_server: Any
+) -> None:
+    monkeypatch.setattr("sceneprint.store.objects.TRIED_S", 1)
+    monkeypatch.setattr("sceneprint.store.objects.AWAY_S", 0.0)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    store = open_store(f"sqlite:///{tmp_path / 'new' / 'a.db'}", bucket)
+    with pytest.raises(UnusableStore, match="cannot be read"):
+        store.blobs.put(b"depth")
+    with pytest.raises(UnusableStore):
+        store.blobs.remove("0" * 64)
+    with pytest.raises(UnusableStore):
+        store.blobs.check()
+    store.close()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", object_server.endpoint)
+    store = open_store(f"sqlite:///{tmp_path / 'new' / 'a.db'}", bucket)
+    store.blobs.put(b"depth")
+    store.blobs.check()
+    open_objects(bucket).delete(MARK)
+    with pytest.raises(UnusableStore, match="emptied or replaced"):
+        store.blobs.check()
+    store.close()
+
+
+def test_all_processes_share_one_lock(store_url: str, bucket: str) -> None:
+    store = open_store(store_url, bucket)
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDS, store_url, bucket], stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        with store.blobs.removing() as allowed:
+            assert not allowed
+        with store.blobs.kept():  # others may need them kept as well
+            pass
+        other.kill()
+    with store.database.read():  # one more round trip: the server sees the end of the connection
+        pass
+    for _ in range(200):
+        with store.blobs.removing() as allowed:
+            if allowed:
+                break
+    assert allowed
+    with store.blobs.removing() as allowed, store.blobs.removing() as also:
+        assert (allowed, also) == (True, False)
+    store.close()
+
+
+def test_what_was_put_is_held_without_asking_until_something_is_removed(
+    postgres_url: str, bucket: str
+) -> None:
+    mine, theirs = (open_store(postgres_url, bucket) for _ in range(2))
+    objects = open_objects(bucket)
+    digest = mine.blobs.put(b"depth")
+    objects.delete(f"blobs/{digest[:2]}/{digest}")  # past all locks: nobody can know
+    assert mine.blobs.holds(digest)  # not asked
+    assert not theirs.blobs.holds(digest)  # asked: another process put it
+    mine.blobs.put(b"depth")
+    with theirs.blobs.removing() as allowed:
+        assert allowed
+        theirs.blobs.remove(digest)
+        assert not mine.blobs.holds(digest)  # while it goes on
+    assert not mine.blobs.holds(digest)
+    mine.blobs.put(b"depth")
+    assert mine.blobs.holds(digest)
+    mine.blobs.remove(digest)
+    assert not mine.blobs.holds(digest)
+    mine.close()
+    theirs.close()
+
+
+def test_a_remover_that_dies_is_not_forgotten(postgres_url: str, bucket: str) -> None:
+    mine, theirs = (open_store(postgres_url, bucket) for _ in range(2))
+    removing = theirs.blobs.removing()
+    assert removing.__enter__()
+    digest = mine.blobs.put(b"depth")
+    objects_of(theirs)._locks.close()  # as its process would, before it counted to the end
+    objects_of(theirs).objects.delete(f"blobs/{digest[:2]}/{digest}")
+    assert not mine.blobs.holds(digest)
+    with mine.blobs.removing() as allowed:  # its lock is free
+        assert allowed
+    digest = mine.blobs.put(b"depth")
+    objects_of(mine).objects.delete(f"blobs/{digest[:2]}/{digest}")
+    assert mine.blobs.holds(digest)  # counted evenly again, and so not asked
+    removing.__exit__(None, None, None)
+    mine.close()
+    theirs.close()
+
+
+def test_a_lock_that_was_lost_is_said(postgres_url: str, bucket: str) -> None:
+    store = open_store(postgres_url, bucket)
+    kept = store.blobs.kept()
+    kept.__enter__()
+    with store.database.write() as connection:
+        connection.execute(
+            text(
+                "SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' "
+                "AND mode = 'ShareLock'"
+            )
+        )
+    with pytest.raises(UnusableStore, match=r"connection was lost.*Do it again"):
+        kept.__exit__(None, None, None)
+    store.close()

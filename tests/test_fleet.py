@@ -1,0 +1,216 @@
+"""`make fleet` at reduced size, with real processes; and that it would see what is wrong."""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.fleet import checking, doors, saboteur
+from benchmarks.fleet.__main__ import BEGIN, END, table
+from benchmarks.fleet.checking import Found, check
+from benchmarks.fleet.doors import Diary, Doors, Shut, Wait
+from benchmarks.fleet.driving import FleetFigures, Plan, drive, outages
+from benchmarks.fleet.postgres import NoServer, binaries
+from benchmarks.fleet.recordings import GRIDS, walks
+from benchmarks.fleet.robots import Kept, Listener
+from benchmarks.fleet.saboteur import PRIMARY, Kill, Promotion, schedule
+from benchmarks.pages import put_between
+from benchmarks.soak.load import free_port
+from sceneprint.client import Client
+from sceneprint.errors import DatasetError
+
+#: At reduced size.
+SMALL = Plan(seconds=6, robots=2, rate=2, kills=2, promotions=1, seed=30, workers=1)
+
+
+def test_a_fleet_loses_nothing(
+    tmp_path: Path, building: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    try:
+        binaries()
+    except NoServer as error:
+        pytest.skip(str(error))
+    monkeypatch.setattr(saboteur, "AWAY_S", (0.0, 0.0))
+    monkeypatch.setattr(saboteur, "UNNOTICED_S", 0.2)
+    monkeypatch.setattr(checking, "COMPARED", 4)
+    plan = Plan(**vars(SMALL) | {"data": building})
+    found = drive(tmp_path, plan)
+    assert found.kills == {"service": 1, "worker": 1, PRIMARY: 1}
+    assert (found.lost, found.window, found.damaged, found.faults) == (0, 0, 0, [])
+    assert found.found == Found(
+        acknowledged=found.found.acknowledged, indexed=found.found.acknowledged,
+        found=found.found.acknowledged,
+    )  # fmt: skip
+    assert found.found.acknowledged > 6
+    assert found.sound
+    [promotion] = found.promotions
+    assert len(promotion.resumed) == 2
+    assert max(promotion.resumed.values()) < 60  # the claim is 10 s; machines of tests are busy
+    assert promotion.unreceived == frozenset()
+
+
+def test_the_schedule_is_that_of_its_seed() -> None:
+    due = schedule(100, 20, 2, random.Random(3))
+    assert due == schedule(100, 20, 2, random.Random(3)) != schedule(100, 20, 2, random.Random(4))
+    assert due == sorted(due)
+    assert all(10 <= at <= 90 for at, _ in due)
+    primaries = [at for at, victim in due if victim == PRIMARY]
+    assert len(due) == 22
+    assert [at < 50 for at in primaries] == [True, False]
+
+
+def test_walks_have_nothing_in_common(building: Path) -> None:
+    found = walks(building, 3, 60)
+    assert [len(one) for one in found] == [60, 60, 60]
+    assert len({shot.png for walk in found for shot in walk}) == 180
+    assert {shot.meta.intrinsics.width for shot in found[0] if shot.meta.intrinsics} == {160}
+    with pytest.raises(DatasetError, match=f"fewer than 850 frames in {GRIDS} grids"):
+        walks(building, 1, 850)
+
+
+@pytest.mark.parametrize(
+    ("waits", "told"),
+    [
+        ([], [0.0, 0.0, 0.0]),
+        ([Wait("upload", 9.0, 12.0)], [2.0, 0.0, 0.0]),  # from the kill on
+        ([Wait("upload", 11.0, 12.5), Wait("query", 11.5, 12.0)], [1.5, 0.0, 0.0]),
+        ([Wait("upload", 9.0, 22.0)], [12.0, 0.0, 0.0]),  # not back at the second
+        ([Wait("upload", 31.0, 34.0), Wait("upload", 19.0, 21.0)], [0.0, 1.0, 3.0]),
+        ([Wait("upload", 1.0, 2.0)], [0.0, 0.0, 0.0]),  # before anything was killed
+    ],
+)
+def test_a_wait_is_put_down_to_one_kill(waits: list[Wait], told: list[float]) -> None:
+    kills = [Kill("service", 10.0), Kill(PRIMARY, 20.0), Kill("service", 30.0)]
+    first, second, third = told
+    assert outages(kills, waits) == {"service": [first, third], PRIMARY: [second]}
+
+
+@contextmanager
+def answering(*statuses: int) -> Iterator[str]:
+    """A server that gives these answers, one after the other, and its address."""
+    left = list(statuses)
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(left.pop(0))
+            self.send_header("Retry-After", "0")
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_address[1]}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_a_robot_asks_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doors, "PAUSE_S", 0.01)
+    diary = Diary()
+    with answering(503, 200, 500, 404) as url:
+        dead = f"http://127.0.0.1:{free_port()}"
+        with Doors([dead, url], "secret", diary) as asked:
+            assert asked.ask("upload", "GET", "/").status_code == 200
+            assert asked.ask("query", "GET", "/").status_code == 404
+    assert diary.repeated == 3 + 2  # dead, 503, dead, 200; 500, dead, 404
+    assert [wait.kind for wait in diary.waits] == ["upload", "query"]
+    assert [line[:10] for line in diary.faults] == ["query: 500"]  # to be retried, and a fault
+
+
+def test_a_robot_gives_up_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doors, "PAUSE_S", 0.01)
+    monkeypatch.setattr(doors, "PATIENCE_S", 0.1)
+    nobody = [f"http://127.0.0.1:{free_port()}"]
+    with Doors(nobody, "secret", Diary()) as asked, pytest.raises(Shut):
+        asked.ask("upload", "GET", "/")
+
+
+def test_what_is_not_there_is_seen(
+    tmp_path: Path, building: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checking, "EVENTS_S", 0.0)
+    [walk] = walks(building, 1, 5)
+    with Client.embedded(tmp_path) as client:
+        client.create_map("fleet", model="compact")
+        added = [client.upload("fleet", one.png, one.meta, wait_s=60) for one in walk[:4]]
+        waiting = client.upload("fleet", walk[4].png, walk[4].meta)
+        kept = [
+            Kept(one.frame_id, "fleet", shot, 0.0)
+            for one, shot in zip([*added, waiting], walk, strict=True)
+        ]
+        client.delete_frame("fleet", added[1].frame_id)
+        # the second is gone, the third was told of as the fourth, and nobody of the fourth
+        told = [kept[0], kept[1], Kept(kept[2].frame_id, "fleet", walk[3], 0.0), kept[4]]
+        listener = Listener("fleet", Doors(["http://127.0.0.1:1"], "secret", Diary()))
+        listener.heard["frame.received", kept[0].frame_id] = 2
+        found = check(told, [client, client], [listener])
+    assert found == Found(
+        acknowledged=4, indexed=2, found=1, missing={kept[1].frame_id}, stuck=1, strangers=1,
+        unheard=2, heard_twice=1,
+    )  # fmt: skip
+
+
+def figures(found: Found, **changed: Any) -> FleetFigures:
+    same: dict[str, Any] = {
+        "plan": Plan(), "kills": Counter(service=2, primary=1),
+        "outages": {"service": [1.25, 0.0], PRIMARY: [3.0]},
+        "promotions": [Promotion(None, 10.0, 11.5, {"a": 0.5, "b": 2.0}, frozenset())],
+        "answers": Counter(found=3), "repeated": 4, "faults": [], "damaged": 0, "leftovers": 0,
+        "lost": 0, "window": 0, "seconds": 99.0,
+    }  # fmt: skip
+    return FleetFigures(found=found, **same | changed)
+
+
+@pytest.mark.parametrize(
+    ("found", "changed", "sound"),
+    [
+        ({}, {}, True),
+        ({}, {"leftovers": 3}, True),
+        ({"indexed": 8, "found": 8, "stated": 1}, {}, True),
+        ({"acknowledged": 0, "indexed": 0, "found": 0}, {}, False),
+        ({"found": 8}, {}, False),
+        ({"indexed": 8, "found": 8}, {}, False),
+        ({"stuck": 1}, {}, False),
+        ({"doubled": 1}, {}, False),
+        ({"strangers": 1}, {}, False),
+        ({"unheard": 1}, {}, False),
+        ({"heard_twice": 1}, {}, False),
+        ({"disagreeing": 1}, {}, False),
+        ({}, {"lost": 1}, False),
+        ({}, {"damaged": 1}, False),
+        ({}, {"faults": ["upload: 500"]}, False),
+        # what an asynchronous standby had not received is missing, and nothing else
+        ({"indexed": 8, "found": 8, "missing": {"a"}}, {"window": 1}, True),
+        ({"indexed": 8, "found": 8, "missing": {"a"}}, {"window": 2}, False),
+    ],
+)
+def test_what_is_wrong_fails(found: dict[str, Any], changed: dict[str, Any], sound: bool) -> None:
+    whole: dict[str, Any] = {"acknowledged": 9, "indexed": 9, "found": 9}
+    assert figures(Found(**whole | found), **changed).sound is sound
+
+
+def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    put_between(page, BEGIN, END, table(figures(Found(acknowledged=9, indexed=9, found=9))))
+    text = page.read_text()
+    assert text.startswith(f"before\n{BEGIN}\n### 8 robots for 120 s, a synchronous standby\n")
+    assert text.endswith(f"{END}\nafter\n")
+    assert "SIGKILL of 1 of primary, 2 of service." in text
+    assert "| **lost** | **0** |" in text
+    assert "| service | 0.0, 1.2 |" in text
+    assert "each service answered 0.5, 2.0 s after that" in text
