@@ -19,6 +19,7 @@ help:
 	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
 	@echo "make soak    200 kills, and a crowd of writers and readers; rewrites its part of docs/reliability.md"
 	@echo "make siege   broken uploads, every operation fuzzed, ten times too many requests; likewise"
+	@echo "make fleet   robots, services, workers and PostgreSQL with a standby, parts killed; likewise"
 	@echo "make models  train the presets that ship with the package (minutes)"
 	@echo "make lock    resolve the dependencies anew into requirements.txt"
 
@@ -71,6 +72,10 @@ soak: $(STAMP)
 
 siege: $(STAMP)
 	$(BIN)/python -m benchmarks.siege --page docs/reliability.md
+
+fleet: $(STAMP)
+	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md
+	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --asynchronous
 
 models: $(STAMP)
 	$(BIN)/sceneprint train --preset paper --out sceneprint/presets/paper.safetensors

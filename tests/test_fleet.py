@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from benchmarks.fleet import checking, doors, saboteur
-from benchmarks.fleet.__main__ import BEGIN, END, table
+from benchmarks.fleet.__main__ import MARKS, table
 from benchmarks.fleet.checking import Found, check
 from benchmarks.fleet.doors import Diary, Doors, Shut, Wait
 from benchmarks.fleet.driving import FleetFigures, Plan, drive, outages
@@ -28,7 +28,7 @@ from sceneprint.client import Client
 from sceneprint.errors import DatasetError
 
 #: At reduced size.
-SMALL = Plan(seconds=6, robots=2, rate=2, kills=2, promotions=1, seed=30, workers=1)
+SMALL = Plan(seconds=6, robots=2, rate=2, kills=2, promotions=1, seed=1, workers=1)
 
 
 def test_a_fleet_loses_nothing(
@@ -43,7 +43,7 @@ def test_a_fleet_loses_nothing(
     monkeypatch.setattr(checking, "COMPARED", 4)
     plan = Plan(**vars(SMALL) | {"data": building})
     found = drive(tmp_path, plan)
-    assert found.kills == {"service": 1, "worker": 1, PRIMARY: 1}
+    assert (found.kills["service"], found.kills[PRIMARY], found.kills.total()) == (1, 1, 3)
     assert (found.lost, found.window, found.damaged, found.faults) == (0, 0, 0, [])
     assert found.found == Found(
         acknowledged=found.found.acknowledged, indexed=found.found.acknowledged,
@@ -68,9 +68,9 @@ def test_the_schedule_is_that_of_its_seed() -> None:
 
 
 def test_walks_have_nothing_in_common(building: Path) -> None:
-    found = walks(building, 3, 60)
-    assert [len(one) for one in found] == [60, 60, 60]
-    assert len({shot.png for walk in found for shot in walk}) == 180
+    found = walks(building, 3, 24)
+    assert [len(one) for one in found] == [24, 24, 24]
+    assert len({shot.png for walk in found for shot in walk}) == 72
     assert {shot.meta.intrinsics.width for shot in found[0] if shot.meta.intrinsics} == {160}
     with pytest.raises(DatasetError, match=f"fewer than 850 frames in {GRIDS} grids"):
         walks(building, 1, 850)
@@ -204,12 +204,12 @@ def test_what_is_wrong_fails(found: dict[str, Any], changed: dict[str, Any], sou
 
 
 def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    put_between(page, BEGIN, END, table(figures(Found(acknowledged=9, indexed=9, found=9))))
+    page, (begin, end) = tmp_path / "page.md", MARKS[False]
+    page.write_text(f"before\n{begin}\nold\n{end}\nafter\n")
+    put_between(page, begin, end, table(figures(Found(acknowledged=9, indexed=9, found=9))))
     text = page.read_text()
-    assert text.startswith(f"before\n{BEGIN}\n### 8 robots for 120 s, a synchronous standby\n")
-    assert text.endswith(f"{END}\nafter\n")
+    assert text.startswith(f"before\n{begin}\n### 8 robots for 120 s, a synchronous standby\n")
+    assert text.endswith(f"{end}\nafter\n")
     assert "SIGKILL of 1 of primary, 2 of service." in text
     assert "| **lost** | **0** |" in text
     assert "| service | 0.0, 1.2 |" in text

@@ -17,7 +17,11 @@ from benchmarks.machine import describe_machine
 from benchmarks.pages import put_between
 from sceneprint.cli.signals import ended_by_signals
 
-BEGIN, END = "<!-- fleet:begin -->", "<!-- fleet:end -->"
+#: Marks in the page, by whether the standby is asynchronous.
+MARKS = {
+    False: ("<!-- fleet:begin -->", "<!-- fleet:end -->"),
+    True: ("<!-- fleet-asynchronous:begin -->", "<!-- fleet-asynchronous:end -->"),
+}
 
 
 def table(figures: FleetFigures) -> list[str]:
@@ -113,7 +117,7 @@ def main(arguments: list[str] | None = None) -> int:
     lines = ["", when, "", *table(figures)]
     print("\n".join(lines))
     if page is not None:
-        put_between(page, BEGIN, END, lines)
+        put_between(page, *MARKS[plan.asynchronous], lines)
     return 0 if figures.sound else 1
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
 import time
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
@@ -16,6 +15,9 @@ from benchmarks.fleet.doors import PAUSE_S
 from benchmarks.fleet.pair import Pair
 from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.soak.load import Part, free_port
+from sceneprint.engine import Engine
+from sceneprint.maintenance.fsck import fsck
+from sceneprint.settings import Settings
 
 #: Seconds for all service processes to begin, on a machine that is busy with much else.
 PATIENCE_S = 180.0
@@ -63,7 +65,8 @@ class Fleet:
         self._shared = self._shared | SETTINGS | {
             "SCENEPRINT_DATABASE_URL": self.pair.url, "SCENEPRINT_BLOB_URL": blobs
         }  # fmt: skip
-        secret = self._told("keys", "--create", "fleet").split()[-1]
+        with self._here() as settings, Engine(settings) as engine:
+            secret = engine.create_key("fleet").secret
         for host in range(n_services):
             port = free_port()
             self.urls.append(f"http://127.0.0.1:{port}")
@@ -79,21 +82,10 @@ class Fleet:
         return secret
 
     def fsck(self) -> tuple[int, int]:
-        """Leftovers and other findings of `sceneprint fsck`.
-
-        Raises
-        ------
-        RuntimeError : it could not look.
-        """
-        report = self._folder / "fsck.json"
-        self._told("fsck", "--grace", "0", "--json", str(report))
-        findings = json.loads(report.read_text())["findings"]
-        left = sum(one["severity"] == "leftover" for one in findings)
-        return left, len(findings) - left
-
-    def logs(self) -> dict[str, str]:
-        """What the processes had to say, by their names."""
-        return {path.stem: path.read_text() for path in sorted(self._folder.glob("*.log"))}
+        """Files that nothing refers to, and what is damaged; see `sceneprint fsck`."""
+        with self._here() as settings:
+            found = Counter(one.finding.severity for one in fsck(settings, grace_s=0.0))
+        return found["leftover"], found["damage"]
 
     def stop(self) -> None:
         """Ask services and workers to end."""
@@ -112,17 +104,16 @@ class Fleet:
         arguments = ["sceneprint", *command, "--data", str(self._folder / f"host-{host + 1}")]
         return Process(name, arguments, self._folder / f"{name}.log", self._shared)
 
-    def _told(self, *command: str) -> str:
-        """What a command prints that ends by itself, on the first host."""
-        done = subprocess.run(
-            [sys.executable, "-m", "sceneprint", *command, "--data", str(self._folder / "host-1")],
-            env=os.environ | self._shared, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        if done.returncode not in (0, 1):  # 1: there are findings
-            raise RuntimeError(
-                f"sceneprint {command[0]} ended with {done.returncode}: {done.stderr}"
-            )
-        return done.stdout
+    @contextmanager
+    def _here(self) -> Iterator[Settings]:
+        """Let this process be one of the first host for a while."""
+        before = dict(os.environ)
+        os.environ.update(self._shared)
+        try:
+            yield Settings(data_dir=self._folder / "host-1")
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
 
 
 class Process(Part):

@@ -121,7 +121,7 @@ class Server:
         if self.is_running:
             return
         told = {**self._options, "port": str(self.port)}
-        command = [*_prefix(), str(self._bin / "postgres"), "-D", str(self.data)]
+        command = [*of_nobody(), str(self._bin / "postgres"), "-D", str(self.data)]
         command += [part for item in told.items() for part in ("-c", "=".join(item))]
         (self.data / "postmaster.pid").unlink(missing_ok=True)  # of one that was killed
         with self.log.open("ab") as log:
@@ -251,14 +251,15 @@ class Server:
 
     def _run(self, name: str, *arguments: str) -> None:
         done = subprocess.run(
-            [*_prefix(), str(self._bin / name), *arguments],
+            [*of_nobody(), str(self._bin / name), *arguments],
             capture_output=True, text=True, env=_environment(), cwd="/", check=False,
         )  # fmt: skip
         if done.returncode != 0:
             raise NoServer(f"{name}: {done.stderr.strip() or done.stdout.strip()}")
 
 
-def _prefix() -> tuple[str, ...]:
+def of_nobody() -> tuple[str, ...]:
+    """What a command begins with that root may not run: PostgreSQL's, for one."""
     return _AS_NOBODY if os.geteuid() == 0 else ()
 
 

@@ -73,7 +73,7 @@ def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
     ]
     # every robot begins elsewhere; those of one recording see it through different grids
     places = [(sequence, grid) for grid in range(GRIDS) for sequence in recorded if sequence]
-    found: list[list[Shot]] = [[] for _ in range(n)]
+    found: list[list[tuple[FrameReference, int]]] = [[] for _ in range(n)]
     while any(len(one) < frames for one in found):
         for walk in found:
             if len(walk) >= frames:
@@ -84,8 +84,8 @@ def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
                     "robots, for a shorter time, or give more recordings."
                 )
             sequence, grid = places.pop(0)
-            walk += [thinned(one, grid) for one in sequence[: frames - len(walk)]]
-    return found
+            walk += [(one, grid) for one in sequence[: frames - len(walk)]]
+    return [[thinned(*one) for one in walk] for walk in found]
 
 
 def thinned(frame: FrameReference, grid: int) -> Shot:

@@ -14,17 +14,14 @@ if TYPE_CHECKING:
 
 #: Clocks that differ by more are told, and by more than a lease are wrong, seconds.
 APART_S = 2.0
-#: A replica that is farther behind than this is of no use, whatever is asked of it, seconds.
-LONG_BEHIND_S = 300.0
 #: What a commit that was acknowledged needs to survive the loss of power.
-_DURABLE = ("fsync", "full_page_writes", "synchronous_commit")
+_DURABLE = ("fsync", "full_page_writes")
 _ASKED = """
 SELECT current_setting('server_version') AS version,
   current_setting('server_encoding') AS encoding,
   current_setting('fsync') AS fsync,
   current_setting('full_page_writes') AS full_page_writes,
-  -- of a connection of our own it is never off; what others are given is told
-  (SELECT reset_val FROM pg_settings WHERE name = 'synchronous_commit') AS synchronous_commit,
+  current_setting('synchronous_commit') AS synchronous_commit,
   current_setting('synchronous_standby_names') AS standbys,
   current_setting('data_checksums') AS checksums,
   current_setting('max_connections')::int
@@ -38,7 +35,7 @@ SELECT current_setting('server_version') AS version,
 _BEHIND = """
 SELECT pg_is_in_recovery(), CASE WHEN pg_last_wal_receive_lsn() = pg_last_wal_replay_lsn() THEN 0
   ELSE extract(epoch FROM clock_timestamp() - pg_last_xact_replay_timestamp()) END,
-  (SELECT version_num FROM alembic_version)
+  (SELECT count(*) FROM pg_stat_wal_receiver)
 """
 
 
@@ -93,12 +90,15 @@ def _durability(told: Mapping[str, object]) -> Finding:
             f"{', '.join(off)} off: what was acknowledged may be lost when the server's host "
             "fails. Set it on."
         )
-        return Finding("WRONG" if {*off} - {"synchronous_commit"} else "note", "durability", text)
+        return Finding("WRONG", "durability", text)
     text = "commits survive the loss of power"
+    if told["standbys"] and told["synchronous_commit"] == "local":
+        text += "; synchronous_commit is local, so that no standby is waited for. Set it on."
+        return Finding("note", "durability", text)
     if told["standbys"]:
         text += f", and of the host: a standby is waited for ({told['standbys']})"
     else:
-        text += "; no standby is waited for: with the host's disk is lost what was since the copy"
+        text += "; no standby is waited for, so that what came last may go with the host's disk"
     if told["checksums"] == "off":
         text += "; data_checksums are off, so that a damaged page may be found late"
         return Finding("note", "durability", text)
@@ -151,7 +151,7 @@ def _clock(before: float, there: float, after: float, settings: Settings) -> Fin
 def _replica(url: str, settings: Settings) -> Finding:
     from sceneprint.errors import SceneprintError
     from sceneprint.store.database import reach_database
-    from sceneprint.store.revisions import known_revisions
+    from sceneprint.store.revisions import known_revisions, revision_of
 
     try:
         database = reach_database(url)
@@ -162,7 +162,8 @@ def _replica(url: str, settings: Settings) -> Finding:
             text = "SCENEPRINT_REPLICA_URL is no URL of PostgreSQL. Correct it, or unset it."
             return Finding("WRONG", "replica", text)
         with database.read() as connection:
-            standby, behind, schema = connection.exec_driver_sql(_BEHIND).one()
+            standby, behind, receives = connection.exec_driver_sql(_BEHIND).one()
+            schema = revision_of(connection)
     except SceneprintError as error:
         text = f"{error} Until then the primary is asked."
         return Finding("WRONG", "replica", text)
@@ -172,8 +173,11 @@ def _replica(url: str, settings: Settings) -> Finding:
         return Finding("note", "replica", f"{database.shown} is no standby, but a primary")
     if schema != known_revisions()[0]:
         return Finding("note", "replica", f"{database.shown} has schema {schema}: not used yet")
-    text = f"{database.shown} is {float(behind or 0):.1f} s behind"
-    if behind is not None and behind > settings.replica_lag_s:
-        text += f", more than SCENEPRINT_REPLICA_LAG_S ({settings.replica_lag_s:g} s): not used"
+    text = f"{database.shown} is {'some time' if behind is None else f'{behind:.1f} s'} behind"
+    if not receives:
+        text += ", and receives nothing from its primary. See its log."
+        return Finding("note", "replica", text)
+    if behind is None or behind > settings.replica_lag_s:
+        text += f"; SCENEPRINT_REPLICA_LAG_S is {settings.replica_lag_s:g} s: it is not used"
         return Finding("note", "replica", text)
     return Finding("ok", "replica", text)

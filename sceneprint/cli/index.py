@@ -37,6 +37,10 @@ def add_to(commands: Any) -> None:
     stats.add_argument("--json", action="store_true", help="print JSON, a line a map")
     verify = what.add_parser("verify", help="read all of it; exit code 1 where something is wrong")
     rebuild = what.add_parser("rebuild", help="make it anew from the database")
+    purge = what.add_parser(
+        "purge", help="leave no byte of a deleted frame on this node, now and not within PURGE_S"
+    )
+    add_data_option(purge)
     for one in (stats, verify, rebuild):
         one.add_argument("map", nargs="*", metavar="MAP", help="default: all maps")
         add_data_option(one)
@@ -47,10 +51,12 @@ def run(options: argparse.Namespace) -> int:
     """Do what was asked for with the indexes of the data folder."""
     from sceneprint.engine import Engine
 
-    do = {"stats": _stats, "verify": _verify, "rebuild": _rebuild}[options.what]
     settings = settings_of(options)
     require_database(settings)
     with Engine(settings) as engine:
+        if options.what == "purge":
+            return _purge(engine)
+        do = {"stats": _stats, "verify": _verify, "rebuild": _rebuild}[options.what]
         for name in options.map:  # all of them are there, before anything is done with one
             engine.get_map(name)
         names = options.map or [one.name for one in engine.list_maps().items]
@@ -107,4 +113,16 @@ def _verify(engine: Engine, name: str, _: argparse.Namespace) -> int:
 
 def _rebuild(engine: Engine, name: str, _: argparse.Namespace) -> int:
     print(f"map {name}: generation {engine.rebuild_index(name)}")
+    return 0
+
+
+def _purge(engine: Engine) -> int:
+    found = engine.purging.now()
+    print(
+        f"removed what deletions had left: {found.blobs} blobs, {found.answers} kept answers, "
+        f"{found.reconstructions} reconstructions; {found.indexes} indexes were made anew"
+    )
+    if not engine.store.database.shrink_log():
+        print("the log of the database is in use: run it again when nobody reads")
+        return 1
     return 0

@@ -107,16 +107,25 @@ class Client(
 
     # maps
 
-    def create_map(self, name: str, title: str | None = None, model: str = "paper") -> Map:
+    def create_map(
+        self, name: str, title: str | None = None, model: str = "paper", **limits: float | None
+    ) -> Map:
         """Make a map, or find that it is there as wanted.
+
+        Parameters
+        ----------
+        name, title, model : of the map
+        limits : `quota_frames` and `quota_bytes`, which are the operator's to set, and
+            `retention_days`; see NewMap
 
         Raises
         ------
-        InvalidRequest : the name is no slug, or there is no such model.
-        MapExists : there is one of that name with another title or model.
+        InvalidRequest : the name is no slug, or there is no such model or limit.
+        MapExists : there is one of that name with another title or model, or other limits.
+        Forbidden : a quota is given, and the key has not `admin` for `*`.
         """
         return self._backend.create_map(
-            checked(NewMap, "The map", name=name, title=title, model=model)
+            checked(NewMap, "The map", name=name, title=title, model=model, **limits)
         )
 
     def maps(self) -> list[Map]:

@@ -26,8 +26,10 @@ class EditsBackend(Protocol):
     ) -> Frame:
         """Change the metadata of a frame."""
 
-    def edit_map(self, map_name: str, changes: Mapping[str, Any], if_match: str | None) -> Map:
-        """Change the title of a map."""
+    def edit_map(
+        self, map_name: str, changes: Mapping[str, Any], if_match: str | None, *, dry_run: bool
+    ) -> Map:
+        """Change title, quotas and retention of a map."""
 
 
 class RemoteEdits(Sender):
@@ -39,9 +41,12 @@ class RemoteEdits(Sender):
         """Change the metadata of a frame."""
         return self._ask(Frame, "PATCH", frame_path(map_name, frame_id), **_edit(changes, if_match))
 
-    def edit_map(self, map_name: str, changes: Mapping[str, Any], if_match: str | None) -> Map:
-        """Change the title of a map."""
-        return self._ask(Map, "PATCH", map_path(map_name), **_edit(changes, if_match))
+    def edit_map(
+        self, map_name: str, changes: Mapping[str, Any], if_match: str | None, *, dry_run: bool
+    ) -> Map:
+        """Change title, quotas and retention of a map."""
+        asked = {"params": {"dry_run": "true"}} if dry_run else {}
+        return self._ask(Map, "PATCH", map_path(map_name), **_edit(changes, if_match), **asked)
 
 
 class EmbeddedEdits:
@@ -58,12 +63,14 @@ class EmbeddedEdits:
         tags = None if if_match is None else (if_match,)
         return edit_frame(self._engine.store, map_name, frame_id, changes, tags)
 
-    def edit_map(self, map_name: str, changes: Mapping[str, Any], if_match: str | None) -> Map:
-        """Change the title of a map."""
+    def edit_map(
+        self, map_name: str, changes: Mapping[str, Any], if_match: str | None, *, dry_run: bool
+    ) -> Map:
+        """Change title, quotas and retention of a map."""
         from sceneprint.engine.edits import edit_map
 
         tags = None if if_match is None else (if_match,)
-        return edit_map(self._engine.store, map_name, changes, tags)
+        return edit_map(self._engine.store, map_name, changes, tags, dry_run=dry_run)
 
 
 class Edits:
@@ -92,10 +99,16 @@ class Edits:
         return self._backend.edit_frame(map_name, frame_id, changes, if_match)
 
     def edit_map(
-        self, map_name: str, changes: Mapping[str, Any], if_match: str | None = None
-    ) -> Map:
-        """Change the title of a map; parameters and errors as of `edit_frame`."""
-        return self._backend.edit_map(map_name, changes, if_match)
+        self, map_name: str, changes: Mapping[str, Any], if_match: str | None = None, *,
+        dry_run: bool = False,
+    ) -> Map:  # fmt: skip
+        """Change title, quotas and retention of a map; parameters and errors as of `edit_frame`.
+
+        Quotas are the operator's: they ask for a key with `admin` for `*`, else Forbidden. With
+        `dry_run` nothing is changed, and the map told as it would be: `overdue` is how many frames
+        its retention would delete at once.
+        """
+        return self._backend.edit_map(map_name, changes, if_match, dry_run=dry_run)
 
 
 def _edit(changes: Mapping[str, Any], if_match: str | None) -> dict[str, Any]:

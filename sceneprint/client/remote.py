@@ -52,7 +52,7 @@ class Remote(
 
     def create_map(self, new: NewMap) -> Map:
         """Make a map, or find that it is there as wanted."""
-        return self._ask(Map, "POST", "/v1/maps", json=new.model_dump())
+        return self._ask(Map, "POST", "/v1/maps", json=new.model_dump(exclude_unset=True))
 
     def list_maps(self) -> list[Map]:
         """All maps by name."""

@@ -26,7 +26,7 @@ def create_map(store: Store, new: NewMap) -> tuple[Map, bool]:
     MapExists : there is one of that name with another title, model, quota or retention.
     """
     model = read_model(new.model)
-    limits = new.model_dump(include=LIMITS & new.model_fields_set)
+    limits = new.model_dump(include=set(LIMITS & new.model_fields_set))
     with store.database.write() as connection:
         there = {row.name: row for row in list_maps(connection)}.get(new.name)
         if there is None:

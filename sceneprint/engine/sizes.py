@@ -10,6 +10,7 @@ from pathlib import Path
 from sqlalchemy import Connection, func, select
 
 from sceneprint.engine.readers import index_folder
+from sceneprint.errors import UnusableStore
 from sceneprint.schemas.operations import Sizes
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database, FolderBlobs, Store
@@ -74,7 +75,7 @@ def _of_database(database: Database) -> int | None:
 
 
 def _of_objects(store: Store) -> int:
-    """Bytes of all blobs in an object store: some of the rows are weighed, and nothing is listed."""
+    """Bytes of all blobs in an object store: some of the rows are weighed, nothing is listed."""
     with store.database.read() as connection:
         some = spread_frames(connection, SPREAD)
         weight = weigh(connection, some)
@@ -86,10 +87,14 @@ def _of_objects(store: Store) -> int:
 
 def _of_artifacts(blobs: Blobs, artifacts: Sequence[str]) -> int:
     """Bytes of some blobs; of many that each cost a request, a few stand for all."""
-    if isinstance(blobs, FolderBlobs) or len(artifacts) <= ASKED:
+    if isinstance(blobs, FolderBlobs):
         return sum(blobs.size(one) or 0 for one in artifacts)
-    some = artifacts[:: -(-len(artifacts) // ASKED)]
-    return sum(blobs.size(one) or 0 for one in some) * len(artifacts) // len(some)
+    some = artifacts[:: max(-(-len(artifacts) // ASKED), 1)]
+    try:
+        asked = sum(blobs.size(one) or 0 for one in some)
+    except UnusableStore:  # other figures are told while the store is away
+        return 0
+    return asked * len(artifacts) // max(len(some), 1)
 
 
 def _of_blobs(folder: Path) -> int:

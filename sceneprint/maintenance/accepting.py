@@ -11,6 +11,7 @@ import json
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from itertools import islice
 from typing import Any
 
 from sqlalchemy import JSON, BigInteger, Boolean, Column, Float, Integer, LargeBinary, String, Text
@@ -21,7 +22,7 @@ from sceneprint.maintenance.columns import Form
 from sceneprint.store.tables import metadata
 
 #: Rows that are named one by one.
-_SHOWN = 5
+_SHOWN = 6
 _SMALL, _LARGE = 1 << 31, 1 << 63
 #: What is wrong with a value; None where nothing is.
 _Look = Callable[[Any], str | None]
@@ -40,13 +41,14 @@ def check_acceptable(file: sqlite3.Connection) -> None:
     """
     before, file.text_factory = file.text_factory, _text
     try:
-        refused = [told for table in metadata.sorted_tables for told in _refused(file, Form(table))]
+        every = (told for table in metadata.sorted_tables for told in _refused(file, Form(table)))
+        refused, others = [*islice(every, _SHOWN)], sum(1 for _ in every)
     finally:
         file.text_factory = before
     if refused:
-        more = "" if len(refused) <= _SHOWN else f"; and {len(refused) - _SHOWN} more values"
+        more = f"; and {others} more values" if others else ""
         raise SnapshotError(
-            f"PostgreSQL cannot hold {'; '.join(refused[:_SHOWN])}{more}. Nothing was restored: "
+            f"PostgreSQL cannot hold {'; '.join(refused)}{more}. Nothing was restored: "
             "restore it to a folder, delete or mend these there, and take another snapshot."
         )
 

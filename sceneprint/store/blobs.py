@@ -146,7 +146,8 @@ class Blobs(Protocol):
         """All that lies where blobs are kept, in no order."""
 
     def check(self) -> None:
-        """See that it answers, at the cost of one short request at most.
+        """See that a store on the network answers, or did two seconds ago; a folder has nothing
+        to be asked.
 
         Raises
         ------

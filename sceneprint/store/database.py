@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, event
-from sqlalchemy.exc import ArgumentError
 
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
 from sceneprint.store.faults import explained, shown
@@ -20,7 +19,6 @@ from sceneprint.store.postgres import (
     MIGRATION_S,
     configure,
     connect_options,
-    database_url,
     history_of,
     open_postgres,
     require_kept,
@@ -35,6 +33,7 @@ from sceneprint.store.sqlite import (
     configure_sqlite,
     shrink_log,
 )
+from sceneprint.store.urls import database_url
 
 if TYPE_CHECKING:
     import psycopg
@@ -221,7 +220,7 @@ def is_there(url: str) -> bool:
     """
     try:
         parsed = database_url(url)
-    except (UnusableStore, ArgumentError, ValueError):
+    except UnusableStore:
         return False  # opening it says why
     if parsed.get_backend_name() == "sqlite":
         return parsed.database is not None and Path(parsed.database).is_file()
@@ -268,19 +267,7 @@ def open_database(url: str) -> Database:
 
 
 def _reached(given: str) -> tuple[Database, Engine]:
-    try:
-        return _opened(database_url(given))
-    # what is no number where a port should be may be half of a password: nothing is repeated
-    except (ArgumentError, ImportError, ValueError) as error:
-        raise UnusableStore(
-            f"{given.partition(':')[0]!r:.80} begins no URL of a database that can be opened. Set "
-            "SCENEPRINT_DATABASE_URL to one, such as postgresql+psycopg://user:password@host/name "
-            "(what is special in a password written as %40), or leave it out for SQLite in the "
-            "data folder."
-        ) from (error if isinstance(error, ImportError) else None)
-
-
-def _opened(url: URL) -> tuple[Database, Engine]:
+    url = database_url(given)
     if url.get_backend_name() != "sqlite":
         engine = open_postgres(url)
         return Database(engine), engine

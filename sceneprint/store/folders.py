@@ -255,14 +255,7 @@ class FolderBlobs:
                     yield BlobEntry(one.path, one.name if own else None, changed_at, part)
 
     def check(self) -> None:
-        """See that the folder is there.
-
-        Raises
-        ------
-        UnusableStore : it is not.
-        """
-        if not self._folder.is_dir():
-            raise UnusableStore(f"{self._folder}: there is no such folder. Is its disk mounted?")
+        """There is nothing to be asked."""
 
     def close(self) -> None:
         """Nothing is held open."""

@@ -13,13 +13,13 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from sqlalchemy import URL, Engine, create_engine, event
-from sqlalchemy.exc import ArgumentError
 
 from sceneprint.errors import NewerSchema, UnusableStore
 from sceneprint.store.database import Database
 from sceneprint.store.faults import shown
-from sceneprint.store.postgres import database_url, open_postgres
+from sceneprint.store.postgres import open_postgres
 from sceneprint.store.revisions import known_revisions, revision_of
+from sceneprint.store.urls import database_url
 
 
 @contextmanager
@@ -36,12 +36,7 @@ def look_at(url: str) -> Iterator[Database]:
         the beginning was written meanwhile: what was read may be wrong.
     NewerSchema : a later version of sceneprint wrote it.
     """
-    try:
-        parsed = database_url(url)
-    except (ArgumentError, ValueError) as error:  # what is in it may be half of a password
-        raise UnusableStore(
-            "The database's URL is none of SQLAlchemy's. Check SCENEPRINT_DATABASE_URL."
-        ) from error
+    parsed = database_url(url)
     path = _file_of(parsed) if parsed.get_backend_name() == "sqlite" else None
     if path is not None:
         engine, alone = _opened(parsed, path)

@@ -136,7 +136,9 @@ def keep_model(connection: Connection, model_id: str, name: str, content: bytes)
     """Keep a model's file, where it is not kept yet."""
     if connection.execute(select(models.c.id).where(models.c.id == model_id)).first() is None:
         connection.execute(
-            insert(models).values(id=model_id, name=name, content=content, created_at=time.time())
+            insert(models).values(
+                id=model_id, name=name[:64], content=content, created_at=time.time()
+            )
         )
 
 

@@ -12,9 +12,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import tempfile
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
@@ -33,6 +35,8 @@ from sceneprint.writing import sync_folder
 FOLDER, MARK = "blobs/", "sceneprint.json"
 #: Blobs that this process has put last, of which it knows whether any can have been removed since.
 _KNOWN = 4_096
+#: Seconds for which `check` tells what it found last.
+CHECK_S = 2.0
 
 
 class ObjectBlobs:
@@ -51,6 +55,9 @@ class ObjectBlobs:
         self._claimed = False
         self._put: OrderedDict[str, int] = OrderedDict()  # removals until then, by digest
         self._lock = threading.Lock()
+        self._asking = threading.Lock()  # for `check`, and what it found when
+        self._wrong: UnusableStore | None = None
+        self._answered = -math.inf
 
     def claim(self, *, anew: bool = True) -> None:
         """See that the prefix is this store's, and mark it where it is nobody's yet.
@@ -239,12 +246,27 @@ class ObjectBlobs:
             yield BlobEntry(place, name if own else None, one.changed_at)
 
     def check(self) -> None:
-        """See that the store answers: one short request."""
-        if self.objects.size(MARK) is None and self._claimed:
-            raise UnusableStore(
-                f"{self.objects.url}: {MARK} is gone, which was there before: the bucket was "
-                "emptied or replaced. Bring its objects back."
-            )
+        """See that the store answers; see `Blobs.check`."""
+        if self._asking.acquire(blocking=False):  # else somebody asks, and the last answer holds
+            try:
+                if time.monotonic() - self._answered > CHECK_S:
+                    self._wrong = self._look()
+                    self._answered = time.monotonic()
+            finally:
+                self._asking.release()
+        if self._wrong is not None:
+            raise type(self._wrong)(str(self._wrong))
+
+    def _look(self) -> UnusableStore | None:
+        try:
+            if self.objects.look(MARK) is None and self._claimed:
+                return UnusableStore(
+                    f"{self.objects.url}: {MARK} is gone, which was there before: the bucket was "
+                    "emptied or replaced. Bring its objects back."
+                )
+        except UnusableStore as error:
+            return error
+        return None
 
     def close(self) -> None:
         """Give back the connections of its locks."""

@@ -1,4 +1,4 @@
-"""How PostgreSQL is set up: which URLs mean it, what a connection is told, and how a turn is taken.
+"""How PostgreSQL is set up: what a connection is told, and how a turn is taken.
 
 Writers take turns as they do in SQLite: each begins with one advisory lock of the database, held
 until its commit. So what a transaction reads stays true until it writes, and numbers that it is
@@ -10,7 +10,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy import URL, Connection, Engine, create_engine, event, text
 from sqlalchemy.engine import ExceptionContext
 
 from sceneprint.errors import UnusableStore
@@ -43,35 +43,9 @@ _CONNECT = {
     "keepalives_count": "3",
     "tcp_user_timeout": "9000",
 }
-#: Drivers by what a URL begins with; the short ones are what providers hand out.
-_DRIVERS = ("postgresql", "postgres", "postgresql+psycopg")
+#: Oldest version that is known to do.
 _OLDEST = 14
 _WARNED = "sceneprint_warned"
-
-
-def database_url(given: str) -> URL:
-    """The URL of a database, of one of the two kinds that are known.
-
-    Raises
-    ------
-    UnusableStore : it is of no such kind; the message repeats nothing of it but the kind.
-    ArgumentError, ValueError : it is no URL.
-    """
-    kind = given.partition(":")[0]
-    if kind in _DRIVERS:
-        if given.count("@") > 1:  # the rest would be taken for the name of a host, and be told
-            raise UnusableStore(
-                "The database's URL has more than one @. Write the one in a password as %40."
-            )
-        return make_url(given).set(drivername="postgresql+psycopg")
-    url = make_url(given)
-    if url.get_backend_name() != "sqlite":
-        raise UnusableStore(
-            f"{kind!r:.80} is no database that is known. Set SCENEPRINT_DATABASE_URL to "
-            "postgresql+psycopg://user:password@host/database, or leave it out for SQLite in the "
-            "data folder."
-        )
-    return url
 
 
 def open_postgres(url: URL) -> Engine:
@@ -106,14 +80,13 @@ def configure(connection: Any, _record: object = None) -> None:
     ------
     UnusableStore : the server is too old, or its database is not of UTF-8.
     """
-    info = connection.info
-    encoding = info.parameter_status("server_encoding")
-    if info.server_version < _OLDEST * 10_000 or encoding != "UTF8":
+    version = connection.info.server_version // 10_000
+    encoding = connection.info.parameter_status("server_encoding")
+    if version < _OLDEST or encoding != "UTF8":
         connection.close()
         raise UnusableStore(
-            f"The database server is PostgreSQL {info.server_version // 10_000} with encoding "
-            f"{encoding}. Version {_OLDEST} or later is needed, and a database made with "
-            "ENCODING 'UTF8'."
+            f"The server is PostgreSQL {version}, and the database of encoding {encoding}. Version "
+            f"{_OLDEST} or later is needed, and a database made with ENCODING 'UTF8'."
         )
     connection.adapters.register_dumper(str, _texts())
     before, connection.autocommit = connection.autocommit, True

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
 from anyio import to_thread
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 
 from sceneprint.engine.edits import edit_frame, edit_map
 from sceneprint.engine.maps import LIMITS
@@ -23,6 +24,15 @@ router = APIRouter(prefix="/maps/{map_name}")
 
 MERGE_PATCH = "application/merge-patch+json"
 _KINDS = (MERGE_PATCH, "application/json")
+
+
+DryRun = Annotated[
+    bool,
+    Query(
+        description="Change nothing; the map is told as it would be: `overdue` is how many frames "
+        "`retention_days` would delete at once."
+    ),
+]
 
 
 def _document(record: str) -> dict[str, Any]:
@@ -65,8 +75,9 @@ async def patch_frame(
     dependencies=[Depends(may_admin)],
 )
 async def patch_map(
-    map_name: str, request: Request, here: Here, asking: Asking, response: Response
-) -> Map:
+    map_name: str, request: Request, here: Here, asking: Asking, response: Response,
+    dry_run: DryRun = False,
+) -> Map:  # fmt: skip
     """Change title, quotas and retention of a map (JSON merge patch, RFC 7396).
 
     Quotas are the operator's: `quota_frames` and `quota_bytes` ask for `admin` for `*`.
@@ -74,8 +85,10 @@ async def patch_map(
     patch, tags = await _patch(request), expected(request)
     if OPERATORS & patch.keys():
         asking.require_every("admin")
-    edited = await to_thread.run_sync(edit_map, here.engine.store, map_name, patch, tags)
-    request.state.audited = {name: getattr(edited, name) for name in LIMITS & patch.keys()}
+    edit = partial(edit_map, here.engine.store, map_name, patch, tags, dry_run=dry_run)
+    edited = await to_thread.run_sync(edit)
+    told = {name: getattr(edited, name) for name in sorted(LIMITS & patch.keys())}
+    request.state.audited = {"dry_run": True} if dry_run else told
     response.headers["ETag"] = f'"{edited.etag}"'
     return edited
 

@@ -46,8 +46,11 @@ async def healthz() -> Health:
 @router.head("/readyz", include_in_schema=False)
 @router.get("/readyz", responses=declared(), response_model_exclude_defaults=True)
 def readyz(here: Here, asking: Guest) -> Readiness:
-    """Answers while the database does; 503 while it does not. No key is asked for."""
+    """Answers while the database and the object store do; 503 while one does not. No key is asked
+    for.
+    """
     frames = jobs = None
+    here.engine.store.blobs.check()
     if asking is not None and asking.reads_every:
         frames, jobs = here.engine.counts()
     else:  # whoever shows no key has nothing counted: that takes the longer the more there is

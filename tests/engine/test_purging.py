@@ -14,8 +14,10 @@ import pytest
 from sqlalchemy import inspect, text
 
 from sceneprint.engine import Engine
+from sceneprint.engine.readers import index_folder
 from sceneprint.engine.uploads import Upload
 from sceneprint.errors import UnknownJob, UnknownQuery
+from sceneprint.index import newest
 from sceneprint.schemas import NewMap, Query
 from sceneprint.schemas.reconstructions import NewReconstruction
 from sceneprint.store.editing import write_frame
@@ -69,6 +71,7 @@ def places(engine: Engine, folder: Path, wanted: list[bytes]) -> set[str]:
 @pytest.fixture
 def lived_in(make_engine, store_url, uploads, work_off, tmp_path):
     """A map whose index was published twice."""
+    (tmp_path / "data" / "blobs").mkdir(parents=True)  # of a database that is there nobody makes it
     engine = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2)
     engine.create_map(NewMap(name="hall", model="compact"))
     for one in uploads[:6]:
@@ -90,8 +93,10 @@ def secret(lived_in, ids, uploads):
         vectors = [stored_vector(connection, n, row.model_id) or b"" for n in numbers]
         blobs = geometry_blobs(connection, numbers, row.model_id)
     artifacts = [engine.store.blobs.get(blobs[n]) for n in numbers]
-    generation = engine._upkeep.newest(row)
-    assert generation is not None and len(generation) == len(numbers)
+    folder = index_folder(engine.settings.indexes, row)
+    generation = newest(folder, row.model_id, len(vectors[0]))
+    assert generation is not None
+    assert len(generation) == len(numbers)
     codes = generation.coarse.index.reconstruct_n(0, len(numbers)).astype(np.uint8)
     place = int(generation.places.of(np.array(numbers[:1]))[0])
     return {

@@ -5,11 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 
+from sceneprint.datasets import write_depth_png
+from sceneprint.schemas import CameraIntrinsics, FrameMeta
 from sceneprint.store import Store, open_store
+from sceneprint.types import Frame
 
 #: Seconds that anything may take on the slowest machine.
 PATIENCE_S = 90.0
@@ -28,6 +32,27 @@ def until() -> Callable[[Callable[[], Any]], Any]:
         raise AssertionError("it did not come true")
 
     return wait
+
+
+class Small(NamedTuple):
+    """A small depth image."""
+
+    png: bytes
+    meta: FrameMeta
+
+
+@pytest.fixture(scope="session")
+def small(room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory) -> list[Small]:
+    """Frames of their own content: every fourth sample from another corner each."""
+    path, found = tmp_path_factory.mktemp("png") / "a.png", []
+    for number in range(12):
+        frame, (y, x) = room_frames[number % 6], divmod(number, 4)
+        k = frame.intrinsics
+        write_depth_png(path, np.ascontiguousarray(frame.depth[y::4, x::4]), 1000.0)
+        lens = CameraIntrinsics(width=160, height=120, fx=k.fx / 4, fy=k.fy / 4,
+                                cx=(k.cx - x) / 4, cy=(k.cy - y) / 4)  # fmt: skip
+        found.append(Small(path.read_bytes(), FrameMeta(intrinsics=lens)))
+    return found
 
 
 @pytest.fixture

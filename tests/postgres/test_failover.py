@@ -15,12 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import numpy as np
 import pytest
 
 from benchmarks.fleet.postgres import Server
-from sceneprint.datasets import write_depth_png
-from sceneprint.types import Frame
 
 #: What is promised: seconds from the promotion to the first answer, and to the first job.
 RESUMES_S = 10.0
@@ -44,21 +41,6 @@ class Fleet:
 
     def ask(self, method: str, path: str, **given: Any) -> httpx.Response:
         return self.client.request(method, self.url + path, **given)
-
-
-@pytest.fixture(scope="module")
-def views(room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
-    """Small frames of their own content, as the parts of a form."""
-    path, found = tmp_path_factory.mktemp("png") / "a.png", []
-    for number in range(12):
-        frame, (y, x) = room_frames[number % 6], divmod(number, 4)
-        k = frame.intrinsics
-        write_depth_png(path, np.ascontiguousarray(frame.depth[y::4, x::4]), 1000.0)
-        lens = {"width": 160, "height": 120, "fx": k.fx / 4, "fy": k.fy / 4,
-                "cx": (k.cx - x) / 4, "cy": (k.cy - y) / 4}  # fmt: skip
-        meta = json.dumps({"intrinsics": lens})
-        found.append({"frame": ("a.png", path.read_bytes()), "meta": (None, meta)})
-    return found
 
 
 @pytest.fixture
@@ -104,10 +86,14 @@ def fleet(
 
 
 def test_nothing_acknowledged_is_lost_and_all_goes_on_by_itself(
-    fleet: Fleet, views: list[Any], until: Callable[..., Any]
+    fleet: Fleet, small: list[Any], until: Callable[..., Any]
 ) -> None:
     assert fleet.ask("POST", "/v1/maps", json={"name": "hall", "model": "compact"}).is_success
     kept = []
+    views = [
+        {"frame": ("a.png", one.png), "meta": (None, one.meta.model_dump_json(exclude_unset=True))}
+        for one in small
+    ]
 
     def upload(view: Any) -> httpx.Response:
         answer = fleet.ask("POST", "/v1/maps/hall/frames", files=view)

@@ -79,10 +79,10 @@ def test_all_figures_are_there(served, make_map):
 
 
 def test_models_and_reencoding_over_http(served, make_map, refused):
-    path, client = make_map(served, "again"), served.client
+    path, client = make_map(served, "anew"), served.client
     listed = client.get("/v1/models").json()["items"]
     compact = next(one for one in listed if one["name"] == "compact")
-    assert "again" in compact["maps"]
+    assert "anew" in compact["maps"]
     place = f"{path}/reencoding"
     for body in ({"model": "huge"}, {}, [], {"model": "paper", "x": 1}):
         refused(client.post(place, json=body), 422, "invalid-request")
@@ -94,7 +94,7 @@ def test_models_and_reencoding_over_http(served, make_map, refused):
     refused(client.delete(place), 409, "conflict")
     begun = client.post(place, json={"model": "paper"})
     assert begun.status_code == 202
-    assert begun.json()["name"] == "again"
+    assert begun.json()["name"] == "anew"
 
 
 def answered(status: str, seconds: float) -> Answer:

@@ -279,6 +279,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.sqlite_only("a database in a folder that may be read alone")
 def test_a_read_only_folder_is_served_as_it_is(sealed, stored, begin, small_shots, refused):
     before = contents(stored)
     server = begin(command=sealed("serve", "0"), workers=1)
@@ -305,6 +306,7 @@ def test_a_read_only_folder_is_served_as_it_is(sealed, stored, begin, small_shot
     assert contents(stored) == before
 
 
+@pytest.mark.sqlite_only("a database in a folder that may be read alone")
 @pytest.mark.parametrize("sealed", ["permissions"], indirect=True)
 def test_workers_and_doctor_say_that_a_folder_is_read_only(sealed, stored):
     before = contents(stored)

@@ -2,35 +2,52 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from contextlib import closing
+from datetime import UTC, datetime
 from pathlib import Path
 
+import psycopg
+import pytest
+from alembic import command
+from alembic.config import Config
 from pydantic import SecretStr
+from sqlalchemy import create_engine, insert
 
-from benchmarks.fleet.postgres import Server
+import migrations
 from sceneprint.engine import Engine
+from sceneprint.errors import DamagedSnapshot, SnapshotError, UnknownSnapshot
+from sceneprint.maintenance.exporting import copy_server
 from sceneprint.maintenance.fleets import restore_to_fleet
+from sceneprint.maintenance.fsck import fsck
 from sceneprint.maintenance.restoring import restore_snapshot
+from sceneprint.maintenance.shelf import Shelf
 from sceneprint.maintenance.snapshots import take_snapshot
 from sceneprint.schemas import Query
 from sceneprint.settings import Settings
+from sceneprint.store import open_database
+from sceneprint.store.tables import keys, metadata
+
+pytestmark = pytest.mark.sqlite_only("these have servers of their own")
 
 SIGNED = 4
 
 
-def fleet_of(folder: Path, url: str) -> Settings:
-    return Settings(data_dir=folder, database_url=SecretStr(url), index_dir=None)
+def fleet_of(folder: Path, url: str, **other: object) -> Settings:
+    return Settings(data_dir=folder, database_url=SecretStr(url), index_dir=None, **other)
 
 
 def answers_of(settings: Settings, asked: list) -> list:
     """What the map `hall` answers, but for what no two answers share."""
     free = {"query_id": "", "milliseconds": {}}
     with Engine(settings) as engine:
-        return [
-            engine.query_upload("hall", one.data, one.meta, Query(exact=True)).model_copy(
-                update=free
-            )
-            for one in asked
-        ]
+        found = [engine.query_upload("hall", x.data, x.meta, Query(exact=True)) for x in asked]
+        return [one.model_copy(update=free) for one in found]
 
 
 def inserted(sql: str) -> list[str]:
@@ -38,8 +55,29 @@ def inserted(sql: str) -> list[str]:
     return [line for line in sql.splitlines() if line.startswith("INSERT")]
 
 
-def test_there_and_back(archive, master, uploads, postgres: Server, tmp_path, content, settings):
-    fleet = fleet_of(tmp_path / "fleet", postgres.create("there"))
+def ask(url: str, asked: str) -> list[tuple]:
+    with psycopg.connect(url.replace("+psycopg", ""), autocommit=True) as connection:
+        return connection.execute(asked).fetchall()
+
+
+def rows_in(url: str) -> int:
+    """Rows that are not there of themselves."""
+    names = [one.name for one in metadata.sorted_tables if one.name not in ("secrets", "samples")]
+    return sum(ask(url, f"SELECT count(*) FROM {name}")[0][0] for name in names)
+
+
+def changed(folder: Path, *statements: str | tuple[str, tuple]) -> None:
+    """Change a data folder's database past all that would refuse it."""
+    with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
+        for one in statements:
+            database.execute(*((one,) if isinstance(one, str) else one))
+        database.commit()
+
+
+def test_there_and_back(
+    archive, master, uploads, postgres, postgres_url, tmp_path, content, settings
+):
+    fleet = fleet_of(tmp_path / "fleet", postgres_url)
     told = restore_to_fleet(archive, fleet)
     assert told.manifest.frames["indexed"] == SIGNED
     asked = uploads[: SIGNED + 2]
@@ -51,5 +89,203 @@ def test_there_and_back(archive, master, uploads, postgres: Server, tmp_path, co
     restore_snapshot(tmp_path / "back.tar", tmp_path / "home")
     restore_snapshot(archive, tmp_path / "straight")
     wanted, found = content(tmp_path / "straight"), content(tmp_path / "home")
-    assert inserted(found.pop("")) == inserted(wanted.pop(""))
+    sql = inserted(found.pop(""))
+    assert sql == inserted(wanted.pop(""))
+    assert any("sqlite_sequence" in line for line in sql)
+    assert any("secrets" in line for line in sql)
     assert found == wanted
+
+
+def test_no_number_is_given_out_twice(data, postgres_url, tmp_path, rows, settings):
+    newest = "(SELECT max(number) FROM events)"
+    [(highest,)] = rows(data, f"SELECT {newest}")
+    changed(data, f"DELETE FROM events WHERE number = {newest}")
+    take_snapshot(settings(data), tmp_path / "a.tar")
+    restore_to_fleet(tmp_path / "a.tar", fleet_of(tmp_path / "fleet", postgres_url))
+    asked = "SELECT nextval(pg_get_serial_sequence('{}', 'number'))"
+    assert ask(postgres_url, asked.format("events")) == [(highest + 1,)]
+    assert ask(postgres_url, asked.format("samples")) == [(1,)]  # none was ever given out
+
+
+def test_what_is_there_stays(archive, postgres, postgres_url, tmp_path):
+    with Engine(fleet_of(tmp_path / "used", postgres_url)) as engine:
+        engine.create_key("robot")
+        before = rows_in(postgres_url)
+        with pytest.raises(SnapshotError, match="has rows in its table"):
+            restore_to_fleet(archive, fleet_of(tmp_path / "new", postgres_url))
+        assert rows_in(postgres_url) == before > 0
+    empty = postgres.create("in_use")
+    with (
+        Engine(fleet_of(tmp_path / "service", empty)),
+        pytest.raises(SnapshotError, match="is in use: "),
+    ):
+        restore_to_fleet(archive, fleet_of(tmp_path / "new", empty))
+    (tmp_path / "embedded").mkdir()
+    (tmp_path / "embedded" / "sceneprint.db").touch()
+    with pytest.raises(SnapshotError, match="the database of another store"):
+        restore_to_fleet(archive, fleet_of(tmp_path / "embedded", empty))
+    assert not (tmp_path / "new").exists()
+    assert rows_in(empty) == 0
+
+
+def test_a_damaged_archive_leaves_nothing(archive, postgres, tmp_path):
+    """Also where the damage is in its last blob."""
+    bad, url = tmp_path / "bad.tar", postgres.create("untouched")
+    data = bytearray(archive.read_bytes())
+    data[-4000] ^= 1
+    bad.write_bytes(data)
+    with pytest.raises(DamagedSnapshot):
+        restore_to_fleet(bad, fleet_of(tmp_path / "fleet", url))
+    assert ask(url, "SELECT count(*) FROM pg_tables WHERE schemaname = 'public'") == [(0,)]
+    assert not (tmp_path / "fleet" / "blobs").exists()
+
+
+def test_what_postgresql_cannot_hold_is_found_before(data, postgres, tmp_path, settings):
+    frame, url = "number = (SELECT min(number) FROM frames)", postgres.create("choosy")
+    changed(
+        data,
+        ("UPDATE maps SET title = ?", ("a\0b",)),
+        f"UPDATE frames SET robot = '{'r' * 129}', intrinsics = '[NaN]' WHERE {frame}",
+        f"UPDATE frames SET base_frame = robot WHERE {frame}",
+        f"UPDATE frames SET session = CAST(x'41ff' AS TEXT), bytes = 'many' WHERE {frame}",
+        "UPDATE keys SET created_at = 'today'",
+    )
+    take_snapshot(settings(data), tmp_path / "a.tar")
+    with pytest.raises(SnapshotError) as refused:
+        restore_to_fleet(tmp_path / "a.tar", fleet_of(tmp_path / "fleet", url))
+    for said in (
+        "created_at of row '",
+        "title of row 1 of table maps (a zero byte in a text)",
+        "robot of row 1 of table frames (129 characters, where 128 have room)",
+        "bytes of row 1 of table frames (no such whole number)",
+        "intrinsics of row 1 of table frames (no JSON)",
+        "session of row 1 of table frames (no UTF-8)",
+        "; and 1 more values",
+    ):
+        assert said in str(refused.value)
+    assert ask(url, "SELECT count(*) FROM pg_tables WHERE schemaname = 'public'") == [(0,)]
+    assert not (tmp_path / "fleet" / "blobs").exists()
+
+
+def test_a_snapshot_of_an_earlier_schema(postgres, tmp_path, settings):
+    data = tmp_path / "data"
+    (data / "blobs").mkdir(parents=True)
+    config = Config()
+    config.set_main_option("script_location", str(Path(migrations.__file__).parent))
+    engine = create_engine(f"sqlite:///{data}/sceneprint.db")
+    with engine.begin() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, "0001")
+    engine.dispose()
+    changed(data, "INSERT INTO models VALUES ('m', 'm', x'00ff', 1.5)")
+    take_snapshot(settings(data), tmp_path / "a.tar")
+    url = postgres.create("earlier")
+    restore_to_fleet(tmp_path / "a.tar", fleet_of(tmp_path / "fleet", url))
+    assert ask(url, "SELECT id, content, created_at FROM models") == [("m", b"\0\xff", 1.5)]
+    assert ask(url, "SELECT count(*) FROM secrets") == [(1,)]
+
+
+RESTORE = "import sys; from sceneprint.cli import main; sys.exit(main(sys.argv[1:]))"
+
+
+def test_killed_half_way_it_can_be_restored_again(archive, postgres_url, tmp_path, master, content):
+    fleet = fleet_of(tmp_path / "fleet", postgres_url)
+    said = {"SCENEPRINT_DATABASE_URL": postgres_url}
+    with psycopg.connect(postgres_url.replace("+psycopg", "")) as holder:
+        holder.execute("LOCK TABLE signatures IN SHARE MODE")  # what is written waits for it
+        process = subprocess.Popen(
+            [sys.executable, "-c", RESTORE, "restore", str(archive), "--data", fleet.data_dir],
+            env=os.environ | said,
+        )
+        waits = "SELECT count(*) FROM pg_locks WHERE NOT granted AND locktype = 'relation'"
+        until = time.monotonic() + 60
+        while ask(postgres_url, waits) == [(0,)] and time.monotonic() < until:
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert rows_in(postgres_url) == 0
+    while ask(
+        postgres_url,
+        "SELECT 1 FROM pg_stat_activity WHERE application_name = 'sceneprint'"
+        " AND datname = current_database()",
+    ):  # the server has not seen yet that it is gone
+        time.sleep(0.05)
+    told = restore_to_fleet(archive, fleet)
+    assert rows_in(postgres_url) > 0
+    assert [one for one in fsck(fleet) if one.left] == []
+    assert told.manifest.blobs.count == len([*(fleet.data_dir / "blobs").glob("*/*")])
+    assert not [*fleet.data_dir.glob(".restoring-*")]
+
+
+def test_the_copy_is_one_state(postgres_url, tmp_path):
+    """What is committed while it is made is not in it, whatever table is next."""
+    database, late = open_database(postgres_url), open_database(postgres_url)
+
+    def key(name: str) -> dict[str, object]:
+        return {"id": name, "name": name, "digest": name, "grants": {}, "created_at": 0.0}
+
+    with closing(database), closing(late):
+        with late.write() as connection:
+            connection.execute(insert(keys), [key("early")])
+        told: list[int] = []
+
+        def written(done: int) -> None:
+            if not told:
+                with late.write() as connection:
+                    connection.execute(insert(keys), [key("late")])
+            told.append(done)
+
+        copy_server(database, tmp_path / "copy.db", written)
+    assert len(told) == len(metadata.sorted_tables)
+    with closing(sqlite3.connect(tmp_path / "copy.db")) as copy:
+        assert copy.execute("SELECT id, grants FROM keys").fetchall() == [("early", "{}")]
+    assert ask(postgres_url, "SELECT id FROM keys ORDER BY id") == [("early",), ("late",)]
+
+
+def test_commands(archive, postgres, tmp_path, sceneprint, monkeypatch):
+    url, data = postgres.create("commands"), tmp_path / "data"
+    secret = url.replace("postgres@", "postgres:hidden@")
+    for one in (secret, f"{url}?password=hidden", "hidden"):
+        said = sceneprint("restore", archive, "--data", data, "--database", one, expect=2)
+        assert said.stderr.startswith("sceneprint restore: --database: ")
+        assert "hidden" not in said.stderr
+    again = ("restore", archive, "--data", data, "--database", url)
+    assert "--replace moves a folder" in sceneprint(*again, "--replace", expect=2).stderr
+    shown = url.replace("+psycopg", "")
+    assert f"is restored to {shown}: 1 maps" in sceneprint(*again).stdout
+    assert "nothing is overwritten" in sceneprint(*again, expect=2).stderr
+    monkeypatch.setenv("SCENEPRINT_DATABASE_URL", secret)
+    out = tmp_path / "a.tar"
+    assert "1 maps, 5 frames" in sceneprint("snapshot", "--data", data, "--out", out).stdout
+    assert "is whole" in sceneprint("restore", "--verify-only", out).stdout
+
+
+def test_blobs_and_snapshots_in_an_object_store(
+    archive, postgres_url, bucket, tmp_path, uploads, sceneprint, monkeypatch
+):
+    kept = {"blob_url": SecretStr(f"{bucket}/one"), "snapshot_url": bucket, "snapshots_kept": 2}
+    fleet = fleet_of(tmp_path / "node", postgres_url, **kept)
+    told = restore_to_fleet(archive, fleet)
+    assert not (tmp_path / "node" / "blobs").exists()
+    with Engine(fleet) as engine:
+        blobs = {*engine.store.blobs.digests()}
+        engine.store.blobs.remove(first := min(blobs))
+    assert len(blobs) == told.manifest.blobs.count
+    shelf = Shelf(fleet)
+    ids = [f"{datetime.now(UTC):%Y%m%d}T00000{n}Z-0123abcd" for n in range(3)]
+    for one in ids:
+        assert shelf.take(one).damaged == 1  # the one that was removed
+    other = Shelf(fleet_of(tmp_path / "other", postgres_url, **kept))  # another host
+    assert [one.snapshot_id for one in other.list()] == ids[:0:-1]
+    with other.open(ids[2]) as file:
+        assert file.read(13) == b"manifest.json"
+    with pytest.raises(UnknownSnapshot):
+        other.find(ids[0])
+    other.delete(ids[1])
+    assert [one.snapshot_id for one in shelf.list()] == [ids[2]]
+    monkeypatch.setenv("SCENEPRINT_SNAPSHOT_URL", bucket)
+    said = sceneprint("restore", ids[2], "--data", tmp_path / "home", expect=1)
+    assert f"{first[:12]}, missing" in said.stderr
+    assert len([*(tmp_path / "home" / "blobs").glob("*/*")]) == len(blobs) - 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["home", "node"]

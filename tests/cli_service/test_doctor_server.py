@@ -1,0 +1,96 @@
+"""What `sceneprint doctor` says of PostgreSQL, its replica, and of object stores."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+from pydantic import SecretStr
+
+from benchmarks.fleet.postgres import Server
+from sceneprint.cli.checks_database import database
+from sceneprint.cli.checks_objects import object_stores
+from sceneprint.cli.checks_server import server
+from sceneprint.cli.findings import Finding
+from sceneprint.settings import Settings
+from sceneprint.store import open_database
+
+
+def found_in(url: str, **other: object) -> dict[str, Finding]:
+    settings = Settings(data_dir=Path("/nowhere"), database_url=SecretStr(url), **other)
+    found = [database(settings), *server(settings), *object_stores(settings)]
+    return {one.subject: one for one in found}
+
+
+def test_a_server_and_its_replica(postgres: Server, tmp_path: Path) -> None:
+    url = postgres.create("looked_at")
+    open_database(url).close()
+    standby = postgres.standby(tmp_path / "standby", synchronous=False)
+    try:
+        near = standby.url("looked_at")
+        found = found_in(url, replica_url=SecretStr(near))
+        assert found["database"].verdict == found["database server"].verdict == "ok"
+        assert found["database server"].text.startswith("PostgreSQL 1")
+        assert found["durability"].verdict == "WRONG"  # the server of tests syncs nothing
+        assert "fsync, full_page_writes off" in found["durability"].text
+        assert (found["clock"].verdict, found["connections"].verdict) == ("ok", "ok")
+        assert found["pgvector"].text.endswith("the first use makes it (CREATE EXTENSION)")
+        assert found["replica"].verdict == "ok"
+        postgres.execute("CREATE TABLE seen (number int)", "looked_at")
+        seen = "SELECT to_regclass('seen') IS NOT NULL"
+        while standby.execute(seen, "looked_at") == [(False,)]:
+            time.sleep(0.01)
+        standby.execute("SELECT pg_wal_replay_pause()")
+        postgres.execute("CREATE TABLE unseen (number int)", "looked_at")
+        until = time.monotonic() + 30
+        while found["replica"].verdict == "ok" and time.monotonic() < until:
+            found = found_in(url, replica_url=SecretStr(near), replica_lag_s=0.1)
+        assert "SCENEPRINT_REPLICA_LAG_S is 0.1 s: it is not used" in found["replica"].text
+        assert "is a standby, to which nothing" in found_in(near)["database server"].text
+    finally:
+        standby.kill()
+    gone = found_in(url, replica_url=SecretStr(near))["replica"]
+    assert (gone.verdict, "Until then the primary is asked" in gone.text) == ("WRONG", True)
+    assert "is no standby" in found_in(url, replica_url=SecretStr(url))["replica"].text
+
+
+def test_a_user_who_may_not_make_extensions(postgres: Server) -> None:
+    url = postgres.create("modest")
+    postgres.execute("CREATE ROLE robot LOGIN")
+    mine = url.replace("postgres@", "robot@")
+    found = found_in(mine, workers=250)
+    assert found["pgvector"].verdict == "note"
+    assert "this user may not make it" in found["pgvector"].text
+    assert found["connections"].verdict == "note"
+    assert "Raise max_connections, or run fewer" in found["connections"].text
+    assert found_in(mine, shortlist="database")["pgvector"].verdict == "WRONG"
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("postgresql://me:hidden@127.0.0.1:1/maps", "postgresql://me@127.0.0.1:1/maps: "),
+        ("mysql://me:hidden@host/maps", "'mysql' is no database that is known"),
+    ],
+)
+def test_a_server_that_cannot_be_asked(url: str, said: str) -> None:
+    found = database(Settings(data_dir=Path("/nowhere"), database_url=SecretStr(url)))
+    assert (found.verdict, found.subject) == ("WRONG", "database")
+    assert said in found.text
+    assert "hidden" not in found.text
+
+
+def test_object_stores(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = Settings(
+        data_dir=tmp_path, database_url=None, blob_url=SecretStr(f"{bucket}/blobs"),
+        snapshot_url=f"file://{tmp_path}/kept",
+    )  # fmt: skip
+    blobs, snapshots = object_stores(settings)
+    assert (blobs.verdict, snapshots.verdict) == ("ok", "ok")
+    assert blobs.text.startswith(f"{bucket}/blobs: written, read and removed in ")
+    assert "AWS_... of the environment" in blobs.text
+    assert not any(path.is_file() for path in tmp_path.rglob("*"))
+    lost = Settings(data_dir=tmp_path, database_url=None, snapshot_url=f"{bucket}-none")
+    [found] = object_stores(lost)
+    assert (found.verdict, found.subject) == ("WRONG", "snapshots")

@@ -1,0 +1,152 @@
+"""The check of a fleet's store on PostgreSQL: what is found there, and mended there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import psycopg
+import pytest
+from pydantic import SecretStr
+
+from sceneprint.engine import Engine
+from sceneprint.errors import StoreAway
+from sceneprint.maintenance.fleets import restore_to_fleet
+from sceneprint.maintenance.fsck import Outcome, fsck
+from sceneprint.maintenance.snapshots import take_snapshot
+from sceneprint.schemas import JobState
+from sceneprint.settings import Settings
+
+pytestmark = pytest.mark.sqlite_only("these have servers of their own")
+
+FIRST = "(SELECT MIN(number) FROM frames WHERE state = 'indexed')"
+WAITING = "(SELECT MAX(number) FROM frames WHERE state = 'received')"
+
+
+class Fleet:
+    """A store on PostgreSQL, and what happens to it."""
+
+    def __init__(self, settings: Settings, url: str) -> None:
+        self.settings, self._url = settings, url.replace("+psycopg", "")
+
+    def sql(self, *asked: str) -> list[tuple]:
+        """Ask or change the database past all that would refuse it."""
+        with psycopg.connect(self._url, autocommit=True) as connection:
+            connection.execute("SET session_replication_role = replica")
+            found = [connection.execute(one) for one in asked][-1]
+            return found.fetchall() if found.description else []
+
+    def look(self, **how: object) -> list[Outcome]:
+        found = list(fsck(self.settings, **how))
+        return [one for one in found if one.finding.kind != "unchecked-pages"]
+
+    def kinds(self, **how: object) -> list[str]:
+        return [one.finding.kind for one in self.look(**how)]
+
+    def work(self) -> set[JobState | None]:
+        with Engine(self.settings) as engine:
+            states = set()
+            while (claimed := engine.claim("w")) is not None:
+                states.add(engine.run(claimed))
+            return states
+
+
+@pytest.fixture(scope="session")
+def archive(master, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("archive") / "master.tar"
+    take_snapshot(master.settings, path)
+    return path
+
+
+@pytest.fixture
+def fleet(archive, master, postgres_url, tmp_path) -> Fleet:
+    settings = Settings(
+        data_dir=tmp_path / "node", database_url=SecretStr(postgres_url), index_dir=None,
+        cache_dir=master.settings.cache_dir,
+    )  # fmt: skip
+    restore_to_fleet(archive, settings)
+    return Fleet(settings, postgres_url)
+
+
+def test_rows_are_checked_and_mended(fleet):
+    assert fleet.kinds() == fleet.kinds(quick=True) == []
+    fleet.sql(
+        f"UPDATE signatures SET vector = 'x' || substr(vector, 2) WHERE frame_number = {FIRST}",
+        f"DELETE FROM signatures WHERE frame_number = {FIRST} + 1",
+        f"UPDATE frames SET pose_x = pose_x + 1 WHERE number = {FIRST} + 2",
+        f"DELETE FROM frame_tags WHERE frame_number = {FIRST} + 2",
+        f"UPDATE jobs SET state = 'dead' WHERE frame_number = {WAITING}",
+        "UPDATE maps SET revision = 11 WHERE name = 'hall'",
+    )
+    wanted = [
+        "damaged-signature", "frame-without-job", "frame-without-signature", "other-position",
+        "other-tags", "revision-ahead",
+    ]  # fmt: skip
+    assert sorted(fleet.kinds()) == wanted
+    repaired = fleet.look(repair=True)
+    assert sorted(one.finding.kind for one in repaired) == wanted
+    assert [one.error for one in repaired if one.left] == []
+    assert fleet.work() == {JobState.SUCCEEDED}
+    assert fleet.kinds() == []
+    [moved] = (fleet.settings.data_dir / "quarantine").iterdir()
+    assert moved.name.startswith("signature-")
+
+
+def test_blobs_are_checked_and_mended(fleet):
+    blob, state = fleet.sql(f"SELECT blob, state FROM frames WHERE number = {WAITING}")[0]
+    [(geometry,)] = fleet.sql(f"SELECT geometry FROM signatures WHERE frame_number = {FIRST}")
+    blobs = fleet.settings.blob_dir
+    (blobs / blob[:2] / blob).unlink()
+    (blobs / geometry[:2] / geometry).write_bytes(b"other")
+    assert state == "received"
+    assert sorted(fleet.kinds()) == ["damaged-artifact", "missing-upload"]
+    assert [one.error for one in fleet.look(repair=True) if one.left] == []
+    assert fleet.work() == {JobState.SUCCEEDED}
+    assert [one.finding.severity for one in fleet.look()] == ["note"]  # the loss is known
+
+
+def test_rows_that_refer_to_none_are_fatal(fleet):
+    fleet.sql(f"INSERT INTO frame_tags VALUES ({WAITING} + 7, 'x')", "DELETE FROM maps "
+              "WHERE name = 'attic'")  # fmt: skip
+    found = fleet.look(repair=True)
+    assert ("dangling-row", "row 22, 'x' of table frame_tags") in [
+        (one.finding.kind, one.finding.what) for one in found
+    ]
+    assert all(one.done is None for one in found)
+    assert any("refers to a row of maps" in one.finding.means for one in found)
+
+
+def test_pages_are_checked_where_the_server_can(fleet):
+    """The wheel has no amcheck: functions of its names stand in for it."""
+    notes = [one.finding for one in fsck(fleet.settings)]
+    assert [one.kind for one in notes] == ["unchecked-pages"]
+    fleet.sql(
+        """CREATE FUNCTION bt_index_check(checked regclass, heap boolean) RETURNS void AS $$
+        BEGIN
+          IF checked = 'ix_frames_blob'::regclass THEN
+            RAISE 'item order invariant violated' USING ERRCODE = 'XX002';
+          END IF;
+        END $$ LANGUAGE plpgsql""",
+        """CREATE FUNCTION verify_heapam(relation regclass, a boolean DEFAULT false,
+          b boolean DEFAULT false, c text DEFAULT 'none', d bigint DEFAULT NULL,
+          e bigint DEFAULT NULL, OUT blkno bigint, OUT offnum integer, OUT attnum integer,
+          OUT msg text) RETURNS SETOF record AS $$
+          SELECT 0, 1, 1, 'xmin is off' WHERE relation = 'keys'::regclass $$ LANGUAGE sql""",
+    )
+    found = [(one.finding.kind, one.finding.means) for one in fsck(fleet.settings)]
+    assert found == [
+        ("damaged-database", "table keys: xmin is off"),
+        ("damaged-database", found[1][1]),
+    ]
+    assert found[1][1].startswith("index ix_frames_blob: item order invariant violated")
+
+
+def test_a_server_that_is_away_is_no_damage(fleet, postgres):
+    seen = fsck(fleet.settings)
+    next(seen)  # the first note; the next check finds the connections gone
+    name = fleet.settings.database.rsplit("/")[-1]
+    postgres.execute(f"ALTER DATABASE {name} ALLOW_CONNECTIONS false")
+    postgres.execute(
+        "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE application_name='sceneprint'"
+    )
+    with pytest.raises(StoreAway):
+        list(seen)

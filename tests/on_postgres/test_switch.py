@@ -1,0 +1,62 @@
+"""What leads tests to PostgreSQL does so: one database for each data folder, as with a file."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.schemas import NewMap
+from sceneprint.settings import Settings
+
+pytestmark = pytest.mark.skipif(
+    os.environ.get("SCENEPRINT_TEST_DATABASE") != "postgresql", reason="make test-postgres"
+)
+#: Another process that names the maps of a folder.
+CHILD = """
+import sys
+from pathlib import Path
+from sceneprint.engine import Engine
+from sceneprint.settings import Settings
+with Engine(Settings(data_dir=Path(sys.argv[1]))) as engine:
+    print(engine.store.database.dialect, *[one.name for one in engine.list_maps().items])
+"""
+
+
+def opened(folder: Path) -> Engine:
+    return Engine(Settings(data_dir=folder, database_url=None))
+
+
+def names(engine: Engine) -> list[str]:
+    return [one.name for one in engine.list_maps().items]
+
+
+def test_a_folder_has_a_database_and_its_copy_a_copy(tmp_path: Path) -> None:
+    first, copy = tmp_path / "first", tmp_path / "copy"
+    with opened(first) as engine:
+        assert engine.store.database.dialect == "postgresql"
+        engine.create_map(NewMap(name="hall", model="compact"))
+    shutil.copytree(first, copy)
+    with opened(copy) as engine:
+        assert names(engine) == ["hall"]
+        engine.create_map(NewMap(name="attic", model="compact"))
+    with opened(first) as engine, opened(tmp_path / "other") as other:
+        assert (names(engine), names(other)) == (["hall"], [])
+    told = subprocess.run(
+        [sys.executable, "-c", CHILD, str(copy)], capture_output=True, text=True, check=True
+    )
+    assert told.stdout.split() == ["postgresql", "attic", "hall"]
+    assert [path.name for path in tmp_path.rglob("*.db")] == []
+
+
+def test_a_folder_that_was_removed_begins_anew(tmp_path: Path) -> None:
+    with opened(tmp_path / "data") as engine:
+        engine.create_map(NewMap(name="hall", model="compact"))
+    shutil.rmtree(tmp_path / "data")
+    with opened(tmp_path / "data") as engine:
+        assert names(engine) == []

@@ -1,0 +1,80 @@
+"""An asynchronous standby is promoted: what it had not received is gone, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.fleet.postgres import Server
+from sceneprint.engine import Engine
+from sceneprint.errors import StoreAway, UnknownFrame
+from sceneprint.schemas import JobState, NewMap, Query
+from sceneprint.settings import Settings
+
+ASKED = Query(k=5, candidates=5, keep=False)
+
+
+@pytest.fixture
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, Server]]:
+    folder = tmp_path_factory.mktemp("pair")
+    primary = Server(folder / "primary")
+    primary.start()
+    primary.create("fleet")
+    standby = primary.standby(folder / "standby", synchronous=False)
+    yield primary, standby
+    primary.kill()
+    standby.kill()
+
+
+@pytest.fixture
+def engine(pair: tuple[Server, Server], tmp_path: Path) -> Iterator[Engine]:
+    hosts = "&".join(f"host=127.0.0.1:{server.port}" for server in pair)
+    url = f"postgresql://postgres@/fleet?{hosts}&target_session_attrs=read-write"
+    with Engine(Settings.model_validate({"database_url": url, "data_dir": tmp_path})) as opened:
+        yield opened
+
+
+def index(engine: Engine, frame: Any) -> str:
+    added, _ = engine.add_frame("hall", *frame)
+    work = engine.claim("w")
+    assert work is not None
+    assert engine.run(work) == JobState.SUCCEEDED
+    return added.frame_id
+
+
+def found(engine: Engine, frame: Any) -> list[str]:
+    answer = engine.query_upload("hall", *frame, ASKED)
+    return sorted(match.frame_id for match in answer.matches)
+
+
+def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
+    engine: Engine, pair: tuple[Server, Server], small: list[Any], until: Callable[..., Any]
+) -> None:
+    primary, standby = pair
+    engine.create_map(NewMap(name="hall", model="compact"))
+    kept = [index(engine, frame) for frame in small[:2]]
+    written = "SELECT pg_current_wal_lsn()::text"
+    (at,) = primary.execute(written)[0]
+    until(lambda: standby.execute(f"SELECT pg_last_wal_replay_lsn() >= '{at}'")[0][0])
+    standby.execute("ALTER SYSTEM SET primary_conninfo = ''")
+    standby.execute("SELECT pg_reload_conf()")
+    until(lambda: primary.execute("SELECT count(*) FROM pg_stat_replication")[0] == (0,))
+    before = engine.store.database.history
+    lost = index(engine, small[2])
+    assert found(engine, small[2]) == sorted([*kept, lost])  # held in memory from now on
+    primary.kill()
+    with pytest.raises(StoreAway):
+        engine.get_map("hall")
+    standby.promote()
+    assert engine.get_map("hall").frames == {"indexed": 2}
+    assert engine.store.database.history != before
+    with pytest.raises(UnknownFrame):
+        engine.get_frame("hall", lost)
+    other = index(engine, small[3])  # which is given the number and the revision of the lost one
+    assert engine.get_map("hall").frames == {"indexed": 3}
+    assert found(engine, small[3]) == sorted([*kept, other])
+    again = index(engine, small[2])  # as by a robot that keeps its frames for a while
+    assert found(engine, small[2]) == sorted([*kept, other, again])

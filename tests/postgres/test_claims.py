@@ -1,0 +1,249 @@
+"""Claims that wait for no turn, beside all that else happens to a job: who is first, counts."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import pytest
+from sqlalchemy import Connection, text, update
+
+from sceneprint.errors import LostLease
+from sceneprint.schemas import JobState
+from sceneprint.store import Store, cancelling, clock, deaths, listing, queue
+from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.queue import Claim
+from sceneprint.store.records import JobRow
+from sceneprint.store.tables import jobs
+
+BLOCKED = text(
+    "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database() "
+    "AND wait_event_type = 'Lock'"
+)
+
+
+@pytest.fixture
+def store(server_store: Store) -> Store:
+    """With three jobs of no frame that wait."""
+    with server_store.database.write() as connection:
+        keep_model(connection, "ab" * 32, "toy", b"the file of a model")
+        row = add_map(connection, "hall", None, "ab" * 32)
+        for _ in range(3):
+            queue.enqueue(connection, "import", None, map_number=row.number)
+    return server_store
+
+
+def claim(store: Store, worker: str = "w", lease_s: float = 60.0) -> Claim | None:
+    with store.database.write(turn=False) as connection:
+        return queue.claim(connection, worker, lease_s)
+
+
+def claimed(store: Store, worker: str = "w", lease_s: float = 60.0) -> Claim:
+    held = claim(store, worker, lease_s)
+    assert held is not None
+    return held
+
+
+def now_is(store: Store, job: JobRow) -> JobRow:
+    with store.database.read() as connection:
+        return listing.find_job(connection, job.id)
+
+
+def turned(store: Store, job: JobRow, **values: object) -> None:
+    with store.database.write() as connection:
+        connection.execute(update(jobs).where(jobs.c.number == job.number).values(**values))
+
+
+@contextmanager
+def uncommitted(store: Store) -> Iterator[tuple[Connection, Callable[[], None]]]:
+    """A transaction without a turn, and what commits it."""
+    with ExitStack() as held:
+        connection = held.enter_context(store.database.write(turn=False))
+        yield connection, held.pop_all().close
+
+
+def beside(store: Store, until: Callable[..., Any], what: Callable[[], Any]) -> Callable[[], Any]:
+    """Begin something that has to wait for a lock; what waits for its end, and returns it."""
+    found: list[Any] = []
+
+    def run() -> None:
+        try:
+            found.append(what())
+        except Exception as error:
+            found.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+
+    def waits() -> bool:
+        assert found == [], found
+        with store.database.read() as connection:
+            return bool(connection.execute(BLOCKED).scalar_one() == 1)
+
+    until(waits)
+
+    def end() -> Any:
+        thread.join(60)
+        (one,) = found
+        return one
+
+    return end
+
+
+def test_a_claim_waits_for_no_turn_and_passes_over_what_another_has_in_hand(store: Store) -> None:
+    with store.database.write(), uncommitted(store) as (connection, commit):
+        first = queue.claim(connection, "a", 60.0)
+        second, third = claimed(store, "b"), claimed(store, "c")
+        assert claim(store, "d") is None
+        commit()
+    assert first is not None
+    assert [held.job.number for held in (first, second, third)] == [1, 2, 3]
+    assert [now_is(store, held.job).worker for held in (first, second, third)] == ["a", "b", "c"]
+
+
+def test_what_fell_silent_is_locked_only_by_who_takes_it(store: Store) -> None:
+    silent = claimed(store, "dead", -1.0)
+    with store.database.write(turn=False) as connection:
+        held = queue.claim(connection, "a", 60.0)
+        assert held is not None
+        assert held.job.number == 2  # what was not tried yet goes first
+        with store.database.write(turn=False) as other:
+            other.execute(text("SET LOCAL lock_timeout = 1"))
+            queue.renew(other, silent, 60.0)  # nobody has it locked
+    turned(store, silent.job, leased_until=0.0)
+    third, again = claimed(store, "b"), claimed(store, "c")
+    assert (third.job.number, again.job.number, again.token) == (3, 1, 2)
+
+
+@pytest.mark.parametrize("first", ["claim", "cancel"])
+def test_a_claim_beside_a_cancellation(store: Store, until: Any, first: str) -> None:
+    with store.database.read() as connection:
+        job = listing.find_job(connection, _id_of(connection, 1))
+
+    def cancel() -> None:
+        with store.database.write() as connection:
+            cancelling.cancel(connection, job)
+
+    if first == "claim":
+        with uncommitted(store) as (connection, commit):
+            held = queue.claim(connection, "w", 60.0)
+            done = beside(store, until, cancel)
+            commit()
+        assert done() is None
+        assert held is not None
+        with pytest.raises(LostLease), store.database.write() as connection:
+            queue.finish(connection, held, JobState.SUCCEEDED)
+    else:
+        with store.database.write() as connection:
+            cancelling.cancel(connection, job)
+            assert claimed(store).job.number == 2  # passed over, though not committed
+    assert now_is(store, job).state == JobState.CANCELLED
+
+
+def _id_of(connection: Connection, number: int) -> str:
+    asked = text("SELECT id FROM jobs WHERE number = :number")
+    return str(connection.execute(asked, {"number": number}).scalar_one())
+
+
+@pytest.mark.parametrize("what", ["finish", "check_held", "renew"])
+def test_an_end_that_comes_late_and_a_claim_take_effect_once(
+    store: Store, until: Any, what: str
+) -> None:
+    """The lease is over, and both find the job: the second waits, and finds that it lost it."""
+    late = claimed(store, "late", -1.0)
+    claimed(store, "b"), claimed(store, "c")
+
+    def end(connection: Connection) -> None:
+        if what == "finish":
+            queue.finish(connection, late, JobState.SUCCEEDED)
+        elif what == "renew":
+            queue.renew(connection, late, 60.0)
+        else:
+            queue.check_held(connection, late)
+
+    with store.database.write() as connection:  # the end is first
+        end(connection)
+        assert claim(store, "next") is None
+    turned(store, late.job, state=JobState.RUNNING, leased_until=0.0)
+
+    def ends() -> None:
+        with store.database.write() as connection:
+            end(connection)
+
+    with uncommitted(store) as (connection, commit):  # the claim is
+        held = queue.claim(connection, "next", 60.0)
+        done = beside(store, until, ends)
+        commit()
+    assert isinstance(done(), LostLease)
+    assert held is not None
+    assert now_is(store, late.job).worker == "next"
+    assert now_is(store, late.job) == held.job
+
+
+def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(
+    store: Store, until: Any
+) -> None:
+    dead = claimed(store, "dead", -1.0)
+    claimed(store, "b"), claimed(store, "c")
+
+    def tell() -> JobRow | None:
+        with store.database.write() as connection:
+            return deaths.fail_of_dead(
+                connection, dead.job.id, dead.token, "died", "trace", counts=False
+            )
+
+    with uncommitted(store) as (connection, commit):
+        held = queue.claim(connection, "next", 60.0)
+        done = beside(store, until, tell)
+        commit()
+    assert done() is None
+    assert held is not None
+    assert now_is(store, dead.job) == held.job  # which is not queued again under its worker
+
+
+def test_a_renewal_beside_the_burial_of_its_job(store: Store, until: Any) -> None:
+    held = claimed(store, "w", -1.0)
+    turned(store, held.job, attempts=queue.MAXIMUM_ATTEMPTS)
+
+    def bury() -> list[JobRow]:
+        with store.database.write() as connection:
+            return deaths.bury(connection)
+
+    with uncommitted(store) as (connection, commit):
+        queue.renew(connection, held, 60.0)
+        done = beside(store, until, bury)
+        commit()
+    assert done() == []
+    assert now_is(store, held.job).state == JobState.RUNNING
+
+
+def test_a_token_that_a_promoted_standby_gave_out_again_is_anothers(store: Store) -> None:
+    held = claimed(store, "first")
+    turned(store, held.job, worker="second")  # the same token: the standby lacked the first claim
+    with pytest.raises(LostLease), store.database.write() as connection:
+        queue.finish(connection, held, JobState.SUCCEEDED)
+
+
+@pytest.mark.parametrize("hours", [-5, 5])
+def test_the_clock_of_a_host_decides_nothing(
+    store: Store, monkeypatch: pytest.MonkeyPatch, hours: int
+) -> None:
+    real = time.time
+    monkeypatch.setattr(time, "time", lambda: real() + 3600 * hours)
+    held = claimed(store, "w", 60.0)
+    assert held.job.started_at == pytest.approx(real(), abs=30)
+    assert held.job.leased_until == pytest.approx(real() + 60, abs=30)
+    claimed(store), claimed(store)
+    assert claim(store) is None  # no lease is over
+    with store.database.read() as connection:
+        assert not queue.has_due(connection)
+        assert 0 < (queue.due_in_s(connection) or 0) <= 60
+        assert clock.read_clock(connection) == pytest.approx(real(), abs=30)
+    with store.database.write() as connection:
+        queue.give_back(connection, held)
+    assert claimed(store).job.number == held.job.number  # at once
+    with store.database.write() as connection:
+        assert deaths.bury(connection) == []

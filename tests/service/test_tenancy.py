@@ -1,0 +1,161 @@
+"""Tenants of one service: quotas that only the operator sets, retention, deletion for good.
+
+On both databases, over HTTP with keys; a service without workers, whose jobs are done here.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import httpx
+import pytest
+from anyio.from_thread import BlockingPortal, start_blocking_portal
+
+from sceneprint.engine import Engine
+from sceneprint.schemas.keys import Scope
+from sceneprint.settings import Settings
+from service.app import create_app
+
+KEYS: dict[str, dict[str, Scope]] = {
+    "boss": {"*": "admin"}, "tenant": {"alpha": "admin", "later": "admin"},
+    "robot": {"alpha": "write"}, "other": {"bravo": "admin"},
+}  # fmt: skip
+
+
+@dataclass
+class House:
+    """A service, its engine, and keys to it."""
+
+    client: httpx.AsyncClient
+    portal: BlockingPortal
+    engine: Engine
+    secrets: dict[str, str]
+
+    def ask(self, key: str, method: str, path: str, **request: Any) -> httpx.Response:
+        headers = {"Authorization": f"Bearer {self.secrets[key]}", **request.pop("headers", {})}
+        answer: httpx.Response = self.portal.call(
+            partial(self.client.request, method, path, headers=headers, **request)
+        )
+        return answer
+
+    def work(self) -> None:
+        while (work := self.engine.claim("here:1")) is not None:
+            self.engine.run(work)
+
+
+@pytest.fixture
+def house(tmp_path, store_url) -> Iterator[House]:
+    (tmp_path / "blobs").mkdir()
+    app = create_app(
+        Settings(data_dir=tmp_path, database_url=store_url, require_keys=True, requests_per_s=0)
+    )
+    with (
+        start_blocking_portal() as portal,
+        portal.wrap_async_context_manager(app.router.lifespan_context(app)),
+        portal.wrap_async_context_manager(
+            httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://here")
+        ) as client,
+    ):
+        engine = app.state.context.engine
+        secrets = {name: engine.create_key(name, grants).secret for name, grants in KEYS.items()}
+        made = House(client, portal, engine, secrets)
+        for name in ("alpha", "bravo"):
+            made.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
+        yield made
+
+
+def test_a_quota_is_the_operators(house: House, refused: Callable[..., dict[str, Any]]) -> None:
+    path = "/v1/maps/alpha"
+    for body in ({"quota_frames": 10}, {"quota_bytes": None}, {"title": "x", "quota_frames": 1}):
+        for key in ("tenant", "robot"):
+            answer = house.ask(key, "PATCH", path, json=body)
+            refused(answer, 403, "forbidden", "'admin' for")
+        refused(house.ask("other", "PATCH", path, json=body), 404, "unknown-map")
+    assert house.ask("tenant", "GET", path).json()["title"] is None
+    told = house.ask("boss", "PATCH", path, json={"quota_frames": 10, "quota_bytes": 10**9}).json()
+    assert (told["quota_frames"], told["quota_bytes"], told["used_frames"]) == (10, 10**9, 0)
+    new = {"name": "later", "model": "compact"}
+    refused(
+        house.ask("tenant", "POST", "/v1/maps", json=new | {"quota_frames": 5}), 403, "forbidden"
+    )
+    assert (
+        house.ask("tenant", "POST", "/v1/maps", json=new | {"retention_days": 5}).status_code == 201
+    )
+    # and it is not lost by deleting the map and making it anew
+    assert house.ask("tenant", "DELETE", path).status_code == 204
+    made = house.ask("tenant", "POST", "/v1/maps", json={"name": "alpha", "model": "compact"})
+    assert (made.status_code, made.json()["quota_frames"]) == (201, 10)
+    audited = house.ask("boss", "GET", "/v1/audit").json()["items"]
+    [change] = [one for one in audited if one["action"] == "patch_map"]
+    assert (change["actor"], change["map"]) == ("boss", "alpha")
+    assert change["data"] == {"status": 200, "quota_bytes": 10**9, "quota_frames": 10}
+
+
+def test_beyond_the_quota_nothing_is_taken(house, refused, small_shots):
+    path, (a, b, c, *_) = "/v1/maps/alpha/frames", small_shots
+    house.ask("boss", "PATCH", "/v1/maps/alpha", json={"quota_frames": 2})
+    assert house.ask("robot", "POST", path, **a.form()).status_code == 202
+    batch = {
+        "files": [("frame", ("f.png", one.png, "image/png")) for one in (a, b, c)],
+        "data": {"metas": json.dumps({"intrinsics": a.camera})},
+    }
+    items = house.ask("robot", "POST", f"{path}/batch", **batch).json()["items"]
+    assert [one["status"] for one in items] == [200, 202, 403]
+    assert items[2]["problem"]["type"] == "/problems/quota-exceeded"
+    for method, place in (("POST", path), ("PUT", f"{path}/mine")):
+        answer = house.ask("robot", method, place, **c.form())
+        refused(answer, 403, "quota-exceeded", "holds 2 frames of the 2")
+    assert house.ask("robot", "GET", f"{path}/mine").status_code == 404
+    told = house.ask("tenant", "GET", "/v1/maps/alpha").json()
+    assert (told["used_frames"], told["used_bytes"]) == (2, len(a.png) + len(b.png))
+    # of another's use nobody is told
+    assert [one["name"] for one in house.ask("other", "GET", "/v1/maps").json()["items"]] == [
+        "bravo"
+    ]
+    other = house.ask("other", "GET", "/v1/maps/bravo").json()
+    assert (other["used_frames"], other["quota_frames"]) == (0, None)
+
+
+def test_retention_is_tried_set_and_told(house, small_shots):
+    path = "/v1/maps/alpha"
+    house.ask("robot", "POST", f"{path}/frames", **small_shots[0].form())
+    tried = house.ask("tenant", "PATCH", f"{path}?dry_run=true", json={"retention_days": 1e-9})
+    assert (tried.json()["overdue"], tried.json()["retention_days"]) == (1, 1e-9)
+    assert house.ask("tenant", "GET", path).json()["retention_days"] is None
+    assert house.ask("robot", "PATCH", path, json={"retention_days": 1}).status_code == 403
+    assert house.ask("tenant", "PATCH", path, json={"retention_days": 1e-9}).json()["overdue"] == 1
+    house.engine.publish_due()
+    told = house.ask("tenant", "GET", path).json()
+    assert (told["frames"], told["used_bytes"], told["overdue"]) == ({"deleted": 1}, 0, 0)
+    [event] = house.ask("robot", "GET", "/v1/events?kind=frame.deleted").json()["items"]
+    assert event["data"] == {"reason": "retention"}
+
+
+def test_an_answer_goes_with_its_map_and_with_its_frame(house, refused, small_shots):
+    path = "/v1/maps/alpha"
+    for i, shot in enumerate(small_shots[:3]):
+        house.ask("robot", "PUT", f"{path}/frames/f{i}", **shot.form())
+    house.work()
+    asked = [
+        house.ask("robot", "POST", f"{path}/queries", json={"frame_id": f"f{i}"}).json()["query_id"]
+        for i in (0, 1)
+    ]
+    assert [house.ask("robot", "GET", f"/v1/queries/{one}").status_code for one in asked] == [
+        200
+    ] * 2
+    house.ask("tenant", "DELETE", f"{path}/frames/f0")
+    refused(house.ask("robot", "GET", f"/v1/queries/{asked[0]}"), 404, "unknown-query")
+    assert house.ask("robot", "GET", f"/v1/queries/{asked[1]}").status_code == 200
+    house.ask("tenant", "DELETE", path)
+    for made_anew in (False, True):
+        if made_anew:
+            house.ask("tenant", "POST", "/v1/maps", json={"name": "alpha", "model": "compact"})
+        for place in ("", "/points", "/question", "/preview.png", "/similarities"):
+            answer = house.ask("robot", "GET", f"/v1/queries/{asked[1]}{place}")
+            refused(answer, 404, "unknown-query")
+        again = house.ask("robot", "POST", f"/v1/queries/{asked[1]}/again", json={})
+        refused(again, 404, "unknown-query")

@@ -1,0 +1,306 @@
+"""A database on a server: its schema, its turns, its readers, and what SQLite is not asked."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from alembic import command
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from sqlalchemy import create_engine, insert, select, text
+
+from benchmarks.fleet.postgres import Server
+from sceneprint.errors import StoreAway, StoreLocked, UnusableStore
+from sceneprint.store import Database, Store, database, open_database, open_store, postgres
+from sceneprint.store.audit import Change, list_changes, note
+from sceneprint.store.database import is_there, reach_database
+from sceneprint.store.events import tell
+from sceneprint.store.frames import add_frame, frames_of
+from sceneprint.store.keys import create_key, list_keys
+from sceneprint.store.maps import add_map, find_map, keep_model, list_maps, map_of
+from sceneprint.store.records import MapRow
+from sceneprint.store.revisions import known_revisions, migration_config
+from sceneprint.store.tables import events, maps, metadata
+
+Race = Callable[..., list[Any]]
+
+OPENS = """
+from sceneprint.store import open_database
+from sqlalchemy import text
+
+def work(i):
+    database = open_database(ARGS[0])
+    with database.read() as connection:
+        found = connection.execute(text("SELECT version_num FROM alembic_version")).all()
+    database.close()
+    return [row[0] for row in found]
+"""
+#: Keeps the turn until it is told to end.
+HOLDS = """
+import sys
+from sceneprint.store import open_database
+with open_database(sys.argv[1]).write():
+    print("held", flush=True)
+    sys.stdin.readline()
+"""
+SQLITE = """
+import sys
+from pathlib import Path
+from sceneprint.store import open_store
+store = open_store(sys.argv[1], Path(sys.argv[2]))
+with store.database.write() as connection:
+    connection.exec_driver_sql("SELECT 1")
+print([name for name in ("psycopg", "obstore") if name in sys.modules])
+"""
+
+
+@pytest.fixture
+def empty_url(postgres: Server) -> Iterator[str]:
+    """A database without any table."""
+    yield postgres.create("bare")
+    postgres.drop("bare")
+
+
+@pytest.fixture
+def served(postgres_url: str) -> Iterator[Database]:
+    opened = open_database(postgres_url)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def keeper(postgres_url: str) -> Iterator[Callable[[], None]]:
+    """Another process that has the turn; ends it when it is called."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDS, postgres_url], text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stdout.readline() == "held\n"
+
+    def end() -> None:
+        process.communicate("\n", timeout=60)
+
+    yield end
+    if process.poll() is None:
+        end()
+
+
+def test_four_processes_may_open_an_empty_database_at_once(empty_url: str, race: Race) -> None:
+    assert not is_there(empty_url)
+    assert race(OPENS, 4, empty_url) == [[known_revisions()[0]]] * 4
+    assert is_there(empty_url)
+    made = open_database(empty_url)
+    with made.read() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, metadata) == []
+        narrow = connection.execute(
+            text(
+                "SELECT table_name, column_name FROM information_schema.columns WHERE table_schema "
+                "= 'public' AND table_name <> 'alembic_version' AND (data_type = 'integer' OR "
+                "(data_type IN ('text', 'character varying') AND collation_name IS DISTINCT FROM "
+                "'C'))"
+            )
+        ).all()
+        assert narrow == []
+        counted = connection.execute(text("SELECT DISTINCT data_type::text FROM pg_sequences"))
+        assert counted.scalars().all() == ["bigint"]
+    made.close()
+
+
+def test_what_an_earlier_version_stored_is_brought_along(empty_url: str) -> None:
+    engine, config = create_engine(empty_url), migration_config()
+    with engine.begin() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, "0005")
+        connection.execute(text("INSERT INTO models VALUES ('m', 'compact', 'x', 1.0)"))
+        for number, name in enumerate("ab", 1):
+            connection.execute(
+                text(
+                    "INSERT INTO maps (name, model_id, revision, created_at) VALUES (:n, 'm', 7, 1)"
+                ),
+                {"n": name},
+            )
+            connection.execute(
+                text("INSERT INTO events (at, kind, map, data) VALUES (1, 'x', :n, '{}')"),
+                {"n": name},
+            )
+            assert connection.execute(text("SELECT max(number) FROM maps")).scalar() == number
+        secret = connection.execute(text("SELECT value FROM secrets")).scalar_one()
+    engine.dispose()
+    opened = open_database(empty_url)
+    with opened.write() as connection:
+        assert [(row.number, row.name, row.revision) for row in list_maps(connection)] \
+            == [(1, "a", 7), (2, "b", 7)]  # fmt: skip
+        assert map_of(connection, 1).retention_days is None
+        assert add_map(connection, "c", None, "m").number == 3
+        assert connection.execute(text("SELECT value FROM secrets")).scalar_one() == secret
+        # as after billions of events
+        connection.execute(text("SELECT setval('events_number_seq', 3000000000)"))
+        tell(connection, "key.created")
+        assert connection.execute(text("SELECT max(number) FROM events")).scalar() == 3_000_000_001
+    opened.close()
+
+
+def test_the_blobs_of_a_database_that_is_there_are_not_made_up_for(
+    postgres_url: str, empty_url: str, tmp_path: Path
+) -> None:
+    new = open_store(empty_url, tmp_path / "new" / "blobs")
+    new.blobs.put(b"upload")
+    new.database.close()
+    assert (tmp_path / "new" / "blobs").is_dir()
+    old = open_store(postgres_url, tmp_path / "old" / "blobs")
+    with pytest.raises(UnusableStore, match="No such file or directory"):
+        old.blobs.put(b"upload")
+    old.database.close()
+    assert not (tmp_path / "old").exists()
+
+
+def test_a_turn_that_another_process_keeps_is_said(
+    served: Database, keeper: Callable[[], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(database, "BUSY_S", 0.2)
+    for _ in range(2):  # the second, who comes after one that waited in vain, waits less
+        with (
+            pytest.raises(StoreLocked, match=r"nothing was stored\. Come back.*pg_stat_activity"),
+            served.write(),
+        ):
+            pytest.fail("it is not our turn")
+    with served.read() as connection:  # readers wait for nobody
+        assert list_maps(connection) == []
+    with served.write(turn=False) as connection:  # nor does who needs no turn
+        connection.execute(insert(events).values(at=0.0, kind="x", data={}))
+    keeper()
+    with served.write() as connection:
+        assert connection.execute(text("SHOW lock_timeout")).scalar() == "10s"
+        assert connection.execute(select(events.c.kind)).scalars().all() == ["x"]
+
+
+def test_a_migration_waits_for_its_turn_longer_than_a_writer(
+    served: Database, keeper: Callable[[], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(database, "BUSY_S", 0.05)
+    with pytest.raises(StoreLocked), served.write():
+        pytest.fail("it is not our turn")
+    soon = threading.Timer(0.5, keeper)
+    soon.start()
+    with served.write(unchecked=True) as connection:
+        for name in ("statement_timeout", "lock_timeout", "idle_in_transaction_session_timeout"):
+            assert connection.execute(text(f"SHOW {name}")).scalar() == "0"
+    soon.join()
+    with served.write() as connection:  # on the same connection, for the next
+        assert connection.execute(text("SHOW lock_timeout")).scalar() == "10s"
+
+
+def test_a_reader_sees_one_state_and_writes_nothing(served: Database) -> None:
+    with ExitStack() as stack:
+        held = [stack.enter_context(served.read()) for _ in range(3)]
+        for connection in held:
+            shown = [
+                connection.execute(text(f"SHOW {name}")).scalar()
+                for name in ("transaction_isolation", "transaction_read_only", "lock_timeout",
+                             "statement_timeout", "idle_in_transaction_session_timeout",
+                             "application_name")
+            ]  # fmt: skip
+            assert shown == ["repeatable read", "on", "10s", "1min", "30s", "sceneprint"]
+    with pytest.raises(UnusableStore, match="read-only transaction"), served.read() as connection:
+        keep_model(connection, "m", "toy", b"x")
+    with served.write() as connection:  # the connection that was refused is not given out again
+        assert connection.execute(text("SHOW transaction_read_only")).scalar() == "off"
+        assert connection.execute(text("SHOW transaction_isolation")).scalar() == "read committed"
+
+
+def test_more_readers_than_connections_are_told_so(
+    postgres_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("KEPT", 1), ("MOST", 2), ("BUSY_S", 0.1)):
+        monkeypatch.setattr(postgres, name, value)
+    few = reach_database(postgres_url)
+    with few.read(), few.read(), pytest.raises(StoreLocked, match="all connections"), few.read():
+        pytest.fail("there are two")
+    with few.read() as connection:
+        assert list_maps(connection) == []
+    few.close()
+
+
+def test_a_connection_of_its_own_commits_each_statement(served: Database) -> None:
+    own = served.driver_connection()
+    own.execute("INSERT INTO events (at, kind, data) VALUES (1, 'own', '{}')")
+    with served.read() as connection:
+        assert connection.execute(select(events.c.kind)).scalars().all() == ["own"]
+    with pytest.raises(StoreAway, match="is tried again"), served.explained():
+        own.execute("SELECT pg_terminate_backend(pg_backend_pid())")
+    assert own.closed
+
+
+def test_texts_are_in_the_order_of_their_code_points(store: Store) -> None:
+    names = ["b", "B", "a", "_", "-", "ä", "Z", "z", "é", "10", "9", "\U0001f600", "\uffee"]
+    with store.database.write() as connection:
+        for name in names:
+            create_key(connection, name, {"*": "read"})
+        told = [key.name for key in list_keys(connection)]
+        assert told == sorted(names)
+        after = told[4]
+        assert [key.name for key in list_keys(connection, after, 3)] == sorted(names)[5:8]
+
+
+def test_a_text_with_nul_is_found_nowhere_and_noted_all_the_same(store: Store) -> None:
+    with store.database.write() as connection:
+        keep_model(connection, "m", "n" * 200, b"x")
+        add_map(connection, "hall", None, "m")
+        assert [row.name for row in list_maps(connection)] == ["hall"]
+        found = connection.execute(select(maps.c.number).where(maps.c.name == "hall\0"))
+        assert found.all() == []
+        note(connection, Change("a" * 99, "boss\0", map="m" * 99, target="hall\0"))
+        (line,) = list_changes(connection, None, 9, None, None)
+    assert (len(line.action), line.actor[:4], line.map) == (64, "boss", "m" * 63)
+
+
+def test_more_numbers_are_asked_for_than_one_statement_takes(
+    store: Store, hall: MapRow, received: Callable[..., Any]
+) -> None:
+    made = [received(name).number for name in "abc"]
+    with store.database.read() as connection:
+        found = frames_of(connection, range(70_000))
+    assert sorted(found) == made
+
+
+def test_numbers_may_have_64_bits(store: Store, hall: MapRow) -> None:
+    values = {
+        "blob": "b", "bytes": 2**40, "intrinsics": {}, "depth_scale": 1.0, "tags": [],
+        "depth_along_ray": False, "pose": None,
+    }  # fmt: skip
+    with store.database.write() as connection:
+        connection.execute(
+            insert(maps).values(
+                number=2**40, name="far", model_id=hall.model_id, revision=2**41, created_at=1.0
+            )
+        )
+        frame = add_frame(connection, 2**40, values)
+        assert (frame.map_number, frame.bytes) == (2**40, 2**40)
+        assert find_map(connection, "far").revision == 2**41
+
+
+def test_a_process_on_sqlite_loads_no_driver_of_others(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SQLITE, f"sqlite:///{tmp_path / 'a.db'}", str(tmp_path / "blobs")],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
+def test_what_was_stored_is_json(store: Store, hall: MapRow) -> None:
+    """Not of PostgreSQL's other kind, which sorts keys and knows no escaped NUL."""
+    data = {"b": 1, "a": ["\0", "\ud800", 1e300, None]}
+    with store.database.write() as connection:
+        tell(connection, "map.edited", "hall", **data)
+        (found,) = connection.execute(select(events.c.data).where(events.c.kind == "map.edited"))
+    assert json.dumps(found[0]) == json.dumps(data)

@@ -1,0 +1,112 @@
+"""The commands of docs/deployment.md, run in their order by a shell, on real servers."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from benchmarks.fleet.postgres import Server, binaries, of_nobody
+from sceneprint.engine import Engine
+from sceneprint.schemas import NewMap
+from sceneprint.settings import Settings
+
+PAGE = (Path(__file__).resolve().parent.parent / "docs" / "deployment.md").read_text()
+#: Folders that commands of the product run from, and that of PostgreSQL's.
+PATH = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+
+Run = Callable[..., str]
+
+
+def blocks(title: str) -> list[str]:
+    """Blocks of commands below a heading, up to the next one."""
+    section = re.split(r"^#+ ", PAGE.split(f"# {title}\n", 1)[1], maxsplit=1, flags=re.MULTILINE)
+    return re.findall(r"^```sh\n(.*?)^```", section[0], re.DOTALL | re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def primary(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    # as many as a standby has whose configuration nobody has written
+    folder = tmp_path_factory.mktemp("primary")
+    server = Server(folder, durable=True, options={"max_connections": "100"})
+    server.start()
+    yield server
+    server.kill()
+
+
+@pytest.fixture
+def run(primary: Server, bucket: str, tmp_path: Path) -> Run:
+    """Run a block with the environment of a node, and of the database's administrator."""
+
+    def shell(block: str, **given: str) -> str:
+        told = {
+            **os.environ, "PATH": f"{binaries()}:{PATH}", "PGHOST": "127.0.0.1",
+            "PGPORT": str(primary.port), "PGUSER": "postgres", "PGPASSWORD": "not a default",
+            "SCENEPRINT_BLOB_URL": bucket, "SCENEPRINT_DATA_DIR": str(tmp_path / "caches"), **given,
+        }  # fmt: skip
+        done = subprocess.run(
+            [*of_nobody(), "bash", "-euo", "pipefail", "-c", block],
+            env=told, cwd=tmp_path, capture_output=True, text=True, timeout=120,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
+        return done.stdout
+
+    return shell
+
+
+def database(*ports: int) -> str:
+    """The URL of a fleet's database on servers of this machine, as the environment file has it."""
+    hosts = "".join(f"host=127.0.0.1:{port}&" for port in ports)
+    return f"postgresql+psycopg://sceneprint@/sceneprint?{hosts}target_session_attrs=read-write"
+
+
+def test_commands_in_their_order(primary: Server, run: Run, tmp_path: Path) -> None:
+    (made,) = blocks("The database")
+    run(made)
+    one, there_and, back = tmp_path / "one", *blocks("From one machine to a fleet, and back")
+    with Engine(Settings(data_dir=one)) as engine:
+        engine.create_map(NewMap(name="building", model="compact"))
+    url = database(primary.port)
+    run(there_and, ONE_MACHINE=str(one), SCENEPRINT_DATABASE_URL=url)
+    assert primary.execute("SELECT name FROM maps", "sceneprint") == [("building",)]
+
+    (follow,) = blocks("A standby")
+    standby = Server(tmp_path / "standby-server")  # only for the port that it would take
+    standby_data = tmp_path / "standby"
+    told = {"STANDBY_DATA": str(standby_data), "STANDBY_PORT": str(standby.port)}
+    said = run(follow, PRIMARY_HOST="127.0.0.1", PRIMARY_PORT=str(primary.port), **told)
+    assert re.search(r"standby1 +\| streaming \| sync ", said)
+    try:
+        (node,) = blocks("Every node")
+        url = database(primary.port, standby.port)
+        said = run(node, SCENEPRINT_DATABASE_URL=url)
+        assert "WRONG" not in said, said
+        assert len(re.findall(r"\bsp_\w+", said)) == 2, said
+        primary.kill()
+        (promote,) = blocks("When the primary dies")
+        assert re.findall(r"^ (t|on|off)$", run(promote, **told), re.MULTILINE) == ["t", "off"]
+        names = "SELECT name FROM keys ORDER BY name"
+        asked = f'psql --port {standby.port} --dbname sceneprint -Atc "{names}"'
+        assert run(asked).split() == ["operator", "robot-7"]
+
+        (backup,) = blocks("Backup")
+        run(backup, SCENEPRINT_DATABASE_URL=url)
+        run(back, SCENEPRINT_DATABASE_URL=url, FOLDER=str(tmp_path / "again"))
+        with Engine(Settings(data_dir=tmp_path / "again")) as engine:
+            assert [one.name for one in engine.list_maps().items] == ["building"]
+            assert [one.name for one in engine.list_keys().items] == ["operator", "robot-7"]
+    finally:
+        run(f"pg_ctl stop --mode immediate --silent --pgdata {standby_data}")
+
+
+def test_what_root_does_is_at_least_a_shells() -> None:
+    found = re.findall(r"^```bash\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    assert found
+    for block in found:
+        done = subprocess.run(["bash", "-n", "-c", block], capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, "")

@@ -1,0 +1,41 @@
+"""The same tests on PostgreSQL: those that say most in a second; `make test-postgres` runs all."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).resolve().parent
+#: Files by what they need to begin; a process of pytest for each.
+GROUPS = {
+    "engine": (
+        "on_postgres/test_switch.py", "engine/test_uploads.py", "engine/test_jobs.py",
+        "engine/test_work.py", "engine/test_upkeep.py", "engine/test_filters.py",
+    ),
+    "service": (
+        "service/test_maps_and_frames.py", "service/test_events.py", "service/test_once.py",
+        "service/test_filters.py", "service/test_lifecycle.py",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.usefixtures("postgres")  # skips where there is no server
+@pytest.mark.parametrize("group", GROUPS)
+def test_what_holds_on_sqlite_holds_on_postgresql(group: str, tmp_path: Path) -> None:
+    outside = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-n", "0", "-q", "-p", "no:cacheprovider", "--tb=short",
+         "--basetemp", str(tmp_path / "base"), *[str(TESTS / name) for name in GROUPS[group]]],
+        env=outside | {
+            "SCENEPRINT_TEST_DATABASE": "postgresql", "PYTHONPATH": str(TESTS / "on_postgres"),
+        },
+        cwd=TESTS.parent, capture_output=True, text=True, timeout=900, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    last = done.stdout.splitlines()[-1]
+    assert "passed" in last
+    assert "failed" not in last
