@@ -20,6 +20,7 @@ from prometheus_client import (
 from sceneprint import __version__
 from sceneprint.engine.statistics import Figures
 from sceneprint.schemas import Answer, FrameState, JobState
+from sceneprint.schemas.operations import ReplicaSeen
 from service.sampling import Sampler
 
 EVENTS = "/v1/events"
@@ -74,12 +75,7 @@ class Metrics:
         )  # fmt: skip
         self._events = self._gauge("newest_event", "Number of the newest event: grows for ever.")
         self._disk = self._gauge("disk_bytes", "Disk space taken by each part.", "part")
-        self._replica = self._gauge(
-            "replica_behind_seconds", "What is older is in the read replica; 0 without one."
-        )
-        self._replica_used = self._gauge(
-            "replica_used", "1 while queries are answered from the read replica."
-        )
+        self._replica: tuple[Gauge, Gauge] | None = None  # told where there is one
         self._free = self._gauge("disk_free_bytes", "Left on the disk of the data folder.")
         self._gauge("build_info", "Version of the service.", "version", "python").labels(
             __version__, platform.python_version()
@@ -107,6 +103,16 @@ class Metrics:
         for stage, milliseconds in answer.milliseconds.items():
             self._stages.labels(stage).observe(milliseconds / 1e3)
 
+    def _tell_replica(self, seen: ReplicaSeen) -> None:
+        if self._replica is None:
+            self._replica = (
+                self._gauge("replica_used", "1 while queries are answered from the read replica."),
+                self._gauge("replica_behind_seconds", "What is older is in the read replica."),
+            )
+        used, behind = self._replica
+        used.set(seen.used)
+        behind.set(math.inf if seen.behind_s is None else seen.behind_s)
+
     def text(self, figures: Figures, streams: int) -> bytes:
         """All figures in Prometheus' text format."""
         for state in FrameState:
@@ -126,10 +132,8 @@ class Metrics:
         self._workers.labels("idle").set(len(figures.workers) - busy)
         self._began.set(figures.began)
         self._events.set(figures.events)
-        seen = figures.replica
-        self._replica.set(0.0 if seen is None else math.inf if seen.behind_s is None
-                          else seen.behind_s)  # fmt: skip
-        self._replica_used.set(seen is not None and seen.used)
+        if figures.replica is not None:
+            self._tell_replica(figures.replica)
         sizes = figures.sizes
         self._disk.labels("database").set(sizes.database or 0)
         self._disk.labels("blobs").set(sizes.blobs)

@@ -58,7 +58,7 @@ def pytest_configure(config: pytest.Config) -> None:
         folder = Path(tempfile.mkdtemp(prefix="sceneprint-"))
         server = Server(folder)
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
-        config.add_cleanup(server.kill)
+        config.add_cleanup(lambda: server.stop("immediate"))
         server.start()
         open_database(server.create(TEMPLATE)).close()
         server.execute("CREATE TABLE folders (name text, place text)")
@@ -130,7 +130,7 @@ def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         open_database(server.create(TEMPLATE)).close()
         yield server
     finally:
-        server.kill()  # nobody looks at its data again
+        server.stop("immediate")  # nobody looks at its data again
         shutil.rmtree(server.folder, ignore_errors=True)  # it is large
 
 

@@ -11,8 +11,7 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, cast
@@ -21,6 +20,7 @@ import numpy as np
 
 from benchmarks.fleet.metering import Meter, Work, memory_of
 from benchmarks.fleet.pair import DATABASE, Pair
+from benchmarks.fleet.paper import Costs, paper
 from benchmarks.fleet.recordings import ROOM_FRAMES, recordings
 from benchmarks.machine import describe_machine
 from benchmarks.pages import put_between
@@ -37,35 +37,6 @@ BEGIN, END = "<!-- fleet-costs:begin -->", "<!-- fleet-costs:end -->"
 MAP = "costs"
 #: Commits that are timed, and codes that are linked.
 COMMITS, CODES, DIMENSION = 300, 30_000, 128
-
-
-@dataclass
-class Costs:
-    """All that was measured.
-
-    Parameters
-    ----------
-    model, signature_bytes : that signed
-    frames : how many were uploaded and signed
-    upload, sign, query : see Work; the query has all stages, k = 5
-    tables : bytes a frame of tables with their indexes, by name
-    blobs : bytes a frame of uploads, and of geometry artifacts
-    commit_ms : p50 and p99 of the smallest write in its turn, without and with a standby
-    linked : codes a second that enter the graph (HNSW), and its bytes a code with the table
-    memory : bytes that a service and a worker have for themselves, after some work
-    """
-
-    model: str
-    signature_bytes: int
-    frames: int
-    upload: Work
-    sign: Work
-    query: Work
-    tables: Mapping[str, float]
-    blobs: tuple[float, float]
-    commit_ms: Mapping[str, tuple[float, float]]
-    linked: tuple[float, float, float] | None
-    memory: Mapping[str, int] = field(default_factory=dict)
 
 
 def measure(folder: Path, data: Path, n: int, model: str) -> Costs:
@@ -244,7 +215,8 @@ def table(found: Costs) -> list[str]:
     for name, one in (("upload", found.upload), ("sign", found.sign), ("query", found.query)):
         lines.append(
             f"| {name} | {one.wall_ms:.1f} | {one.own_ms:.1f} | {one.database_ms:.1f} | "
-            f"{one.turn_ms:.1f} | {one.commits:.1f} | {one.wal_bytes:,.0f} |"
+            f"{one.turn_ms:.1f} | {one.commits[0]:.1f} + {one.commits[1]:.1f} | "
+            f"{one.wal_bytes:,.0f} |"
         )
     rows = sum(found.tables.values())
     told = ", ".join(
@@ -290,7 +262,7 @@ def main(arguments: list[str] | None = None) -> int:
         f"Measured {datetime.now(UTC):%Y-%m-%d} on {machine.processor}, {machine.cores} "
         "processors; `python -m benchmarks.fleet.costs`."
     )
-    lines = ["", when, "", *table(found)]
+    lines = ["", when, "", *table(found), *paper(found)]
     print("\n".join(lines))
     if options.page is not None:
         put_between(options.page, BEGIN, END, lines)

@@ -16,7 +16,7 @@ from typing import cast
 
 from sqlalchemy import Connection
 
-from benchmarks.fleet.pair import DATABASE, Pair
+from benchmarks.fleet.pair import Pair
 from sceneprint.cli.served import serving
 from sceneprint.client import Client
 from sceneprint.datasets import FrameReference
@@ -35,7 +35,7 @@ class Work:
     wall_ms : median
     own_ms, database_ms : of a processor, in this process and in the primary's
     turn_ms : in which no other process could write
-    commits : that wrote
+    commits : in turn, and of those that need none
     wal_bytes : of the primary's log
     """
 
@@ -43,7 +43,7 @@ class Work:
     own_ms: float
     database_ms: float
     turn_ms: float
-    commits: float
+    commits: tuple[float, float]
     wal_bytes: float
 
 
@@ -58,6 +58,7 @@ class Meter:
     def __init__(self, pair: Pair) -> None:
         self._pair = pair
         self._turn_s = 0.0
+        self._commits = [0, 0]
 
     @contextmanager
     def running(self) -> Iterator[Callable[[Sequence[float]], Work]]:
@@ -72,6 +73,7 @@ class Meter:
             begun = time.perf_counter()
             with write(database, unchecked=unchecked, turn=turn) as connection:
                 yield connection
+            meter._commits[not turn] += 1
             if turn:
                 meter._turn_s += time.perf_counter() - begun
 
@@ -79,29 +81,26 @@ class Meter:
 
         def told(seconds: Sequence[float]) -> Work:
             after = self._reading()
-            own, database, turn, commits, wal = (
+            own, database, turn, commits, others, wal = (
                 (b - a) / len(seconds) for a, b in zip(before, after, strict=True)
             )
             return Work(
-                1e3 * statistics.median(seconds), 1e3 * own, 1e3 * database, 1e3 * turn, commits,
-                wal,
+                1e3 * statistics.median(seconds), 1e3 * own, 1e3 * database, 1e3 * turn,
+                (commits, others), wal,
             )  # fmt: skip
 
-        Database.write = timed  # type: ignore[method-assign]
+        Database.write = timed  # type: ignore[method-assign, assignment]
         try:
             yield told
         finally:
-            Database.write = write  # type: ignore[method-assign]
+            Database.write = write  # type: ignore[method-assign, assignment]
 
-    def _reading(self) -> tuple[float, float, float, float, float]:
+    def _reading(self) -> tuple[float, ...]:
         primary = self._pair.primary
-        [(number, wal)] = primary.execute(
-            "SELECT pg_snapshot_xmax(pg_current_snapshot())::text::bigint, "
-            "pg_wal_lsn_diff(pg_current_wal_lsn(), '0/0')::bigint",
-            DATABASE,
-        )
+        [(wal,)] = primary.execute("SELECT pg_wal_lsn_diff(pg_current_wal_lsn(), '0/0')::bigint")
         spent = _spent(int((primary.data / "postmaster.pid").read_text().split()[0]))
-        return time.process_time(), spent, self._turn_s, cast(int, number), cast(int, wal)
+        own = time.process_time()
+        return own, spent, self._turn_s, *self._commits, cast(int, wal)
 
 
 def _spent(postmaster: int) -> float:

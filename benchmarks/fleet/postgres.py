@@ -5,6 +5,7 @@ Server(folder)  --start-->  url(database)  --kill | stop | standby | promote--> 
 
 from __future__ import annotations
 
+import ctypes
 import os
 import random
 import shutil
@@ -26,6 +27,8 @@ OPTIONS = {
     "shared_buffers": "32MB", "max_connections": "200", "unix_socket_directories": "",
     "listen_addresses": "127.0.0.1", "jit": "off", "logging_collector": "off",
     "log_timezone": "UTC", "timezone": "UTC", "max_wal_size": "256MB",
+    # in its folder: nobody else would remove from /dev/shm what a killed one leaves
+    "dynamic_shared_memory_type": "mmap",
 }  # fmt: skip
 #: What a test need not wait for: a SIGKILL loses nothing that the kernel has.
 FORGETFUL = {"fsync": "off", "full_page_writes": "off"}
@@ -167,6 +170,7 @@ class Server:
             self._process.wait(PATIENCE_S)
             while any(map(_lives, children)):
                 time.sleep(0.01)
+            self._remove_segment()
         self._forget()
 
     def create(self, database: str, template: str | None = None) -> str:
@@ -236,6 +240,12 @@ class Server:
         except OSError:
             return False
         return len(lines) >= 8 and lines[7].strip() == "ready"
+
+    def _remove_segment(self) -> None:
+        """What marks that a server has this folder, and outlives it; there are only so many."""
+        with suppress(OSError, IndexError, ValueError):
+            line = (self.data / "postmaster.pid").read_text().splitlines()[6]
+            ctypes.CDLL(None).shmctl(int(line.split()[1]), 0, None)  # IPC_RMID
 
     def _forget(self) -> None:
         self._process = None

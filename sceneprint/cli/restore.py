@@ -128,6 +128,11 @@ def _made(
     """Restored to a folder."""
     from sceneprint.maintenance.restoring import restore_snapshot
 
+    if settings.blob_url is not None:
+        raise InvalidRequest(
+            "SCENEPRINT_BLOB_URL is set, and blobs are restored to the data folder, where no "
+            "service would look then. Unset it, or restore into a fleet: --database."
+        )
     with shown_progress("restore") as progress:
         snapshot, aside = restore_snapshot(
             archive, settings.data_dir, replace=options.replace, progress=progress

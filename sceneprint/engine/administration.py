@@ -71,6 +71,7 @@ class Administration:
         self.store = open_store(
             settings.database, settings.blobs,
             None if replica is None else replica.get_secret_value(), settings.replica_lag_s,
+            settings.purge_s,
         )  # fmt: skip
         self.signers = Signers(self.store.database, settings.cache_dir)
         self._upkeep = Upkeep(

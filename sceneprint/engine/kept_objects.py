@@ -73,7 +73,7 @@ class KeptObjects:
         done: list[bool] = []
         # of its own, and nobody waits for it in the end: a store that hangs costs no query more
         sending = threading.Thread(
-            target=self._send, args=(kept.answer.query_id, data, done), daemon=True
+            target=self._send, args=(kept.answer.query_id, data, done), daemon=True, name="keep"
         )
         try:
             sending.start()

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from sceneprint.engine.engine import Engine
-from sceneprint.errors import StoreAway
+from sceneprint.errors import StoreAway, UnusableStore
 from sceneprint.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -34,6 +34,11 @@ def open_engine(
     ------
     UnusableStore, NewerSchema : see Engine. Of a server that is away, once it was waited for.
     """
+    if str(settings.blobs).startswith("memory:"):
+        raise UnusableStore(
+            "SCENEPRINT_BLOB_URL=memory:/// keeps blobs in one process, and a service has workers "
+            "of its own: they would find none. Use file:///folder, or `Client.embedded`."
+        )
     until, said = time.monotonic() + patience_s, False
     while True:
         try:

@@ -29,7 +29,7 @@ from sceneprint.schemas import (
 )
 from sceneprint.schemas.options import MOST_MAPS
 from sceneprint.store import Store
-from sceneprint.store.maps import find_map, list_maps, model_names, unknown_map
+from sceneprint.store.maps import find_maps, list_maps, model_names, unknown_map
 from sceneprint.store.records import MapRow
 from sceneprint.store.replica import asked
 
@@ -94,17 +94,15 @@ class Queries:
         self, asked_of: Sequence[MapRow], asked: Asked, query: Query, deadline: Deadline
     ) -> Answer:
         """Answer from the maps as they are now; ModelMismatch where one has switched meanwhile."""
-        rows = []
         database = self._store.queried
         with database.read() as connection:
-            for one in asked_of:
-                row = find_map(connection, one.name)
+            rows = find_maps(connection, [one.name for one in asked_of])
+            for row, one in zip(rows, asked_of, strict=True):
                 if row.number != one.number:
                     raise UnknownMap(
                         f"Map {row.name!r} was deleted and made anew while it was asked. Ask again."
                     )
                 check_model(asked.model_id, row.model_id)
-                rows.append(row)
             views = self._readers.views(connection, database, rows)
         places = [Place(row, view) for row, view in zip(rows, views, strict=True)]
         for place in places:

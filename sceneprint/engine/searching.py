@@ -6,7 +6,7 @@ signature, Places  --search_maps-->  Searched
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -24,6 +24,10 @@ from sceneprint.store import Store
 from sceneprint.store.filters import passing
 from sceneprint.store.records import MapRow
 from sceneprint.types import Bytes
+
+#: Maps of WHOLE frames that are compared whole in one query. Of more frames together, a map is
+#: compared whole up to CHEAP of its own: its code costs as much as comparing 512 frames.
+MANY_WHOLE, CHEAP = 4, 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +118,11 @@ def search_maps(
     model : of all of them
     """
     parts = tuple(_part(store, place, asked, query) for place in places)
+    together = sum(part.passed for part in parts if part.place.view.kind == "local")
+    parts = tuple(
+        replace(part, exact=query.exact or compares_all(part.place.view, part.passed, together))
+        for part in parts
+    )
     size = ranking_size(sum(part.passed for part in parts))
     hits = _searched(asked.vector, parts, size, query.exact)
     keys = np.concatenate([one.keys for one in hits])
@@ -126,11 +135,18 @@ def search_maps(
                     owners[first], size)  # fmt: skip
 
 
-def compares_all(view: Shortlist, passed: int) -> bool:
+def compares_all(view: Shortlist, passed: int, together: int = 0) -> bool:
     """Whether so few frames of a map are compared whole; the database, which sends each, decides
     that itself.
+
+    Parameters
+    ----------
+    view : of the map
+    passed : frames of it that may be found
+    together : such frames of all maps that are asked; of very many small maps are compared whole
     """
-    return view.kind == "local" and passed <= WHOLE
+    most = WHOLE if together <= MANY_WHOLE * WHOLE else min(WHOLE, CHEAP)
+    return view.kind == "local" and passed <= most
 
 
 def is_shortlisted(searched: Searched, asked: Asked, part: Part, number: int) -> bool:
@@ -178,8 +194,7 @@ def _part(store: Store, place: Place, asked: Asked, query: Query) -> Part:
     among = None
     if query.filter is not None:
         among = _among(store, place, dead, asked, query.filter)
-    passed = size if among is None else len(among)
-    return Part(place, dead, among, size, query.exact or compares_all(view, passed))
+    return Part(place, dead, among, size, query.exact)
 
 
 def _among(store: Store, place: Place, dead: frozenset[int], asked: Asked, wanted: Filter) -> Keys:

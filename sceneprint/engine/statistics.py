@@ -192,7 +192,7 @@ class Statistics:
             )
 
     def workers(self, connection: Connection) -> list[WorkerSeen]:
-        """Processes that wait for jobs, of SQLite on this machine, and those that have one in hand."""
+        """Processes that wait for jobs, with SQLite on this machine, and those that have one."""
         busy = at_work(connection, read_clock(connection))
         names = sorted({*self._bell.listeners(connection), *busy})
         return [WorkerSeen(name=name, job_id=busy.get(name)) for name in names]

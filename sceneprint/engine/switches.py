@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from sceneprint.errors import Busy, ModelMismatch, SceneprintError, UnknownMap
 from sceneprint.store import Store
-from sceneprint.store.maps import find_map
+from sceneprint.store.maps import find_maps
 from sceneprint.store.records import MapRow
 
 T = TypeVar("T")
@@ -31,7 +31,7 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
     Busy : a map switched again and again.
     """
     with store.queried.read() as connection:
-        rows = [find_map(connection, name) for name in maps]
+        rows = find_maps(connection, maps)
     for _ in range(TRIES):
         try:
             found = ask(rows)
@@ -68,7 +68,7 @@ def _other_models(store: Store, rows: Sequence[MapRow]) -> list[MapRow] | None:
     """The maps where one of them has another model by now, or None."""
     try:
         with store.queried.read() as connection:
-            now = [find_map(connection, row.name) for row in rows]
+            now = find_maps(connection, [row.name for row in rows])
     except UnknownMap:
         return None
     pairs = list(zip(now, rows, strict=True))

@@ -18,6 +18,7 @@ from sqlalchemy import select
 
 from sceneprint.errors import SceneprintError, UnusableStore
 from sceneprint.maintenance.blobs import check_artifacts, check_uploads
+from sceneprint.maintenance.counting import check_counts
 from sceneprint.maintenance.files import check_files
 from sceneprint.maintenance.findings import Finding, Folder, Progress, is_of_rows
 from sceneprint.maintenance.generations import check_indexes
@@ -38,8 +39,8 @@ from sceneprint.store.tables import frames
 GRACE_S = 3600.0
 
 _CHECKS: tuple[Callable[[Folder], Iterator[Finding]], ...] = (
-    check_database, check_models, check_rows, check_signatures, check_uploads, check_artifacts,
-    check_products, check_files, check_indexes, check_tables,
+    check_database, check_models, check_rows, check_counts, check_signatures, check_uploads,
+    check_artifacts, check_products, check_files, check_indexes, check_tables,
 )  # fmt: skip
 
 

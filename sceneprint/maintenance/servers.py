@@ -55,7 +55,7 @@ def _dangling(folder: Folder, key: ForeignKeyConstraint, restore: str) -> Iterat
     child, parent = key.table, key.referred_table
     form, pairs = Form(child), [(one.parent, one.column) for one in key.elements]
     lost = (
-        select(child.primary_key.columns)
+        select(*child.primary_key.columns)
         .join(parent, and_(*(own == its for own, its in pairs)), isouter=True)
         .where(*(own.is_not(None) for own, _ in pairs), *(its.is_(None) for _, its in pairs))
         .limit(_MOST)

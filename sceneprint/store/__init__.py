@@ -64,8 +64,9 @@ class Store:
 
 
 def open_store(
-    url: str, blobs: Path | str, replica_url: str | None = None, replica_lag_s: float = 0.0
-) -> Store:
+    url: str, blobs: Path | str, replica_url: str | None = None, replica_lag_s: float = 0.0,
+    purge_s: float = 3600.0,
+) -> Store:  # fmt: skip
     """Open both, made where both are missing.
 
     The folder of a database that is there is never made: its disk is not mounted, and what was
@@ -76,12 +77,13 @@ def open_store(
     url : of the database
     blobs : folder, or URL of an object store
     replica_url, replica_lag_s : see Replica; it need not be there
+    purge_s : see `open_blobs`
 
     Raises
     ------
     UnusableStore, NewerSchema : see `open_database`, `open_blobs` and Replica.
     """
-    opened = _open_store(url, blobs)
+    opened = _open_store(url, blobs, purge_s)
     if replica_url is None:
         return opened
     try:
@@ -91,7 +93,7 @@ def open_store(
         raise
 
 
-def _open_store(url: str, blobs: Path | str) -> Store:
+def _open_store(url: str, blobs: Path | str, purge_s: float) -> Store:
     new = not is_sealed(url) and not is_there(url)
     if isinstance(blobs, Path):
         kept = FolderBlobs(blobs, make=new)  # the data folder is made with it
@@ -100,15 +102,16 @@ def _open_store(url: str, blobs: Path | str) -> Store:
         _make_folder_of(url)
     database = open_database(url)
     try:
-        return Store(database, open_blobs(blobs, database))
+        return Store(database, open_blobs(blobs, database, purge_s=purge_s))
     except BaseException:
         database.close()
         raise
 
 
 def open_blobs(
-    blobs: Path | str, database: Database, *, make: bool = False, claim: bool = True
-) -> Blobs:
+    blobs: Path | str, database: Database, *, make: bool = False, claim: bool = True,
+    purge_s: float = 3600.0,
+) -> Blobs:  # fmt: skip
     """Open the blobs that a database refers to.
 
     An object store that is away is no error yet: what is asked of it is refused while it is.
@@ -119,6 +122,7 @@ def open_blobs(
     database : whose they are
     make : a folder that is missing
     claim : mark a prefix of an object store that is nobody's yet; else it is looked at alone
+    purge_s : seconds after which nothing is left in memory of what another process removed
 
     Raises
     ------
@@ -134,7 +138,7 @@ def open_blobs(
         raise UnusableStore("Blobs in an object store need a database that is kept: name a file.")
     else:
         locks = SessionLocks(database)
-    found = ObjectBlobs(objects, locks, lambda: Seals(database).owner)
+    found = ObjectBlobs(objects, locks, lambda: Seals(database).owner, purge_s)
     try:
         found.claim(anew=claim and not database.read_only)
     except StoreAway as error:

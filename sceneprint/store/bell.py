@@ -78,12 +78,12 @@ class Bell:
         for name in names:
             self._ring(self._folder / name)
 
-    def listeners(self, connection: Connection | None = None) -> list[str]:
+    def listeners(self, _connection: Connection | None = None) -> list[str]:
         """Host and process id, as `host:pid`, of every process of this machine that listens.
 
         Parameters
         ----------
-        connection : of the database, where there is one at hand: a server knows who listens
+        _connection : of the database, where there is one at hand: a server knows who listens
         """
         try:
             names = sorted(os.listdir(self._folder))  # noqa: PTH208

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, event
+from sqlalchemy import Connection, Engine, NullPool, create_engine, event
 
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
 from sceneprint.store.faults import explained, shown

@@ -11,7 +11,7 @@ from sqlalchemy import ColumnElement, Connection, func, insert, select, update
 
 from sceneprint.errors import UnknownFrame
 from sceneprint.schemas import FrameState
-from sceneprint.store.blocks import blocks
+from sceneprint.store.blocks import among, blocks
 from sceneprint.store.deleting import delete_frames
 from sceneprint.store.quotas import ROOMLESS, count_on
 from sceneprint.store.records import FrameRow, MapRow, frame_row
@@ -151,7 +151,9 @@ def frames_of(connection: Connection, numbers: Iterable[int]) -> dict[int, Frame
     found: dict[int, FrameRow] = {}
     for some in blocks(numbers):
         rows = connection.execute(
-            select(frames).where(frames.c.number.in_(some), frames.c.state != FrameState.DELETED)
+            select(frames).where(
+                among(connection, frames.c.number, some), frames.c.state != FrameState.DELETED
+            )
         ).mappings()
         found |= {row["number"]: frame_row(row) for row in rows}
     return found
@@ -218,9 +220,7 @@ def _free(connection: Connection, map_number: int, frame_id: str) -> None:
     )
 
 
-def _weigh(
-    connection: Connection, number: int, state: FrameState | None, size: int | None
-) -> None:
+def _weigh(connection: Connection, number: int, state: FrameState | None, size: int | None) -> None:
     """Count what a frame takes from now on.
 
     Parameters

@@ -9,7 +9,7 @@ from sqlalchemy import Connection, func, select
 
 from sceneprint.errors import UnknownJob
 from sceneprint.schemas import JobState
-from sceneprint.store.blocks import blocks
+from sceneprint.store.blocks import among, blocks
 from sceneprint.store.records import JobRow, job_row
 from sceneprint.store.tables import frames, jobs, maps
 
@@ -118,7 +118,7 @@ def jobs_of(connection: Connection, frame_numbers: list[int]) -> dict[int, JobRo
     for some in blocks(frame_numbers):
         rows = connection.execute(
             select(jobs)
-            .where(jobs.c.frame_number.in_(some), jobs.c.kind == "sign")
+            .where(among(connection, jobs.c.frame_number, some), jobs.c.kind == "sign")
             .order_by(jobs.c.number)
         ).mappings()
         found |= {row["frame_number"]: job_row(row) for row in rows}

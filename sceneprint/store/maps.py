@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from sqlalchemy import Connection, delete, func, insert, select, update
 
@@ -36,6 +36,18 @@ def find_map(connection: Connection, name: str) -> MapRow:
     if row is None:
         raise unknown_map(name)
     return map_row(row)
+
+
+def find_maps(connection: Connection, names: Sequence[str]) -> list[MapRow]:
+    """The maps of some names, in their order, by one statement; UnknownMap where one is none."""
+    if len(names) == 1:
+        return [find_map(connection, names[0])]
+    found = connection.execute(select(maps).where(maps.c.name.in_(names))).mappings()
+    rows = {row["name"]: map_row(row) for row in found}
+    for name in names:
+        if name not in rows:
+            raise unknown_map(name)
+    return [rows[name] for name in names]
 
 
 def unknown_map(name: str) -> UnknownMap:

@@ -29,6 +29,7 @@ from sceneprint.store.faults import unusable
 from sceneprint.store.incoming import IncomingBlob
 from sceneprint.store.locks import Locks
 from sceneprint.store.objects import Objects
+from sceneprint.store.recent import Recent
 from sceneprint.writing import sync_folder
 
 #: Under the prefix: the blobs, and the name of whom they belong to.
@@ -47,10 +48,14 @@ class ObjectBlobs:
     objects : of the prefix
     locks : of all that share it
     owner : tells what the store is called that they belong to
+    purge_s : seconds after which nothing is left in memory of what another process removed
     """
 
-    def __init__(self, objects: Objects, locks: Locks, owner: Callable[[], str]) -> None:
+    def __init__(
+        self, objects: Objects, locks: Locks, owner: Callable[[], str], purge_s: float = 3600.0
+    ) -> None:
         self.objects = objects
+        self._recent = Recent(purge_s)
         self._locks, self._owner = locks, owner
         self._claimed = False
         self._put: OrderedDict[str, int] = OrderedDict()  # removals until then, by digest
@@ -137,6 +142,9 @@ class ObjectBlobs:
     def get(self, digest: str) -> bytes:
         """The bytes of a digest, checked against it; see `Blobs.get`."""
         require_digest(digest)
+        recent = self._recent.get(digest)
+        if recent is not None:
+            return recent
         try:
             data = self.objects.get(_key(digest))
         except FileNotFoundError as error:
@@ -149,6 +157,7 @@ class ObjectBlobs:
                 f"The blob {digest[:12]} is damaged: its content has another hash. Restore it "
                 "from a copy, or delete the frame and upload it again."
             )
+        self._recent.put(digest, data)
         return data
 
     def open(self, digest: str) -> BinaryIO:
@@ -188,6 +197,7 @@ class ObjectBlobs:
         self.claim()
         with self._lock:
             self._put.pop(digest, None)
+        self._recent.remove(digest)
         self.objects.delete(_key(digest))
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
@@ -269,8 +279,9 @@ class ObjectBlobs:
         return None
 
     def close(self) -> None:
-        """Give back the connections of its locks."""
+        """Give back the connections of its locks, and what was read lately."""
         self._locks.close()
+        self._recent.close()
 
 
 def _key(digest: str) -> str:

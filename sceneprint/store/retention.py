@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 
 from sqlalchemy import ColumnElement, Connection, delete, func, or_, select
 
-from sceneprint.store.blocks import blocks
+from sceneprint.store.blocks import among, blocks
 from sceneprint.store.events import Wanted, newest_number
 from sceneprint.store.former import last_event
 from sceneprint.store.tables import events, maps
@@ -108,7 +108,7 @@ def spent_numbers(
 def remove_events(connection: Connection, numbers: Sequence[int]) -> None:
     """Remove events; see `spent_numbers`."""
     for some in blocks(numbers):
-        connection.execute(delete(events).where(events.c.number.in_(some)))
+        connection.execute(delete(events).where(among(connection, events.c.number, some)))
 
 
 def _names(connection: Connection) -> list[str]:

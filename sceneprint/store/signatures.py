@@ -11,7 +11,7 @@ from sqlalchemy import Connection, delete, func, insert, select, update
 
 from sceneprint.errors import DamagedSignature
 from sceneprint.schemas import FrameState
-from sceneprint.store.blocks import blocks
+from sceneprint.store.blocks import among, blocks
 from sceneprint.store.maps import next_revision
 from sceneprint.store.records import FrameRow, MapRow
 from sceneprint.store.tables import frames, maps, signatures
@@ -192,7 +192,8 @@ def geometry_blobs(connection: Connection, numbers: Iterable[int], model_id: str
     for some in blocks(numbers):
         rows = connection.execute(
             select(signatures.c.frame_number, signatures.c.geometry).where(
-                signatures.c.frame_number.in_(some), signatures.c.model_id == model_id
+                among(connection, signatures.c.frame_number, some),
+                signatures.c.model_id == model_id,
             )
         )
         found |= {row.frame_number: row.geometry for row in rows}
@@ -239,7 +240,8 @@ def stored_signatures(
     for some in blocks(numbers):
         rows = connection.execute(
             select(signatures.c.frame_number, signatures.c.vector, signatures.c.checksum).where(
-                signatures.c.frame_number.in_(some), signatures.c.model_id == model_id
+                among(connection, signatures.c.frame_number, some),
+                signatures.c.model_id == model_id,
             )
         )
         found |= {n: bytes(vector) for n, vector, checksum in rows if crc32(vector) == checksum}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, func, select
 
 from sceneprint.schemas import FrameState
-from sceneprint.store.tables import frames, signatures
+from sceneprint.store.tables import frames
 
 #: Number of a frame, its signature, and the CRC-32 that it had when it was stored.
 Vector = tuple[int, bytes, int]
@@ -35,24 +35,25 @@ def heads(
     connection: Connection, numbers: Collection[int], map_numbers: Collection[int], model_id: str
 ) -> list[Head]:
     """Signatures of those of some frames that can be found in the maps, by number."""
-    # one table after the other: of a join of tables it has no figures of yet the planner makes
-    # a hundred times the work
-    there = connection.execute(
-        select(frames.c.number, frames.c.map_number).where(
-            frames.c.number == func.any(list(numbers)), frames.c.state == FrameState.INDEXED
-        )
-    )
+    # one table after the other, by nothing but its key, of its own type: of a join, or a state, of
+    # tables that it has no figures of yet, the planner makes a hundred times the work
     wanted = set(map_numbers)
-    of = {number: of_map for number, of_map in there if of_map in wanted}
-    found = connection.execute(
-        select(signatures.c.frame_number, signatures.c.checksum).where(
-            signatures.c.frame_number == func.any(list(of)), signatures.c.model_id == model_id
+    of = {
+        number: of_map
+        for number, of_map, state in _read(
+            connection,
+            "SELECT number, map_number, state FROM frames WHERE number = ANY(%s::bigint[])",
+            (list(numbers),),
         )
+        if of_map in wanted and state == FrameState.INDEXED
+    }
+    found = _read(
+        connection,
+        "SELECT frame_number, checksum FROM signatures "
+        "WHERE frame_number = ANY(%s::bigint[]) AND model_id = %s ORDER BY frame_number",
+        (list(of), model_id),
     )
-    return sorted(
-        (Head(number, of[number], checksum) for number, checksum in found),
-        key=lambda head: head.number,
-    )
+    return [Head(number, of[number], checksum) for number, checksum in found]
 
 
 def vectors(connection: Connection, numbers: Collection[int], model_id: str) -> list[Vector]:
@@ -60,7 +61,7 @@ def vectors(connection: Connection, numbers: Collection[int], model_id: str) -> 
     return _read(
         connection,
         "SELECT frame_number, vector, checksum FROM signatures "
-        "WHERE frame_number = ANY(%s) AND model_id = %s ORDER BY frame_number",
+        "WHERE frame_number = ANY(%s::bigint[]) AND model_id = %s ORDER BY frame_number",
         (list(numbers), model_id),
     )
 

@@ -236,7 +236,7 @@ def test_maps_are_listed_made_and_deleted(sceneprint: Run, house: str) -> None:
         "There is no map 'hall'" in sceneprint("maps", "--delete", "hall", "--yes", expect=2).stderr
     )
     assert "name: String should match" in sceneprint("maps", "--create", "A b", expect=2).stderr
-    assert "Add --create" in sceneprint("maps", "--title", "x", expect=2).stderr
+    assert "--create NAME or --edit" in sceneprint("maps", "--title", "x", expect=2).stderr
 
 
 def test_a_service_that_is_not_there(sceneprint: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -288,3 +288,22 @@ def test_a_query_goes_on_after_a_file_that_is_not_taken(
     assert [json.loads(line)["name"] for line in done.stdout.splitlines()] \
         == ["seq-01/frame-000000", "seq-01/frame-000002"]  # fmt: skip
     assert done.stderr == f"seq-01/frame-000001: {error}\n"
+
+
+def test_a_map_has_limits(sceneprint: Run, house: str) -> None:
+    made = sceneprint("maps", "--create", "small", "--model", "compact", "--quota-frames", "2")
+    assert re.fullmatch(r"map small, compact-\w{12}, 0 of 2 frames\n", made.stdout)
+    changes = ("--quota-frames", "none", "--quota-bytes", "1500000", "--retention-days", "30")
+    done = sceneprint("maps", "--edit", "small", "--title", "Small", *changes).stdout
+    assert done.endswith(", 0.0 of 1.5 MB, kept 30 days\n")
+    [line] = [one for one in sceneprint("maps").stdout.splitlines() if one.startswith("small ")]
+    assert line.endswith("  Small  (0.0 of 1.5 MB, kept 30 days)")
+    told = sceneprint("maps", "--edit", house, "--retention-days", "0.000001", expect=2).stderr
+    assert "would delete 6 frames of map" in told
+    assert "Add --yes" in told
+    told = sceneprint("maps", "--edit", house, "--retention-days", "1000", "--json").stdout
+    assert Map.model_validate_json(told).frames["indexed"] == 6
+    sceneprint("maps", "--edit", house, "--retention-days", "none")
+    assert "Nothing to change" in sceneprint("maps", "--edit", house, expect=2).stderr
+    assert "--create NAME or --edit" in sceneprint("maps", "--quota-bytes", "1", expect=2).stderr
+    sceneprint("maps", "--delete", "small", "--yes")

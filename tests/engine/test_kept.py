@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import uuid
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,13 @@ import numpy as np
 import pytest
 
 from sceneprint.engine import kept_folder as module
+from sceneprint.engine import kept_objects
 from sceneprint.engine.kept import Kept, KeptQueries
 from sceneprint.engine.kept_folder import KeptFolder
 from sceneprint.errors import UnknownQuery
 from sceneprint.schemas import Answer, Counts, Query, SeveralQuery
 from sceneprint.store.filters import Taken
+from sceneprint.store.objects import open_objects
 
 COUNTS = Counts(map=0, passed=0, compared=0, ranked=0, selected=0, validated=0, accepted=0)
 
@@ -165,3 +168,46 @@ def test_a_folder_that_cannot_be_written_costs_nothing(tmp_path: Path) -> None:
     assert not queries.keep(one)
     with pytest.raises(UnknownQuery):
         queries.find(one.answer.query_id)
+
+
+def test_answers_go_when_they_are_old_or_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    objects = open_objects("memory:///")
+    kept = kept_objects.KeptObjects(objects, 3600.0, 10_000, purge_s=3600.0)
+    many = [made(1000) for _ in range(12)]
+    assert all(kept.keep(one) for one in many)
+    left = {key.rpartition("/")[2] for key in [one.key for one in objects.list("queries/")]}
+    assert left == {one.answer.query_id for one in many[-len(left) :]}  # the newest
+    assert 4 <= len(left) < 10
+    newest = many[-1].answer.query_id
+    again = kept.find(newest)
+    assert (again.answer, again.geometry) == (many[-1].answer, many[-1].geometry)
+    assert not kept.keep(made(10_000))
+    for name in (many[0].answer.query_id, "../sceneprint.json", "0" * 32):
+        with pytest.raises(UnknownQuery):
+            kept.find(name)
+    # of another process, that died: whoever goes through them all removes them
+    other = kept_objects.KeptObjects(objects, 3600.0, 10_000, purge_s=3600.0)
+    assert other.forget(lambda one: one.answer.query_id != newest) == 1
+    with pytest.raises(UnknownQuery):
+        kept.find(newest)
+    assert other.forget(lambda _: False) == 0  # it was done just now
+    objects.delete("queries/.looked")
+    short = kept_objects.KeptObjects(objects, 0.0, 10_000)
+    assert short.forget(lambda _: True) == len(left) - 1
+    assert [one.key for one in objects.list("queries/")] == ["queries/.looked"]
+    one = made(10)
+    assert short.keep(one)
+    with pytest.raises(UnknownQuery):
+        short.find(one.answer.query_id)
+    monkeypatch.setattr(kept_objects, "_UNDER_WAY", 0)
+    assert not kept_objects.KeptObjects(objects, 1.0, 10_000).keep(one)
+
+
+def test_what_cannot_be_kept_costs_no_answer(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    monkeypatch.setattr("sceneprint.store.objects.TRIED_S", 0)
+    kept = kept_objects.KeptObjects(open_objects(bucket), 60.0, 10_000)
+    assert not kept.keep(made(10))
+    for one in threading.enumerate():
+        if one.name == "keep":
+            one.join()

@@ -5,6 +5,7 @@ First they are found in each place where they may be; then it is deleted, and th
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +22,7 @@ from sceneprint.index import newest
 from sceneprint.schemas import NewMap, Query
 from sceneprint.schemas.reconstructions import NewReconstruction
 from sceneprint.store.editing import write_frame
-from sceneprint.store.frames import find_frame
+from sceneprint.store.frames import delete_frame, find_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import geometry_blobs, stored_vector
 
@@ -54,7 +55,7 @@ def rows(engine: Engine) -> Iterator[tuple[str, bytes]]:
         for table in inspect(connection).get_table_names():
             told = connection.execute(text(f'SELECT t::text FROM "{table}" t')).scalars()
             for row in told:
-                raw = b"".join(map(bytes.fromhex, re.findall(r'x([0-9a-f]{40,})', row)))
+                raw = b"".join(map(bytes.fromhex, re.findall(r"x([0-9a-f]{40,})", row)))
                 yield f"table {table}", row.encode() + raw
 
 
@@ -160,3 +161,40 @@ def test_no_byte_of_a_map_is_left(lived_in, secret, ids, uploads, tmp_path):
     for what, wanted in secret.items():
         assert places(engine, tmp_path, wanted) == set(), what
     assert list(engine.store.blobs.digests()) == []
+
+
+def test_readers_let_go_of_what_was_deleted(empty, uploads, work_off):
+    engine = empty
+    for one in uploads[:3]:
+        engine.add_frame("hall", one.data, one.meta)
+    work_off(engine)
+    view = engine.view("hall")[2]
+    gone = bytes(view.tail.signatures[0])
+    engine.delete_frame("hall", engine.list_frames("hall").items[0].frame_id)
+    held = engine.view("hall")[2]
+    assert (held.size, len(held.tail), bytes(held.tail.signatures[0])) == (2, 3, gone)
+    with engine.store.database.read() as connection:
+        engine._readers.purge(connection)
+    now = engine.view("hall")[2]
+    assert (now.size, len(now.tail), now.revision) == (2, 2, held.revision)
+    assert gone not in now.tail.signatures.tobytes()
+    assert now.tail.signatures.tobytes() == view.tail.signatures[1:].tobytes()
+
+
+def test_what_a_snapshot_or_a_crash_left_goes_later(empty, uploads):
+    engine, (a, b, *_) = empty, uploads
+    for one in (a, b):
+        engine.add_frame("hall", one.data, one.meta)
+    first, second = (one.frame_id for one in engine.list_frames("hall").items)
+    with engine.store.blobs.kept():  # as while a snapshot is being taken
+        engine.delete_frame("hall", first)
+        assert len(list(engine.store.blobs.digests())) == 2
+        assert engine.purging.now().blobs == 1
+    assert len(list(engine.store.blobs.digests())) == 2
+    with engine.store.database.write() as connection:  # and then the process died
+        row = find_map(connection, "hall")
+        delete_frame(connection, row, find_frame(connection, row, second))
+    engine.add_frame("hall", b.data, b.meta)  # the same upload has come again
+    assert engine.purging.now().blobs == 2
+    assert list(engine.store.blobs.digests()) == [hashlib.sha256(b.data).hexdigest()]
+    assert engine.purging.now().blobs == 0

@@ -14,7 +14,7 @@ from benchmarks.fleet.bulk import fill, walk
 from sceneprint.engine import Engine, coding, readers, searching, stored
 from sceneprint.geometry.retrieval import distances
 from sceneprint.models import Model
-from sceneprint.schemas import Answer, NamedFrame, Query
+from sceneprint.schemas import Answer, ExplainedFrame, NamedFrame, Query
 from sceneprint.settings import Settings
 from sceneprint.store import codes
 from sceneprint.store.frames import find_frame
@@ -339,15 +339,16 @@ def test_a_damaged_signature_costs_its_frame_alone(filled: Engine, small_model: 
 
 def test_why_a_frame_is_not_found_names_the_shortlist(filled: Engine) -> None:
     code_all(filled)
-    rank = ask(filled, "hall-1", exact=True, explain_frame="hall-450").explained_frame
-    told = ask(filled, "hall-1", explain_frame="hall-450").explained_frame
-    assert rank is not None
-    assert told is not None
+
+    def explained(**more: Any) -> ExplainedFrame:
+        told = ask(filled, "hall-1", **more).explained_frame
+        assert told is not None
+        return told
+
+    rank, told = (explained(exact=exact, explain_frame="hall-450") for exact in (True, False))
     assert (told.rank, told.distance, rank.shortlisted) == (rank.rank, rank.distance, True)
-    missed = [
-        one for i in range(300, 600, 50)
-        if not (one := ask(filled, "hall-1", explain_frame=f"hall-{i}").explained_frame).shortlisted
-    ]  # fmt: skip
+    each = [explained(explain_frame=f"hall-{i}") for i in range(300, 600, 50)]
+    missed = [one for one in each if not one.shortlisted]
     assert missed
     for one in missed:
         assert one.lost_at == "shortlist"

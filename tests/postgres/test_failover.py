@@ -36,7 +36,10 @@ class Fleet:
 
     def log(self, message: str) -> list[dict[str, Any]]:
         text = self.errors.read_text()
-        lines = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
+        try:
+            lines = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
+        except json.JSONDecodeError as error:
+            raise AssertionError(f"not JSON in the log: {text[-3000:]}") from error
         return [line for line in lines if line["message"] == message]
 
     def ask(self, method: str, path: str, **given: Any) -> httpx.Response:
@@ -44,9 +47,7 @@ class Fleet:
 
 
 @pytest.fixture
-def fleet(
-    tmp_path_factory: pytest.TempPathFactory, until: Callable[..., Any]
-) -> Iterator[Fleet]:
+def fleet(tmp_path_factory: pytest.TempPathFactory, until: Callable[..., Any]) -> Iterator[Fleet]:
     """`sceneprint serve`, started before its database is there."""
     folder = tmp_path_factory.mktemp("fleet")
     primary = Server(folder / "primary")

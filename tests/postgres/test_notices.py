@@ -1,4 +1,4 @@
-"""The bell over NOTIFY: who waits on any host is woken, and nothing that is wrong harms who rings."""
+"""The bell over NOTIFY: who waits on any host is woken, and nothing harms who rings."""
 
 from __future__ import annotations
 

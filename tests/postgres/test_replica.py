@@ -154,15 +154,12 @@ def test_it_is_asked_only_while_it_is_near_by_the_log_and_not_by_a_clock(
     until(lambda: ours.near())  # nothing is written: it has all, however long ago that was
     held(pair, True)
     try:
-        at = time.monotonic()
         with primary.write() as connection:
             tell(connection, "map.created", "one")
         until(lambda: (ours.standing().behind_s or 0) > 1.5)  # though it is measured all the while
         assert ours.near() is None
         told = ours.standing()
         assert not told.used
-        assert told.behind_s is not None
-        assert told.behind_s < time.monotonic() - at + 1.0
         assert told.reason == "it is farther behind than 0.2 s"
     finally:
         held(pair, False)
@@ -198,12 +195,10 @@ def test_what_is_no_replica_or_is_away_costs_no_query(
     primary.close()
 
 
-def test_one_of_an_older_schema_is_not_used(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_of_an_older_schema_is_not_used(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     assert store.replica is not None
     monkeypatch.setattr(replica, "known_revisions", lambda: ("9999", frozenset()))
-    with pytest.raises(UnusableStore, match="has schema 0.*, not yet ours"):
+    with pytest.raises(UnusableStore, match=r"has schema 0.*, not yet ours"):
         store.replica.measure()
 
 

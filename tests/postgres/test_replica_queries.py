@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from benchmarks.fleet.postgres import Server
 from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest
 from sceneprint.schemas import Answer, JobState, NewMap, Query
+from sceneprint.schemas.operations import ReplicaSeen
 from sceneprint.settings import Settings
 from sceneprint.store.replica import Replica
+from service.metrics import Metrics
 
 Until = Callable[[Callable[[], Any]], Any]
 
@@ -111,5 +114,11 @@ def test_queries_are_answered_from_the_replica_as_from_the_database(
     assert seen.used
     assert seen.behind_s is not None
     figures = engine.operations.statistics.figures()
-    assert figures.replica is not None
-    assert figures.replica.used
+    told, counted = Metrics().text(figures, 0).decode(), Metrics()
+    assert "sceneprint_replica_used 1.0" in told
+    assert "sceneprint_replica" not in counted.text(replace(figures, replica=None), 0).decode()
+    away = replace(figures, replica=ReplicaSeen(used=False, behind_s=None))
+    for _ in range(2):
+        told = counted.text(away, 0).decode()
+        assert "sceneprint_replica_used 0.0" in told
+        assert "sceneprint_replica_behind_seconds +Inf" in told

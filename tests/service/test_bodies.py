@@ -170,7 +170,6 @@ def test_a_caller_who_hangs_up_leaves_nothing_behind(narrow, wire, small_shots):
     assert kept(narrow.folder) == []
     assert narrow.client.get("/readyz").json() | {"version": ""} == {
         "status": "ready", "version": "", "read_only": False, "frames": {}, "jobs": {},
-        "replica": None,
     }  # fmt: skip
     assert narrow.log("request broke down") == []  # it is no fault of ours
     assert [line for line in narrow.log() if line["level"] == "error"] == []

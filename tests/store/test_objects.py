@@ -8,14 +8,18 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from benchmarks.fleet.s3 import ObjectServer
-from sceneprint.errors import StoreAway, UnusableStore
+from sceneprint.errors import DamagedBlob, StoreAway, UnusableStore
 from sceneprint.store import objects as module
+from sceneprint.store import recent
+from sceneprint.store.locks import FileLocks
+from sceneprint.store.object_blobs import ObjectBlobs
 from sceneprint.store.objects import PART, check_objects, open_objects
 
 HALF_WAY = """
@@ -162,3 +166,44 @@ def test_a_server_that_never_answers_is_given_up(
         objects = open_objects(bucket)
         with pytest.raises(StoreAway, match="cannot be read"):
             objects.get("a")
+
+
+def test_what_was_read_lately_is_held_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recent, "MOST", 100)
+    held = recent.Recent(3600.0)
+    for number in range(12):
+        held.put(f"{number}", bytes([number]) * 10)
+    assert [held.get(f"{number}") for number in range(3)] == [None, None, b"\2" * 10]
+    held.put("2", b"x" * 10)  # read anew: the newest again
+    held.put("12", b"y" * 5)
+    assert (held.get("2"), held.get("3")) == (b"x" * 10, None)
+    held.put("large", bytes(recent.LARGEST + 1))
+    assert held.get("large") is None
+    held.remove("2")
+    assert held.get("2") is None
+    held.close()
+    assert held.get("12") is None
+
+
+def test_what_was_read_lately_goes_by_itself() -> None:
+    held = recent.Recent(0.05)
+    held.put("a", b"x")
+    while held._held:  # nobody asks for it
+        time.sleep(0.01)
+    assert held._bytes == 0
+    held.put("b", b"y")  # and so does what comes later
+    while held._held:
+        time.sleep(0.01)
+
+
+def test_a_blob_is_read_once_by_a_process_that_needs_it_often(tmp_path: Path) -> None:
+    objects = open_objects("memory:///")
+    locks = FileLocks(tmp_path / "lock", make=True)
+    one, other = (ObjectBlobs(objects, locks, lambda: "me", 3600.0) for _ in range(2))
+    digest = one.put(b"depth")
+    assert one.get(digest) == b"depth"
+    other.remove(digest)
+    assert one.get(digest) == b"depth"  # until `purge_s` is over
+    one.remove(digest)
+    with pytest.raises(DamagedBlob):
+        one.get(digest)

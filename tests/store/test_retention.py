@@ -63,7 +63,7 @@ def test_what_happens_elsewhere_moves_nothing(filled):
         own = floors(connection, 10)["shop"]
         assert own == numbers_of(connection, "shop")[-11]
         assert {after for after, floor in before.items() if floor > after} == set(range(own))
-        for _ in range(500):
+        for _ in range(150):
             tell(connection, "frame.received", "hall")
             tell(connection, "key.created")
         assert floors(connection, 10)["shop"] == own

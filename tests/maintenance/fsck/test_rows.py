@@ -9,6 +9,7 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.schemas import Query
+from sceneprint.store.tables import frames
 
 FIRST = "(SELECT MIN(number) FROM frames WHERE state = 'indexed')"
 WAITING = "(SELECT number FROM frames WHERE state = 'received')"
@@ -70,7 +71,8 @@ FAULTS = {
     "another position": (
         f"UPDATE frames SET pose_y = pose_y + 1 WHERE number = {FIRST}",
         "other-position",
-        "SELECT pose_y = json_extract(pose, '$[1][3]') FROM frames WHERE number = 1",
+        # another sample of the same view
+        "SELECT pose_y = (SELECT pose_y FROM frames WHERE number = 2) FROM frames WHERE number = 1",
         [(1,)],
     ),
     "a revision beyond the map's": (
@@ -111,6 +113,18 @@ def test_a_fault_is_named_and_repaired(house: Any, fault: str) -> None:
     assert told(house.look()) == []
 
 
+def test_what_a_map_is_counted_to_hold(house: Any) -> None:
+    asked = "SELECT used_frames, used_bytes FROM maps ORDER BY number"
+    before = house.sql(asked)
+    house.sql("UPDATE maps SET used_frames = used_frames + 1 WHERE name = 'hall'")
+    assert house.look(quick=True) == house.look(map_name="attic") == []
+    [found] = house.look()
+    assert (found.finding.kind, found.finding.map) == ("other-use", "hall")
+    assert f"to hold {before[0][0] + 1} frames of {before[0][1]} bytes" in found.finding.means
+    assert [one.left for one in house.look(repair=True)] == [False]
+    assert (house.sql(asked), house.look()) == (before, [])
+
+
 def test_what_is_repaired_is_signed(house: Any, truth: Any, uploads: Any) -> None:
     house.sql(f"DELETE FROM signatures WHERE frame_number = {FIRST}")
     house.sql(f"UPDATE jobs SET state = 'cancelled' WHERE frame_number = {WAITING}")
@@ -135,6 +149,7 @@ def test_one_map_is_looked_at_alone(house: Any) -> None:
     }
 
 
+@pytest.mark.sqlite_only("PostgreSQL holds no such row")
 def test_a_row_that_cannot_be_read_does_not_hide_the_others(house: Any) -> None:
     """Its tags are no JSON; nothing can say what they were."""
     house.sql("UPDATE frames SET tags = '[\"all' WHERE number = 3")
@@ -147,6 +162,7 @@ def test_a_row_that_cannot_be_read_does_not_hide_the_others(house: Any) -> None:
     assert position.finding.kind == "other-position"
 
 
+@pytest.mark.sqlite_only("PostgreSQL holds no such row")
 def test_a_signature_whose_counts_cannot_be_read_is_made_again(house: Any) -> None:
     sound = house.sql("SELECT * FROM signatures ORDER BY frame_number")
     house.sql("UPDATE signatures SET n_pairs = CAST(x'5b31ff5d' AS TEXT) WHERE frame_number = 3")
@@ -188,7 +204,7 @@ def test_an_index_that_differs_from_the_database_is_made_again(
 
 def test_an_index_that_lacks_a_frame_is_made_again(house: Any) -> None:
     """As one that was published while a signature was damaged."""
-    columns = {name: name for _, name, *_ in house.sql("PRAGMA table_info(frames)")}
+    columns = {column.name: column.name for column in frames.columns}
     columns |= {"number": "99", "id": "'ff'", "content_id": "'ff'"}
     house.sql(  # a frame of `hall` that its index has never heard of, though as old as others
         f"INSERT INTO frames ({', '.join(columns)})"
@@ -199,6 +215,11 @@ def test_an_index_that_lacks_a_frame_is_made_again(house: Any) -> None:
         " n_pairs FROM signatures WHERE frame_number = 1"
     )
     house.sql("INSERT INTO frame_tags SELECT 99, tag FROM frame_tags WHERE frame_number = 1")
+    house.sql(
+        "UPDATE maps SET used_frames = used_frames + 1,"
+        " used_bytes = used_bytes + (SELECT bytes FROM frames WHERE number = 99)"
+        " WHERE name = 'hall'"
+    )
     (found,) = house.look(repair=True)
     assert (found.finding.kind, found.left) == ("other-index", False)
     assert found.finding.means.endswith(": frames ff")

@@ -75,11 +75,11 @@ def test_rows_are_checked_and_mended(fleet):
         f"UPDATE frames SET pose_x = pose_x + 1 WHERE number = {FIRST} + 2",
         f"DELETE FROM frame_tags WHERE frame_number = {FIRST} + 2",
         f"UPDATE jobs SET state = 'dead' WHERE frame_number = {WAITING}",
-        "UPDATE maps SET revision = 11 WHERE name = 'hall'",
+        "UPDATE maps SET revision = 11, used_bytes = used_bytes - 1 WHERE name = 'hall'",
     )
     wanted = [
         "damaged-signature", "frame-without-job", "frame-without-signature", "other-position",
-        "other-tags", "revision-ahead",
+        "other-tags", "other-use", "revision-ahead",
     ]  # fmt: skip
     assert sorted(fleet.kinds()) == wanted
     repaired = fleet.look(repair=True)

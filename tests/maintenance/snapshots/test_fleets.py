@@ -285,6 +285,10 @@ def test_blobs_and_snapshots_in_an_object_store(
     other.delete(ids[1])
     assert [one.snapshot_id for one in shelf.list()] == [ids[2]]
     monkeypatch.setenv("SCENEPRINT_SNAPSHOT_URL", bucket)
+    monkeypatch.setenv("SCENEPRINT_BLOB_URL", f"{bucket}/one")
+    refused = sceneprint("restore", ids[2], "--data", tmp_path / "home", expect=2)
+    assert "SCENEPRINT_BLOB_URL is set" in refused.stderr
+    monkeypatch.delenv("SCENEPRINT_BLOB_URL")
     said = sceneprint("restore", ids[2], "--data", tmp_path / "home", expect=1)
     assert f"{first[:12]}, missing" in said.stderr
     assert len([*(tmp_path / "home" / "blobs").glob("*/*")]) == len(blobs) - 1

@@ -1,0 +1,110 @@
+"""What a large fleet would take, reckoned from what single things cost here.
+
+Costs  --paper-->  lines of Markdown
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from benchmarks.fleet.metering import Work
+
+#: The fleet, in sites that have a map each, and how often each robot sends a frame that is kept,
+#: and asks where it is, seconds.
+ROBOTS, FRAMES, MAPS, EVERY_S = 1_000, 10_000_000, 50, 10.0
+#: Share of a processor, and of the turn, that is work on an ordinary day.
+USED = 0.6
+#: Bytes a frame of an index on a node's disk beside the signature, and in memory of a process.
+INDEX, CODE = 150, 128
+
+
+@dataclass
+class Costs:
+    """All that was measured.
+
+    Parameters
+    ----------
+    model, signature_bytes : that signed
+    frames : how many were uploaded and signed
+    upload, sign, query : see Work; the query has all stages, k = 5
+    tables : bytes a frame of tables with their indexes, by name
+    blobs : bytes a frame of uploads, and of geometry artifacts
+    commit_ms : p50 and p99 of the smallest write in its turn, without and with a standby
+    linked : codes a second that enter the graph (HNSW), and its bytes a code with the table
+    memory : bytes that a service and a worker have for themselves, after some work
+    """
+
+    model: str
+    signature_bytes: int
+    frames: int
+    upload: Work
+    sign: Work
+    query: Work
+    tables: Mapping[str, float]
+    blobs: tuple[float, float]
+    commit_ms: Mapping[str, tuple[float, float]]
+    linked: tuple[float, float, float] | None
+    memory: Mapping[str, int] = field(default_factory=dict)
+
+
+def paper(found: Costs) -> list[str]:
+    """The arithmetic, as lines of Markdown."""
+    rate = ROBOTS / EVERY_S
+    work = {"uploads": found.upload, "signing": found.sign, "queries": found.query}
+    own = {name: rate * one.own_ms / 1e3 for name, one in work.items()}
+    database = sum(rate * one.database_ms / 1e3 for one in work.values())
+    turn_ms = found.upload.turn_ms + found.sign.turn_ms
+    wal = rate * (found.upload.wal_bytes + found.sign.wal_bytes)
+    rows = sum(found.tables.values())
+    segment = found.signature_bytes + INDEX
+    lines = [
+        f"### On paper: {ROBOTS:,} robots, {FRAMES:,} frames in {MAPS} maps, `{found.model}`",
+        "",
+        f"Each robot sends a frame that is kept, and asks where it is, every {EVERY_S:g} s: "
+        f"{rate:g} frames and {rate:g} queries a second. Processors are reckoned to work for "
+        f"{USED:.0%} of the time.",
+        "",
+        "| | how | |",
+        "|---|---|--:|",
+        *(
+            f"| processors for {name} | {rate:g} x {one.own_ms:.1f} ms / {USED:g} | "
+            f"{own[name] / USED:.0f} |"
+            for name, one in work.items()
+        ),
+        f"| processors of the database | {rate:g} x "
+        f"{sum(one.database_ms for one in work.values()):.1f} ms / {USED:g} | "
+        f"{database / USED:.0f} |",
+        f"| the turn is taken for | {rate:g} x {turn_ms:.1f} ms | {rate * turn_ms / 1e3:.0%} of "
+        "the time |",
+        f"| the turn is full at | 1 / {turn_ms:.1f} ms | {1e3 / turn_ms:.0f} frames a second |",
+        f"| log of the database (WAL), and to each standby | {rate:g} x "
+        f"{found.upload.wal_bytes + found.sign.wal_bytes:,.0f} bytes | {wal / 1e6:.1f} MB a "
+        f"second, {wal * 86400 / 1e9:,.0f} GB a day |",
+        f"| rows of the database | {rows:,.0f} bytes a frame | {FRAMES * rows / 1e9:,.0f} GB |",
+        f"| blobs | {sum(found.blobs):,.0f} bytes a frame | "
+        f"{FRAMES * sum(found.blobs) / 1e12:.1f} TB |",
+    ]
+    if found.linked is not None:
+        speed, plain, graph = found.linked
+        lines += [
+            "| codes and their graph in the database, to be held in its memory | "
+            f"{plain:,.0f} + {graph:,.0f} bytes a frame | "
+            f"{FRAMES * (plain + graph) / 1e9:.0f} GB |",
+            f"| linking all of them anew (a refit), one processor | {speed:,.0f} a second | "
+            f"{FRAMES / speed / 3600:.1f} h |",
+        ]
+    each = FRAMES / MAPS
+    return [
+        *lines,
+        f"| index of a node that asks one map of {each:,.0f} frames: memory of each process, disk "
+        f"| {CODE} and {segment:,} bytes a frame | {each * CODE / 1e6:.0f} MB, "
+        f"{each * segment / 1e9:.1f} GB |",
+        f"| of one that asks all maps | the same | {FRAMES * CODE / 1e9:.1f} GB, "
+        f"{FRAMES * segment / 1e9:,.0f} GB |",
+        *(
+            f"| memory of a {name} process, without its index | measured | {size / 1e6:,.0f} MB |"
+            for name, size in sorted(found.memory.items())
+        ),
+        "",
+    ]

@@ -1,0 +1,89 @@
+"""A fleet's store: PostgreSQL and an object store, with engines that share nothing else."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.engine import sizes as measuring
+from sceneprint.schemas import NewMap, Query
+from sceneprint.schemas.ingest import ImportOptions
+from sceneprint.store.objects import Objects, open_objects
+
+
+@pytest.fixture
+def nodes(
+    make_engine: Callable[..., Engine], postgres_url: str, bucket: str, tmp_path: Path
+) -> tuple[Engine, Engine]:
+    """Two, each with a data folder of its own."""
+    shared = {"database_url": postgres_url, "blob_url": f"{bucket}/fleet"}
+    one, other = (make_engine(tmp_path / name, **shared) for name in ("one", "other"))
+    return one, other
+
+
+def keys(objects: Objects, prefix: str) -> list[str]:
+    return sorted(one.key for one in objects.list(prefix))
+
+
+def test_what_one_node_takes_another_works_on(
+    nodes: tuple[Engine, Engine], uploads: Any, work_off: Callable[[Engine], list[Any]], bucket: str
+) -> None:
+    one, other = nodes
+    objects = open_objects(f"{bucket}/fleet")
+    one.create_map(NewMap(name="hall", model="compact"))
+    added = [one.add_frame("hall", each.data, each.meta)[0] for each in uploads[:2]]
+    assert len(keys(objects, "blobs/")) == 2
+    assert work_off(other) == ["succeeded"] * 2
+    assert len(keys(objects, "blobs/")) == 4  # with the artifacts
+    told = one.query_upload("hall", uploads[0].data, uploads[0].meta, Query(k=1))
+    assert told.status == "found"
+    assert told.matches[0].frame_id == added[0].frame_id
+    assert other.kept.find(told.query_id).answer == told
+    assert keys(objects, "queries/") == [f"queries/{told.query_id}"]
+    assert not (one.settings.data_dir / "blobs").exists()
+    assert not (one.settings.data_dir / "queries").exists()
+    size = measuring.sizes(one.settings, one.store)
+    assert size.blobs == sum(each.size for each in objects.list("blobs/"))
+    assert size.database is not None
+    assert size.database > 1 << 20
+    row_of = {each.digest: each.place for each in one.store.blobs.entries()}
+    assert all(place.startswith(f"{bucket}/fleet/blobs/") for place in row_of.values())
+    # what is deleted is gone from the bucket at once, and with the map so is everything
+    other.delete_frame("hall", added[1].frame_id)
+    assert len(keys(objects, "blobs/")) == 2
+    one.delete_map("hall")
+    assert keys(objects, "blobs/") == []
+
+
+def test_an_archive_is_read_where_it_lies(
+    nodes: tuple[Engine, Engine], uploads: Any, work_off: Callable[[Engine], list[Any]], bucket: str
+) -> None:
+    one, other = nodes
+    one.create_map(NewMap(name="hall", model="compact"))
+    made = io.BytesIO()
+    camera = uploads[0].meta.intrinsics.model_dump(exclude={"distortion"})
+    with tarfile.open(fileobj=made, mode="w:gz") as archive:
+        members = {"run/intrinsics.json": json.dumps(camera).encode()}
+        members |= {f"run/{i}.png": one.data for i, one in enumerate(uploads[:3])}
+        for name, data in members.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            archive.addfile(info, io.BytesIO(data))
+    with one.imports.receive("hall") as receiver:
+        receiver.write(made.getvalue())
+        file = receiver.end()
+    job = one.imports.begin("hall", file, ImportOptions())[0]
+    assert work_off(other) == ["succeeded"] * 4
+    told = one.imports.get("hall", job.job_id)
+    assert told.result is not None
+    assert told.result["received"] == 3
+    names = {key.rpartition("/")[2] for key in keys(open_objects(f"{bucket}/fleet"), "blobs/")}
+    assert len(names) == 6  # uploads and artifacts; the archive went with its job
+    assert file.blob not in names
