@@ -280,7 +280,7 @@ class StoreLocked(UnusableStore):
 
 
 class StoreAway(UnusableStore):
-    """The server of the database does not answer, or the connection to it was lost."""
+    """The server of the database, or of the blobs, does not answer, or the connection was lost."""
 
 
 class NewerSchema(StoreError):

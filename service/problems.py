@@ -55,8 +55,8 @@ UNUSABLE: dict[type[errors.SceneprintError], str] = {
     f"what is stored go on. {_LOG} Make the data folder writable there, and start it again.",
     errors.StoreLocked: "Another process has been writing to the service's store for long, and "
     f"nothing was taken; queries go on. {_LOG} Come back later.",
-    errors.StoreAway: "The service's database does not answer. What was sent may have been stored "
-    f"just before: send it again, and it is stored once. {_LOG} Come back later.",
+    errors.StoreAway: "The service's database or object store does not answer. What was sent may "
+    f"have been stored just before: send it again, and it is stored once. {_LOG} Come back later.",
     errors.UnusableStore: "The service cannot use its store at the moment, and nothing was taken. "
     "Its log says why under the request's id. Come back later.",
 }

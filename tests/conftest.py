@@ -39,7 +39,7 @@ from sceneprint.types import Frame
 LONG = (
     "test_container.py", "test_bench_rows.py", "test_quality.py", "test_same_as_evaluate.py",
     "test_soak.py", "test_siege.py", "test_tour.py", "test_kill.py", "test_docs.py",
-    "test_survival.py",
+    "test_survival.py", "test_on_postgres.py",
 )  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -18,6 +18,8 @@ from benchmarks.fleet.__main__ import MARKS, table
 from benchmarks.fleet.checking import Found, check
 from benchmarks.fleet.doors import Diary, Doors, Shut, Wait
 from benchmarks.fleet.driving import FleetFigures, Plan, drive, outages
+from benchmarks.fleet.metering import Work
+from benchmarks.fleet.paper import Costs, paper
 from benchmarks.fleet.postgres import NoServer, binaries
 from benchmarks.fleet.recordings import GRIDS, walks
 from benchmarks.fleet.robots import Kept, Listener
@@ -214,3 +216,29 @@ def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
     assert "| **lost** | **0** |" in text
     assert "| service | 0.0, 1.2 |" in text
     assert "each service answered 0.5, 2.0 s after that" in text
+
+
+def test_what_is_on_paper_is_multiplied_right() -> None:
+    costs = Costs(
+        model="compact", signature_bytes=12_800, frames=50,
+        upload=Work(30.0, 12.0, 2.0, 3.0, (1.0, 0.0), 3_000.0),
+        sign=Work(90.0, 60.0, 3.0, 5.0, (1.0, 1.0), 27_000.0),
+        query=Work(200.0, 180.0, 1.0, 0.0, (0.0, 0.0), 0.0),
+        tables={"signatures": 14_000.0, "frames": 2_000.0}, blobs=(76_000.0, 174_000.0),
+        commit_ms={"alone": (4.0, 9.0)}, linked=(2_000.0, 340.0, 560.0), memory={"worker": 10**8},
+    )  # fmt: skip
+    told = {line.split(" | ")[0]: line.split(" | ")[-1] for line in paper(costs)}
+    assert told["| processors for signing"] == "10 |"  # 100 a second x 60 ms / 0.6
+    assert told["| processors for queries"] == "30 |"
+    assert told["| processors of the database"] == "1 |"
+    assert told["| the turn is taken for"] == "80% of the time |"
+    assert told["| the turn is full at"] == "125 frames a second |"
+    assert (
+        told["| log of the database (WAL), and to each standby"]
+        == "3.0 MB a second, 259 GB a day |"
+    )
+    assert told["| rows of the database"] == "160 GB |"
+    assert told["| blobs"] == "2.5 TB |"
+    assert told["| codes and their graph in the database, to be held in its memory"] == "9 GB |"
+    assert told["| linking all of them anew (a refit), one processor"] == "1.4 h |"
+    assert told["| of one that asks all maps"] == "1.3 GB, 130 GB |"

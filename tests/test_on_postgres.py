@@ -14,11 +14,11 @@ TESTS = Path(__file__).resolve().parent
 GROUPS = {
     "engine": (
         "on_postgres/test_switch.py", "engine/test_uploads.py", "engine/test_jobs.py",
-        "engine/test_work.py", "engine/test_upkeep.py", "engine/test_filters.py",
+        "engine/test_upkeep.py",
     ),
     "service": (
         "service/test_maps_and_frames.py", "service/test_events.py", "service/test_once.py",
-        "service/test_filters.py", "service/test_lifecycle.py",
+        "service/test_faults.py",
     ),
 }  # fmt: skip
 

@@ -93,7 +93,7 @@ class Meter:
         try:
             yield told
         finally:
-            Database.write = write  # type: ignore[method-assign, assignment]
+            Database.write = write  # type: ignore[method-assign]
 
     def _reading(self) -> tuple[float, ...]:
         primary = self._pair.primary

@@ -29,7 +29,7 @@ def object_stores(settings: Settings) -> Iterator[Finding]:
 
 def _looked_at(subject: str, setting: str, url: str) -> Finding:
     from sceneprint.errors import SceneprintError
-    from sceneprint.store.objects import VARIABLES, check_objects, open_objects
+    from sceneprint.store.object_urls import VARIABLES, check_objects, open_objects
 
     try:
         objects = open_objects(url, setting)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from sqlalchemy import Connection
+from sqlalchemy.exc import SQLAlchemyError
 
 from sceneprint.engine.choosing import Choosing
 from sceneprint.engine.shortlists import WHOLE
@@ -81,9 +82,12 @@ class Coding:
             return 0
         try:
             with self._database.write(turn=False) as turn:
-                return self._step(time.monotonic() + STEP_S) if codes.take_turn(turn) else 0
-        except SceneprintError as error:  # a cache: it costs nobody anything but time
-            log.error("codes are not brought on", extra={"error": str(error)})
+                if not codes.take_turn(turn):
+                    return 0
+                allow(turn, 0)  # it does nothing itself, for as long as a graph takes
+                return self._step(time.monotonic() + STEP_S)
+        except (SceneprintError, SQLAlchemyError) as error:  # it costs nobody anything but time
+            log.error("codes are not brought on", extra={"error": f"{error!s:.500}"})
             return 0
 
     def _step(self, until: float) -> int:

@@ -8,6 +8,7 @@ pages and log of SQLite. On PostgreSQL dead rows are VACUUM's.
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ log = logging.getLogger(__name__)
 
 #: Seconds for which a deletion is left to whoever began it.
 _YOUNG_S = 60.0
+#: Longest time for blobs that were left: frames wait to be signed.
+_SWEEP_S = 20.0
 #: Times that making an index anew takes, for which its map is left in peace afterwards: of a large
 #: one it costs hours, and a deletion an hour would keep a worker at it for ever.
 PAUSE = 10.0
@@ -72,7 +75,8 @@ class Purging:
         if time.monotonic() < self._next:
             return None
         self._next = time.monotonic() + self._every_s
-        return self._all(time.time() - min(_YOUNG_S, self._every_s), self._rested)
+        before = time.time() - min(_YOUNG_S, self._every_s)
+        return self._all(before, self._rested, seconds=min(_SWEEP_S, self._every_s))
 
     def now(self) -> Purged:
         """Remove all that is left at once.
@@ -92,7 +96,7 @@ class Purging:
 
     def _all(
         self, before: float | None, wanted: Callable[[MapRow], bool],
-        failed: list[Exception] | None = None,
+        failed: list[Exception] | None = None, seconds: float = math.inf,
     ) -> Purged:  # fmt: skip
         def tried(do: Callable[[], int]) -> int:
             try:
@@ -109,7 +113,7 @@ class Purging:
         with self._store.database.read() as connection:
             rows = [row for row in list_maps(connection) if wanted(row)]
         found = Purged(
-            blobs=tried(lambda: sweep_doomed(self._store, before)),
+            blobs=tried(lambda: sweep_doomed(self._store, before, seconds)),
             reconstructions=tried(lambda: self._reconstructions.forget(standing)),
             answers=tried(lambda: self._kept.forget(standing.all_of)),
             indexes=sum(tried(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]

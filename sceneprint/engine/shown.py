@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from sqlalchemy import select
 
 from sceneprint.engine.kept import Kept
@@ -24,16 +26,19 @@ class Standing:
         self._frames: dict[tuple[str, str], float | None] = {}  # when they were received
 
     def asked(self, kept: Kept) -> bool:
-        """Whether the maps that were asked and the frame that was looked up are still those."""
+        """Whether the maps that were asked are still those, and the frame that was looked up is
+        there, or one that has its id since: whoever asks again is told of that.
+        """
         frame = kept.answer.frame
         return all(self.map(name, kept.at) for name in kept.answer.maps) and (
-            frame is None or self.frame(frame.map, frame.frame_id, kept.at)
+            frame is None or self.frame(frame.map, frame.frame_id, math.inf)
         )
 
     def all_of(self, kept: Kept) -> bool:
-        """Whether all frames that an answer shows are still there too."""
-        matches = kept.answer.matches
-        return self.asked(kept) and all(self.frame(m.map, m.frame_id, kept.at) for m in matches)
+        """Whether all frames that an answer was made from and shows are still those too."""
+        own = kept.answer.frame
+        shown = [*kept.answer.matches, *([] if own is None else [own])]
+        return self.asked(kept) and all(self.frame(f.map, f.frame_id, kept.at) for f in shown)
 
     def map(self, name: str, at: float) -> bool:
         """Whether a map is there that was there at that time, seconds since 1970."""

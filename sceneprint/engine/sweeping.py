@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Sequence
 
@@ -16,8 +17,8 @@ log = logging.getLogger(__name__)
 #: Blobs that are removed in one transaction, and seconds after which it ends anyhow: writers wait
 #: meanwhile, and a store of objects may be far away.
 SWEPT_AT_ONCE, SWEPT_S = 200, 0.5
-#: Blobs of deleted frames that are looked at in one turn of a worker's upkeep.
-_LEFT_AT_ONCE = 2_000
+#: Blobs of deleted frames that are asked for at once.
+_LEFT_AT_ONCE = 1_000
 
 
 def sweep(store: Store, blobs: Sequence[str]) -> None:
@@ -55,7 +56,7 @@ def sweep_deleted(store: Store, blobs: Sequence[str]) -> None:
         log.warning("blobs left for later", extra={"blobs": len(blobs), "error": str(error)})
 
 
-def sweep_doomed(store: Store, before: float | None = None) -> int:
+def sweep_doomed(store: Store, before: float | None = None, seconds: float = math.inf) -> int:
     """Remove what was doomed and is still there: its process died, or a snapshot was being taken.
 
     Parameters
@@ -63,13 +64,18 @@ def sweep_doomed(store: Store, before: float | None = None) -> int:
     store : see Store
     before : only what was doomed before this time, seconds since 1970: of what is younger,
         somebody may be at it
+    seconds : after which the rest is left for another time
 
     Returns
     -------
-    swept : number of blobs that are settled
+    swept : number of blobs that were looked at
     """
-    with store.database.read() as connection:
-        blobs = doomed_blobs(connection, _LEFT_AT_ONCE, before)
-    if blobs:
+    until, last, count = time.monotonic() + seconds, "", 0
+    while time.monotonic() < until:
+        with store.database.read() as connection:
+            blobs = doomed_blobs(connection, _LEFT_AT_ONCE, before, last)
+        if not blobs:
+            break
         sweep(store, blobs)
-    return len(blobs)
+        count, last = count + len(blobs), blobs[-1]
+    return count

@@ -53,7 +53,7 @@ def open_rack(settings: Settings) -> Rack:
     """The one of a node's settings; nothing is asked of it yet."""
     if settings.snapshot_url is None:
         return _Folder(settings.snapshot_dir)
-    from sceneprint.store.objects import open_objects
+    from sceneprint.store.object_urls import open_objects
 
     return _Objects(open_objects(settings.snapshot_url, "SCENEPRINT_SNAPSHOT_URL"))
 

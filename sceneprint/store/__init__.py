@@ -22,7 +22,7 @@ from sceneprint.store.faults import unusable
 from sceneprint.store.folders import FolderBlobs
 from sceneprint.store.locks import FileLocks, Locks
 from sceneprint.store.object_blobs import ObjectBlobs
-from sceneprint.store.objects import open_objects
+from sceneprint.store.object_urls import open_objects
 from sceneprint.store.replica import Replica, current
 from sceneprint.store.sealed import is_sealed
 from sceneprint.store.seals import Seals

@@ -116,9 +116,13 @@ def doom_found(connection: Connection, *found: Select[tuple[str]]) -> None:
     )
 
 
-def doomed_blobs(connection: Connection, limit: int, before: float | None = None) -> list[str]:
-    """Blobs that are noted, at most so many; those noted before a time, if one is given."""
-    asked = select(doomed.c.blob).order_by(doomed.c.blob).limit(limit)
+def doomed_blobs(
+    connection: Connection, limit: int, before: float | None = None, after: str = ""
+) -> list[str]:
+    """Blobs that are noted, at most so many after one of them; those noted before a time, if one
+    is given.
+    """
+    asked = select(doomed.c.blob).where(doomed.c.blob > after).order_by(doomed.c.blob).limit(limit)
     if before is not None:
         asked = asked.where(doomed.c.at < before)
     return list(connection.execute(asked).scalars())

@@ -156,6 +156,8 @@ _MEANT: dict[str, tuple[type[UnusableStore], str]] = {
     "28": (UnusableStore, "Check user and password in SCENEPRINT_DATABASE_URL, and pg_hba.conf."),
     "3D000": (UnusableStore, "Make the database, or name another in SCENEPRINT_DATABASE_URL."),
     "URL": (UnusableStore, "Correct SCENEPRINT_DATABASE_URL."),
+    # not ours to have asked for: it was there when this process began
+    "42P01": (UnusableStore, "Its tables are not there, or no longer. Restore it from a copy."),
     "42501": (UnusableStore, "The user must own the database's tables: grant what is missing."),
     "58": (UnusableStore, "The server has trouble with its files. Look into its log."),
     "XX001": (UnusableStore, "The server's files are damaged. Restore a snapshot or a backup."),

@@ -1,6 +1,6 @@
 """Object storage by URL: bytes under keys, in a store that others operate.
 
-URL  --open_objects-->  Objects  --put | get | list | delete-->  s3://, gs://, az://, file://, memory://
+URL  --open_objects (object_urls.py)-->  Objects  --put | get | list | delete-->  a store
 
 Every call ends: a request has a time limit, all tries of one together have another, and after a
 store was found away the next callers are told at once for a moment. What is large goes in parts,
@@ -17,33 +17,22 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
-from urllib.parse import unquote, urlsplit
+from typing import TYPE_CHECKING, BinaryIO
 
 from sceneprint.errors import StoreAway, StoreFull, UnusableStore
 from sceneprint.store.ranges import RangeFile
-from sceneprint.writing import make_folder, sync_folder
+from sceneprint.writing import sync_folder
 
 if TYPE_CHECKING:
-    from obstore.store import ClientConfig, ObjectStore, RetryConfig
+    from obstore.store import ObjectStore
 
 #: Bytes that one request carries at most; what has more goes in parts, so many at once.
 PART, AT_ONCE = 8 << 20, 3
 #: Most parts that a store takes of one object.
 MOST_PARTS = 9_000
-#: Seconds for a connection, for a request of a few bytes, and for one of a part; and seconds after
-#: which no request is tried again.
-CONNECT_S, SMALL_S, PART_S, TRIED_S = 3, 10, 60, 8
 #: Seconds for which nobody tries again a store that was just found away.
 AWAY_S = 1.0
-#: Kinds of stores, and the beginnings of the environment variables they are configured by.
-VARIABLES = {
-    "s3": "AWS_", "s3a": "AWS_", "gs": "GOOGLE_", "az": "AZURE_", "azure": "AZURE_",
-    "abfs": "AZURE_", "abfss": "AZURE_", "file": "", "memory": "",
-}  # fmt: skip
-_ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
 _REFUSED = ("PermissionDeniedError", "UnauthenticatedError")
 _NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|bucket does not exist")
 _FULL = re.compile(r"\b507\b|StorageFull|QuotaExceeded|InsufficientStorage", re.IGNORECASE)
@@ -75,6 +64,7 @@ class Objects:
     ----------
     small, large : the store, for requests of a few bytes and for those of many
     url : to show
+    variables : of the environment that it is configured by, to show
     folder : where it is one
 
     Every method raises UnusableStore where the store is away or refuses, StoreFull where it has
@@ -82,9 +72,11 @@ class Objects:
     """
 
     def __init__(
-        self, small: ObjectStore, large: ObjectStore, url: str, folder: Path | None = None
-    ) -> None:
+        self, small: ObjectStore, large: ObjectStore, url: str, variables: str = "none",
+        folder: Path | None = None,
+    ) -> None:  # fmt: skip
         self._small, self._large, self._folder = small, large, folder
+        self._variables = variables
         #: Where it is, to show; there are no credentials in it.
         self.url = url
         self._away = (0.0, "")  # until when, and what was said
@@ -301,146 +293,6 @@ class Objects:
     ) -> UnusableStore:
         return kind(
             f"{self.url}: {what} ({said}). See that the store is there and can be reached from "
-            f"here, and that its settings in the environment ({self._variables or 'none'}) are "
+            f"here, and that its settings in the environment ({self._variables}) are "
             "right."
         )
-
-    @property
-    def _variables(self) -> str:
-        begin = VARIABLES[self.url.partition(":")[0]]
-        return f"{begin}..." if begin else ""
-
-
-def check_url(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> None:
-    """See that a URL names an object store, and nothing that must not be in it.
-
-    Parameters
-    ----------
-    url : such as s3://bucket/prefix
-    setting : that it is of, for messages; the URL itself is not shown, it may hold a password
-
-    Raises
-    ------
-    UnusableStore : it does not.
-    """
-    try:
-        parts = urlsplit(url)
-        named, netloc = parts.scheme.lower(), parts.netloc
-    except ValueError:
-        named, netloc, parts = "", "", urlsplit("")
-    if "@" in netloc or parts.query or parts.fragment:
-        raise UnusableStore(
-            f"{setting} holds a user, a password or a query. Credentials are read from the "
-            "environment alone (AWS_..., GOOGLE_..., AZURE_...): leave them out of it."
-        )
-    steps = unquote(parts.path).split("/")
-    wrong = any(one in (".", "..") for one in steps) or not unquote(parts.path).isprintable()
-    lacking = {"file": not parts.path.startswith("/") or parts.path == "/", "memory": False}
-    if named not in VARIABLES or wrong or lacking.get(named, not netloc) or (
-        named in lacking and netloc
-    ):  # fmt: skip
-        raise UnusableStore(
-            f"{setting} names no object store. Set it to s3://bucket/prefix, gs://bucket/prefix, "
-            "az://account/container/prefix, file:///folder, or memory:/// to try."
-        )
-
-
-def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
-    """Open an object store; nothing is asked of it yet.
-
-    Parameters
-    ----------
-    url : s3://bucket/prefix, gs://bucket/prefix, az://account/container/prefix, file:///folder, or
-        memory:/// for what ends with the process; credentials come from the environment
-    setting : that it is of, for messages
-
-    Raises
-    ------
-    UnusableStore : it is none, or cannot be opened with this environment.
-    """
-    check_url(url, setting)
-    try:
-        from obstore.exceptions import BaseError
-        from obstore.store import LocalStore, MemoryStore, from_url
-    except ImportError as error:
-        raise UnusableStore(
-            f"{setting} needs obstore, which cannot be imported here ({error}). Install it: "
-            "pip install obstore"
-        ) from error
-    kind, url = url.partition(":")[0].lower(), url.rstrip("/")
-    plain = [name for name in _ENDPOINTS if os.environ.get(name, "").startswith("http://")]
-    if kind.startswith("s3") and plain and not _allows_http():
-        raise UnusableStore(
-            f"{plain[0]} names a server without TLS. Set AWS_ALLOW_HTTP=true where nobody can "
-            "listen in between, or give it as https://."
-        )
-    if kind == "memory":
-        memory = MemoryStore()
-        return Objects(memory, memory, "memory:///")
-    if kind == "file":
-        folder = Path(unquote(urlsplit(url).path))
-        try:
-            make_folder(folder)
-        except OSError as error:
-            raise UnusableStore(
-                f"{folder}: the folder cannot be made ({error.strerror}). Check its permissions."
-            ) from error
-        local = LocalStore(folder)
-        return Objects(local, local, url, folder)
-    try:
-        small, large = (
-            from_url(url, client_options=_client(seconds), retry_config=_retries())
-            for seconds in (SMALL_S, PART_S)
-        )
-    except (BaseError, ValueError) as error:
-        said = str(error).partition("\n")[0]
-        raise UnusableStore(
-            f"{url}: the store cannot be opened ({said:.200}). See {setting} and the variables "
-            f"{VARIABLES[kind]}... of the environment."
-        ) from None
-    return Objects(small, large, url)
-
-
-def _client(seconds: int) -> ClientConfig:
-    return {
-        "allow_http": _allows_http(),  # takes the place of what the library finds itself
-        "connect_timeout": timedelta(seconds=CONNECT_S),
-        "timeout": timedelta(seconds=seconds),
-        "user_agent": "sceneprint",
-    }
-
-
-def _allows_http() -> bool:
-    names = [f"{begin}ALLOW_HTTP" for begin in ("AWS_", "GOOGLE_", "AZURE_")]
-    return any(os.environ.get(name, "").lower() in ("1", "true", "yes") for name in names)
-
-
-def _retries() -> RetryConfig:
-    backoff: Any = {
-        "init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=1), "base": 2,
-    }  # fmt: skip
-    return {"max_retries": 8, "retry_timeout": timedelta(seconds=TRIED_S), "backoff": backoff}
-
-
-def check_objects(objects: Objects) -> float:
-    """Write, read and remove a small object; returns the seconds it took.
-
-    Raises
-    ------
-    UnusableStore : one of that is not possible, or what is read is not what was written.
-    """
-    key, data = f"check/{os.urandom(8).hex()}", os.urandom(64)
-    begun = time.perf_counter()
-    objects.put(key, data)
-    try:
-        same = objects.get(key) == data
-    except FileNotFoundError:
-        same = False
-    finally:
-        objects.delete(key)
-    if not same:
-        raise UnusableStore(
-            f"{objects.url}: what is written is not what is read at once afterwards. Use a store "
-            "that is strongly consistent, as S3, GCS and Azure are."
-        )
-    return time.perf_counter() - begun

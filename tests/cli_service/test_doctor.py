@@ -31,6 +31,7 @@ def verdicts(text: str) -> dict[str, str]:
     return {line[7:23].strip(): line[:5].strip() for line in lines}
 
 
+@pytest.mark.sqlite_only("this server is told not to wait for its disk")
 def test_a_sound_machine(sceneprint: Run, data_folder: Path, service_url: str) -> None:
     done = sceneprint("doctor", "--data", data_folder)
     found = verdicts(done.stdout)
@@ -45,6 +46,7 @@ def test_a_sound_machine(sceneprint: Run, data_folder: Path, service_url: str) -
     assert done.stdout.splitlines()[-1] == "all that is needed is fine"
 
 
+@pytest.mark.sqlite_only("this server is told not to wait for its disk")
 def test_a_machine_where_nothing_was_used_yet(
     sceneprint: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -63,6 +65,7 @@ def test_a_machine_where_nothing_was_used_yet(
     assert list(tmp_path.rglob("*")) == []  # looking makes nothing
 
 
+@pytest.mark.sqlite_only("a file that is damaged")
 def test_what_is_wrong_says_what_to_do(sceneprint: Run, tmp_path: Path) -> None:
     (tmp_path / "sceneprint.db").write_bytes(b"not a database " * 100)
     done = sceneprint("doctor", "--data", tmp_path, "--url", "http://127.0.0.1:1", expect=2)
@@ -82,6 +85,7 @@ def found_in(settings: Settings) -> dict[str, Finding]:
     return {one.subject: one for one in checks.machine(settings)}
 
 
+@pytest.mark.sqlite_only("what is in its file")
 def test_databases_of_other_versions(tmp_path: Path) -> None:
     Client.embedded(tmp_path).close()
     settings = Settings(data_dir=tmp_path, database_url=None)
@@ -104,6 +108,7 @@ def content(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.glob("sceneprint.db*"))}
 
 
+@pytest.mark.sqlite_only("what is in its file")
 def test_looking_at_a_database_changes_nothing(tmp_path: Path) -> None:
     """One that was closed, one that is in use, one whose process was killed, and a copy of that."""
     path, killed, copy = (tmp_path / one / "sceneprint.db" for one in ("data", "killed", "copy"))

@@ -18,7 +18,7 @@ from sceneprint.engine.kept_folder import KeptFolder
 from sceneprint.errors import UnknownQuery
 from sceneprint.schemas import Answer, Counts, Query, SeveralQuery
 from sceneprint.store.filters import Taken
-from sceneprint.store.objects import open_objects
+from sceneprint.store.object_urls import open_objects
 
 COUNTS = Counts(map=0, passed=0, compared=0, ranked=0, selected=0, validated=0, accepted=0)
 
@@ -205,7 +205,7 @@ def test_answers_go_when_they_are_old_or_too_many(monkeypatch: pytest.MonkeyPatc
 
 def test_what_cannot_be_kept_costs_no_answer(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
-    monkeypatch.setattr("sceneprint.store.objects.TRIED_S", 0)
+    monkeypatch.setattr("sceneprint.store.object_urls.TRIED_S", 0)
     kept = kept_objects.KeptObjects(open_objects(bucket), 60.0, 10_000)
     assert not kept.keep(made(10))
     for one in threading.enumerate():

@@ -13,9 +13,12 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.engine import sizes as measuring
+from sceneprint.engine.opening import open_engine
+from sceneprint.errors import UnusableStore
 from sceneprint.schemas import NewMap, Query
 from sceneprint.schemas.ingest import ImportOptions
-from sceneprint.store.objects import Objects, open_objects
+from sceneprint.store.object_urls import open_objects
+from sceneprint.store.objects import Objects
 
 
 @pytest.fixture
@@ -87,3 +90,14 @@ def test_an_archive_is_read_where_it_lies(
     names = {key.rpartition("/")[2] for key in keys(open_objects(f"{bucket}/fleet"), "blobs/")}
     assert len(names) == 6  # uploads and artifacts; the archive went with its job
     assert file.blob not in names
+
+
+def test_what_ends_with_a_process_is_for_one_process_alone(
+    make_engine: Callable[..., Engine], uploads: Any, work_off: Callable[[Engine], list[Any]]
+) -> None:
+    engine = make_engine(blob_url="memory:///")
+    engine.create_map(NewMap(name="hall", model="compact"))
+    engine.add_frame("hall", uploads[0].data, uploads[0].meta)
+    assert work_off(engine) == ["succeeded"]
+    with pytest.raises(UnusableStore, match=r"memory:///.*Client.embedded"):
+        open_engine(engine.settings)

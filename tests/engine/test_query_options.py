@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine, searching
+from sceneprint.engine import Engine, searching, views
 from sceneprint.engine.deadlines import FIRST_S, Deadline
 from sceneprint.errors import UnknownFrame
 from sceneprint.geometry.diversity import DiversityParameters, diversify

@@ -63,6 +63,7 @@ REFUSED: list[tuple[type[BaseModel], dict[str, Any], str]] = [
     (FrameMeta, meta(robot=""), "robot"),
     (FrameMeta, meta(robot="r\n"), "robot"),
     (FrameMeta, meta(robot="r\0"), "robot"),
+    (NewMap, {"name": "hall", "title": "t\0"}, "title"),
     (FrameMeta, meta(session="s" * 129), "session"),
     (FrameMeta, meta(tags=["a"] * 33), "tags"),
     (FrameMeta, meta(tags=["a", ""]), "tags.1"),

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine, administration, readers, searching
+from sceneprint.engine import Engine, administration, readers, searching, views
 from sceneprint.errors import UnreadableModel
 from sceneprint.index import search
 from sceneprint.schemas import JobState, NewMap, Query

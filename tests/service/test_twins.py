@@ -1,11 +1,13 @@
 """Two stores with the same map, in one of which much happens in others: a key for the map that
-both have is told the same by either, but for times and for what is drawn by chance.
+both have is told the same by either, but for times and for what is drawn by chance. And a third
+one, on another database.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import secrets
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -87,10 +89,11 @@ class Twin:
 
 
 @contextmanager
-def twin(folder: Path, shots: list[Any], *, busy: bool) -> Iterator[Twin]:
-    """A store with the maps alpha and bravo."""
+def twin(folder: Path, url: str | None, shots: list[Any], *, busy: bool) -> Iterator[Twin]:
+    """A store with the maps alpha and bravo, on SQLite where no database is given."""
+    (folder / "blobs").mkdir()
     settings = Settings(
-        data_dir=folder, database_url=None, require_keys=True, requests_per_s=0, events_kept=1000
+        data_dir=folder, database_url=url, require_keys=True, requests_per_s=0, events_kept=1000
     )
     app = create_app(settings)
     with (
@@ -101,8 +104,8 @@ def twin(folder: Path, shots: list[Any], *, busy: bool) -> Iterator[Twin]:
         ) as client,
     ):
         engine = app.state.context.engine
-        secrets = {name: engine.create_key(name, grants).secret for name, grants in KEYS.items()}
-        made = Twin(client, portal, engine, secrets, shots, busy)
+        keys = {name: engine.create_key(name, grants).secret for name, grants in KEYS.items()}
+        made = Twin(client, portal, engine, keys, shots, busy)
         for name in ("bravo", "alpha"):
             made.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
             made.disturb()
@@ -203,22 +206,25 @@ def plain(told: list[str]) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory, small_shots, small_model) -> list[list[str]]:
-    """All that is told, of the quiet one and of the busy one."""
+def both(tmp_path_factory, small_shots, small_model, postgres) -> list[list[str]]:
+    """All that is told, of the quiet one, the busy one, and a busy one on PostgreSQL."""
     found = []
+    server = postgres.create(f"twin{secrets.token_hex(6)}")
     with ExitStack() as stack:
-        for busy in (False, True):
-            one = stack.enter_context(twin(tmp_path_factory.mktemp("twin"), small_shots, busy=busy))
+        for busy, url in ((False, None), (True, None), (True, server)):
+            folder = tmp_path_factory.mktemp("twin")
+            one = stack.enter_context(twin(folder, url, small_shots, busy=busy))
             live(one, small_model)
             found.append(plain(list(everything(one))))
     return found
 
 
 def test_what_happens_in_other_maps_moves_nothing_that_is_told(both):
-    quiet, busy = both
+    quiet, busy, server = both
     assert len(quiet) > 60
-    for a, b in zip(quiet, busy, strict=True):
+    for a, b, c in zip(quiet, busy, server, strict=True):
         assert a == b
+        assert a == c
 
 
 def test_it_is_all_there(both):

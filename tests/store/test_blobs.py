@@ -18,7 +18,7 @@ from sceneprint.errors import DamagedBlob, ReadOnlyStore, StoreFull, UnusableSto
 from sceneprint.store import Blobs, FolderBlobs
 from sceneprint.store.locks import FileLocks
 from sceneprint.store.object_blobs import MARK, ObjectBlobs
-from sceneprint.store.objects import open_objects
+from sceneprint.store.object_urls import open_objects
 
 DIGEST = hashlib.sha256(b"depth").hexdigest()
 KEY = f"blobs/{DIGEST[:2]}/{DIGEST}"
@@ -156,9 +156,8 @@ def test_nothing_but_a_digest_becomes_a_path(blobs: FolderBlobs, given: str) -> 
 def test_a_blob_in_parts_is_there_whole_or_not_at_all(kept: Kept) -> None:
     parts = [bytes([number]) * 3_000_000 for number in range(7)]  # more than a store takes at once
     whole = b"".join(parts)
-    with pytest.raises(RuntimeError), kept.blobs.incoming() as blob:
+    with kept.blobs.incoming() as blob:
         blob.write(parts[0])
-        raise RuntimeError
     assert kept.files() == []
     with kept.blobs.incoming() as blob:
         for part in parts:

@@ -16,15 +16,17 @@ import pytest
 
 from benchmarks.fleet.s3 import ObjectServer
 from sceneprint.errors import DamagedBlob, StoreAway, UnusableStore
+from sceneprint.store import object_urls, recent
 from sceneprint.store import objects as module
-from sceneprint.store import recent
 from sceneprint.store.locks import FileLocks
 from sceneprint.store.object_blobs import ObjectBlobs
-from sceneprint.store.objects import PART, check_objects, open_objects
+from sceneprint.store.object_urls import check_objects, open_objects
+from sceneprint.store.objects import PART
 
 HALF_WAY = """
 import sys, time
-from sceneprint.store.objects import PART, open_objects
+from sceneprint.store.object_urls import open_objects
+from sceneprint.store.objects import PART
 
 class Slow:
     place = 0
@@ -121,8 +123,8 @@ def test_who_is_killed_half_way_leaves_nothing_to_be_read(bucket: str) -> None:
 @pytest.fixture
 def brittle(monkeypatch: pytest.MonkeyPatch) -> Iterator[ObjectServer]:
     """A server of this test alone, and little patience with it."""
-    monkeypatch.setattr(module, "TRIED_S", 1)
-    monkeypatch.setattr(module, "SMALL_S", 1)
+    monkeypatch.setattr(object_urls, "TRIED_S", 1)
+    monkeypatch.setattr(object_urls, "SMALL_S", 1)
     monkeypatch.setattr(module, "AWAY_S", 0.2)
     with ObjectServer() as server:
         for name, value in server.env.items():
@@ -158,8 +160,8 @@ def test_a_server_that_falls_acknowledges_nothing(brittle: ObjectServer) -> None
 def test_a_server_that_never_answers_is_given_up(
     monkeypatch: pytest.MonkeyPatch, bucket: str
 ) -> None:
-    monkeypatch.setattr(module, "SMALL_S", 1)
-    monkeypatch.setattr(module, "TRIED_S", 1)
+    monkeypatch.setattr(object_urls, "SMALL_S", 1)
+    monkeypatch.setattr(object_urls, "TRIED_S", 1)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         place = f"http://127.0.0.1:{silent.getsockname()[1]}"
         monkeypatch.setenv("AWS_ENDPOINT_URL", place)

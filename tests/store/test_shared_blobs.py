@@ -13,7 +13,7 @@ from sqlalchemy import text
 from sceneprint.errors import UnusableStore
 from sceneprint.store import Store, open_blobs, open_database, open_store
 from sceneprint.store.object_blobs import MARK, ObjectBlobs
-from sceneprint.store.objects import open_objects
+from sceneprint.store.object_urls import open_objects
 
 HOLDS = """
 import sys, time
@@ -59,7 +59,7 @@ def test_who_only_looks_marks_nothing(store_url: str, bucket: str) -> None:
 def test_a_store_that_is_away_is_opened_and_claimed_later(
     tmp_path: Path, bucket: str, monkeypatch: pytest.MonkeyPatch, object_server: Any
 ) -> None:
-    monkeypatch.setattr("sceneprint.store.objects.TRIED_S", 1)
+    monkeypatch.setattr("sceneprint.store.object_urls.TRIED_S", 1)
     monkeypatch.setattr("sceneprint.store.objects.AWAY_S", 0.0)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     store = open_store(f"sqlite:///{tmp_path / 'new' / 'a.db'}", bucket)

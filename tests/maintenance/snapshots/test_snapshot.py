@@ -27,8 +27,10 @@ from sqlalchemy import create_engine
 import migrations
 from sceneprint.engine import Engine
 from sceneprint.errors import SnapshotError, UnusableStore
+from sceneprint.maintenance import taking
 from sceneprint.maintenance.restoring import restore_snapshot, verify_snapshot
 from sceneprint.maintenance.snapshots import take_snapshot
+from sceneprint.store import FolderBlobs
 from sceneprint.store.frames import refers_to
 
 
@@ -279,6 +281,37 @@ def test_a_read_only_folder_can_be_taken(master):
         assert done.stdout == "9 0\n", done.stderr
         assert names_in(data) == before
         assert verify_snapshot(out / "a.tar").manifest.blobs.count == 9
+
+
+def test_large_blobs_go_in_parts(data, tmp_path, settings, rows, monkeypatch):
+    """The same archive, and the same that is left out of it."""
+    [(lost,), (broken,), *_] = rows(
+        data, "SELECT DISTINCT blob FROM frames WHERE state <> 'deleted'"
+    )
+    (data / "blobs" / lost[:2] / lost).unlink()
+    (data / "blobs" / broken[:2] / broken).write_bytes(b"no picture, and no small one either")
+    asked: list[str] = []
+    monkeypatch.setattr(FolderBlobs, "open", _told(FolderBlobs.open, asked))
+    small = take_snapshot(settings(data), tmp_path / "small.tar")
+    assert asked == []
+    monkeypatch.setattr(taking, "_LARGE", 20)
+    large = take_snapshot(settings(data), tmp_path / "large.tar")
+    assert len(asked) == large.manifest.blobs.count == small.manifest.blobs.count > 0
+    assert large.damaged == small.damaged
+    assert {one.digest: one.why for one in large.damaged} == {lost: "missing", broken: "damaged"}
+    held = []
+    for name in ("small.tar", "large.tar"):
+        with tarfile.open(tmp_path / name) as tar:
+            held.append({one.name: tar.extractfile(one).read() for one in tar.getmembers()[2:]})
+    assert held[0] == held[1]
+
+
+def _told(call: Callable[..., object], names: list[str]) -> Callable[..., object]:
+    def told(blobs: object, digest: str) -> object:
+        names.append(digest)
+        return call(blobs, digest)
+
+    return told
 
 
 def test_interrupted_it_leaves_nothing(master, tmp_path, settings):

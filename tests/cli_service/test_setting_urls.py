@@ -1,0 +1,54 @@
+"""URLs among the settings: which are taken, and that none is repeated where it is refused."""
+
+from __future__ import annotations
+
+import argparse
+import traceback
+
+import pytest
+
+from sceneprint.cli.serve import settings_of
+from sceneprint.errors import InvalidRequest
+
+SERVER = "postgresql+psycopg://u:hunter2@host/db"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("BLOB_URL", "s3://key:hunter2@bucket/prefix", "come from the environment"),
+        ("BLOB_URL", "s3://bucket?secret=hunter2", "come from the environment"),
+        ("SNAPSHOT_URL", "gs://bucket/p#hunter2", "come from the environment"),
+        ("BLOB_URL", "s3://[hunter2", "come from the environment"),
+        ("BLOB_URL", "hunter2://bucket", "begins with none of s3://, gs://, az://"),
+        ("SNAPSHOT_URL", "hunter2", "begins with none of s3://"),
+        ("BLOB_URL", "", "begins with none of s3://"),
+        ("BLOB_URL", "s3:///hunter2", "names no bucket"),
+        ("REPLICA_URL", SERVER, "SCENEPRINT_DATABASE_URL names"),
+    ],
+)
+def test_a_url_that_is_none_is_refused_and_not_repeated(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: str, said: str
+) -> None:
+    monkeypatch.delenv("SCENEPRINT_DATABASE_URL", raising=False)
+    monkeypatch.setenv(f"SCENEPRINT_{name}", value)
+    with pytest.raises(InvalidRequest, match=rf"SCENEPRINT_{name}\.$") as caught:
+        settings_of(argparse.Namespace())
+    assert said in str(caught.value)
+    assert "hunter2" not in "".join(traceback.format_exception(caught.value))
+
+
+def test_urls_are_taken_and_hide_what_is_in_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (
+        ("DATABASE_URL", SERVER), ("REPLICA_URL", SERVER), ("BLOB_URL", "s3://bucket/prefix"),
+        ("SNAPSHOT_URL", "file:///srv/snapshots"),
+    ):  # fmt: skip
+        monkeypatch.setenv(f"SCENEPRINT_{name}", value)
+    found = settings_of(argparse.Namespace())
+    assert found.database == SERVER
+    assert found.replica_url is not None
+    assert found.replica_url.get_secret_value() == SERVER
+    assert found.blob_url is not None
+    assert found.blob_url.get_secret_value() == "s3://bucket/prefix"
+    assert found.snapshot_url == "file:///srv/snapshots"
+    assert "hunter2" not in repr(found)

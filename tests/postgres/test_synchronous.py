@@ -1,0 +1,62 @@
+"""A commit counts when its standby has it: no time limit and no hand makes it count before."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from sqlalchemy import text
+
+from benchmarks.fleet.postgres import Server
+from sceneprint.errors import UnusableStore
+from sceneprint.store import Store
+from sceneprint.store.events import Wanted, list_events, tell
+
+WAITING = "FROM pg_stat_activity WHERE wait_event = 'SyncRep'"
+
+
+@pytest.fixture
+def forsaken(postgres: Server) -> Iterator[Server]:
+    """A server whose standby is away."""
+    for statement in ("ALTER SYSTEM SET synchronous_standby_names = 'nobody'",
+                      "SELECT pg_reload_conf()"):  # fmt: skip
+        postgres.execute(statement)
+    yield postgres
+    postgres.execute("ALTER SYSTEM RESET synchronous_standby_names")
+    postgres.execute("SELECT pg_reload_conf()")
+
+
+def test_a_commit_whose_wait_is_ended_by_hand_is_not_acknowledged(
+    server_store: Store, forsaken: Server, until: Callable[..., Any]
+) -> None:
+    database, raised = server_store.database, []
+
+    def write() -> None:
+        try:
+            with database.write() as connection:
+                limit = connection.execute(text("SHOW statement_timeout")).scalar_one()
+                assert limit == "0"  # else the server would end the wait itself
+                tell(connection, "map.created", "hall")
+        except Exception as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=write, daemon=True)
+    thread.start()
+    until(lambda: forsaken.execute(f"SELECT 1 {WAITING}"))
+    with database.read() as connection:  # others go on reading, and see nothing of it
+        assert list_events(connection, Wanted(), after=0, limit=9) == []
+    forsaken.execute(f"SELECT pg_cancel_backend(pid) {WAITING}")
+    thread.join(60)
+    assert [type(error) for error in raised] == [UnusableStore]
+    assert "the wait for a standby was ended by hand" in str(raised[0])
+
+
+def test_other_warnings_are_no_doubt(server_store: Store) -> None:
+    with server_store.database.write() as connection:
+        connection.execute(text("DO $$ BEGIN RAISE WARNING 'of something else'; END $$"))
+        tell(connection, "map.created", "hall")
+    with server_store.database.read() as connection:
+        assert len(list_events(connection, Wanted(), after=0, limit=9)) == 1
+        assert connection.execute(text("SHOW statement_timeout")).scalar_one() == "1min"
