@@ -36,9 +36,10 @@ class Standing:
 
     def all_of(self, kept: Kept) -> bool:
         """Whether all frames that an answer was made from and shows are still those too."""
-        own = kept.answer.frame
-        shown = [*kept.answer.matches, *([] if own is None else [own])]
-        return self.asked(kept) and all(self.frame(f.map, f.frame_id, kept.at) for f in shown)
+        own, matches = kept.answer.frame, kept.answer.matches
+        shown = {(one.map, one.frame_id) for one in matches}
+        shown |= set() if own is None else {(own.map, own.frame_id)}
+        return self.asked(kept) and all(self.frame(*place, kept.at) for place in shown)
 
     def map(self, name: str, at: float) -> bool:
         """Whether a map is there that was there at that time, seconds since 1970."""

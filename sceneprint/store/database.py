@@ -11,10 +11,11 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Connection, Engine, NullPool, create_engine, event
+from sqlalchemy import Connection, Engine, event
 
-from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
+from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store.faults import explained, shown
+from sceneprint.store.migrating import migrate
 from sceneprint.store.postgres import (
     MIGRATION_S,
     configure,
@@ -23,23 +24,13 @@ from sceneprint.store.postgres import (
     open_postgres,
     require_kept,
 )
-from sceneprint.store.revisions import known_revisions, migration_config, revision_of
-from sceneprint.store.sealed import Sealed, sealed_file
-from sceneprint.store.sqlite import (
-    BUSY_S,
-    HELD_S,
-    begin_sqlite,
-    configure_sealed,
-    configure_sqlite,
-    shrink_log,
-)
+from sceneprint.store.revisions import revision_of
+from sceneprint.store.sealed import Sealed
+from sceneprint.store.sqlite import BUSY_S, HELD_S, open_sqlite, shrink_log
 from sceneprint.store.urls import database_url
 
 if TYPE_CHECKING:
     import psycopg
-
-#: Alembic keeps the migration that runs in a variable of its module.
-_migrating = threading.Lock()
 
 
 class Database:
@@ -259,7 +250,7 @@ def open_database(url: str) -> Database:
     """
     database, engine = _reached(url)
     try:
-        _migrate(database, engine)
+        migrate(database, engine)
     except BaseException:
         database.close()
         raise
@@ -271,58 +262,5 @@ def _reached(given: str) -> tuple[Database, Engine]:
     if url.get_backend_name() != "sqlite":
         engine = open_postgres(url)
         return Database(engine), engine
-    path, sealed = sealed_file(url), None
-    if path is not None:
-        sealed = Sealed(path)
-        # each transaction opens the file in the way that is right then
-        engine = create_engine(url, creator=sealed.connect, poolclass=NullPool)
-    else:
-        # SQLite waits for a writer itself, fairly enough; readers never wait in WAL
-        engine = create_engine(url, connect_args={"timeout": BUSY_S}, pool_size=16, max_overflow=-1)
-    event.listen(engine, "connect", configure_sqlite if sealed is None else configure_sealed)
-    event.listen(engine, "begin", begin_sqlite)
+    engine, sealed = open_sqlite(url)
     return Database(engine, sealed), engine
-
-
-def _migrate(database: Database, engine: Engine) -> None:
-    """Run what is missing of `migrations/`, in one transaction."""
-    head, known = known_revisions()
-    with database.read() as connection:
-        current = _current(connection, known, engine)
-    if current == head:
-        return
-    if database.read_only:
-        raise ReadOnlyStore(
-            f"{shown(engine.url)} has schema {current}, this version needs {head}, and the file is "
-            "read-only. Open it once where it may be written, or use the version that wrote it."
-        )
-    with database.write(unchecked=True) as connection:  # another process may have been first
-        if _current(connection, known, engine) != head:
-            from alembic import command
-
-            config = migration_config()
-            config.attributes["connection"] = connection
-            with _migrating:
-                command.upgrade(config, "head")
-            if database.is_sqlite:
-                _require_whole(connection, engine)
-
-
-def _require_whole(connection: Connection, engine: Engine) -> None:
-    """What `unchecked` did not look at, looked at in the end."""
-    if connection.exec_driver_sql("PRAGMA foreign_key_check").first() is not None:
-        raise UnusableStore(
-            f"{shown(engine.url)}: rows refer to others that are not there, so it is not brought "
-            "to the schema of this version, and nothing was changed. Run `sceneprint fsck` of the "
-            "version that wrote it."
-        )
-
-
-def _current(connection: Connection, known: frozenset[str], engine: Engine) -> str | None:
-    current = revision_of(connection)
-    if current is not None and current not in known:
-        raise NewerSchema(
-            f"{shown(engine.url)} has schema {current}, which this version of sceneprint does not "
-            "know: a later one wrote it. Use that version, or another data folder."
-        )
-    return current

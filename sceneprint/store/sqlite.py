@@ -4,12 +4,29 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import Connection
+from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, event
+
+from sceneprint.store.sealed import Sealed, sealed_file
 
 #: Seconds a writer waits for another, and waits after somebody has waited so long in vain.
 BUSY_S, HELD_S = 10.0, 0.1
 #: Seconds for which emptying the log waits for readers: writers wait for it meanwhile.
 SHRINKING_S = 0.5
+
+
+def open_sqlite(url: URL) -> tuple[Engine, Sealed | None]:
+    """An engine whose connections are told what all are told, and where the file is read alone."""
+    path, sealed = sealed_file(url), None
+    if path is not None:
+        sealed = Sealed(path)
+        # each transaction opens the file in the way that is right then
+        engine = create_engine(url, creator=sealed.connect, poolclass=NullPool)
+    else:
+        # SQLite waits for a writer itself, fairly enough; readers never wait in WAL
+        engine = create_engine(url, connect_args={"timeout": BUSY_S}, pool_size=16, max_overflow=-1)
+    event.listen(engine, "connect", configure_sqlite if sealed is None else configure_sealed)
+    event.listen(engine, "begin", begin_sqlite)
+    return engine, sealed
 
 
 def configure_sqlite(connection: Any, _record: Any) -> None:
