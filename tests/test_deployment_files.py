@@ -31,7 +31,7 @@ def said_by_haproxy(text: str, folder: Path) -> tuple[int, str]:
     path = folder / "haproxy.cfg"
     path.write_text(text)
     done = subprocess.run(
-        [tool("haproxy", "haproxy"), "-c", "-q", "-f", str(path)],
+        [tool("haproxy", "haproxy"), "-c", "-f", str(path)],
         env={**os.environ, "API_HOST": "localhost"}, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     return done.returncode, done.stdout + done.stderr
@@ -39,7 +39,8 @@ def said_by_haproxy(text: str, folder: Path) -> tuple[int, str]:
 
 def test_haproxy_takes_its_file(tmp_path: Path) -> None:
     text = (FOLDER / "haproxy.cfg").read_text()
-    assert said_by_haproxy(text, tmp_path) == (0, "")
+    returned, said = said_by_haproxy(text, tmp_path)
+    assert (returned, said.strip()) == (0, "Configuration file is valid")
     returned, said = said_by_haproxy(text.replace("option httpchk", "option httpcheck"), tmp_path)
     assert returned != 0
     assert "httpcheck" in said

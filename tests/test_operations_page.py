@@ -10,6 +10,7 @@ from typing import Any, get_args
 from sceneprint.cli import parser
 from sceneprint.schemas import AnswerStatus, FrameState, JobState
 from sceneprint.schemas.events import KINDS, MISSED
+from sceneprint.schemas.operations import ReplicaSeen
 from sceneprint.settings import Settings
 from service.metrics import Metrics
 
@@ -33,7 +34,9 @@ def rows(text: str) -> dict[str, list[str]]:
 def families() -> dict[str, set[str]]:
     """Names of all that is told to Prometheus, with their labels."""
     found: dict[str, set[str]] = {}
-    for collector in Metrics().registry._collector_to_names:  # also those without data
+    metrics = Metrics()
+    metrics._tell_replica(ReplicaSeen(used=True, behind_s=0.5))  # told only where there is one
+    for collector in metrics.registry._collector_to_names:  # also those without data
         labels = set(getattr(collector, "_labelnames", ()))
         for family in collector.describe():
             name = family.name + ("_total" if family.type == "counter" else "")

@@ -24,7 +24,10 @@ KINDS = {
     "frame.failed": "Signing it broke down in every try, or was given up.",
     "frame.edited": "Its metadata was changed.",
     "frame.reencoded": "It was signed once more, for the model to come or what was damaged.",
-    "frame.deleted": "It was removed; no query finds it.",
+    "frame.deleted": (
+        "It was removed; no query finds it. `data.reason` is `retention` where its map keeps none "
+        "so old."
+    ),
     "import.done": "An archive was imported, as far as it could be; `data` is its result.",
     "association.found": "A job that looked for associations is over; `data` is its result.",
     "key.created": "A key was made; of no map.",

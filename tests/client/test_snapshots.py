@@ -18,6 +18,7 @@ from sceneprint.schemas import JobState
 from sceneprint.settings import Settings
 
 
+@pytest.mark.sqlite_only("it is restored to a folder; for PostgreSQL see test_fleets")
 def test_a_snapshot_taken_over_the_service_restores_to_the_same_answers(
     remote: Client, service_url: str, map_name: str, references: tuple[FrameReference, ...],
     tmp_path: Path,
