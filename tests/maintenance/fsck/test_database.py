@@ -27,6 +27,7 @@ def dump(path: Path) -> set[str]:
         return set(database.iterdump())
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_flipped_byte_anywhere_in_it_breaks_no_check(house: Any) -> None:
     """It is found, or harmless; and where it is found, a repair leaves every blob where it is."""
     path = house.data / "sceneprint.db"
@@ -65,6 +66,7 @@ def test_a_flipped_byte_anywhere_in_it_breaks_no_check(house: Any) -> None:
     assert house.look() == []
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_an_index_that_contradicts_its_table_keeps_all_hands_off(house: Any) -> None:
     """Else a frame whose row names another blob would seem to have lost its upload."""
     ((blob,),) = house.sql("SELECT blob FROM frames WHERE number = 1")
@@ -112,6 +114,7 @@ def test_a_damaged_model_that_ships_is_put_back(house: Any) -> None:
     assert house.look() == []
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_folder_that_is_not_there_is_not_taken_for_one_that_has_lost_all(house: Any) -> None:
     """As of a disk that is not mounted."""
     for name in ("blobs", "sceneprint.db"):
@@ -155,6 +158,7 @@ def test_a_quick_look_sees_what_is_missing(house: Any) -> None:
     assert found == ["missing-upload", "damaged-index"]
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_log_that_was_not_emptied_is_read_and_left(house: Any, tmp_path: Any) -> None:
     """Of a service that was killed: the last commits are in it."""
     with Engine(house.settings) as engine:

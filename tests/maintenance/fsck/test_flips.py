@@ -57,6 +57,7 @@ def named(finding: Finding) -> str | None:
     return finding.frame_id or str(finding.path)
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 @pytest.mark.parametrize("kind", [*INDEX, "table", "artifact", "upload", "signature"])
 def test_a_flipped_byte_is_named_and_nothing_else_is(house: Any, kind: str) -> None:
     rng = np.random.default_rng(7)
@@ -138,6 +139,7 @@ def test_a_damaged_artifact_is_quarantined_and_made_again(
     assert house.sql("SELECT revision FROM maps WHERE name = 'hall'") == before
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_damaged_signature_is_quarantined_and_made_again(
     house: Any, truth: Any, uploads: Any
 ) -> None:
@@ -213,6 +215,7 @@ def test_the_upload_of_a_frame_that_is_not_signed_yet_fails_it(house: Any, uploa
     assert house.look() == []
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 @pytest.mark.parametrize("others", ["artifact", "signature"])
 def test_what_was_made_of_a_lost_upload_cannot_be_made_again(
     house: Any, others: str, truth: Any, uploads: Any

@@ -33,6 +33,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return err
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_repair_makes_no_database_and_so_removes_no_upload(
     house: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -47,6 +48,7 @@ def test_a_repair_makes_no_database_and_so_removes_no_upload(
     assert not list(house.data.glob("sceneprint.db*"))
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_blobs_beside_a_database_that_knows_no_frame_are_left_alone(house: Any) -> None:
     for path in house.data.glob("sceneprint.db*"):
         path.unlink()
@@ -150,6 +152,7 @@ def test_a_snapshot_makes_up_for_no_disk(
     assert not (house.data / "blobs").exists()
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 @pytest.mark.parametrize(
     "command",
     [["index", "stats"], ["index", "rebuild"], ["thin", "hall", "--keep", "3"],

@@ -38,6 +38,7 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_what_is_in_an_archive(master, archive, rows):
     """Read by the tar of Python, and checked against the folder by hand."""
     with tarfile.open(archive) as tar:
@@ -84,6 +85,7 @@ def test_the_blobs_are_those_that_no_sweep_would_remove(master, archive, setting
     assert len(all_there) == len(held) + 1  # the orphan
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_what_is_restored_is_what_was_there(
     data, archive, tmp_path, content, answers, uploads, settings
 ):
@@ -109,6 +111,7 @@ def test_what_is_restored_is_what_was_there(
     assert snapshot.manifest.n_frames == 5
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_snapshot_of_a_snapshot_is_the_same(archive, tmp_path, settings):
     """Byte for byte, but for the manifest and the time in the headers."""
     restore_snapshot(archive, tmp_path / "new")
@@ -120,6 +123,7 @@ def test_a_snapshot_of_a_snapshot_is_the_same(archive, tmp_path, settings):
     assert members[0] == members[1]
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_the_commands(master, tmp_path, sceneprint, monkeypatch):
     monkeypatch.chdir(tmp_path)
     said = sceneprint("snapshot", "--data", master)
@@ -145,6 +149,7 @@ def test_the_commands(master, tmp_path, sceneprint, monkeypatch):
     assert names_in(tmp_path) == sorted([name, "folder", "new"])
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_it_is_in_nobodys_way(data, tmp_path, settings):
     """Taken while somebody holds the right to write, with his changes not yet committed."""
     with closing(sqlite3.connect(data / "sceneprint.db", isolation_level=None)) as writer:
@@ -158,6 +163,7 @@ def test_it_is_in_nobodys_way(data, tmp_path, settings):
         assert new.execute("SELECT title FROM maps").fetchall() == [(None,)]
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_damaged_blobs_are_left_out_and_named(data, tmp_path, sceneprint, rows, settings):
     (first, second) = rows(data, "SELECT id, blob FROM frames WHERE state = 'indexed' LIMIT 2")
     ((artifact,),) = rows(
@@ -194,6 +200,7 @@ def test_damaged_blobs_are_left_out_and_named(data, tmp_path, sceneprint, rows, 
         assert len(list(engine.store.blobs.digests())) == 7
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_what_cannot_be_taken(data, tmp_path, sceneprint, monkeypatch):
     def refused(text: str, folder: Path = data) -> None:
         said = sceneprint("snapshot", "--data", folder, "--out", tmp_path / "a.tar", expect=2)
@@ -223,6 +230,7 @@ def test_what_cannot_be_taken(data, tmp_path, sceneprint, monkeypatch):
     refused("the database cannot be copied")
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_database_that_could_not_be_restored_is_not_taken(data, tmp_path, settings):
     with closing(sqlite3.connect(data / "sceneprint.db")) as database:
         database.execute("DELETE FROM maps")  # foreign keys are not looked after here
@@ -232,6 +240,7 @@ def test_a_database_that_could_not_be_restored_is_not_taken(data, tmp_path, sett
     assert names_in(tmp_path) == ["data"]
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_database_of_an_earlier_schema_is_taken_as_it_is(tmp_path, settings):
     """Before an upgrade is when one wants a snapshot."""
     data = tmp_path / "data"
@@ -265,6 +274,7 @@ print(taken.manifest.blobs.count, len(taken.damaged))
 """
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
 def test_a_read_only_folder_can_be_taken(master):
     """By another user, who may write nothing there; nor is anything written."""
@@ -283,6 +293,7 @@ def test_a_read_only_folder_can_be_taken(master):
         assert verify_snapshot(out / "a.tar").manifest.blobs.count == 9
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_large_blobs_go_in_parts(data, tmp_path, settings, rows, monkeypatch):
     """The same archive, and the same that is left out of it."""
     [(lost,), (broken,), *_] = rows(
@@ -328,6 +339,7 @@ def test_interrupted_it_leaves_nothing(master, tmp_path, settings):
     assert names_in(tmp_path) == ["a.tar"]
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_progress_goes_from_nothing_to_all(master, tmp_path, settings):
     seen: list[tuple[int, int]] = []
     take_snapshot(settings(master), tmp_path / "a.tar", lambda *one: seen.append(one))
@@ -350,6 +362,7 @@ def longest_file() -> Iterator[Callable[[int], None]]:
     signal.signal(signal.SIGXFSZ, handler)
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_where_there_is_no_room(master, archive, tmp_path, sceneprint, longest_file):
     """In the copy of the database, in the archive, and in a blob that is unpacked."""
     database = (master / "sceneprint.db").stat().st_size

@@ -66,6 +66,7 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_what_is_there_stays(archive, data, tmp_path, content, sceneprint):
     before = content(data)
     said = sceneprint("restore", archive, "--data", data, expect=2)
@@ -98,6 +99,7 @@ def test_an_empty_folder_is_filled_and_stays_the_same_one(archive, tmp_path, con
     assert content(folder) == content(tmp_path / "new")
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_replaced_it_is_moved_aside(archive, data, tmp_path, content, sceneprint, rows):
     rows(data, "UPDATE maps SET title = 'as it was'")
     (data / "index").mkdir()
@@ -128,6 +130,7 @@ def test_a_link_to_it_stays_one(archive, data, tmp_path, content):
     assert names_in(link) == ["blobs", "sceneprint.db"]
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_in_use_it_is_not_replaced(archive, data, tmp_path, sceneprint):
     with subprocess.Popen(
         [sys.executable, "-c", ENGINE, str(data)],
@@ -173,6 +176,7 @@ def test_somebody_else_is_faster(archive, tmp_path, exists, name):
     assert names_in(tmp_path) == ["new"]
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_replacement_that_fails_is_undone(archive, data, tmp_path, content):
     """The database is opened at the last moment, by nobody who could be seen before."""
     before, holders = content(data), []
@@ -235,6 +239,7 @@ def test_two_at_once_leave_each_other_alone(archive, tmp_path):
     assert names_in(tmp_path) == ["new"]
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_mount_is_filled_and_never_moved(archive, tmp_path):
     if subprocess.run(["unshare", "-rm", "true"], capture_output=True).returncode != 0:
         pytest.skip("this machine lets nobody mount anything")
@@ -252,6 +257,7 @@ def test_a_mount_is_filled_and_never_moved(archive, tmp_path):
     assert lines[2::2] == [f"{held} []"] * 3
 
 
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_restored_by_the_command_it_serves(archive, tmp_path, settings):
     restore_snapshot(archive, tmp_path / "a" / "b")
     with Engine(settings(tmp_path / "a" / "b")) as engine:
