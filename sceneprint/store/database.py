@@ -16,6 +16,7 @@ from sqlalchemy import Connection, Engine, event
 from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store.faults import explained, shown
 from sceneprint.store.migrating import migrate
+from sceneprint.store import postgres
 from sceneprint.store.postgres import (
     MIGRATION_S,
     configure,
@@ -128,7 +129,7 @@ class Database:
         ------
         ReadOnlyStore : it may be read alone.
         StoreLocked : another process writes for longer than BUSY_S; who comes after that waits
-            for HELD_S only, until somebody gets through.
+            for HELD_S only (of the database's kind), until somebody gets through.
         StoreFull : the disk has no room.
         UnusableStore : it cannot be written for another reason.
         """
@@ -137,7 +138,8 @@ class Database:
             with self.explained(), self._engine.begin() as connection:
                 yield connection
             return
-        wait_s = HELD_S if self._held else BUSY_S
+        held_s = HELD_S if self.is_sqlite else postgres.HELD_S
+        wait_s = held_s if self._held else BUSY_S
         if unchecked and not self.is_sqlite:
             wait_s = MIGRATION_S
         if not self._turn.acquire(timeout=wait_s):
@@ -194,7 +196,11 @@ class Database:
             args, given = self._engine.dialect.create_connect_args(self._engine.url)
             options = {**connect_options(self._engine.url), **given}
             found = psycopg.connect(*args, **options, autocommit=True)
-            configure(found)
+            try:
+                configure(found)
+            except BaseException:
+                found.close()
+                raise
         return found
 
     def close(self) -> None:

@@ -156,6 +156,7 @@ _MEANT: dict[str, tuple[type[UnusableStore], str]] = {
     "28": (UnusableStore, "Check user and password in SCENEPRINT_DATABASE_URL, and pg_hba.conf."),
     "3D000": (UnusableStore, "Make the database, or name another in SCENEPRINT_DATABASE_URL."),
     "URL": (UnusableStore, "Correct SCENEPRINT_DATABASE_URL."),
+    "plan": (StoreLocked, "Tables were changed meanwhile, and nothing was stored. Come back."),
     # not ours to have asked for: it was there when this process began
     "42P01": (UnusableStore, "Its tables are not there, or no longer. Restore it from a copy."),
     "42501": (UnusableStore, "The user must own the database's tables: grant what is missing."),
@@ -186,10 +187,20 @@ def told(url: URL, error: object, broken: bool) -> UnusableStore | None:
     """
     said = " ".join(str(error).split()).rstrip(".")
     state = getattr(error, "sqlstate", None) or (_state_of(said) if broken else "")
+    state = "plan" if is_of_old_plan(error) else state
     kind, what = _MEANT.get(state) or _MEANT.get(state[:2]) or (StoreAway, _AWAY)
     if what == _AWAY and not broken:
         return None
     return kind(f"{shown(url)}: {said:.400}. {what}")
+
+
+def is_of_old_plan(error: object) -> bool:
+    """Whether a statement was prepared for tables that have other columns by now.
+
+    Its SQLSTATE is that of all that is not supported, and its text in the server's language.
+    """
+    diagnosis = getattr(error, "diag", None)
+    return getattr(diagnosis, "source_function", None) == "RevalidateCachedQuery"
 
 
 def _state_of(said: str) -> str:

@@ -30,6 +30,8 @@ CHANNEL = "sceneprint"
 LISTENS = "sceneprint "
 #: Seconds between two rings: of a crowd of uploads one is enough.
 REST_S = 0.02
+#: Seconds that closing waits for a ring under way: to a server that does not answer it takes long.
+CLOSING_S = 2.0
 #: Seconds after which who could not connect tries again.
 AGAIN_S = 2.0
 
@@ -84,7 +86,7 @@ class Notices(Bell):
             ringer, self._ringer = self._ringer, None
         self._rung.set()
         if ringer is not None:
-            ringer.join()
+            ringer.join(CLOSING_S)
 
     def _keep_ringing(self) -> None:
         """Tell the server of what was rung, over one connection."""
@@ -92,6 +94,8 @@ class Notices(Bell):
         while self._rung.wait() and not self._closed:
             self._rung.clear()
             for _ in range(2):  # the server may have closed the one that was good the last time
+                if self._closed:
+                    break
                 try:
                     if connection is None:
                         connection = self._database.driver_connection()

@@ -14,7 +14,7 @@ from sqlalchemy import URL, Connection, Engine, create_engine, event, text
 from sqlalchemy.engine import ExceptionContext
 
 from sceneprint.errors import UnusableStore
-from sceneprint.store.faults import shown
+from sceneprint.store.faults import is_of_old_plan, shown
 from sceneprint.store.sqlite import BUSY_S
 
 #: Advisory locks are two numbers: this one, which is ours alone, and what is locked.
@@ -28,6 +28,9 @@ CODES = 7
 STATEMENT_S, IDLE_S = 60.0, 30.0
 #: Seconds that a new schema may wait for its turn: another process may be making it.
 MIGRATION_S = 600.0
+#: Seconds a writer waits after somebody has waited in vain: the queue is of the whole fleet, and
+#: who leaves it after a moment, and begins at its end again, would never get through.
+HELD_S = 2.0
 #: Connections that a process keeps, and has at most.
 KEPT, MOST = 8, 32
 #: Seconds after which a connection is made anew, so that servers added since get their share.
@@ -64,7 +67,7 @@ def open_postgres(url: URL) -> Engine:
     event.listen(engine, "begin", _begin)
     event.listen(engine, "connect", _watch_commits)
     event.listen(engine, "commit", _forget_warnings)
-    event.listen(engine, "handle_error", _leave_standby)
+    event.listen(engine, "handle_error", _leave_behind)
     return engine
 
 
@@ -193,9 +196,12 @@ def _forget_warnings(connection: Connection) -> None:
     connection.info.pop(_WARNED, None)
 
 
-def _leave_standby(context: ExceptionContext) -> None:
-    """Give a connection up whose server is a standby: the next may lead to the one that writes."""
-    if getattr(context.original_exception, "sqlstate", None) == "25006":
+def _leave_behind(context: ExceptionContext) -> None:
+    """Give all connections up whose server is a standby, as the next may lead to the one that
+    writes; and those that prepared statements for tables that another process changed.
+    """
+    error = context.original_exception
+    if getattr(error, "sqlstate", None) == "25006" or is_of_old_plan(error):
         context.is_disconnect = True
 
 
