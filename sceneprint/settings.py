@@ -38,7 +38,10 @@ def is_loopback(host: str) -> bool:
 class Settings(BaseSettings):
     """Read from the environment: SCENEPRINT_<FIELD>. Nothing has to be set."""
 
-    model_config = SettingsConfigDict(env_prefix="SCENEPRINT_", frozen=True)
+    model_config = SettingsConfigDict(
+        env_prefix="SCENEPRINT_", frozen=True,
+        hide_input_in_errors=True,  # it may be a URL with a password
+    )  # fmt: skip
 
     #: Folder of derived files (pair tables). Deleting it loses nothing but seconds.
     cache_dir: Path = Field(default_factory=default_cache_dir)

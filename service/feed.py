@@ -17,7 +17,7 @@ from itertools import islice
 
 from anyio import to_thread
 
-from sceneprint.engine.happenings import begin, read_on
+from sceneprint.engine.happenings import begin, missed, read_on
 from sceneprint.errors import Busy, SceneprintError
 from sceneprint.store import Database
 from sceneprint.store.events import EventRow, Wanted, list_events, newest_number
@@ -51,6 +51,9 @@ class Feed:
         # all that is newer than `_since` and known is held; None: nobody has looked yet
         self._since: int | None = None
         self._newest = 0
+        # which line of history these are of, and how often another took its place: a standby that
+        # was promoted gives numbers out again that readers know of others
+        self._history, self._turned = database.history, 0
         self._news = asyncio.Event()
 
     @property
@@ -112,6 +115,7 @@ class Feed:
     ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
         if self._poller is None or self._poller.done():
             self._poller = asyncio.create_task(self._poll())
+        turned = self._turned
         first, place, seen = await to_thread.run_sync(
             begin, self._database, wanted, self._kept, after
         )
@@ -120,11 +124,18 @@ class Feed:
         due = clock() + ALIVE_S
         while not self._closed:
             if clock() >= due:
-                if not await to_thread.run_sync(may_go_on):
-                    return
+                if not await to_thread.run_sync(may_go_on) or self._poller.done():
+                    return  # without a poller it would be silent for ever
                 yield [], seen
                 due = clock() + ALIVE_S
             news = self._news
+            if turned != self._turned:
+                turned = self._turned
+                _, place, seen = await to_thread.run_sync(
+                    begin, self._database, wanted, self._kept, None
+                )
+                yield [missed(seen)], seen
+                continue
             if self._since is None or place < self._since:
                 found, place, seen = await to_thread.run_sync(
                     read_on, self._database, wanted, place, MOST
@@ -167,8 +178,16 @@ class Feed:
             try:
                 if self._since is None:
                     self._newest = self._since = await to_thread.run_sync(self._look)
+                    self._history = self._database.history
                     self._wake()
                 found = await to_thread.run_sync(self._more, self._newest)
+                if self._history != self._database.history:
+                    newest = await to_thread.run_sync(self._look)
+                    self._history, self._turned = self._database.history, self._turned + 1
+                    self._held.clear()
+                    self._newest = self._since = newest
+                    self._wake()
+                    continue
             except SceneprintError as error:
                 log.error("events cannot be read", extra={"error": str(error)})
                 pause = TROUBLE_S

@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
+from sceneprint.store.tables import metadata
 from sceneprint.synth import synthesise_room
 from sceneprint.types import Frame
 
@@ -134,12 +136,67 @@ def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         shutil.rmtree(server.folder, ignore_errors=True)  # it is large
 
 
+@pytest.fixture(scope="session")
+def _clean(postgres: Server) -> list[str]:
+    """Databases that are as new: to make one takes twenty times as long as to clean it."""
+    return []
+
+
 @pytest.fixture
-def postgres_url(postgres: Server) -> Iterator[str]:
-    """URL of a new database with the schema of this version and no rows; removed again."""
-    name = f"t{secrets.token_hex(6)}"
-    yield postgres.create(name, TEMPLATE)
-    postgres.drop(name)
+def postgres_url(postgres: Server, _clean: list[str]) -> Iterator[str]:
+    """URL of a database with the schema of this version and no rows, like a new one."""
+    name = _clean.pop() if _clean else f"t{secrets.token_hex(6)}"
+    if not postgres.execute(f"SELECT 1 FROM pg_database WHERE datname = '{name}'"):
+        postgres.create(name, TEMPLATE)
+    yield postgres.url(name)
+    if _cleaned(postgres, name):
+        _clean.append(name)
+    else:
+        postgres.drop(name)
+
+
+#: What of a database a test may have changed beside its rows.
+_SHAPE = """
+SELECT md5(concat(
+    (SELECT string_agg(concat_ws(' ', c.relname, c.relkind, a.attname, a.atttypid, a.attnotnull,
+                                 a.attcollation, c.reloptions), ',' ORDER BY c.relname, a.attnum)
+     FROM pg_class c JOIN pg_attribute a ON a.attrelid = c.oid AND NOT a.attisdropped
+     WHERE c.relnamespace = 'public'::regnamespace),
+    (SELECT string_agg(conname, ',' ORDER BY conname) FROM pg_constraint),
+    (SELECT string_agg(tgname, ',' ORDER BY tgname) FROM pg_trigger WHERE NOT tgisinternal),
+    (SELECT string_agg(proname, ',' ORDER BY proname) FROM pg_proc
+     WHERE pronamespace = 'public'::regnamespace),
+    (SELECT string_agg(extname, ',' ORDER BY extname) FROM pg_extension),
+    (SELECT string_agg(nspname, ',' ORDER BY nspname) FROM pg_namespace
+     WHERE NOT starts_with(nspname, 'pg_')),
+    (SELECT string_agg(setconfig::text, ',') FROM pg_db_role_setting s JOIN pg_database d
+     ON d.oid = s.setdatabase WHERE d.datname = current_database()),
+    (SELECT string_agg(version_num, ',') FROM alembic_version),
+    (SELECT string_agg(concat(name, value), ',') FROM secrets)
+))"""
+
+
+@cache
+def _shape_of_new(server: Server) -> list[tuple[object, ...]]:
+    return server.execute(_SHAPE, TEMPLATE)
+
+
+def _cleaned(server: Server, name: str) -> bool:
+    """Let a database be as if it were new; False where more than its rows was changed."""
+    import psycopg
+
+    with psycopg.connect(server.url(name).replace("+psycopg", ""), autocommit=True) as connection:
+        connection.execute(
+            "SELECT pg_terminate_backend(pid, 10000) FROM pg_stat_activity "
+            "WHERE datname = current_database() AND pid <> pg_backend_pid()"
+        )
+        if connection.execute(_SHAPE.encode()).fetchall() != _shape_of_new(server):
+            return False
+        tables = [f"DELETE FROM {one.name}" for one in reversed(metadata.sorted_tables)
+                  if one.name != "secrets"]  # fmt: skip
+        numbers = "SELECT setval(oid::regclass, 1, false) FROM pg_class WHERE relkind = 'S'"
+        connection.execute("; ".join(["BEGIN", *tables, numbers, "COMMIT"]).encode())
+    return True
 
 
 @pytest.fixture(scope="session")

@@ -30,7 +30,7 @@ from sceneprint.engine import Engine
 from sceneprint.models import read_model
 from sceneprint.schemas import NewMap, Query
 from sceneprint.settings import Settings
-from sceneprint.store import codes
+from sceneprint.store import fits, graphs
 from sceneprint.store.database import Database
 
 BEGIN, END = "<!-- fleet-costs:begin -->", "<!-- fleet-costs:end -->"
@@ -183,9 +183,9 @@ def _linked(database: Database) -> tuple[float, float, float] | None:
     axes = np.exp(-np.arange(DIMENSION) / 40)
     drawn = np.random.default_rng(0).normal(size=(CODES, DIMENSION)) * 40 * axes
     with database.write(unchecked=True) as connection:
-        if codes.prepare(connection) is not None:
+        if fits.prepare(connection) is not None:
             return None
-        fit = codes.add_fit(connection, "costs", "costs", b"", DIMENSION, CODES)
+        fit = fits.add_fit(connection, "costs", "costs", b"", DIMENSION, CODES)
         rows = [
             {"n": i, "code": "[" + ",".join(f"{x:.5g}" for x in one) + "]"}
             for i, one in enumerate(drawn)
@@ -196,10 +196,10 @@ def _linked(database: Database) -> tuple[float, float, float] | None:
         size = text(f"SELECT pg_total_relation_size('{fit.table}')")
         plain = int(connection.execute(size).scalar_one())
         begun = time.perf_counter()
-        codes.add_graph(connection, fit)
+        graphs.add_graph(connection, fit)
         seconds = time.perf_counter() - begun
         graph = int(connection.execute(size).scalar_one()) - plain
-        codes.drop_fit(connection, fit.number)
+        fits.drop_fit(connection, fit.number)
     return CODES / seconds, plain / CODES, graph / CODES
 
 

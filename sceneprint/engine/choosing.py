@@ -20,8 +20,8 @@ from sceneprint.engine.remembered import Remembered
 from sceneprint.engine.shortlists import WHOLE
 from sceneprint.engine.stored import Stored
 from sceneprint.index import Code, read_code
-from sceneprint.store import Database, codes, vectors
-from sceneprint.store.codes import Fit
+from sceneprint.store import Database, codes, fits, vectors
+from sceneprint.store.fits import Fit
 from sceneprint.store.records import MapRow
 from sceneprint.types import Floats32
 
@@ -59,7 +59,7 @@ class Choosing:
 
     def is_possible(self, connection: Connection) -> bool:
         """Whether any map may be searched in the database."""
-        return self.setting != "local" and codes.can_have(connection)
+        return self.setting != "local" and fits.can_have(connection)
 
     def stored(
         self, connection: Connection, database: Database, rows: Sequence[MapRow], length: int
@@ -73,7 +73,7 @@ class Choosing:
         rows : of the maps
         length : bytes of a signature
         """
-        fit = codes.live_fit(connection, rows[0].model_id) if rows else None
+        fit = fits.live_fit(connection, rows[0].model_id) if rows else None
         if fit is None:
             return {}
         numbers = [row.number for row in rows]
@@ -97,7 +97,7 @@ class Choosing:
         with self._lock:
             held = self._codes.get(fit.code_id)
         if held is None:
-            held = read_code(codes.content_of(connection, fit))
+            held = read_code(fits.content_of(connection, fit))
         with self._lock:
             self._codes[fit.code_id] = held
             self._codes.move_to_end(fit.code_id)
@@ -112,7 +112,7 @@ class Choosing:
         if self.setting == "local" or database.is_sqlite:
             return None
         with database.read() as connection:
-            fit = codes.live_fit(connection, model_id)
+            fit = fits.live_fit(connection, model_id)
             if fit is None:
                 return None
             code = self.code_of(connection, fit)
@@ -132,7 +132,7 @@ class Choosing:
                 codes.forget_codes(connection, [number])
             return
         fit, code = coded
-        now = codes.live_fit(connection, fit.model_id)
+        now = fits.live_fit(connection, fit.model_id)
         if now is not None and now.number == fit.number:
             codes.put_codes(connection, fit, {number: code}, anew=anew)
 

@@ -12,6 +12,7 @@ import logging
 import time
 import zlib
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,12 +21,12 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from sceneprint.engine.choosing import Choosing
 from sceneprint.engine.shortlists import WHOLE
-from sceneprint.errors import SceneprintError
+from sceneprint.errors import SceneprintError, StoreLocked
 from sceneprint.index import SHORTLIST, draw, fit_code, write_code
 from sceneprint.index.codes import SAMPLE
 from sceneprint.index.publishing import GROWTH
-from sceneprint.store import Database, codes, vectors
-from sceneprint.store.codes import Fit
+from sceneprint.store import Database, codes, fits, graphs, vectors
+from sceneprint.store.fits import Fit
 from sceneprint.store.maps import list_maps
 from sceneprint.store.postgres import allow
 from sceneprint.store.records import MapRow
@@ -82,7 +83,7 @@ class Coding:
             return 0
         try:
             with self._database.write(turn=False) as turn:
-                if not codes.take_turn(turn):
+                if not fits.take_turn(turn):
                     return 0
                 allow(turn, 0)  # it does nothing itself, for as long as a graph takes
                 return self._step(time.monotonic() + STEP_S)
@@ -93,24 +94,24 @@ class Coding:
     def _step(self, until: float) -> int:
         with self._database.read() as connection:
             rows = list_maps(connection)
-            fits = codes.list_fits(connection)
+            known = fits.list_fits(connection)
             wanted = {model for row in rows for model in models_of(row)}
-            leftovers = codes.leftovers(connection, wanted)
+            leftovers = fits.leftovers(connection, wanted)
         for number in leftovers:
-            with self._database.write(turn=False) as connection:
-                codes.drop_fit(connection, number)
+            with suppress(StoreLocked), self._database.write() as connection:
+                fits.drop_fit(connection, number)
         filled = 0
         for model_id in sorted(wanted):
-            own = [fit for fit in fits if fit.model_id == model_id and fit.number not in leftovers]
+            own = [fit for fit in known if fit.model_id == model_id and fit.number not in leftovers]
             filled += self._bring_on(model_id, rows, own, until)
         return filled
 
     def _bring_on(
-        self, model_id: str, rows: Sequence[MapRow], fits: Sequence[Fit], until: float
+        self, model_id: str, rows: Sequence[MapRow], own: Sequence[Fit], until: float
     ) -> int:
         asked = [row for row in rows if row.model_id == model_id]
-        live = next((fit for fit in fits if fit.state == "live"), None)
-        filling = next((fit for fit in fits if fit.state == "filling"), None)
+        live = next((fit for fit in own if fit.state == "live"), None)
+        filling = next((fit for fit in own if fit.state == "filling"), None)
         if filling is None and self._is_outgrown(model_id, asked, live):
             filling = self._fit(model_id, asked)
         if filling is not None:
@@ -136,7 +137,7 @@ class Coding:
     def _fit(self, model_id: str, rows: Sequence[MapRow]) -> Fit | None:
         """A code of all maps of a model; None where there can be none."""
         with self._database.write() as connection:
-            reason = codes.prepare(connection)
+            reason = fits.prepare(connection)
         if reason is not None:
             self._not_before = time.monotonic() + AGAIN_S
             log.warning("no shortlist in the database: %s", reason)
@@ -149,7 +150,7 @@ class Coding:
         code = fit_code(sample)
         with self._database.write(turn=False) as connection:
             content = write_code(code)
-            fit = codes.add_fit(connection, model_id, code.id, content, len(code.matrix), n)
+            fit = fits.add_fit(connection, model_id, code.id, content, len(code.matrix), n)
         log.info("code fitted", extra={"fit": fit.number, "frames": n, "maps": len(rows)})
         return fit
 
@@ -171,9 +172,7 @@ class Coding:
                 filled += len(made)
                 state.after = block[-1]
             elif not state.last:
-                with self._database.write(turn=False) as connection:
-                    allow(connection, 0)
-                    codes.add_graph(connection, fit)
+                graphs.add_graph_beside(self._database, fit)
                 self._filling[fit.number] = state = _Filling(last=True)
             else:
                 self._go_live(fit, asked, state.revisions)
@@ -183,7 +182,7 @@ class Coding:
 
     def _go_live(self, fit: Fit, rows: Sequence[MapRow], revisions: Mapping[int, int]) -> None:
         with self._database.write() as connection:
-            codes.make_live(connection, fit)
+            fits.make_live(connection, fit)
             for row in rows:
                 if row.number in revisions:
                     codes.set_complete(connection, fit, row.number, revisions[row.number])

@@ -49,8 +49,8 @@ def begin(database: Database, wanted: Wanted, kept: int, after: int | None) -> P
     if after is None:
         return Part([], newest, seen)
     if after > newest:  # the database was put back to an earlier state
-        return Part([_missed(seen)], newest, seen)
-    return Part([_missed(after)] if lost else [], after, after)
+        return Part([missed(seen)], newest, seen)
+    return Part([missed(after)] if lost else [], after, after)
 
 
 def read_on(database: Database, wanted: Wanted, place: int, most: int) -> Part:
@@ -63,6 +63,6 @@ def read_on(database: Database, wanted: Wanted, place: int, most: int) -> Part:
         return Part(found, max(newest, place), newest_seen(connection, wanted))
 
 
-def _missed(place: int) -> EventRow:
+def missed(place: int) -> EventRow:
     """Stands before what is still there."""
     return EventRow(place, time.time(), MISSED, None, None, None, {})

@@ -156,9 +156,16 @@ class KeptObjects:
 
     def _keeps(self, one: Found, stands: Stands) -> bool:
         try:
+            if one.size == 0:
+                return False
             beginning = self._objects.part(one.key, 0, min(HEAD, one.size))
-            return stands(read_head(beginning, lambda n: self._objects.part(one.key, 0, n)))
+            return stands(read_head(beginning, lambda n: self._begin(one, n)))
         except FileNotFoundError:
             return True  # another has removed it
         except DAMAGED:
             return False
+
+    def _begin(self, one: Found, length: int) -> bytes:
+        if length > one.size:
+            raise ValueError("damaged: it is shorter than it says")
+        return self._objects.part(one.key, 0, length)

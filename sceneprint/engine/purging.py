@@ -18,7 +18,7 @@ from sceneprint.engine.reconstructions import Reconstructions
 from sceneprint.engine.shown import Standing
 from sceneprint.engine.sweeping import sweep_doomed
 from sceneprint.engine.upkeep import Upkeep
-from sceneprint.errors import SceneprintError, UnknownJob, UnknownMap
+from sceneprint.errors import BusyIndex, SceneprintError, UnknownJob, UnknownMap
 from sceneprint.store import Store
 from sceneprint.store.maps import list_maps
 from sceneprint.store.records import MapRow
@@ -30,7 +30,7 @@ _YOUNG_S = 60.0
 #: Longest time for blobs that were left: frames wait to be signed.
 _SWEEP_S = 20.0
 #: Times that making an index anew takes, for which its map is left in peace afterwards: of a large
-#: one it costs hours, and a deletion an hour would keep a worker at it for ever.
+#: one it costs hours, and a deletion an hour would keep the workers at it for ever.
 PAUSE = 10.0
 
 
@@ -68,7 +68,6 @@ class Purging:
         self._reconstructions = reconstructions
         self._every_s = purge_s / 2  # what is deleted just after a look is gone in time too
         self._next = time.monotonic() + self._every_s
-        self._rest: dict[int, float] = {}  # by number of a map: when its index may be made again
 
     def run(self) -> Purged | None:
         """Remove what is left, where it is time; what goes wrong is logged and tried again."""
@@ -76,13 +75,14 @@ class Purging:
             return None
         self._next = time.monotonic() + self._every_s
         before = time.time() - min(_YOUNG_S, self._every_s)
-        return self._all(before, self._rested, seconds=min(_SWEEP_S, self._every_s))
+        return self._all(before, self._upkeep.is_rested, seconds=min(_SWEEP_S, self._every_s))
 
     def now(self) -> Purged:
         """Remove all that is left at once.
 
         Raises
         ------
+        BusyIndex : another process is building one that has to be made anew; the rest is removed.
         StoreError, OSError : as it cannot be removed; the rest is.
         """
         failed: list[Exception] = []
@@ -90,9 +90,6 @@ class Purging:
         if failed:
             raise failed[0]
         return found
-
-    def _rested(self, row: MapRow) -> bool:
-        return time.monotonic() >= self._rest.get(row.number, 0.0)
 
     def _all(
         self, before: float | None, wanted: Callable[[MapRow], bool],
@@ -103,6 +100,11 @@ class Purging:
                 return do()
             except (UnknownMap, UnknownJob):
                 return 0  # deleted meanwhile: the next time
+            except BusyIndex as error:
+                log.info("not all was purged", extra={"error": str(error)})
+                if failed is not None:
+                    failed.append(error)
+                return 0
             except (SceneprintError, OSError, ValueError) as error:
                 log.error("not all was purged", extra={"error": str(error)})
                 if failed is not None:
@@ -127,5 +129,5 @@ class Purging:
         took = time.monotonic() - start
         if done:
             log.info("index purged", extra={"map": row.name, "seconds": round(took, 1)})
-            self._rest[row.number] = time.monotonic() + PAUSE * took
+            self._upkeep.rest(row, PAUSE * took)
         return int(done)

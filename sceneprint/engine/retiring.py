@@ -12,6 +12,7 @@ from sceneprint.engine.sweeping import sweep_deleted
 from sceneprint.errors import SceneprintError
 from sceneprint.store import Store
 from sceneprint.store.aging import DAY_S, aging_maps, old_frames
+from sceneprint.store.clock import read_clock
 from sceneprint.store.deleting import delete_frames
 from sceneprint.store.maps import find_map
 from sceneprint.store.records import MapRow
@@ -47,7 +48,8 @@ class Retiring:
 
         Parameters
         ----------
-        now : seconds since 1970; default: by the clock
+        now : seconds since 1970; default: by the clock of the database, as that of one host that
+            is wrong would delete what is young
         """
         if time.monotonic() < self._next:
             return 0
@@ -57,7 +59,7 @@ class Retiring:
                 rows = aging_maps(connection)
             until, deleted = time.monotonic() + TURN_S, 0
             for row in rows:
-                while (found := self._block(row, time.time() if now is None else now)) > 0:
+                while (found := self._block(row, now)) > 0:
                     deleted += found
                     if time.monotonic() > until:
                         self._next = 0.0  # the next turn goes on
@@ -67,11 +69,12 @@ class Retiring:
             log.warning("old frames were not deleted", extra={"error": str(error)})
             return 0
 
-    def _block(self, row: MapRow, now: float) -> int:
+    def _block(self, row: MapRow, at: float | None) -> int:
         """Delete the oldest frames of a map, a few of them; returns how many."""
         if row.retention_days is None:
             return 0
         with self._store.database.read() as connection:  # most often there is none: no lock
+            now = read_clock(connection) if at is None else at
             if not old_frames(connection, row.number, now - DAY_S * row.retention_days, 1):
                 return 0
         with self._store.database.write() as connection:

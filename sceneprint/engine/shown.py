@@ -39,6 +39,7 @@ class Standing:
         own, matches = kept.answer.frame, kept.answer.matches
         shown = {(one.map, one.frame_id) for one in matches}
         shown |= set() if own is None else {(own.map, own.frame_id)}
+        self._look_up(shown)
         return self.asked(kept) and all(self.frame(*place, kept.at) for place in shown)
 
     def map(self, name: str, at: float) -> bool:
@@ -52,18 +53,26 @@ class Standing:
 
     def frame(self, map_name: str, frame_id: str, at: float) -> bool:
         """Whether a frame is there that was there at that time."""
-        place = map_name, frame_id
-        if place not in self._frames:
-            with self._store.database.read() as connection:
-                asked = (
-                    select(frames.c.received_at)
+        self._look_up({(map_name, frame_id)})
+        received = self._frames[map_name, frame_id]
+        return received is not None and received <= at
+
+    def _look_up(self, places: set[tuple[str, str]]) -> None:
+        """Ask for all frames that are not known yet at once: there are thousands of answers."""
+        new = places - self._frames.keys()
+        if not new:
+            return
+        for place in new:
+            self._frames[place] = None
+        with self._store.database.read() as connection:
+            for name in {name for name, _ in new}:
+                found = connection.execute(
+                    select(frames.c.id, frames.c.received_at)
                     .join(maps, maps.c.number == frames.c.map_number)
                     .where(
-                        maps.c.name == map_name,
-                        frames.c.id == frame_id,
+                        maps.c.name == name,
+                        frames.c.id.in_([frame_id for of, frame_id in new if of == name]),
                         frames.c.state != FrameState.DELETED,
                     )
                 )
-                self._frames[place] = connection.execute(asked).scalar()
-        received = self._frames[place]
-        return received is not None and received <= at
+                self._frames.update({(name, frame_id): at for frame_id, at in found})

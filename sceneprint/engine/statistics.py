@@ -27,6 +27,7 @@ from sceneprint.schemas.operations import (
     Counted,
     IndexState,
     Latency,
+    MapUse,
     Minute,
     ReplicaSeen,
     Sizes,
@@ -144,6 +145,7 @@ class Statistics:
             indexes=indexes,
             workers=workers,
             bytes=taken or self.sizes(),
+            use=None if row is None else _use(row),
             replica=self.replica() if row is None else None,
             total=Counted(**_counted(happened, range(minutes), samples)),
             minutes=_minutes(happened, samples, start, minutes),
@@ -212,6 +214,16 @@ class Statistics:
             kept[row.number] = now, found
             self._sizes_of = kept
         return kept[row.number][1]
+
+
+def _use(row: MapRow) -> MapUse:
+    return MapUse(
+        frames=row.used_frames,
+        bytes=row.used_bytes,
+        quota_frames=row.quota_frames,
+        quota_bytes=row.quota_bytes,
+        retention_days=row.retention_days,
+    )
 
 
 def _minutes(

@@ -23,8 +23,8 @@ from sceneprint.errors import UnknownFrame
 from sceneprint.geometry.retrieval import distances
 from sceneprint.index import SHORTLIST, Code, Hits
 from sceneprint.index.keys import Keys
-from sceneprint.store import Database, codes, vectors
-from sceneprint.store.codes import Fit
+from sceneprint.store import Database, codes, fits, graphs, vectors
+from sceneprint.store.fits import Fit
 from sceneprint.store.vectors import Vector
 from sceneprint.types import Bytes
 
@@ -187,12 +187,12 @@ def _proposed(
 ) -> Keys | None:  # fmt: skip
     """Frames that are compared; None for all, where nothing proposes any."""
     first = views[0]
-    fit = codes.live_fit(connection, first.model_id)
+    fit = fits.live_fit(connection, first.model_id)
     if fit is None:  # dropped since the map was looked at
         return None
     maps = [view.map_number for view in views]
     code = first.code_of(connection, fit).encode(query[None])[0]
-    near = codes.nearest(connection, fit, code, maps, count, asked, wanted, dead)
+    near = graphs.nearest(connection, fit, code, maps, count, asked, wanted, dead)
     others = np.array(sorted(codes.uncoded(connection, fit, maps, 2 * WHOLE)), np.int64)
     if wanted is not None:
         others = others[np.isin(others, wanted)]

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
+import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,12 +24,16 @@ from sceneprint.index import Generation, clear, manifests, newest, newest_number
 from sceneprint.store import Store
 from sceneprint.store.events import anchor_of
 from sceneprint.store.maps import find_map, list_maps
+from sceneprint.store.postgres import allow
 from sceneprint.store.records import MapRow
 from sceneprint.store.reencoding import is_complete
 from sceneprint.store.signatures import changes_since, count_gone, count_indexed, deleted_since
 from sceneprint.types import Bytes
 
 log = logging.getLogger(__name__)
+
+#: In the folder of an index: read from its times, when it was purged, and when it may be again.
+_REST = ".rest"
 
 
 class Upkeep:
@@ -134,6 +141,7 @@ class Upkeep:
         Raises
         ------
         UnknownMap : the map is gone, and with it soon its index.
+        BusyIndex : another process is building it, and may not know of the latest deletions.
         OSError : it cannot be written; what was there stays.
         """
         folder = index_folder(self._indexes, row)
@@ -141,22 +149,50 @@ class Upkeep:
         if not listed:
             return False
         length = self._signers(row.model_id).model.signature_bytes
+        found = newest(folder, row.model_id, length)  # before a connection waits for it
         with self._store.database.read() as connection:
+            allow(connection, 0)
             now = find_map(connection, row.name)
             if now.number != row.number:
                 return False
-            found = newest(folder, row.model_id, length)
             gone = deleted_since(connection, row.number, 0 if found is None else found.revision)
             empty = count_indexed(connection, row.number, 0) == 0
-            older = len(listed) > 1 and count_gone(connection, row.number, 0) > 0
-        if empty:
-            return clear(folder)
-        if found is None:
-            return False  # it is made anew when the map has grown long
-        in_use = len(found) - int((found.places.of(np.fromiter(gone, np.int64)) >= 0).sum())
-        if sum(map(len, found.segments)) > in_use:
-            return self._publish(row, anyway=True, clean=True) is not None
-        return older and clear(folder, but=found.number)
+            left = found is None or len(listed) > 1
+            older = left and count_gone(connection, row.number, 0) > 0
+        if empty or (found is None and older):
+            done = clear(folder)  # of what is damaged, nothing is read: it is made anew in time
+        elif found is None:
+            return False
+        else:
+            in_use = len(found) - int((found.places.of(np.fromiter(gone, np.int64)) >= 0).sum())
+            if sum(map(len, found.segments)) > in_use:
+                done = self._publish(row, anyway=True, clean=True) is not None
+            elif older:
+                done = clear(folder, but=found.number)
+            else:
+                return False
+        if not done:
+            raise BusyIndex(
+                f"Another process is building the index of map {row.name!r}, so bytes of deleted "
+                "frames may be left in it. Try again when it is done."
+            )
+        return True
+
+    def rest(self, row: MapRow, seconds: float) -> None:
+        """Leave the index of a map in peace for so long, whichever process looks after it."""
+        now = time.time()
+        with suppress(OSError):  # removed meanwhile: then there is nothing to be left in peace
+            mark = index_folder(self._indexes, row) / _REST
+            mark.touch()
+            os.utime(mark, (now, now + seconds))
+
+    def is_rested(self, row: MapRow) -> bool:
+        """Whether that time is over."""
+        try:
+            found = (index_folder(self._indexes, row) / _REST).stat()
+        except OSError:
+            return True
+        return not found.st_atime <= time.time() < found.st_mtime  # nor has the clock been set back
 
     def _publish(
         self, row: MapRow, *, anyway: bool = False, anew: bool = False, clean: bool = False
@@ -164,6 +200,7 @@ class Upkeep:
         signer = self._signers(row.model_id)  # before a connection is held: it takes one itself
         damaged: list[int] = []
         with self._store.database.read() as connection:
+            allow(connection, 0)  # it does nothing itself, for as long as building takes
             now = find_map(connection, row.name)
             if row.model_id == now.next_model_id and is_complete(connection, now):
                 now = replace(now, model_id=row.model_id)  # about to be the map's own

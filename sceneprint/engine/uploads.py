@@ -264,12 +264,14 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
         loosen(connection, frame.number, upload.if_novel)
         left.append(ready.blob)
         return Outcome(told(connection, frame))
-    if frame is None or frame.state == FrameState.REDUNDANT:  # a failed one is counted already
-        try:
-            require_room(connection, row, len(upload.data))
-        except QuotaExceeded as error:
-            left.append(ready.blob)
-            return Outcome(None, error=error)
+    new = frame is None or frame.state == FrameState.REDUNDANT
+    # a failed one is counted already, and may come packed otherwise
+    held = 0 if frame is None or new else frame.bytes
+    try:
+        require_room(connection, row, len(upload.data) - held, new=new)
+    except QuotaExceeded as error:
+        left.append(ready.blob)
+        return Outcome(None, error=error)
     of_blob = {"blob": ready.blob, "bytes": len(upload.data), "novelty": upload.if_novel}
     if frame is None:
         values = {"content_id": ready.content, **of_blob, **ready.known}

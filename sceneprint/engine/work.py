@@ -238,7 +238,7 @@ def _store_again(store: Store, readers: Readers, work: Work, made: StoredSignatu
         if not store.blobs.holds(made.geometry):
             raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
         before = geometry_blobs(connection, [number], made.model_id).values()
-        replace_signature(connection, work.frame, made)
-        readers.choosing.keep(connection, number, coded, anew=True)
+        changed = replace_signature(connection, work.frame, made)
+        readers.choosing.keep(connection, number, coded, anew=changed)
         tell_of(connection, "frame.reencoded", work)
         return [blob for blob in before if blob != made.geometry]

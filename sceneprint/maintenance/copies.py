@@ -131,7 +131,43 @@ def copy_database(source: Path, to: Path) -> None:
 def open_copy(path: Path) -> Iterator[sqlite3.Connection]:
     """A database that nobody writes, to be read."""
     with closing(_connect(path, "mode=ro&immutable=1")) as connection:
-        yield connection
+        try:
+            yield connection
+        except sqlite3.Error as error:
+            raise UnusableStore(
+                f"{path}: the copy of the database cannot be read ({error}). Run `sceneprint "
+                "fsck` on the store it was made of."
+            ) from error
+
+
+def check_plain(connection: sqlite3.Connection) -> str | None:
+    """What a database of unknown origin holds beside tables and indexes; None where it is nothing.
+
+    A view or a generated column runs what its author likes whenever a table is read, for ever, and
+    a trigger whenever one is written.
+
+    Parameters
+    ----------
+    connection : of `open_copy`; nothing of it has been read yet
+    """
+    asked = (
+        "SELECT type, name FROM sqlite_master"
+        " WHERE type NOT IN ('table', 'index') OR rootpage = 0 OR rootpage IS NULL LIMIT 1"
+    )
+    tables = "SELECT name FROM sqlite_master WHERE type = 'table'"
+    try:
+        odd = connection.execute(asked).fetchone()
+        if odd is not None:  # without pages of its own: a view, a trigger, a virtual table
+            return f"{odd[0]} {odd[1]!r:.80}"
+        for (name,) in connection.execute(tables).fetchall():
+            made = connection.execute(
+                "SELECT name FROM pragma_table_xinfo(?) WHERE hidden <> 0", (name,)
+            ).fetchone()
+            if made is not None:
+                return f"column {made[0]!r:.80} of {name!r:.80} is generated"
+    except sqlite3.Error:
+        pass  # who reads on says what is wrong
+    return None
 
 
 def check_copy(connection: sqlite3.Connection) -> str | None:
@@ -185,7 +221,9 @@ def counts(connection: sqlite3.Connection) -> dict[str, Any]:
 
 def referred(connection: sqlite3.Connection) -> Iterator[str]:
     """Digests of all blobs that have to be there, each once, in order."""
-    asked = f"SELECT DISTINCT digest FROM ({_every(connection)}) ORDER BY digest"
+    # as text, whatever a database that somebody has edited holds
+    told = "CAST(digest AS TEXT) AS digest"
+    asked = f"SELECT DISTINCT {told} FROM ({_every(connection)}) ORDER BY 1"
     for (digest,) in connection.execute(asked):
         yield digest
 
@@ -205,7 +243,8 @@ def uses(connection: sqlite3.Connection, digest: str) -> tuple[Use, ...]:
     rows = connection.execute(
         "SELECT maps.name, frames.id, used.role FROM"
         f" ({_USES}) AS used JOIN frames ON frames.number = used.number"
-        " JOIN maps ON maps.number = frames.map_number WHERE digest = ? ORDER BY frames.number",
+        " JOIN maps ON maps.number = frames.map_number WHERE CAST(digest AS TEXT) = ?"
+        " ORDER BY frames.number",
         (digest,),
     )
     of_frames = [Use(map=name, frame=frame, role=role) for name, frame, role in rows]
@@ -214,7 +253,8 @@ def uses(connection: sqlite3.Connection, digest: str) -> tuple[Use, ...]:
     rows = connection.execute(
         "SELECT maps.name, jobs.id FROM"
         f" ({_USES_OF_JOBS}) AS used JOIN jobs ON jobs.number = used.number"
-        " JOIN maps ON maps.number = jobs.map_number WHERE digest = ? ORDER BY jobs.number",
+        " JOIN maps ON maps.number = jobs.map_number WHERE CAST(digest AS TEXT) = ?"
+        " ORDER BY jobs.number",
         (digest,),
     )
     return (*of_frames, *(Use(map=name, job=job, role="job") for name, job in rows))

@@ -10,16 +10,16 @@ again.
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from sqlalchemy import URL
 
 from sceneprint.errors import DamagedSnapshot, SnapshotError
 from sceneprint.maintenance.accepting import check_acceptable
-from sceneprint.maintenance.copies import open_copy
+from sceneprint.maintenance.copies import open_copy, referred
 from sceneprint.maintenance.importing import check_empty, copy_into, take_secrets
 from sceneprint.maintenance.manifests import DATABASE
 from sceneprint.maintenance.snapshots import Progress, Snapshot
@@ -28,6 +28,9 @@ from sceneprint.maintenance.unpacking import blobs_of, unpack
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, open_blobs
 from sceneprint.store.database import Database, open_database, reach_database
+from sceneprint.store.marks import Mark
+from sceneprint.store.object_urls import open_objects
+from sceneprint.store.seals import Seals
 from sceneprint.writing import make_folder
 
 #: Blobs that are written at once, and bytes above which one goes alone and in parts.
@@ -66,15 +69,16 @@ def restore_to_fleet(
             archive, made, lambda done, total: tell(done, 2 * total), with_blobs=False
         )
         path = made / DATABASE
-        _bring_here(path)
+        owner = _bring_here(path)
         with open_copy(path) as file:
             check_acceptable(file)
             database = open_database(settings.database)
             try:
-                _fill(
-                    database, file, settings, archive,
-                    lambda done, total: tell(total + done, 2 * total),
-                )  # fmt: skip
+                with _marked(settings, database, owner):
+                    _fill(
+                        database, file, settings, snapshot,
+                        lambda done, total: tell(total + done, 2 * total),
+                    )  # fmt: skip
             finally:
                 database.close()
     return snapshot
@@ -110,43 +114,73 @@ def _check_target(database: Database) -> None:
         )
 
 
-def _bring_here(path: Path) -> None:
-    """Bring a database of an earlier version to the schema of this one."""
+def _bring_here(path: Path) -> str:
+    """Bring a database of an earlier version to the schema of this one; returns whose it is."""
     url = URL.create("sqlite", database=str(path))
-    open_database(url.render_as_string(hide_password=False)).close()
+    with closing(open_database(url.render_as_string(hide_password=False))) as database:
+        return Seals(database).owner
+
+
+@contextmanager
+def _marked(settings: Settings, database: Database, owner: str) -> Iterator[None]:
+    """Have the prefix of an object store to oneself while blobs are put there.
+
+    The store that the snapshot was taken of has the same name: what it keeps must not be shared.
+    """
+    if isinstance(settings.blobs, Path):
+        yield
+        return
+    mark = Mark(open_objects(settings.blobs))
+    with database.read() as connection:
+        check_empty(connection)  # so what a service has marked with its name is nobody's
+    mark.begin(owner, Seals(database).owner)
+    yield
+    mark.end(owner)
 
 
 def _fill(
-    database: Database, file: sqlite3.Connection, settings: Settings, archive: Path, tell: Progress
-) -> None:
+    database: Database, file: sqlite3.Connection, settings: Settings, snapshot: Snapshot,
+    tell: Progress,
+) -> None:  # fmt: skip
     with database.write() as connection:  # who keeps the blobs may ask whose they are
         check_empty(connection)
         take_secrets(connection, file)
     blobs = open_blobs(settings.blobs, database, make=True)
     with closing(blobs), blobs.kept():
-        _put_all(blobs, archive, tell)
+        lost = {one.digest for one in snapshot.damaged}
+        wanted = (digest for digest in referred(file) if digest not in lost)
+        _put_all(blobs, snapshot.path, wanted, tell)
         with database.write() as connection:
             copy_into(connection, file)
 
 
-def _put_all(blobs: Blobs, archive: Path, tell: Progress) -> None:
-    """Keep all blobs, a few at once: each waits for its disk, or for the network."""
+def _put_all(blobs: Blobs, archive: Path, wanted: Iterable[str], tell: Progress) -> None:
+    """Keep all blobs, a few at once: each waits for its disk, or for the network.
+
+    The archive may have been changed, or be another one, since it was verified.
+    """
     waiting: dict[Future[str], str] = {}
+
+    def require(same: bool) -> None:
+        if not same:
+            raise DamagedSnapshot(f"{archive} was changed while it was restored. Try again.")
 
     def kept(done: Iterable[Future[str]]) -> None:
         for one in [*done]:
-            if one.result() != waiting.pop(one):
-                raise DamagedSnapshot(f"{archive} was changed while it was restored. Try again.")
+            require(one.result() == waiting.pop(one))
 
+    left = iter(wanted)
     with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="put") as pool:
         for digest, size, chunks in blobs_of(archive, tell):
+            require(digest == next(left, None))
             if size > _LARGE:
                 with blobs.incoming() as blob:
                     for chunk in chunks:
                         blob.write(chunk)
-                    blob.keep()
+                    require(blob.keep() == digest)
                 continue
             waiting[pool.submit(blobs.put, b"".join(chunks))] = digest
             if len(waiting) >= 2 * _AT_ONCE:
                 kept(wait(waiting, return_when=FIRST_COMPLETED).done)
+        require(next(left, None) is None)
         kept(waiting)

@@ -51,7 +51,9 @@ def copy_into(connection: Connection, file: sqlite3.Connection) -> None:
                 f"{written.told[0]} that were written. Nothing was restored; see the "
                 "server's log."
             )
-    given = dict(file.execute("SELECT name, seq FROM sqlite_sequence"))
+    # anybody may write anything there
+    asked = "SELECT name, seq FROM sqlite_sequence WHERE typeof(seq) = 'integer'"
+    given = dict(file.execute(asked))
     for table in metadata.sorted_tables:
         if Form(table).counts:
             _count_on(connection, table.name, given.get(table.name, 0))

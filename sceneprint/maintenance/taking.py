@@ -16,6 +16,7 @@ from typing import Literal
 
 from sceneprint.errors import DamagedBlob, SnapshotError
 from sceneprint.store import Blobs
+from sceneprint.store.blobs import is_digest
 
 #: Blobs that are read at once, and bytes above which one is read alone and in parts.
 _AT_ONCE, _LARGE = 8, 8 << 20
@@ -74,11 +75,13 @@ def total_bytes(blobs: Blobs, digests: Iterable[str], count: int) -> int:
     """
     step = max(-(-count // _MEASURED), 1)
     with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="measure") as pool:
-        sizes = pool.map(blobs.size, islice(digests, 0, None, step))
+        sizes = pool.map(blobs.size, filter(is_digest, islice(digests, 0, None, step)))
         return step * sum(size or 0 for size in sizes)
 
 
 def _take(blobs: Blobs, digest: str) -> Taken | Untaken:
+    if not is_digest(digest):  # of a database that somebody has edited
+        return Untaken(digest, "missing")
     size = blobs.size(digest)
     if size is not None and size > _LARGE:
         condition = blobs.condition(digest)

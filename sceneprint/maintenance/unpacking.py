@@ -31,6 +31,7 @@ from sceneprint.maintenance.manifests import (
 from sceneprint.maintenance.snapshots import Progress, Snapshot
 from sceneprint.maintenance.staging import check_room
 from sceneprint.maintenance.syncing import DurableFiles
+from sceneprint.store.blobs import is_digest
 from sceneprint.writing import sync_folder
 
 
@@ -130,15 +131,21 @@ def _checked(
     reader: ArchiveReader, manifest: Manifest, archive: Path, path: Path
 ) -> Iterator[sqlite3.Connection]:
     """The database, after it has been looked through: one that is whole may not be sound."""
+    told = {"maps": manifest.maps, "frames": manifest.frames, "signatures": manifest.signatures}
     with copies.open_copy(path) as copy:
-        revision = copies.check_schema(copy, str(archive))
-        wrong = copies.check_copy(copy)
-        if wrong is not None:
-            raise reader.damaged(f"its database is not sound ({wrong})")
-        told = {"maps": manifest.maps, "frames": manifest.frames, "signatures": manifest.signatures}
-        if revision != manifest.schema_revision or copies.counts(copy) != told:
-            raise reader.damaged("its database is another than its manifest says")
-        yield copy
+        try:
+            wrong = copies.check_plain(copy)
+            if wrong is not None:
+                raise reader.damaged(f"its database is none of sceneprint's ({wrong})")
+            revision = copies.check_schema(copy, str(archive))
+            wrong = copies.check_copy(copy)
+            if wrong is not None:
+                raise reader.damaged(f"its database is not sound ({wrong})")
+            if revision != manifest.schema_revision or copies.counts(copy) != told:
+                raise reader.damaged("its database is another than its manifest says")
+            yield copy
+        except sqlite3.Error as error:
+            raise reader.damaged(f"its database cannot be read ({error})") from error
 
 
 def _blobs(
@@ -149,7 +156,8 @@ def _blobs(
     with DurableFiles(folder) as files:
         member = reader.next()
         for digest in copies.referred(copy):
-            if member is None or member[0] != BLOBS + digest:
+            # what is no digest would choose where it is written: nothing is there for it
+            if member is None or member[0] != f"{BLOBS}{digest}" or not is_digest(digest):
                 missing.append(digest)
                 if len(missing) > manifest.damaged.count:
                     raise reader.damaged("a blob is missing, or another one is there")

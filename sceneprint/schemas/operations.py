@@ -118,6 +118,16 @@ class Minute(Counted):
     at: datetime = Field(description="When it began.")
 
 
+class MapUse(Told):
+    """What a map has of what it may have; see Map."""
+
+    frames: int = Field(description="That count for the quota.")
+    bytes: int = Field(description="Of their uploads, as they were sent.")
+    quota_frames: int | None = Field(description="Null: no quota.")
+    quota_bytes: int | None = Field(description="Null: no quota.")
+    retention_days: float | None = Field(description="Null: frames are kept.")
+
+
 class Stats(Told):
     """How the service, or one map, does now and did lately."""
 
@@ -138,6 +148,9 @@ class Stats(Told):
         "a map was asked for."
     )
     bytes: Sizes = Field(description="On the disk; measured at most twice a minute.")
+    use: MapUse | None = Field(
+        default=None, description="Against quota and retention; null where no map was asked for."
+    )
     replica: ReplicaSeen | None = Field(
         default=None,
         description="Null where there is none, or a map was asked for.",

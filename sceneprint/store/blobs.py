@@ -21,6 +21,11 @@ Condition = Literal["sound", "missing", "damaged"]
 DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
+def is_digest(given: object) -> bool:
+    """Whether it is the name of a blob, whatever of."""
+    return isinstance(given, str) and DIGEST.fullmatch(given) is not None
+
+
 def require_digest(given: str) -> None:
     """ValueError for what is no digest: it must not become part of a path or a key."""
     if not DIGEST.fullmatch(given):

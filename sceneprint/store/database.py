@@ -16,7 +16,7 @@ from sqlalchemy import Connection, Engine, event
 from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store.faults import explained, shown
 from sceneprint.store.migrating import migrate
-from sceneprint.store import postgres
+from sceneprint.store.postgres import HELD_S as HELD_OF_FLEET_S
 from sceneprint.store.postgres import (
     MIGRATION_S,
     configure,
@@ -138,7 +138,7 @@ class Database:
             with self.explained(), self._engine.begin() as connection:
                 yield connection
             return
-        held_s = HELD_S if self.is_sqlite else postgres.HELD_S
+        held_s = HELD_S if self.is_sqlite else HELD_OF_FLEET_S
         wait_s = held_s if self._held else BUSY_S
         if unchecked and not self.is_sqlite:
             wait_s = MIGRATION_S

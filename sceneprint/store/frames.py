@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import uuid
 from collections.abc import Iterable
 from typing import Any
@@ -12,6 +11,7 @@ from sqlalchemy import ColumnElement, Connection, func, insert, select, update
 from sceneprint.errors import UnknownFrame
 from sceneprint.schemas import FrameState
 from sceneprint.store.blocks import among, blocks
+from sceneprint.store.clock import now
 from sceneprint.store.deleting import delete_frames
 from sceneprint.store.quotas import ROOMLESS, count_on
 from sceneprint.store.records import FrameRow, MapRow, frame_row
@@ -41,8 +41,8 @@ def add_frame(
     place = {} if pose is None else {f"pose_{axis}": pose[i][3] for i, axis in enumerate("xyz")}
     connection.execute(
         insert(frames).values(
-            id=frame_id, map_number=map_number, state=FrameState.RECEIVED, received_at=time.time(),
-            **values, **place,
+            id=frame_id, map_number=map_number, state=FrameState.RECEIVED,
+            received_at=now(connection), **values, **place,
         )
     )  # fmt: skip
     count_on(connection, map_number, 1, values["bytes"])

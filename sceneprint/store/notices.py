@@ -94,8 +94,6 @@ class Notices(Bell):
         while self._rung.wait() and not self._closed:
             self._rung.clear()
             for _ in range(2):  # the server may have closed the one that was good the last time
-                if self._closed:
-                    break
                 try:
                     if connection is None:
                         connection = self._database.driver_connection()

@@ -1,7 +1,7 @@
 """Blobs in an object store that a fleet shares.
 
     PREFIX/blobs/ab/abcdef...   a blob under its digest
-    PREFIX/sceneprint.json      whose they are: two databases on one prefix would sweep each other's
+    PREFIX/sceneprint.json      whose they are, see marks.py
 
 A blob is put in one step, or in parts that are not there before the last: what was not
 acknowledged leaves nothing behind that could be read. It is put also where one is there, which may
@@ -11,7 +11,6 @@ be damaged, or about to be removed.
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import os
 import tempfile
@@ -28,12 +27,13 @@ from sceneprint.store.blobs import DIGEST, BlobEntry, Condition, require_digest
 from sceneprint.store.faults import unusable
 from sceneprint.store.incoming import IncomingBlob
 from sceneprint.store.locks import Locks
+from sceneprint.store.marks import MARK, Mark
 from sceneprint.store.objects import Objects
 from sceneprint.store.recent import Recent
 from sceneprint.writing import sync_folder
 
-#: Under the prefix: the blobs, and the name of whom they belong to.
-FOLDER, MARK = "blobs/", "sceneprint.json"
+#: Under the prefix: the blobs.
+FOLDER = "blobs/"
 #: Blobs that this process has put last, of which it knows whether any can have been removed since.
 _KNOWN = 4_096
 #: Seconds for which `check` tells what it found last.
@@ -75,28 +75,8 @@ class ObjectBlobs:
         ------
         UnusableStore : it is another's, or the object store cannot be used.
         """
-        if self._claimed:
-            return
-        owner = self._owner()
-        data = json.dumps({"kind": "sceneprint blobs", "store": owner}).encode()
-        for _ in range(2):  # another process may be the first
-            try:
-                found = json.loads(self.objects.get(MARK))["store"]
-            except FileNotFoundError:
-                if not anew or self.objects.put(MARK, data, create=True):
-                    self._claimed = anew
-                    return
-                continue
-            except (ValueError, KeyError, TypeError):
-                found = None
-            if found != owner:
-                raise UnusableStore(
-                    f"{self.objects.url}: the blobs there are of another database, which would "
-                    "lose them to this one. Give each database a prefix of its own in "
-                    f"SCENEPRINT_BLOB_URL. If that database is gone for good, remove {MARK} there."
-                )
-            self._claimed = True
-            return
+        if not self._claimed:
+            self._claimed = Mark(self.objects).claim(self._owner(), anew=anew)
 
     def put(self, data: bytes) -> str:
         """Keep bytes; when this returns the store has acknowledged them. See `Blobs.put`."""
@@ -116,7 +96,8 @@ class ObjectBlobs:
         what = f"{place}: a blob cannot be written"
         with ExitStack() as stack:
             try:
-                file = stack.enter_context(tempfile.TemporaryFile())
+                # a buffer would be written once more when it is closed, on a disk that is full
+                file = stack.enter_context(tempfile.TemporaryFile(buffering=0))
             except OSError as error:
                 raise unusable(what, error) from error
             yield IncomingBlob(file, what, lambda digest: self._keep(file, digest))

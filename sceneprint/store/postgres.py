@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy import URL, Connection, Engine, create_engine, event, text
 from sqlalchemy.engine import ExceptionContext
 
-from sceneprint.errors import UnusableStore
+from sceneprint.errors import StoreAway, UnusableStore
 from sceneprint.store.faults import is_of_old_plan, shown
 from sceneprint.store.sqlite import BUSY_S
 
@@ -169,10 +169,10 @@ def require_kept(connection: Connection) -> None:
 
     Raises
     ------
-    UnusableStore : somebody ended the wait for a standby; the server says so in passing.
+    StoreAway : somebody ended the wait for a standby; the server says so in passing.
     """
     if _WARNED in connection.info:
-        raise UnusableStore(
+        raise StoreAway(
             f"{shown(connection.engine.url)}: the wait for a standby was ended by "
             "hand. What was written is there, and lost if the server falls before a standby "
             "follows. Bring the standby back, or take it out of synchronous_standby_names."

@@ -53,14 +53,15 @@ def counted_anew(connection: Connection, map_number: int) -> Use:
     return Use(int(n), int(size))
 
 
-def require_room(connection: Connection, row: MapRow, size: int) -> None:
-    """See that a map's quota leaves room for one more frame.
+def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> None:
+    """See that a map's quota leaves room for one more frame, or for a larger upload of one.
 
     Parameters
     ----------
     connection : of the transaction that would add it, or of a reading one for a first look
     row : of the map
-    size : bytes of the upload
+    size : bytes that it takes more
+    new : whether the frame is not counted yet
 
     Raises
     ------
@@ -69,15 +70,15 @@ def require_room(connection: Connection, row: MapRow, size: int) -> None:
     if row.quota_frames is None and row.quota_bytes is None:
         return
     use = use_of(connection, row.number)
-    if row.quota_frames is not None and use.frames >= row.quota_frames:
+    if new and row.quota_frames is not None and use.frames >= row.quota_frames:
         raise QuotaExceeded(
             f"Map {row.name!r} holds {use.frames} frames of the {row.quota_frames} that its quota "
             f"allows, so the frame was not taken. {_todo(row.name)}"
         )
-    if row.quota_bytes is not None and use.bytes + size > row.quota_bytes:
+    if size > 0 and row.quota_bytes is not None and use.bytes + size > row.quota_bytes:
         raise QuotaExceeded(
             f"Map {row.name!r} holds {use.bytes} bytes of uploads of the {row.quota_bytes} that "
-            f"its quota allows, so the frame of {size} bytes was not taken. {_todo(row.name)}"
+            f"its quota allows, so {size} bytes more were not taken. {_todo(row.name)}"
         )
 
 

@@ -102,7 +102,9 @@ class SessionLocks:
         # who puts a blob while it is removed must find out: without the counter, nothing goes
         for _ in range(2):  # it is odd already after a remover that died
             number = self._removes.ask(_NEXT)
-            if number is not None and number % 2 == 1:
+            if number is None:  # with the connection the lock is gone
+                break
+            if number % 2 == 1:
                 return True
         self._removes.drop()
         return False

@@ -172,6 +172,8 @@ def test_events_come_live_and_take_no_focus(station, page, settle, until, axe):
 def test_a_key_for_one_map_is_told_of_that_and_what_it_may_not_see(station, open_page, settle, axe):
     page = open_page(extra_http_headers={"X-Forwarded-For": "192.0.2.7"})
     page.allowed.append("401")
+    limits = {"quota_frames": 20, "retention_days": 400}
+    assert station.client.patch("/v1/maps/building", json=limits).is_success
     secret = station.key("guest", {"building": "read"})
     page.goto(f"{station.home}#/operations")
     settle(page)
@@ -184,6 +186,9 @@ def test_a_key_for_one_map_is_told_of_that_and_what_it_may_not_see(station, open
     assert page.get_by_text("are shown to keys that are admin of all maps").is_visible()
     assert page.locator("#operations-map option").all_inner_texts() == ["building"]
     assert page.get_by_role("heading", name="Workers").count() == 0
+    use = page.get_by_role("region", name="Quota and retention")
+    assert use.locator("dd").all_inner_texts()[::2] == ["16 of 20", "400 days"]
+    assert use.locator(".gauge[data-kind]").count() == 0  # a fifth is left
     assert axe(page) == []
     page.get_by_role("link", name="Jobs").click()
     settle(page)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,13 +15,16 @@ import numpy as np
 import pytest
 from sqlalchemy import inspect, text
 
-from sceneprint.engine import Engine
+from sceneprint.engine import Engine, purging, upkeep
+from sceneprint.engine.purging import Purging
 from sceneprint.engine.readers import index_folder
 from sceneprint.engine.uploads import Upload
-from sceneprint.errors import UnknownJob, UnknownQuery
-from sceneprint.index import newest
+from sceneprint.errors import BusyIndex, UnknownJob, UnknownQuery
+from sceneprint.index import newest, newest_number
+from sceneprint.index.files import building
 from sceneprint.schemas import NewMap, Query
 from sceneprint.schemas.reconstructions import NewReconstruction
+from sceneprint.store import postgres
 from sceneprint.store.editing import write_frame
 from sceneprint.store.frames import delete_frame, find_frame
 from sceneprint.store.maps import find_map
@@ -198,3 +202,37 @@ def test_what_a_snapshot_or_a_crash_left_goes_later(empty, uploads):
     assert engine.purging.now().blobs == 2
     assert list(engine.store.blobs.digests()) == [hashlib.sha256(b.data).hexdigest()]
     assert engine.purging.now().blobs == 0
+
+
+def test_an_index_is_made_anew_by_one_process_and_then_rests(
+    lived_in, make_engine, store_url, ids, tmp_path, monkeypatch
+):
+    first, names = lived_in, ids(lived_in)
+    monkeypatch.setattr(postgres, "IDLE_S", 0.2)  # shorter than it takes to make an index
+    built = upkeep.publish
+
+    def slow(*args, **more):
+        found = built(*args, **more)
+        time.sleep(0.5)
+        return found
+
+    monkeypatch.setattr(upkeep, "publish", slow)
+    monkeypatch.setattr(purging, "PAUSE", 1e4)
+    second = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2, purge_s=1)
+    workers = [
+        Purging(one.store, one._upkeep, one.kept, one.reconstructions, 0.0)
+        for one in (second, second)
+    ]
+    first.delete_frame("hall", names[0])
+    folder = index_folder(first.settings.indexes, first._row("hall"))
+    before = newest_number(folder)
+    with building(folder):
+        with pytest.raises(BusyIndex, match="bytes of deleted frames may be left"):
+            second.purging.now()
+        assert [worker.run().indexes for worker in workers] == [0, 0]
+    assert workers[0].run().indexes == 1
+    assert newest_number(folder) == before + 1
+    first.delete_frame("hall", names[1])
+    assert [worker.run().indexes for worker in workers] == [0, 0]
+    assert second.purging.now().indexes == 1  # whoever asks for it need not wait
+    assert newest_number(folder) == before + 2

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import threading
 
 import numpy as np
 import pytest
+from PIL import Image
 from sqlalchemy import select
 
 from sceneprint.engine.edits import edit_map
@@ -166,3 +168,21 @@ def test_limits_are_looked_at_before_they_are_set(empty):
     assert (told.quota_frames, told.quota_bytes, told.retention_days) == (0, 10, None)
     assert told.etag != before
     assert edit_map(empty.store, "hall", {"quota_frames": None}).quota_bytes == 10
+
+
+def test_a_failed_frame_that_comes_larger_needs_room_too(empty, uploads):
+    one = uploads[0]
+    added, _ = empty.add_frame("hall", one.data, one.meta)
+    with empty.store.database.write() as connection:
+        row = find_map(connection, "hall")
+        number = stored.find_frame(connection, row, added.frame_id).number
+        stored.set_state(connection, number, FrameState.FAILED, "it broke down")
+    picture = Image.open(io.BytesIO(one.data))
+    loose = io.BytesIO()
+    picture.save(loose, "png", compress_level=0)
+    limit(empty, quota_frames=1, quota_bytes=len(loose.getvalue()) - 1)
+    with pytest.raises(QuotaExceeded, match=f"so {len(loose.getvalue()) - len(one.data)} bytes m"):
+        empty.add_frame("hall", loose.getvalue(), one.meta)
+    assert used(empty) == Use(1, len(one.data))
+    again, new = empty.add_frame("hall", one.data, one.meta)  # as it was: no more room than before
+    assert (again.frame_id, new, used(empty)) == (added.frame_id, True, Use(1, len(one.data)))

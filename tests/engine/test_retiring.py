@@ -116,3 +116,18 @@ def test_the_oldest_are_found_without_reading_those_that_are_gone(aged):
         plan = connection.execute(text(f"EXPLAIN QUERY PLAN {statement}")).all()
         assert "ix_frames_aging (map_number=? AND received_at<?)" in str(plan)
         assert len(old_frames(connection, number, time.time(), 100)) == 12
+
+
+def test_a_host_whose_clock_is_wrong_deletes_nothing(make_engine, postgres_url, uploads, tmp_path):
+    (tmp_path / "data" / "blobs").mkdir(parents=True)
+    engine = make_engine(tmp_path / "data", database_url=postgres_url)
+    engine.create_map(NewMap(name="hall", model="compact", retention_days=1))
+    right, one = time.time, uploads[0]
+    with pytest.MonkeyPatch.context() as patch:  # a robot that has not been told the time yet
+        patch.setattr(time, "time", lambda: right() - 30 * DAY_S)
+        added, _ = engine.add_frame("hall", one.data, one.meta)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(time, "time", lambda: right() + 30 * DAY_S)
+        assert Retiring(engine.store).run() == 0
+    assert engine.get_frame("hall", added.frame_id).state == "received"
+    assert Retiring(engine.store).run(right() + 30 * DAY_S) == 1

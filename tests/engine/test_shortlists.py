@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,13 @@ import pytest
 from sqlalchemy import event, select, text
 
 from benchmarks.fleet.bulk import fill, walk
-from sceneprint.engine import Engine, coding, readers, searching, stored
+from sceneprint.engine import Engine, choosing, coding, readers, searching, stored
+from sceneprint.errors import StoreLocked
 from sceneprint.geometry.retrieval import distances
 from sceneprint.models import Model
 from sceneprint.schemas import Answer, ExplainedFrame, NamedFrame, Query
 from sceneprint.settings import Settings
-from sceneprint.store import codes
+from sceneprint.store import codes, fits, graphs
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import StoredSignature, replace_signature
@@ -29,8 +31,9 @@ SIZES = {"hall": 900, "yard": 700}
 
 
 @pytest.fixture
-def make(postgres_url: str, tmp_path: Path) -> Iterator[Make]:
-    """Engines on one database, each a node of its own folder."""
+def make(postgres_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+    """Engines on one database, each a node of its own folder, that counts frames each time."""
+    monkeypatch.setattr(choosing, "_COUNTED", 0)
     opened: list[Engine] = []
 
     def engine(node: str = "a", shortlist: str = "database", **more: object) -> Engine:
@@ -68,14 +71,14 @@ def code_all(engine: Engine) -> None:
         pass
 
 
-def live(engine: Engine, model: Model) -> codes.Fit:
+def live(engine: Engine, model: Model) -> fits.Fit:
     with engine.store.database.read() as connection:
-        fit = codes.live_fit(connection, model.id)
+        fit = fits.live_fit(connection, model.id)
     assert fit is not None
     return fit
 
 
-def coded(engine: Engine, fit: codes.Fit) -> set[int]:
+def coded(engine: Engine, fit: fits.Fit) -> set[int]:
     with engine.store.database.read() as connection:
         return set(connection.execute(text(f"SELECT frame_number FROM {fit.table}")).scalars())
 
@@ -133,12 +136,12 @@ def test_both_shortlists_agree_with_the_exact_scan(
     assert [one.exact for one in exact] == [True, True]
     assert found(exact[0]) == found(exact[1]) == nearest(places, asked[3], both, 50)
     # and through the graph, which a table so small is given here
-    monkeypatch.setattr(codes, "GRAPH_FROM", 100)
-    monkeypatch.setattr(codes, "_STEP_COST", 0.0)
+    monkeypatch.setattr(graphs, "GRAPH_FROM", 100)
+    monkeypatch.setattr(graphs, "_STEP_COST", 0.0)
     with filled.store.database.write() as connection:
-        codes.add_graph(connection, live(filled, small_model))
+        graphs.add_graph(connection, live(filled, small_model))
     with filled.store.database.read() as connection:
-        assert codes._by_graph(connection, live(filled, small_model), 500, 1600)
+        assert graphs._by_graph(connection, live(filled, small_model), 500, 1600)
     for maps in (both, ["yard"]):
         answers = [ask(filled, one, maps) for one in asked]
         assert {one.counts.compared for one in answers} == {500}
@@ -178,16 +181,16 @@ def test_a_frame_deleted_during_the_search_or_before_is_not_found_afterwards(
 ) -> None:
     code_all(filled)
     before = ask(filled, "hall-100")
-    gone, proposed = before.matches[0].frame_id, codes.nearest
+    gone, proposed = before.matches[0].frame_id, graphs.nearest
     assert len(filled._readers.choosing.remembered) == 500
 
     def late(*given: Any) -> Any:
-        monkeypatch.setattr(codes, "nearest", proposed)
+        monkeypatch.setattr(graphs, "nearest", proposed)
         chosen = proposed(*given)
         filled.delete_frame("hall", gone)
         return chosen
 
-    monkeypatch.setattr(codes, "nearest", late)
+    monkeypatch.setattr(graphs, "nearest", late)
     during = ask(filled, "hall-100")  # of the state before: its signature is remembered
     assert {gone, *found_ids(during)} == {gone, *found_ids(before)}
     after = ask(filled, "hall-100")
@@ -222,15 +225,15 @@ def test_a_refit_goes_on_beside_queries_and_every_answer_is_right(
     grown = places | {"hall": np.concatenate([places["hall"], more])}
     monkeypatch.setattr(coding, "STEP_S", 0.0)  # a block in each turn
     monkeypatch.setattr(coding, "COUNT_S", 0.0)
-    fits, steps = [], 0
+    asked, steps = [], 0
     while True:
         filled._coding.run()
         frame = f"hall-{50 + 61 * steps % 2500}"
         wanted = nearest(grown, frame, ["hall", "yard"], 10)
         assert recall([ask(filled, frame, ["hall", "yard"])], [wanted]) == 1.0
-        fits.append(live(filled, small_model).number)
+        asked.append(live(filled, small_model).number)
         steps += 1
-        if fits[-1] != first.number:
+        if asked[-1] != first.number:
             break
         assert steps < 40
     assert steps > 10  # 3300 frames in blocks of 256
@@ -239,10 +242,43 @@ def test_a_refit_goes_on_beside_queries_and_every_answer_is_right(
     assert second.code_id != first.code_id
     # whoever began to read the old table may end; then it goes
     assert len(coded(filled, first)) >= 1600
-    monkeypatch.setattr(codes, "KEPT_S", 0.0)
+    monkeypatch.setattr(fits, "KEPT_S", 0.0)
     filled._coding.run()
     with filled.store.database.read() as connection:
-        assert [fit.number for fit in codes.list_fits(connection)] == [second.number]
+        assert [fit.number for fit in fits.list_fits(connection)] == [second.number]
+
+
+def test_frames_are_deleted_while_the_codes_of_a_refit_are_linked(
+    filled: Engine, small_model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code_all(filled)
+    monkeypatch.setattr(graphs, "GRAPH_FROM", 100)
+    database, fit = filled.store.database, live(filled, small_model)
+    with database.read() as connection:
+        codes_before = coded(filled, fit)
+        row = find_map(connection, "hall")
+        frame = find_frame(connection, row, "hall-7")
+    linking = threading.Thread(target=graphs.add_graph_beside, args=(database, fit))
+    with database.write(turn=False) as connection:  # which is waited for
+        connection.execute(text(f"UPDATE {fit.table} SET code = code WHERE frame_number = 1"))
+        linking.start()
+        with database.write(turn=False) as looking:
+            waits = text("SELECT count(*) FROM pg_stat_activity WHERE wait_event_type = 'Lock'")
+            while not looking.execute(waits).scalar_one():
+                pass
+        filled.delete_frame("hall", "hall-7")
+    linking.join()
+    assert coded(filled, fit) == codes_before - {frame.number}
+    monkeypatch.setattr(graphs, "_STEP_COST", 0.0)
+    with database.read() as connection:
+        assert graphs._by_graph(connection, fit, 500, 1600)
+        # what reads the codes, such as a backup, keeps them, and costs nobody his turn for long
+        codes.count_codes(connection, fit)
+        with pytest.raises(StoreLocked), database.write() as writing:
+            fits.drop_fit(writing, fit.number)
+    with database.write() as connection:
+        fits.drop_fit(connection, fit.number)
+        assert fits.list_fits(connection) == []
 
 
 def test_codes_that_are_lost_are_made_again_and_nobody_misses_a_frame(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,9 @@ from sceneprint.engine import Engine
 from sceneprint.errors import StoreAway, UnknownFrame
 from sceneprint.schemas import JobState, NewMap, Query
 from sceneprint.settings import Settings
+from sceneprint.store import Database
+from sceneprint.store.events import EventRow, Wanted
+from service.feed import Feed
 
 ASKED = Query(k=5, candidates=5, keep=False)
 
@@ -50,9 +55,41 @@ def found(engine: Engine, frame: Any) -> list[str]:
     return sorted(match.frame_id for match in answer.matches)
 
 
+@pytest.fixture
+def told(engine: Engine) -> Iterator[list[EventRow]]:
+    """What a stream of events tells, from the first on."""
+    found: list[EventRow] = []
+    ended = threading.Event()
+    thread = threading.Thread(target=_follow, args=(engine.store.database, found, ended))
+    thread.start()
+    yield found
+    ended.set()
+    thread.join()
+
+
+def _follow(database: Database, found: list[EventRow], ended: threading.Event) -> None:
+    async def follow() -> None:
+        feed = Feed(database, most=1, kept=1000)
+        feed.join()
+        reading = asyncio.ensure_future(_gather(feed, found))
+        while not ended.is_set():
+            await asyncio.sleep(0.02)
+        feed.close()
+        await reading
+        feed.leave()
+
+    asyncio.run(follow())
+
+
+async def _gather(feed: Feed, found: list[EventRow]) -> None:
+    async for events, _ in feed.batches(Wanted(), 0, lambda: True):
+        found += events
+
+
 def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
-    engine: Engine, pair: tuple[Server, Server], small: list[Any], until: Callable[..., Any]
-) -> None:
+    engine: Engine, pair: tuple[Server, Server], small: list[Any], until: Callable[..., Any],
+    told: list[EventRow],
+) -> None:  # fmt: skip
     primary, standby = pair
     engine.create_map(NewMap(name="hall", model="compact"))
     kept = [index(engine, frame) for frame in small[:2]]
@@ -65,10 +102,13 @@ def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
     before = engine.store.database.history
     lost = index(engine, small[2])
     assert found(engine, small[2]) == sorted([*kept, lost])  # held in memory from now on
+    until(lambda: (told[-1].kind, told[-1].frame_id) == ("frame.indexed", lost))
     primary.kill()
     with pytest.raises(StoreAway):
         engine.get_map("hall")
     standby.promote()
+    # whoever follows learns that what it was told may not be so, and then goes on
+    until(lambda: told[-1].kind == "events.missed")
     assert engine.get_map("hall").frames == {"indexed": 2}
     assert engine.store.database.history != before
     with pytest.raises(UnknownFrame):
@@ -76,5 +116,7 @@ def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
     other = index(engine, small[3])  # which is given the number and the revision of the lost one
     assert engine.get_map("hall").frames == {"indexed": 3}
     assert found(engine, small[3]) == sorted([*kept, other])
+    until(lambda: (told[-1].kind, told[-1].frame_id) == ("frame.indexed", other))
+    assert [one.kind for one in told].count("events.missed") == 1
     again = index(engine, small[2])  # as by a robot that keeps its frames for a while
     assert found(engine, small[2]) == sorted([*kept, other, again])

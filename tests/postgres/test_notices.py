@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -13,7 +14,7 @@ from sqlalchemy import text
 from benchmarks.fleet.postgres import Server
 from sceneprint.store import Store, notices
 from sceneprint.store.bell import process_name
-from sceneprint.store.database import Database
+from sceneprint.store.database import Database, reach_database
 from sceneprint.store.notices import Notices
 
 #: Seconds after which nothing rings any more, on the slowest machine.
@@ -100,8 +101,6 @@ def test_connections_that_are_lost_are_made_anew(
 def test_where_the_server_is_away_nobody_is_harmed(
     postgres: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sceneprint.store.database import reach_database
-
     monkeypatch.setattr(notices, "AGAIN_S", 0.05)
     away = Notices(reach_database("postgresql://nobody@127.0.0.1:1/none"))
     with away.listen() as listener:
@@ -112,3 +111,19 @@ def test_where_the_server_is_away_nobody_is_harmed(
     away.close()
     away.ring()  # as by a request that ends after the engine
     assert away._ringer is None
+
+
+def test_a_server_that_never_answers_holds_up_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(notices, "CLOSING_S", 0.05)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        mute = Notices(reach_database(f"postgresql://u@127.0.0.1:{port}/x?connect_timeout=60"))
+        mute.ring()
+        asked, _ = silent.accept()
+        ringer = mute._ringer
+        assert ringer is not None
+        mute.close()
+        assert ringer.is_alive()
+        asked.close()
+    ringer.join(FOREVER)
+    assert not ringer.is_alive()

@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import text
 
 from benchmarks.fleet.postgres import Server
-from sceneprint.errors import UnusableStore
+from sceneprint.errors import StoreAway
 from sceneprint.store import Store
 from sceneprint.store.events import Wanted, list_events, tell
 
@@ -49,7 +49,7 @@ def test_a_commit_whose_wait_is_ended_by_hand_is_not_acknowledged(
         assert list_events(connection, Wanted(), after=0, limit=9) == []
     forsaken.execute(f"SELECT pg_cancel_backend(pid) {WAITING}")
     thread.join(60)
-    assert [type(error) for error in raised] == [UnusableStore]
+    assert [type(error) for error in raised] == [StoreAway]  # of which nobody is told that nothing was stored
     assert "the wait for a standby was ended by hand" in str(raised[0])
 
 

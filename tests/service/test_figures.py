@@ -34,8 +34,12 @@ def test_what_was_done_is_told(served, make_map, shots, until):
         1, 1, {"indexed": 1}
     )  # fmt: skip
     assert sum(one["indexed"] for one in own["minutes"]) == 1
+    assert own["use"] == {
+        "frames": 1, "bytes": len(shots[0].png),
+        "quota_frames": None, "quota_bytes": None, "retention_days": None,
+    }  # fmt: skip
     every = client.get("/v1/stats").json()
-    assert len(every["minutes"]) == 60
+    assert (len(every["minutes"]), every["use"]) == (60, None)
     assert every["total"]["indexed"] >= 1
     (worker,) = every["workers"]
     assert int(worker["name"].rpartition(":")[2]) in served.workers

@@ -17,7 +17,8 @@ import pytest
 from sceneprint.errors import DamagedBlob, ReadOnlyStore, StoreFull, UnusableStore
 from sceneprint.store import Blobs, FolderBlobs
 from sceneprint.store.locks import FileLocks
-from sceneprint.store.object_blobs import MARK, ObjectBlobs
+from sceneprint.store.marks import MARK
+from sceneprint.store.object_blobs import ObjectBlobs
 from sceneprint.store.object_urls import open_objects
 
 DIGEST = hashlib.sha256(b"depth").hexdigest()

@@ -133,6 +133,25 @@ def _looked_at(url: str) -> None:
         pass
 
 
+def test_a_table_that_is_changed_elsewhere_costs_one_try(
+    served: Database, postgres: Server, postgres_url: str
+) -> None:
+    """Connections have prepared for it what they asked of it again and again."""
+    name, asked = postgres_url.rpartition("/")[2], text("SELECT a FROM changing")
+    postgres.execute("CREATE TABLE changing (a int)", name)
+    for _ in range(8):
+        with served.write(turn=False) as one, served.write(turn=False) as other:
+            assert [one.execute(asked).all(), other.execute(asked).all()] == [[], []]
+    postgres.execute("ALTER TABLE changing ALTER a TYPE bigint", name)
+    with (
+        pytest.raises(errors.StoreLocked, match="Tables were changed meanwhile, and nothing was"),
+        served.write(turn=False) as one,
+    ):
+        one.execute(asked)
+    with served.write(turn=False) as one, served.write(turn=False) as other:
+        assert [one.execute(asked).all(), other.execute(asked).all()] == [[], []]
+
+
 def test_a_database_of_another_encoding_is_refused(postgres: Server) -> None:
     postgres.execute(
         "CREATE DATABASE ascii ENCODING 'SQL_ASCII' LC_COLLATE 'C' LC_CTYPE 'C' TEMPLATE template0"

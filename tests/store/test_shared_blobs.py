@@ -12,7 +12,8 @@ from sqlalchemy import text
 
 from sceneprint.errors import UnusableStore
 from sceneprint.store import Store, open_blobs, open_database, open_store
-from sceneprint.store.object_blobs import MARK, ObjectBlobs
+from sceneprint.store.marks import MARK
+from sceneprint.store.object_blobs import ObjectBlobs
 from sceneprint.store.object_urls import open_objects
 
 HOLDS = """

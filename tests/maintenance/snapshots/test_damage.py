@@ -10,6 +10,7 @@ import sqlite3
 import tarfile
 from collections.abc import Callable
 from contextlib import closing
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -247,10 +248,37 @@ def test_databases_that_are_none_of_ours(archive, tmp_path, refused):
     refused(with_database(lambda database: database.execute(sql)), "another than its manifest says")
     told = json.loads(members[0][1])["schema_revision"]
     refused(rebuilt(members, schema_revision=told + "x"), "another than its manifest says")
+    for odd, name in (
+        ("VIEW v AS SELECT 1", "view 'v'"),
+        ("TRIGGER t AFTER INSERT ON models BEGIN DELETE FROM maps; END", "trigger 't'"),
+        ("VIRTUAL TABLE r USING rtree(a, b, c)", "table 'r'"),
+        ("TABLE g (a, b AS (zeroblob(900000000)))", "column 'b' of 'g' is generated"),
+    ):
+        made = with_database(methodcaller("execute", f"CREATE {odd}"))
+        refused(made, rf"its database is none of sceneprint's \({name}")
     page = bytearray(members[1][1])
     page[4096 * 3 : 4096 * 4] = bytes(4096)
     refused(with_bytes(bytes(page)), "its database is not sound")
     refused(with_bytes(b"x" * 8192), "no database of sceneprint", UnusableStore)
+
+
+@pytest.mark.parametrize("name", ["{}/evil/x", "../x", b"ab", b"\xff", 5])
+def test_what_is_no_digest_names_no_file(archive, tmp_path, refused, name):
+    """Not the path of a file that is written before it is found to be another."""
+    name = name.format(tmp_path / "..") if isinstance(name, str) else name
+    members = members_of(archive)
+    (tmp_path / "a.db").write_bytes(members[1][1])
+    with closing(sqlite3.connect(tmp_path / "a.db")) as database:
+        one = "(SELECT min(number) FROM frames WHERE state = 'indexed')"
+        given = "CAST(? AS TEXT)" if name == b"\xff" else "?"
+        database.execute(f"UPDATE frames SET blob = {given} WHERE number = {one}", (name,))
+        database.commit()
+    data = (tmp_path / "a.db").read_bytes()
+    (tmp_path / "a.db").unlink()
+    told = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    body = [members[0], (members[1][0], data), entry(f"blobs/{name}", b"evil"), *members[2:]]
+    refused(rebuilt(body, database=told))
+    assert not (tmp_path / ".." / "evil").exists()
 
 
 def test_a_later_version(archive, refused):

@@ -75,3 +75,32 @@ export function room() {
     },
   };
 }
+
+const TIGHT = [[0.95, "bad"], [0.85, "warn"]];
+
+/**
+ * What one map has of what it may have, and for how long.
+ * @returns {{element: HTMLElement, update: (stats: Object<string, any>) => void}}
+ */
+export function limits() {
+  const list = h("dl", { class: "facts" });
+  return {
+    element: h("section", { class: "card", "aria-labelledby": "limits" }, h("h2", { id: "limits" }, "Quota and retention"), list),
+    update({ use }) {
+      const days = use.retention_days;
+      put(list, [
+        ["Frames", share(use.frames, use.quota_frames, count)],
+        ["Uploads", share(use.bytes, use.quota_bytes, bytes)],
+        ["Frames are kept", days === null ? "for ever" : days === 1 ? "1 day" : `${+days.toPrecision(4)} days`],
+      ].map(([name, told]) => h("div", {}, h("dt", {}, name), h("dd", { class: "number" }, told))));
+    },
+  };
+}
+
+/** So much, of so much where there is a quota. */
+function share(used, quota, told) {
+  if (quota === null) return `${told(used)}, no quota`;
+  const full = quota > 0 ? Math.min(used / quota, 1) : 1;
+  const kind = TIGHT.find(([least]) => full >= least)?.[1] ?? null;
+  return [`${told(used)} of ${told(quota)}`, h("span", { class: "gauge", dataset: { kind } }, h("span", { style: { width: `${100 * full}%` } }))];
+}

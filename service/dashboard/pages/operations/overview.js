@@ -8,7 +8,7 @@ import { events } from "./events.js";
 import { health } from "./health.js";
 import { history } from "./history.js";
 import { canRetry, jobRow, retryAllButton } from "./joblist.js";
-import { indexes, room, workers } from "./machines.js";
+import { indexes, limits, room, workers } from "./machines.js";
 import { mapField } from "./mapfield.js";
 import { poll, renewTimes, rows } from "./poll.js";
 import { tiles } from "./tiles.js";
@@ -35,7 +35,7 @@ export async function renderTab(root, { search, signal }) {
   const figures = tiles(whole);
   const hour = history(whole);
   const index = indexes();
-  const parts = whole ? [figures, hour, index, workers(), room()] : [figures, hour, index, room()];
+  const parts = whole ? [figures, hour, index, workers(), room()] : [figures, hour, index, limits(), room()];
 
   async function look() {
     const [stats] = await Promise.all([get("stats", { params: { map }, signal }), line.look(signal), failures.look()]);
