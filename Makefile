@@ -7,6 +7,9 @@ STAMP := $(VENV)/.installed
 # Our kernels want one thread each; more processes, not more threads, use more processors.
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
+# Tests wait for real processes half of their time: half as many again as there are processors.
+export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
+	'import os; n = len(os.sched_getaffinity(0)); print(n + (n + 1) // 2)')
 
 .PHONY: help demo test test-postgres lint kernels format bench screenshots soak siege models lock clean
 

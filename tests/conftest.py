@@ -39,7 +39,8 @@ from sceneprint.types import Frame
 
 #: Files that are begun first: no process is left alone with one of them in the end.
 LONG = (
-    "test_container.py", "test_bench_rows.py", "test_quality.py", "test_same_as_evaluate.py",
+    "test_container.py", "test_on_postgres.py", "test_deployment.py", "test_fleet.py",
+    "test_failover.py", "test_fleets.py", "test_isolation.py", "test_bench_rows.py", "test_quality.py", "test_same_as_evaluate.py",
     "test_soak.py", "test_siege.py", "test_tour.py", "test_kill.py", "test_docs.py",
     "test_survival.py", "test_on_postgres.py",
 )  # fmt: skip
@@ -145,8 +146,10 @@ def _clean(postgres: Server) -> list[str]:
 @pytest.fixture
 def postgres_url(postgres: Server, _clean: list[str]) -> Iterator[str]:
     """URL of a database with the schema of this version and no rows, like a new one."""
-    name = _clean.pop() if _clean else f"t{secrets.token_hex(6)}"
-    if not postgres.execute(f"SELECT 1 FROM pg_database WHERE datname = '{name}'"):
+    if _clean:
+        name = _clean.pop()
+    else:
+        name = f"t{secrets.token_hex(6)}"
         postgres.create(name, TEMPLATE)
     yield postgres.url(name)
     if _cleaned(postgres, name):

@@ -61,6 +61,11 @@ class Choosing:
         """Whether any map may be searched in the database."""
         return self.setting != "local" and fits.can_have(connection)
 
+    def has_codes(self, connection: Connection) -> bool:
+        """Whether the codes of a model are there to be asked."""
+        known = fits.list_fits(connection) if self.is_possible(connection) else []
+        return any(fit.state == "live" for fit in known)
+
     def stored(
         self, connection: Connection, database: Database, rows: Sequence[MapRow], length: int
     ) -> dict[int, Stored]:

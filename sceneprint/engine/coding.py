@@ -43,6 +43,8 @@ BLOCK = 256
 CHECK_S = 600.0
 #: Seconds until it is tried again where the database has no pgvector.
 AGAIN_S = 600.0
+#: Seconds until it is tried again where anything else went wrong.
+PAUSE_S = 30.0
 #: Seconds between two counts of all frames, to see whether they have outgrown the fit.
 COUNT_S = 30.0
 
@@ -83,11 +85,12 @@ class Coding:
             return 0
         try:
             with self._database.write(turn=False) as turn:
+                allow(turn, 0)  # it does nothing itself, for as long as a graph takes
                 if not fits.take_turn(turn):
                     return 0
-                allow(turn, 0)  # it does nothing itself, for as long as a graph takes
                 return self._step(time.monotonic() + STEP_S)
         except (SceneprintError, SQLAlchemyError) as error:  # it costs nobody anything but time
+            self._not_before = time.monotonic() + PAUSE_S
             log.error("codes are not brought on", extra={"error": f"{error!s:.500}"})
             return 0
 
@@ -146,8 +149,10 @@ class Coding:
         with self._database.read() as connection:
             n = sum(vectors.sizes(connection, numbers).values())
             chosen = vectors.at_places(connection, numbers, draw(n, SAMPLE, 0).tolist())
-            sample = np.stack(list(_sound(connection, chosen, model_id).values()))
-        code = fit_code(sample)
+            sample = list(_sound(connection, chosen, model_id).values())
+        if not sample:
+            return None
+        code = fit_code(np.stack(sample))
         with self._database.write(turn=False) as connection:
             content = write_code(code)
             fit = fits.add_fit(connection, model_id, code.id, content, len(code.matrix), n)

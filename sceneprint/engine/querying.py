@@ -33,6 +33,10 @@ from sceneprint.store.maps import find_maps, list_maps, model_names, unknown_map
 from sceneprint.store.records import MapRow
 from sceneprint.store.replica import asked
 
+#: Maps that `*` asks at once where the database has their codes: by one statement, whatever their
+#: number. Without codes this node holds what is asked, and there are MOST_MAPS.
+FLEET_MAPS = 1000
+
 
 class Queries:
     """Asks one or more maps of one model.
@@ -143,12 +147,15 @@ class Queries:
             return list(dict.fromkeys(query.maps))
         with self._store.database.read() as connection:
             names = [row.name for row in list_maps(connection) if may_read(row.name)]
+            most = MOST_MAPS
+            if len(names) > most and self._readers.choosing.has_codes(connection):
+                most = FLEET_MAPS
         if not names:
             raise UnknownMap("There is no map to ask yet. Make one, or name one that is there.")
-        if len(names) > MOST_MAPS:
+        if len(names) > most:
             raise InvalidRequest(
-                f"There are {len(names)} maps, and {MOST_MAPS} can be asked at once. Name them.",
-                (("maps", f"more than {MOST_MAPS}"),),
+                f"There are {len(names)} maps, and {most} can be asked at once. Name them.",
+                (("maps", f"more than {most}"),),
             )
         return names
 

@@ -69,9 +69,11 @@ def restore_to_fleet(
             archive, made, lambda done, total: tell(done, 2 * total), with_blobs=False
         )
         path = made / DATABASE
-        owner = _bring_here(path)
+        _bring_here(path)
         with open_copy(path) as file:
             check_acceptable(file)
+        owner = _owner_of(path)
+        with open_copy(path) as file:
             database = open_database(settings.database)
             try:
                 with _marked(settings, database, owner):
@@ -114,10 +116,16 @@ def _check_target(database: Database) -> None:
         )
 
 
-def _bring_here(path: Path) -> str:
-    """Bring a database of an earlier version to the schema of this one; returns whose it is."""
+def _bring_here(path: Path) -> None:
+    """Bring a database of an earlier version to the schema of this one."""
     url = URL.create("sqlite", database=str(path))
-    with closing(open_database(url.render_as_string(hide_password=False))) as database:
+    open_database(url.render_as_string(hide_password=False)).close()
+
+
+def _owner_of(path: Path) -> str:
+    """What the store is called whose database it is."""
+    url = URL.create("sqlite", database=str(path))
+    with closing(reach_database(url.render_as_string(hide_password=False))) as database:
         return Seals(database).owner
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any
 
 from sqlalchemy import Connection, text
 from sqlalchemy.exc import DBAPIError
@@ -80,9 +81,14 @@ class Fit:
 
 
 def take_turn(connection: Connection) -> bool:
-    """Whether this transaction is the one that fits and fills; until its end no other is."""
-    asked = text("SELECT pg_try_advisory_xact_lock(:locks, :codes)")
-    return bool(connection.execute(asked, {"locks": LOCKS, "codes": CODES}).scalar_one())
+    """Whether this transaction is the one that fits and fills; until its end no other is.
+
+    It must be the last statement: by the driver's simple protocol, it leaves no snapshot behind.
+    Linking codes, in another transaction, would wait for that as long as this one lasts.
+    """
+    driver: Any = connection.connection.driver_connection
+    asked = f"SELECT pg_try_advisory_xact_lock({LOCKS}, {CODES})"
+    return bool(driver.execute(asked, prepare=False).fetchone()[0])
 
 
 def can_have(connection: Connection) -> bool:

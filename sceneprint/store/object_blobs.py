@@ -96,8 +96,7 @@ class ObjectBlobs:
         what = f"{place}: a blob cannot be written"
         with ExitStack() as stack:
             try:
-                # a buffer would be written once more when it is closed, on a disk that is full
-                file = stack.enter_context(tempfile.TemporaryFile(buffering=0))
+                file = stack.enter_context(tempfile.TemporaryFile())
             except OSError as error:
                 raise unusable(what, error) from error
             yield IncomingBlob(file, what, lambda digest: self._keep(file, digest))

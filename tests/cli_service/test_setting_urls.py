@@ -6,9 +6,11 @@ import argparse
 import traceback
 
 import pytest
+from pydantic import ValidationError
 
 from sceneprint.cli.serve import settings_of
 from sceneprint.errors import InvalidRequest
+from sceneprint.settings import Settings
 
 SERVER = "postgresql+psycopg://u:hunter2@host/db"
 
@@ -36,6 +38,9 @@ def test_a_url_that_is_none_is_refused_and_not_repeated(
         settings_of(argparse.Namespace())
     assert said in str(caught.value)
     assert "hunter2" not in "".join(traceback.format_exception(caught.value))
+    with pytest.raises(ValidationError) as refused:  # as `python -m worker` tells it
+        Settings()
+    assert "hunter2" not in str(refused.value)
 
 
 def test_urls_are_taken_and_hide_what_is_in_them(monkeypatch: pytest.MonkeyPatch) -> None:

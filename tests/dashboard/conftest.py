@@ -1,7 +1,7 @@
 """A real service with real workers, and a real Chromium that looks at it.
 
-Playwright's loop runs in this process as long as `browser` lasts, so that is of a file and has ended
-before tests of others begin loops of their own; the service is one for all files.
+Playwright's loop runs in this process as long as `browser` lasts, so that is of a file and has
+ended before tests of others begin loops of their own; the service is one for all files.
 """
 
 from __future__ import annotations

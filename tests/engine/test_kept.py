@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import threading
 import uuid
 from dataclasses import replace
@@ -13,7 +14,7 @@ import pytest
 
 from sceneprint.engine import kept_folder as module
 from sceneprint.engine import kept_objects
-from sceneprint.engine.kept import Kept, KeptQueries
+from sceneprint.engine.kept import SCHEMA_VERSION, Kept, KeptQueries
 from sceneprint.engine.kept_folder import KeptFolder
 from sceneprint.errors import UnknownQuery
 from sceneprint.schemas import Answer, Counts, Query, SeveralQuery
@@ -211,3 +212,13 @@ def test_what_cannot_be_kept_costs_no_answer(bucket: str, monkeypatch: pytest.Mo
     for one in threading.enumerate():
         if one.name == "keep":
             one.join()
+
+
+def test_what_is_no_answer_keeps_no_other_from_being_forgotten() -> None:
+    objects = open_objects("memory:///")
+    kept = kept_objects.KeptObjects(objects, 3600.0, 1 << 20)
+    assert kept.keep(made(10))
+    longer = struct.pack("<5sHIIII", b"SPQRY", SCHEMA_VERSION, 0, 1 << 30, 0, 0)
+    for name, data in (("a", b""), ("b", longer)):  # without a byte, and shorter than it says
+        objects.put(f"queries/{32 * name}", data)
+    assert kept.forget(lambda _: False) == 3

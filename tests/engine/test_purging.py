@@ -208,12 +208,12 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
     lived_in, make_engine, store_url, ids, tmp_path, monkeypatch
 ):
     first, names = lived_in, ids(lived_in)
-    monkeypatch.setattr(postgres, "IDLE_S", 0.2)  # shorter than it takes to make an index
+    monkeypatch.setattr(postgres, "IDLE_S", 0.1)  # shorter than it takes to make an index
     built = upkeep.publish
 
     def slow(*args, **more):
         found = built(*args, **more)
-        time.sleep(0.5)
+        time.sleep(0.25)
         return found
 
     monkeypatch.setattr(upkeep, "publish", slow)

@@ -12,11 +12,11 @@ import pytest
 from sqlalchemy import event, select, text
 
 from benchmarks.fleet.bulk import fill, walk
-from sceneprint.engine import Engine, choosing, coding, readers, searching, stored
-from sceneprint.errors import StoreLocked
+from sceneprint.engine import Engine, choosing, coding, querying, readers, searching, stored
+from sceneprint.errors import InvalidRequest, StoreLocked
 from sceneprint.geometry.retrieval import distances
 from sceneprint.models import Model
-from sceneprint.schemas import Answer, ExplainedFrame, NamedFrame, Query
+from sceneprint.schemas import Answer, ExplainedFrame, NamedFrame, Query, SeveralQuery
 from sceneprint.settings import Settings
 from sceneprint.store import codes, fits, graphs
 from sceneprint.store.frames import find_frame
@@ -176,6 +176,20 @@ def test_maps_are_asked_in_one_statement_and_a_filter_finds_all_it_leaves(
     assert found(many) == wanted[:10]
 
 
+def test_all_maps_of_a_fleet_are_asked_at_once_where_the_database_has_codes(
+    filled: Engine, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(querying, "MOST_MAPS", 1)
+    everywhere = SeveralQuery(maps="*")
+    with pytest.raises(InvalidRequest, match="There are 2 maps, and 1 can be asked at once"):
+        filled.queries.maps_of(everywhere)
+    code_all(filled)
+    assert filled.queries.maps_of(everywhere) == ["hall", "yard"]
+    assert filled.queries.maps_of(everywhere, lambda name: name == "yard") == ["yard"]
+    with pytest.raises(InvalidRequest, match="1 can be asked"):
+        make("b", "local").queries.maps_of(everywhere)
+
+
 def test_a_frame_deleted_during_the_search_or_before_is_not_found_afterwards(
     filled: Engine, places: dict[str, Bytes], small_model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -251,9 +265,11 @@ def test_a_refit_goes_on_beside_queries_and_every_answer_is_right(
 def test_frames_are_deleted_while_the_codes_of_a_refit_are_linked(
     filled: Engine, small_model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    code_all(filled)
     monkeypatch.setattr(graphs, "GRAPH_FROM", 100)
+    code_all(filled)  # whose own turn is not waited for
     database, fit = filled.store.database, live(filled, small_model)
+    with database.write() as connection:
+        connection.execute(text(f"DROP INDEX {fit.graph}"))
     with database.read() as connection:
         codes_before = coded(filled, fit)
         row = find_map(connection, "hall")

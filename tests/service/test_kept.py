@@ -10,9 +10,11 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.engine.kept import Kept
-from sceneprint.schemas import Answer, Counts, Query
+from sceneprint.schemas import Answer, Counts, NewMap, Query
 from sceneprint.schemas.options import FrameName
 from sceneprint.settings import Settings
+from sceneprint.store.frames import add_frame
+from sceneprint.store.maps import find_map
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +116,16 @@ def test_an_answer_is_seen_by_who_may_read_all_of_it(begin):
         assert engine.kept.keep(Kept(answer, Query(), "a" * 64, np.zeros(4, np.uint8), None))
         return answer.query_id
 
+    known = {
+        "content_id": "c", "blob": "00" * 32, "bytes": 3, "intrinsics": {}, "depth_scale": 1.0,
+        "depth_along_ray": False, "tags": [], "robot": None, "session": None,
+        "captured_at": None, "pose_parent": None, "pose": None,
+    }  # fmt: skip
     with Engine(Settings(data_dir=server.folder)) as engine:
+        for name in "ab":
+            engine.create_map(NewMap(name=name, model="compact"))
+        with engine.store.database.write() as connection:
+            add_frame(connection, find_map(connection, "b").number, known, "f")
         keys = {
             "a": engine.create_key("a", {"a": "read"}).secret,
             "both": engine.create_key("both", {"a": "read", "b": "write"}).secret,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ import pytest
 from sqlalchemy import Connection, event, update
 
 from sceneprint.schemas import JobState
-from sceneprint.store import Store, listing, open_store, queue
+from sceneprint.store import Store, listing, open_database, open_store, queue
 from sceneprint.store.frames import add_frame
 from sceneprint.store.maps import add_map, keep_model
 from sceneprint.store.records import FrameRow, JobRow, MapRow
@@ -27,43 +28,53 @@ MODEL = "ab" * 32
 NURSERY = """
 import json, sys
 from multiprocessing import get_context
+import sceneprint.engine.happenings
 
-code, count, ARGS = sys.argv[1], int(sys.argv[2]), json.loads(sys.argv[3])
-exec(code)
+fork = get_context("fork")
 
-def run(i, start, told):
+def run(i, work, start, told):
     start.wait()
     try:
         told.put([i, work(i)])
     except BaseException as error:
         told.put([i, f"{type(error).__name__}: {error}"])
 
-fork = get_context("fork")
-start, told = fork.Barrier(count), fork.Queue()
-children = [fork.Process(target=run, args=(i, start, told)) for i in range(count)]
-for child in children:
-    child.start()
-results = dict(told.get(timeout=60) for _ in children)
-for child in children:
-    child.join()
-print(json.dumps([results[i] for i in range(count)]))
+for line in sys.stdin:
+    code, count, args = json.loads(line)
+    names = {"ARGS": args}
+    exec(code, names)
+    start, told = fork.Barrier(count), fork.Queue()
+    children = [
+        fork.Process(target=run, args=(i, names["work"], start, told)) for i in range(count)
+    ]
+    for child in children:
+        child.start()
+    results = dict(told.get(timeout=60) for _ in children)
+    for child in children:
+        child.join()
+    print(json.dumps([results[i] for i in range(count)]), flush=True)
 """
 
 
 @pytest.fixture(scope="session")
-def race() -> Callable[..., list[Any]]:
+def race() -> Iterator[Callable[..., list[Any]]]:
     """Run `work(i)` of some code in that many processes at once; ARGS are what it is given."""
+    nursery = subprocess.Popen(
+        [sys.executable, "-c", NURSERY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert nursery.stdin is not None
+    assert nursery.stdout is not None
+    to, of = nursery.stdin, nursery.stdout
 
     def run(code: str, count: int, *args: object) -> list[Any]:
-        done = subprocess.run(
-            [sys.executable, "-c", NURSERY, code, str(count), json.dumps([str(a) for a in args])],
-            capture_output=True, text=True, timeout=120, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        found: list[Any] = json.loads(done.stdout)
+        print(json.dumps([code, count, [str(one) for one in args]]), file=to, flush=True)
+        answer = of.readline()
+        assert answer, "the processes did not end well: see their traceback above"
+        found: list[Any] = json.loads(answer)
         return found
 
-    return run
+    yield run
+    nursery.communicate(timeout=60)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -73,6 +84,15 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         alone = marked or "plans" in metafunc.fixturenames
         metafunc.parametrize("url", ["sqlite"] if alone else ["sqlite", "postgresql"],
                              indirect=True)  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def empty_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A SQLite file with the schema of this version, to be copied: making it takes longer."""
+    path = tmp_path_factory.mktemp("empty") / "truth.db"
+    open_database(f"sqlite:///{path}").close()
+    assert [one.name for one in path.parent.iterdir()] == [path.name]  # nothing is in its log
+    return path
 
 
 @pytest.fixture
@@ -85,7 +105,10 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def store(url: str, tmp_path: Path) -> Iterator[Store]:
+def store(url: str, empty_file: Path, tmp_path: Path) -> Iterator[Store]:
+    if url.startswith("sqlite"):
+        (tmp_path / "blobs").mkdir()
+        shutil.copyfile(empty_file, tmp_path / "truth.db")
     opened = open_store(url, tmp_path / "blobs")
     yield opened
     opened.database.close()
@@ -104,13 +127,16 @@ def received(store: Store, hall: MapRow) -> Callable[..., FrameRow]:
     """Insert a frame; what is not given is like that of any other."""
 
     def add(
-        content: str, row: MapRow = hall, frame_id: str | None = None, **given: object
-    ) -> FrameRow:
+        content: str, row: MapRow = hall, frame_id: str | None = None,
+        within: Connection | None = None, **given: object,
+    ) -> FrameRow:  # fmt: skip
         values: dict[str, Any] = {
             "content_id": content, "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1},
             "depth_scale": 1000.0, "depth_along_ray": False, "robot": None, "session": None,
             "captured_at": None, "tags": [], "pose_parent": None, "pose": None,
         }  # fmt: skip
+        if within is not None:
+            return add_frame(within, row.number, values | given, frame_id)
         with store.database.write() as connection:
             return add_frame(connection, row.number, values | given, frame_id)
 

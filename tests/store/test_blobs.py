@@ -29,6 +29,9 @@ import resource, sys
 from pathlib import Path
 from sceneprint.errors import UnusableStore
 from sceneprint.store import FolderBlobs
+from sceneprint.store.locks import FileLocks
+from sceneprint.store.object_blobs import ObjectBlobs
+from sceneprint.store.object_urls import open_objects
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536))
 blobs = FolderBlobs(Path(sys.argv[1]))
@@ -40,6 +43,14 @@ for size in (65537, 5_000_000):
     except UnusableStore as error:
         print(error)
 print(blobs.get(small) == b"s" * 65536)
+fleet = ObjectBlobs(open_objects("memory:///"), FileLocks(Path(sys.argv[1])), lambda: "me")
+try:
+    with fleet.incoming() as blob:  # waits in a temporary file
+        for _ in range(20):
+            blob.write(b"x" * 5000)
+        blob.keep()
+except UnusableStore as error:
+    print(error)
 """
 
 
@@ -213,8 +224,9 @@ def test_a_full_disk_leaves_nothing_and_hurts_nothing(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     told = done.stdout.splitlines()
-    assert len(told) == 3
-    assert all("a blob cannot be written (File too large)" in line for line in told[:2])
+    assert len(told) == 4
+    for line in (*told[:2], told[3]):
+        assert "a blob cannot be written (File too large)" in line
     assert told[2] == "True"
     kept = hashlib.sha256(b"s" * 65536).hexdigest()
     assert files(tmp_path) == [f"blobs/{kept[:2]}/{kept}"]

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime, timedelta
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -48,11 +49,11 @@ def mixed(store: Store, hall: MapRow, received: Received) -> list[FrameRow]:
     rng = np.random.default_rng(4)
     with store.database.write() as connection:
         other = add_map(connection, "other", None, hall.model_id)
-    rows = []
-    for i in range(60):
-        if i % 6 == 0:
-            received(f"o{i}", other, **drawn(rng))
-        rows.append(received(f"{i % 50:064d}", **drawn(rng)))
+        rows = []
+        for i in range(60):
+            if i % 6 == 0:
+                received(f"o{i}", other, within=connection, **drawn(rng))
+            rows.append(received(f"{i % 50:064d}", within=connection, **drawn(rng)))
     with store.database.write() as connection:
         for i, row in enumerate(rows):
             state = str(rng.choice(["indexed", "indexed", "received", "rejected", "deleted"]))
@@ -111,7 +112,7 @@ def test_every_list_is_that_of_plain_python(
 ) -> None:
     rng, sizes = np.random.default_rng(9), Counter[bool]()
     with store.database.read() as connection:
-        for _ in range(150):
+        for _ in range(100):
             wanted, limit = some_listing(rng), int(rng.integers(1, 9))
             expected = [one for one in mixed if passes(one, wanted)]
             if wanted.order == "desc":
@@ -125,7 +126,7 @@ def test_every_list_is_that_of_plain_python(
                     break
             assert found == expected, wanted
             sizes[len(expected) > 0] += 1
-    assert min(sizes.values()) > 20  # neither all empty nor all full
+    assert min(sizes.values()) > 13  # neither all empty nor all full
 
 
 def test_sessions_are_those_of_plain_python(
@@ -217,9 +218,10 @@ def test_poses_are_taken_evenly(store: Store, hall: MapRow, received: Received) 
 SEARCHED = "USING COVERING INDEX ix_frames_searched"
 
 
-@pytest.mark.parametrize(
-    ("wanted", "way"),
-    [
+def test_each_list_takes_the_index_that_is_meant_for_it(
+    store: Store, hall: MapRow, plans: Plans
+) -> None:
+    ways: list[tuple[dict[str, Any], str]] = [
         ({}, "INDEX ix_frames_map_number_number"),
         ({"order": "desc"}, "INDEX ix_frames_map_number_number"),
         ({"state": "indexed"}, "INDEX ix_frames_map_number_number"),
@@ -233,17 +235,13 @@ SEARCHED = "USING COVERING INDEX ix_frames_searched"
         ({"parent_frame": "p"}, SEARCHED),
         ({"tag": "a"}, "INDEX ix_frame_tags_tag_frame_number (tag=?)"),
         ({"content_id": "a" * 64}, "INDEX ix_frames_map_number_content_id"),
-    ],
-)  # fmt: skip
-def test_each_list_takes_the_index_that_is_meant_for_it(
-    store: Store, hall: MapRow, plans: Plans, wanted: dict[str, Any], way: str
-) -> None:
-    listing = FrameListing.model_validate(wanted)
-    for beyond in (None, 7):
+    ]  # fmt: skip
+    for (wanted, way), beyond in product(ways, (None, 7)):
+        listing = FrameListing.model_validate(wanted)
         with store.database.read() as connection, plans(connection) as told:
             list_frames(connection, hall.number, beyond, 9, listing)
-        assert any(way in step for step in told), told
-        assert not any(step.startswith("SCAN") for step in told), told
+        assert any(way in step for step in told), (wanted, told)
+        assert not any(step.startswith("SCAN") for step in told), (wanted, told)
 
 
 def test_sessions_are_counted_without_reading_a_row(

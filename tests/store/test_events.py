@@ -27,7 +27,7 @@ from pathlib import Path
 
 def work(i):
     store = open_store(ARGS[0], Path(ARGS[1]))
-    for n in range(40):
+    for n in range(18):
         try:
             with store.database.write() as connection:
                 for part in range(1 + n % 3):
@@ -74,7 +74,7 @@ def fill(store: Store, count: int) -> None:
 
 def test_who_reads_on_misses_nothing_of_several_writers(race, url, store, tmp_path):
     blobs = tmp_path / "blobs"
-    sure = sum(1 + n % 3 for n in range(40) if n % 7 != 3) * 3
+    sure = sum(1 + n % 3 for n in range(18) if n % 7 != 3) * 3
     *_, seen = race(WRITE + READ, 4, url, blobs, sure)
     with store.database.read() as connection:
         asked = select(events.c.number, events.c.frame_id).order_by(events.c.number)
@@ -83,7 +83,7 @@ def test_who_reads_on_misses_nothing_of_several_writers(race, url, store, tmp_pa
     assert len(seen) == sure
     for i in range(3):  # each writer's own in its order
         own = [frame for _, frame in seen if frame.startswith(f"{i}-")]
-        assert own == [f"{i}-{n}-{k}" for n in range(40) if n % 7 != 3 for k in range(1 + n % 3)]
+        assert own == [f"{i}-{n}-{k}" for n in range(18) if n % 7 != 3 for k in range(1 + n % 3)]
 
 
 def test_the_database_and_the_stream_pick_the_same(empty):

@@ -11,10 +11,13 @@ from sqlalchemy import text
 
 from sceneprint.schemas import FrameState
 from sceneprint.store import open_database
+from sceneprint.store.deleting import doomed_blobs
+from sceneprint.store.former import last_event
 from sceneprint.store.frames import add_frame, frame_of
 from sceneprint.store.keys import list_keys
 from sceneprint.store.listing import find_job
 from sceneprint.store.queue import enqueue
+from sceneprint.store.quotas import Use, counted_anew, use_of
 from sceneprint.store.tables import frame_tags
 
 #: What version 0001 stored of three frames: with tags and pose, with neither, with a tag twice.
@@ -118,4 +121,26 @@ def test_frames_of_before_there_were_clouds_are_depth_images(tmp_path: Path) -> 
         }  # fmt: skip
         added = add_frame(connection, 1, values)
         assert (added.kind, added.cloud, added.intrinsics) == ("cloud", seen, None)
+    database.close()
+
+
+def test_what_a_map_held_before_there_were_quotas_is_counted(tmp_path: Path) -> None:
+    path = tmp_path / "truth.db"
+    an_old_database(path)
+    bring_to(path, "0006")
+    states = ("indexed", "deleted", "redundant")
+    with closing(sqlite3.connect(path)) as connection, connection:
+        for number, state in enumerate(states, 1):
+            connection.execute(
+                "UPDATE frames SET state = ?, bytes = ?, blob = ? WHERE number = ?",
+                (state, 10**number, f"blob-{number}", number),
+            )
+        connection.execute("INSERT INTO events (at, kind, map, data) VALUES (1, 'x', 'gone', '{}')")
+        connection.execute("INSERT INTO events (at, kind, map, data) VALUES (1, 'y', 'hall', '{}')")
+        connection.execute("INSERT INTO events (at, kind, map, data) VALUES (1, 'z', 'gone', '{}')")
+    database = open_database(f"sqlite:///{path}")
+    with database.read() as connection:
+        assert use_of(connection, 1) == counted_anew(connection, 1) == Use(1, 10)
+        assert doomed_blobs(connection, 10) == ["blob-2"]
+        assert (last_event(connection, "gone"), last_event(connection, "never")) == (3, 0)
     database.close()

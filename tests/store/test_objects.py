@@ -132,7 +132,10 @@ def brittle(monkeypatch: pytest.MonkeyPatch) -> Iterator[ObjectServer]:
         yield server
 
 
-def test_a_server_that_falls_acknowledges_nothing(brittle: ObjectServer) -> None:
+def test_a_server_that_falls_acknowledges_nothing(
+    brittle: ObjectServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(object_urls, "TRIED_S", 0.2)
     objects = open_objects(brittle.bucket("fragile"))
 
     class Fatal(io.BytesIO):
@@ -160,8 +163,8 @@ def test_a_server_that_falls_acknowledges_nothing(brittle: ObjectServer) -> None
 def test_a_server_that_never_answers_is_given_up(
     monkeypatch: pytest.MonkeyPatch, bucket: str
 ) -> None:
-    monkeypatch.setattr(object_urls, "SMALL_S", 1)
-    monkeypatch.setattr(object_urls, "TRIED_S", 1)
+    monkeypatch.setattr(object_urls, "SMALL_S", 0.3)
+    monkeypatch.setattr(object_urls, "TRIED_S", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         place = f"http://127.0.0.1:{silent.getsockname()[1]}"
         monkeypatch.setenv("AWS_ENDPOINT_URL", place)

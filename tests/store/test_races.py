@@ -21,7 +21,7 @@ from sceneprint.store.maps import next_revision
 def work(i):
     database, done = open_database(ARGS[0]), []
     while True:
-        with database.write() as connection:
+        with database.write(turn=False) as connection:  # as workers do
             held = queue.claim(connection, f"process {i}", 60.0)
         if held is None:
             return done
@@ -33,14 +33,14 @@ def work(i):
 
 
 def test_threads_at_one_queue_get_each_job_once(store: Store, hall: MapRow, queued: Queued) -> None:
-    wanted = [queued(str(i)).number for i in range(60)]
+    wanted = [queued(str(i)).number for i in range(30)]
     start, done, raised = threading.Barrier(8), [], []
 
     def work(name: str) -> None:
         try:
             start.wait()
             while True:
-                with store.database.write() as connection:
+                with store.database.write(turn=False) as connection:
                     held = queue.claim(connection, name, 60.0)
                 if held is None:
                     return
@@ -59,20 +59,20 @@ def test_threads_at_one_queue_get_each_job_once(store: Store, hall: MapRow, queu
     assert raised == []
     assert sorted(done) == wanted
     with store.database.read() as connection:
-        assert listing.count_jobs(connection) == {"succeeded": 60}
-        assert find_map(connection, "hall").revision == 60
+        assert listing.count_jobs(connection) == {"succeeded": 30}
+        assert find_map(connection, "hall").revision == 30
 
 
 def test_processes_at_one_queue_get_each_job_once(
     url: str, store: Store, hall: MapRow, queued: Queued, race: Callable[..., list[Any]]
 ) -> None:
-    wanted = [queued(str(i)).number for i in range(60)]
+    wanted = [queued(str(i)).number for i in range(30)]
     found = race(WORKS, 3, url, hall.number)
     assert all(isinstance(each, list) for each in found), found  # else what was raised
     assert sorted(number for each in found for number in each) == wanted
     with store.database.read() as connection:
-        assert listing.count_jobs(connection) == {"succeeded": 60}
-        assert find_map(connection, "hall").revision == 60
+        assert listing.count_jobs(connection) == {"succeeded": 30}
+        assert find_map(connection, "hall").revision == 30
 
 
 def test_threads_that_outlive_their_leases_take_effect_once(
@@ -86,7 +86,7 @@ def test_threads_that_outlive_their_leases_take_effect_once(
         try:
             start.wait()
             while True:
-                with store.database.write() as connection:
+                with store.database.write(turn=False) as connection:
                     held = queue.claim(connection, name, -1.0)
                 if held is None:
                     return

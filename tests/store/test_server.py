@@ -43,14 +43,6 @@ def work(i):
     database.close()
     return [row[0] for row in found]
 """
-#: Keeps the turn until it is told to end.
-HOLDS = """
-import sys
-from sceneprint.store import open_database
-with open_database(sys.argv[1]).write():
-    print("held", flush=True)
-    sys.stdin.readline()
-"""
 SQLITE = """
 import sys
 from pathlib import Path
@@ -78,20 +70,12 @@ def served(postgres_url: str) -> Iterator[Database]:
 
 @pytest.fixture
 def keeper(postgres_url: str) -> Iterator[Callable[[], None]]:
-    """Another process that has the turn; ends it when it is called."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", HOLDS, postgres_url], text=True,
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-    )  # fmt: skip
-    assert process.stdout is not None
-    assert process.stdout.readline() == "held\n"
-
-    def end() -> None:
-        process.communicate("\n", timeout=60)
-
-    yield end
-    if process.poll() is None:
-        end()
+    """Who has the turn, as another process would: over connections of its own. Ends it."""
+    other = reach_database(postgres_url)
+    with ExitStack() as held:
+        held.enter_context(other.write())
+        yield held.close
+    other.close()
 
 
 def test_two_processes_may_open_an_empty_database_at_once(empty_url: str, race: Race) -> None:
@@ -167,7 +151,8 @@ def test_the_blobs_of_a_database_that_is_there_are_not_made_up_for(
 def test_a_turn_that_another_process_keeps_is_said(
     served: Database, keeper: Callable[[], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(database, "BUSY_S", 0.2)
+    for name in ("BUSY_S", "HELD_OF_FLEET_S"):
+        monkeypatch.setattr(database, name, 0.2)
     for _ in range(2):  # the second, who comes after one that waited in vain, waits less
         with (
             pytest.raises(StoreLocked, match=r"nothing was stored\. Come back.*pg_stat_activity"),

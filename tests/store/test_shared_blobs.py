@@ -60,7 +60,7 @@ def test_who_only_looks_marks_nothing(store_url: str, bucket: str) -> None:
 def test_a_store_that_is_away_is_opened_and_claimed_later(
     tmp_path: Path, bucket: str, monkeypatch: pytest.MonkeyPatch, object_server: Any
 ) -> None:
-    monkeypatch.setattr("sceneprint.store.object_urls.TRIED_S", 1)
+    monkeypatch.setattr("sceneprint.store.object_urls.TRIED_S", 0.1)
     monkeypatch.setattr("sceneprint.store.objects.AWAY_S", 0.0)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     store = open_store(f"sqlite:///{tmp_path / 'new' / 'a.db'}", bucket)

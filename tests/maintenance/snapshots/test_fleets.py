@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -20,8 +22,9 @@ from pydantic import SecretStr
 from sqlalchemy import create_engine, insert
 
 import migrations
+from sceneprint.cli.served import serving
 from sceneprint.engine import Engine
-from sceneprint.errors import DamagedSnapshot, SnapshotError, UnknownSnapshot
+from sceneprint.errors import DamagedSnapshot, SnapshotError, UnknownSnapshot, UnusableStore
 from sceneprint.maintenance.exporting import copy_server
 from sceneprint.maintenance.fleets import restore_to_fleet
 from sceneprint.maintenance.fsck import fsck
@@ -31,6 +34,8 @@ from sceneprint.maintenance.snapshots import take_snapshot
 from sceneprint.schemas import Query
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
+from sceneprint.store.marks import Mark
+from sceneprint.store.object_urls import open_objects
 from sceneprint.store.tables import keys, metadata
 
 pytestmark = pytest.mark.sqlite_only("these have servers of their own")
@@ -74,14 +79,12 @@ def changed(folder: Path, *statements: str | tuple[str, tuple]) -> None:
         database.commit()
 
 
-def test_there_and_back(
-    archive, master, uploads, postgres, postgres_url, tmp_path, content, settings
-):
+def test_there_and_back(archive, data, uploads, postgres_url, tmp_path, content, settings):
     fleet = fleet_of(tmp_path / "fleet", postgres_url)
     told = restore_to_fleet(archive, fleet)
     assert told.manifest.frames["indexed"] == SIGNED
-    asked = uploads[: SIGNED + 2]
-    before = answers_of(settings(master), asked)
+    asked = uploads[SIGNED - 1 : SIGNED + 2]
+    before = answers_of(settings(data), asked)
     assert all(one.matches for one in before)
     assert answers_of(fleet, asked) == before
     back = take_snapshot(fleet, tmp_path / "back.tar")
@@ -188,7 +191,7 @@ def test_a_snapshot_of_an_earlier_schema(postgres, tmp_path, settings):
 RESTORE = "import sys; from sceneprint.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
-def test_killed_half_way_it_can_be_restored_again(archive, postgres_url, tmp_path, master, content):
+def test_killed_half_way_it_can_be_restored_again(archive, postgres_url, tmp_path):
     fleet = fleet_of(tmp_path / "fleet", postgres_url)
     said = {"SCENEPRINT_DATABASE_URL": postgres_url}
     with psycopg.connect(postgres_url.replace("+psycopg", "")) as holder:
@@ -199,7 +202,7 @@ def test_killed_half_way_it_can_be_restored_again(archive, postgres_url, tmp_pat
         )
         waits = "SELECT count(*) FROM pg_locks WHERE NOT granted AND locktype = 'relation'"
         until = time.monotonic() + 60
-        while ask(postgres_url, waits) == [(0,)] and time.monotonic() < until:
+        while holder.execute(waits).fetchone() == (0,) and time.monotonic() < until:
             assert process.poll() is None
             time.sleep(0.05)
         process.send_signal(signal.SIGKILL)
@@ -266,6 +269,8 @@ def test_blobs_and_snapshots_in_an_object_store(
 ):
     kept = {"blob_url": SecretStr(f"{bucket}/one"), "snapshot_url": bucket, "snapshots_kept": 2}
     fleet = fleet_of(tmp_path / "node", postgres_url, **kept)
+    with Engine(fleet):  # it marks the prefix with a name that the database then loses
+        pass
     told = restore_to_fleet(archive, fleet)
     assert not (tmp_path / "node" / "blobs").exists()
     with Engine(fleet) as engine:
@@ -293,3 +298,60 @@ def test_blobs_and_snapshots_in_an_object_store(
     assert f"{first[:12]}, missing" in said.stderr
     assert len([*(tmp_path / "home" / "blobs").glob("*/*")]) == len(blobs) - 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["home", "node"]
+
+
+def test_taken_over_the_service(
+    archive, postgres, postgres_url, tmp_path, sceneprint, monkeypatch, rows
+):
+    fleet = fleet_of(tmp_path / "node", postgres_url)
+    restore_to_fleet(archive, fleet)
+    # nothing is to be signed, which takes its time
+    postgres.execute("DELETE FROM jobs WHERE state = 'queued'", postgres_url.rpartition("/")[2])
+    monkeypatch.setenv("SCENEPRINT_DATABASE_URL", postgres_url)
+    with serving(fleet.data_dir, 1) as url:
+        said = sceneprint("snapshot", "--url", url, "--out", tmp_path / "a.tar").stdout
+        assert "a.tar: 1 maps, 5 frames" in said
+    restore_snapshot(tmp_path / "a.tar", tmp_path / "home")
+    asked = "SELECT id, blob, revision FROM frames ORDER BY number"
+    assert rows(tmp_path / "home", asked) == ask(postgres_url, asked)
+    [job] = rows(tmp_path / "home", "SELECT state FROM jobs WHERE kind = 'snapshot'")
+    assert job == ("running",)  # the one that took it
+
+
+def test_a_prefix_is_not_shared_with_the_store_that_was_copied(archive, postgres, bucket, tmp_path):
+    """They have the same name, and each would remove what only the other refers to."""
+    marks = open_objects(bucket)
+    first, second = (
+        fleet_of(tmp_path / name, postgres.create(name), blob_url=SecretStr(bucket))
+        for name in ("first", "second")
+    )
+    restore_to_fleet(archive, first)
+    mark = json.loads(marks.get("sceneprint.json"))
+    assert mark.keys() == {"kind", "store"}
+    with pytest.raises(UnusableStore, match="of the store that the snapshot was taken of"):
+        restore_to_fleet(archive, second)
+    assert rows_in(second.database) == 0
+    marks.put("sceneprint.json", json.dumps(mark | {"restoring": True}).encode())
+    restore_to_fleet(archive, second)  # as after one that was killed half way
+    assert rows_in(second.database) == rows_in(first.database)
+    assert json.loads(marks.get("sceneprint.json")) == mark
+    with pytest.raises(UnusableStore, match="of another database"):
+        Mark(marks).begin("0" * 32, "1" * 32)
+
+
+def test_an_archive_that_is_another_when_it_is_read_again(
+    archive, postgres_url, tmp_path, settings
+):
+    """No row refers to a blob that the second reading has not brought."""
+    with Engine(settings(tmp_path / "other")) as engine:
+        engine.create_key("robot")
+    take_snapshot(settings(tmp_path / "other"), tmp_path / "other.tar")
+    path = Path(shutil.copy(archive, tmp_path / "a.tar"))
+
+    def progress(done: int, total: int) -> None:
+        if (tmp_path / "other.tar").exists():  # while it is verified
+            (tmp_path / "other.tar").replace(path)
+
+    with pytest.raises(DamagedSnapshot, match="was changed while it was restored"):
+        restore_to_fleet(path, fleet_of(tmp_path / "fleet", postgres_url), progress)
+    assert rows_in(postgres_url) == 0
