@@ -40,9 +40,9 @@ from sceneprint.types import Frame
 #: Files that are begun first: no process is left alone with one of them in the end.
 LONG = (
     "test_container.py", "test_on_postgres.py", "test_deployment.py", "test_fleet.py",
-    "test_failover.py", "test_fleets.py", "test_isolation.py", "test_bench_rows.py", "test_quality.py", "test_same_as_evaluate.py",
-    "test_soak.py", "test_siege.py", "test_tour.py", "test_kill.py", "test_docs.py",
-    "test_survival.py", "test_on_postgres.py",
+    "test_failover.py", "test_fleets.py", "test_isolation.py", "test_bench_rows.py",
+    "test_quality.py", "test_same_as_evaluate.py", "test_soak.py", "test_siege.py",
+    "test_tour.py", "test_kill.py", "test_docs.py", "test_survival.py",
 )  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
