@@ -51,8 +51,9 @@ class Feed:
         # all that is newer than `_since` and known is held; None: nobody has looked yet
         self._since: int | None = None
         self._newest = 0
-        # which line of history these are of, and how often another took its place: a standby that
-        # was promoted gives numbers out again that readers know of others
+        self._last: EventRow | None = None  # the one of the number `_newest`
+        # which line of history these are of, and how often one took its place that lacks what was
+        # told: a standby that was behind gives numbers out again that readers know of others
         self._history, self._turned = database.history, 0
         self._news = asyncio.Event()
 
@@ -162,9 +163,26 @@ class Feed:
         found = list(islice(self._held, start, start + MOST))
         return found, found[-1].number if found else self._newest
 
-    def _look(self) -> int:
+    def _look(self) -> EventRow | None:
         with self._database.read() as connection:
-            return newest_number(connection)
+            newest = newest_number(connection)
+            found = list_events(connection, Wanted(), after=newest - 1, limit=1)
+        return found[0] if found else None
+
+    def _is_behind(self) -> bool:
+        """Whether the database lacks the last event that is known, or has another in its place."""
+        if self._last is None:
+            return False
+        with self._database.read() as connection:
+            after = self._last.number - 1
+            return list_events(connection, Wanted(), after=after, limit=1) != [self._last]
+
+    async def _begin(self) -> None:
+        """Go on from the newest event that there is."""
+        self._last = await to_thread.run_sync(self._look)
+        self._history = self._database.history
+        self._held.clear()
+        self._newest = self._since = 0 if self._last is None else self._last.number
 
     def _more(self, place: int) -> list[EventRow]:
         with self._database.read() as connection:
@@ -177,16 +195,18 @@ class Feed:
             await asyncio.sleep(pause)
             try:
                 if self._since is None:
-                    self._newest = self._since = await to_thread.run_sync(self._look)
-                    self._history = self._database.history
+                    await self._begin()
                     self._wake()
                 found = await to_thread.run_sync(self._more, self._newest)
                 if self._history != self._database.history:
-                    newest = await to_thread.run_sync(self._look)
-                    self._history, self._turned = self._database.history, self._turned + 1
-                    self._held.clear()
-                    self._newest = self._since = newest
-                    self._wake()
+                    history = self._database.history
+                    if await to_thread.run_sync(self._is_behind):
+                        await self._begin()
+                        self._turned += 1
+                        self._wake()
+                    else:  # as a synchronous standby: it has all that was told
+                        self._history = history
+                    pause = 0.0
                     continue
             except SceneprintError as error:
                 log.error("events cannot be read", extra={"error": str(error)})
@@ -197,7 +217,7 @@ class Feed:
                 self._held.extend(found)
                 while len(self._held) > HELD:
                     self._since = self._held.popleft().number
-                self._newest = found[-1].number
+                self._newest, self._last = found[-1].number, found[-1]
                 self._wake()
 
     def _wake(self) -> None:

@@ -152,7 +152,8 @@ def postgres_url(postgres: Server, _clean: list[str]) -> Iterator[str]:
         name = f"t{secrets.token_hex(6)}"
         postgres.create(name, TEMPLATE)
     yield postgres.url(name)
-    if _cleaned(postgres, name):
+    takes_callers = "SELECT 1 FROM pg_database WHERE datallowconn AND datname = "
+    if postgres.execute(f"{takes_callers}'{name}'") and _cleaned(postgres, name):
         _clean.append(name)
     else:
         postgres.drop(name)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from sceneprint.engine import Engine, readers, searching, upkeep, validating
+from sceneprint.engine import Engine, readers, upkeep, validating, views
 from sceneprint.engine.asking import ask_stored
 from sceneprint.engine.deadlines import Deadline
 from sceneprint.errors import DamagedBlob, UnknownMap
@@ -72,7 +72,7 @@ def test_a_damaged_artifact_costs_its_match_and_no_other(
 def test_what_is_deleted_while_a_query_runs_is_not_told(
     full: Engine, uploads: Any, ids: Ids, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names, search = ids(full), searching.search
+    names, search = ids(full), views.search
     gone = [names[6], names[1]]
 
     def then_delete(*given: Any, **more: Any) -> Any:
@@ -81,7 +81,7 @@ def test_what_is_deleted_while_a_query_runs_is_not_told(
             full.delete_frame("hall", gone.pop())
         return hits
 
-    monkeypatch.setattr(searching, "search", then_delete)
+    monkeypatch.setattr(views, "search", then_delete)
     for query, missing in ((Query(), names[1]), (R, names[6])):
         answer = full.query_upload("hall", uploads[1].data, uploads[1].meta, query)
         assert missing not in [m.frame_id for m in answer.matches]
