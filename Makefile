@@ -11,11 +11,12 @@ export OPENBLAS_NUM_THREADS ?= 1
 export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
 	'import os; n = len(os.sched_getaffinity(0)); print(n + (n + 1) // 2)')
 
-.PHONY: help demo test test-postgres lint kernels format bench screenshots soak siege models lock clean
+.PHONY: help demo test test-thorough test-postgres lint kernels format bench screenshots soak siege models lock clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
 	@echo "make test    lint, types, import contracts and all tests"
+	@echo "make test-thorough  tests that make test leaves out, as they take minutes: the image, whole recordings"
 	@echo "make test-postgres  the tests of what stands on the database, on PostgreSQL"
 	@echo "make lint    lint, types and import contracts only"
 	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
@@ -55,6 +56,10 @@ test: $(STAMP)
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # What PostgreSQL does as well, on it: tests/on_postgres leads each process there.
+# What takes long and seldom breaks: the image built step by step, whole recordings, benchmarks.
+test-thorough: $(STAMP) kernels
+	$(BIN)/python -m pytest -n auto --dist loadfile -m thorough
+
 test-postgres: $(STAMP) kernels
 	SCENEPRINT_TEST_DATABASE=postgresql PYTHONPATH=$(CURDIR)/tests/on_postgres \
 		$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder \

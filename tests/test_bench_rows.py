@@ -269,6 +269,7 @@ def test_a_search_from_a_shortlist_is_compared_with_the_scan_of_all() -> None:
     assert 0 < found.spread[0] <= found.ratio <= found.spread[1]
 
 
+@pytest.mark.thorough
 def test_a_start_is_measured_with_and_without_the_index(building: Path) -> None:
     with service.frames_of(building, 25) as frames:
         found = readiness.measure(frames[0], list(frames[1:]), 60, "compact")

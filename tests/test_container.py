@@ -613,11 +613,13 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Image:
     return made
 
 
+@pytest.mark.thorough
 def test_every_step_runs_but_what_is_roots(image: Image) -> None:
     assert image.skipped == ["groupadd", "useradd", "chown"]
     assert len(image.ran) == sum(step.name == "RUN" for step in steps_of(DOCKERFILE))
 
 
+@pytest.mark.thorough
 def test_what_is_installed_is_the_lock_and_no_more(image: Image) -> None:
     code = (
         "import json; from importlib.metadata import distributions as d;"
@@ -636,6 +638,7 @@ def test_what_is_installed_is_the_lock_and_no_more(image: Image) -> None:
     assert {"pip", "setuptools", "pytest", "mypy", "ruff", "dash"} & set(there) == set()
 
 
+@pytest.mark.thorough
 def test_kernels_are_compiled_and_tables_built(image: Image) -> None:
     cache = Path(image.env["SCENEPRINT_CACHE_DIR"])
     assert len(list(cache.glob("table-*.bin"))) == len(PRESETS)
@@ -685,6 +688,7 @@ def start(image: Image, tmp_path: Path) -> Iterator[Callable[[str, dict[str, str
             running.process.wait()
 
 
+@pytest.mark.thorough
 def test_service_and_worker_run_as_composed(
     image: Image, start: Callable[[str, dict[str, str]], Running], room_frames: tuple[Frame, ...],
     tmp_path: Path,

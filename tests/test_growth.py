@@ -150,6 +150,7 @@ def test_recall_by_a_naive_scan(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.thorough
 def test_recall_of_a_real_map(data_root: Path, tmp_path: Path) -> None:
     """Every sixth frame of redkitchen, stretches of it held out."""
     frames = find_sequences(data_root / "7scenes/redkitchen")[0].frames[::6]

@@ -92,6 +92,7 @@ def test_same_bytes_in_another_process(
     np.testing.assert_array_equal(elsewhere, sign(room_frames[0], small_signer).vector)
 
 
+@pytest.mark.thorough
 def test_nearly_the_same_on_another_processor(
     small_signer: Signer, room_frames: tuple[Frame, ...], tmp_path: Path
 ) -> None:

@@ -85,6 +85,7 @@ def test_redkitchen_over_http_is_redkitchen_evaluated(data_root: Path, tmp_path:
     check(tmp_path, figures, named(frames[0:600:15]), named(frames[650:1000:44]))
 
 
+@pytest.mark.thorough
 def test_the_demo_prints_the_figures_of_evaluate(building: Path, tmp_path: Path) -> None:
     """The first half of a walk, signed with the smaller preset."""
     half = tmp_path / "half"

@@ -36,6 +36,7 @@ def trained() -> tuple[Model, list[tuple[str, int, int]]]:
     return model, steps
 
 
+@pytest.mark.thorough
 def test_processes_do_not_matter(trained: tuple[Model, object]) -> None:
     alone = train("tiny", MODEL, MIXTURE, TRAINING, jobs=1)
     assert alone.id == trained[0].id

@@ -11,6 +11,7 @@ from benchmarks import dashboard
 from benchmarks.rooms import multiply
 
 
+@pytest.mark.thorough
 def test_pages_are_timed_and_weighed(browser, station, settle, open_page, monkeypatch):
     monkeypatch.setattr(dashboard, "DRAWN", 2)
     sent = station.frames[3].form(k="2")

@@ -168,6 +168,7 @@ def test_a_drop_waits_for_its_camera_and_an_archive_goes_to_imports(
     expect(page.get_by_label("cx")).to_have_value("32")
 
 
+@pytest.mark.thorough
 def test_five_hundred_files_and_a_service_that_asks_to_wait(
     open_page: Callable[..., Page], serve: Callable[..., Any], settle: Callable[[Page], None],
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, until: Callable[..., Any],

@@ -83,6 +83,7 @@ def test_pictures_show_something(alone: tuple[dict[str, Any], Path]) -> None:
         assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 20
 
 
+@pytest.mark.thorough
 def test_the_number_of_processes_changes_nothing(
     alone: tuple[dict[str, Any], Path], asked: list[str], tmp_path: Path
 ) -> None:

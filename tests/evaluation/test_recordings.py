@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from sceneprint.cli import main
 
 
+@pytest.mark.thorough
 def test_redkitchen_among_other_scenes(data_root: Path, tmp_path: Path) -> None:
     """Every 15th frame of the forward database, and other scenes in it as well."""
     kitchen, desk = data_root / "7scenes/redkitchen", data_root / "tum/fr1_rpy"

@@ -6,12 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import sceneprint as sp
 from sceneprint.datasets import find_sequences
 from sceneprint.index import Generation, Tail, search
 
 
+@pytest.mark.thorough
 def test_the_shortlist_of_a_real_map(data_root: Path, published: Callable[..., Generation]) -> None:
     """Every sixth frame of three recordings; every eighth of these is asked for and left out.
 
