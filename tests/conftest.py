@@ -309,3 +309,22 @@ def room_frames() -> tuple[Frame, ...]:
         for room in rooms
         for i, frame in enumerate(room.frames)
     )
+
+
+@pytest.fixture(scope="session")
+def bring_to() -> Callable[[str, str], None]:
+    """Lets the migrations of a version and before it make or change the database of a URL."""
+
+    def bring(url: str, version: str) -> None:
+        from alembic import command
+        from sqlalchemy import create_engine
+
+        from sceneprint.store.revisions import migration_config
+
+        config, engine = migration_config(), create_engine(url)
+        with engine.begin() as connection:
+            config.attributes["connection"] = connection
+            command.upgrade(config, version)
+        engine.dispose()
+
+    return bring

@@ -9,20 +9,24 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from anyio.from_thread import BlockingPortal, start_blocking_portal
 
 from sceneprint.datasets import write_depth_png
 from sceneprint.engine import Engine
 from sceneprint.schemas.keys import Scope
 from sceneprint.settings import Settings
 from sceneprint.types import Floats32, Frame, Intrinsics
+from service.app import create_app
 
 BIN = Path(sys.executable).parent
 #: The origin whose pages may ask the server for all tests.
@@ -291,3 +295,55 @@ def walled(wall: Callable[..., Walled]) -> Walled:
         "admin": {"alpha": "admin"}, "writer": {"alpha": "write"}, "reader": {"alpha": "read"},
     }  # fmt: skip
     return wall(keys, requests_per_s=0, failed_keys_per_minute=0)
+
+
+@dataclass
+class House:
+    """A service without workers, whose jobs are done here, its engine, and keys to it.
+
+    Parameters
+    ----------
+    client, portal, engine : of the service, which runs in a thread of its own
+    secrets : of the keys
+    """
+
+    client: httpx.AsyncClient
+    portal: BlockingPortal
+    engine: Engine
+    secrets: dict[str, str]
+
+    def ask(self, key: str, method: str, path: str, **request: Any) -> httpx.Response:
+        headers = {"Authorization": f"Bearer {self.secrets[key]}", **request.pop("headers", {})}
+        asked = partial(self.client.request, method, path, headers=headers, **request)
+        answer: httpx.Response = self.portal.call(asked)
+        return answer
+
+    def work(self) -> None:
+        """Do all jobs that wait."""
+        while (work := self.engine.claim("here:1")) is not None:
+            self.engine.run(work)
+
+
+@contextmanager
+def _opened(
+    folder: Path, url: str | None, keys: Mapping[str, Mapping[str, Scope]], **more: object
+) -> Iterator[House]:
+    (folder / "blobs").mkdir()
+    given = {"data_dir": folder, "database_url": url, "require_keys": True, "requests_per_s": 0}
+    app = create_app(Settings.model_validate(given | more))
+    with (
+        start_blocking_portal() as portal,
+        portal.wrap_async_context_manager(app.router.lifespan_context(app)),
+        portal.wrap_async_context_manager(
+            httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://here")
+        ) as client,
+    ):
+        engine = app.state.context.engine
+        secrets = {name: engine.create_key(name, grants).secret for name, grants in keys.items()}
+        yield House(client, portal, engine, secrets)
+
+
+@pytest.fixture(scope="session")
+def open_house() -> Callable[..., Any]:
+    """Opens a service in a folder, on SQLite where no database is given, with some keys."""
+    return _opened

@@ -7,18 +7,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
-import httpx
 import pytest
-from anyio.from_thread import BlockingPortal, start_blocking_portal
 
-from sceneprint.engine import Engine
 from sceneprint.schemas.keys import Scope
-from sceneprint.settings import Settings
-from service.app import create_app
 
 KEYS: dict[str, dict[str, Scope]] = {
     "boss": {"*": "admin"}, "tenant": {"alpha": "admin", "later": "admin"},
@@ -26,49 +19,15 @@ KEYS: dict[str, dict[str, Scope]] = {
 }  # fmt: skip
 
 
-@dataclass
-class House:
-    """A service, its engine, and keys to it."""
-
-    client: httpx.AsyncClient
-    portal: BlockingPortal
-    engine: Engine
-    secrets: dict[str, str]
-
-    def ask(self, key: str, method: str, path: str, **request: Any) -> httpx.Response:
-        headers = {"Authorization": f"Bearer {self.secrets[key]}", **request.pop("headers", {})}
-        answer: httpx.Response = self.portal.call(
-            partial(self.client.request, method, path, headers=headers, **request)
-        )
-        return answer
-
-    def work(self) -> None:
-        while (work := self.engine.claim("here:1")) is not None:
-            self.engine.run(work)
-
-
 @pytest.fixture
-def house(tmp_path, store_url) -> Iterator[House]:
-    (tmp_path / "blobs").mkdir()
-    app = create_app(
-        Settings(data_dir=tmp_path, database_url=store_url, require_keys=True, requests_per_s=0)
-    )
-    with (
-        start_blocking_portal() as portal,
-        portal.wrap_async_context_manager(app.router.lifespan_context(app)),
-        portal.wrap_async_context_manager(
-            httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://here")
-        ) as client,
-    ):
-        engine = app.state.context.engine
-        secrets = {name: engine.create_key(name, grants).secret for name, grants in KEYS.items()}
-        made = House(client, portal, engine, secrets)
+def house(tmp_path, store_url, open_house) -> Iterator[Any]:
+    with open_house(tmp_path, store_url, KEYS) as opened:
         for name in ("alpha", "bravo"):
-            made.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
-        yield made
+            opened.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
+        yield opened
 
 
-def test_a_quota_is_the_operators(house: House, refused: Callable[..., dict[str, Any]]) -> None:
+def test_a_quota_is_the_operators(house, refused: Callable[..., dict[str, Any]]) -> None:
     path = "/v1/maps/alpha"
     for body in ({"quota_frames": 10}, {"quota_bytes": None}, {"title": "x", "quota_frames": 1}):
         for key in ("tenant", "robot"):

@@ -9,20 +9,13 @@ import json
 import re
 import secrets
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import partial
-from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
-from anyio.from_thread import BlockingPortal, start_blocking_portal
 
-from sceneprint.engine import Engine
 from sceneprint.schemas.keys import Scope
-from sceneprint.settings import Settings
-from service.app import create_app
 
 KEYS: dict[str, dict[str, Scope]] = {
     "boss": {"*": "admin"}, "admin": {"alpha": "admin"}, "reader": {"alpha": "read"},
@@ -38,33 +31,23 @@ OWN_HEADERS = ("date", "x-request-id", "content-length")
 
 @dataclass
 class Twin:
-    """One of the two: a service without workers, whose jobs are done here.
+    """One of them: a service, and what happens in it.
 
     Parameters
     ----------
-    client, portal, engine : of the service, which runs in a thread of its own
-    secrets : of the keys
+    house : the service
+    shots : frames to send
     busy : whether much happens beside `alpha`
     """
 
-    client: httpx.AsyncClient
-    portal: BlockingPortal
-    engine: Engine
-    secrets: dict[str, str]
+    house: Any
     shots: list[Any]
     busy: bool
     ids: dict[str, str] = field(default_factory=dict)
     sent: int = 0
 
     def ask(self, key: str, method: str, path: str, **request: Any) -> Any:
-        headers = {"Authorization": f"Bearer {self.secrets[key]}", **request.pop("headers", {})}
-        asked = partial(self.client.request, method, path, headers=headers, **request)
-        return self.portal.call(asked)
-
-    def work(self) -> None:
-        """Do all jobs that wait."""
-        while (work := self.engine.claim("here:1")) is not None:
-            self.engine.run(work)
+        return self.house.ask(key, method, path, **request)
 
     def disturb(self) -> None:
         """What would show, if anything of it did: rows of every table that others number too."""
@@ -88,30 +71,6 @@ class Twin:
         return f"{key} {method} {path}\n{answer.status_code} {json.dumps(kept)}\n{text}\n"
 
 
-@contextmanager
-def twin(folder: Path, url: str | None, shots: list[Any], *, busy: bool) -> Iterator[Twin]:
-    """A store with the maps alpha and bravo, on SQLite where no database is given."""
-    (folder / "blobs").mkdir()
-    settings = Settings(
-        data_dir=folder, database_url=url, require_keys=True, requests_per_s=0, events_kept=1000
-    )
-    app = create_app(settings)
-    with (
-        start_blocking_portal() as portal,
-        portal.wrap_async_context_manager(app.router.lifespan_context(app)),
-        portal.wrap_async_context_manager(
-            httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://here")
-        ) as client,
-    ):
-        engine = app.state.context.engine
-        keys = {name: engine.create_key(name, grants).secret for name, grants in KEYS.items()}
-        made = Twin(client, portal, engine, keys, shots, busy)
-        for name in ("bravo", "alpha"):
-            made.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
-            made.disturb()
-        yield made
-
-
 def live(one: Twin, small_model: Any) -> None:
     """What happens in alpha, and in the busy one always something else before and after."""
     path = "/v1/maps/alpha"
@@ -124,9 +83,9 @@ def live(one: Twin, small_model: Any) -> None:
         assert sent.status_code == 202, sent.text
         one.ids["job_id"] = sent.json()["job_id"]
         one.disturb()
-    one.work()
+    one.house.work()
     if one.busy:  # a model that no other map has, and jobs for it
-        one.engine.reencode("bravo", small_model)
+        one.house.engine.reencode("bravo", small_model)
     asked = one.ask("boss", "POST", f"{path}/queries", json={"frame_id": "frame-0"})
     one.ids["query_id"] = asked.json()["query_id"]
     one.disturb()
@@ -136,7 +95,7 @@ def live(one: Twin, small_model: Any) -> None:
         assert begun.status_code == 202, begun.text
         one.ids["association"] = begun.json()["association_id"]
         one.disturb()
-    one.work()
+    one.house.work()
     fused = one.ask("boss", "POST", f"/v1/queries/{one.ids['query_id']}/reconstruction", json={})
     one.ids["reconstruction"] = fused.json()["job_id"]
     one.disturb()
@@ -206,14 +165,18 @@ def plain(told: list[str]) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory, small_shots, small_model, postgres) -> list[list[str]]:
+def both(tmp_path_factory, small_shots, small_model, postgres, open_house) -> list[list[str]]:
     """All that is told, of the quiet one, the busy one, and a busy one on PostgreSQL."""
     found = []
     server = postgres.create(f"twin{secrets.token_hex(6)}")
     with ExitStack() as stack:
         for busy, url in ((False, None), (True, None), (True, server)):
             folder = tmp_path_factory.mktemp("twin")
-            one = stack.enter_context(twin(folder, url, small_shots, busy=busy))
+            house = stack.enter_context(open_house(folder, url, KEYS, events_kept=1000))
+            one = Twin(house, small_shots, busy)
+            for name in ("bravo", "alpha"):
+                one.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
+                one.disturb()
             live(one, small_model)
             found.append(plain(list(everything(one))))
     return found

@@ -216,3 +216,19 @@ def plans() -> Callable[[Connection], AbstractContextManager[list[str]]]:
         event.remove(connection, "before_cursor_execute", explain)
 
     return looked_at
+
+
+@pytest.fixture(scope="session")
+def opens() -> str:
+    """Code for `race`: opens the database of a URL, and tells the schema that it then has."""
+    return """
+from sceneprint.store import open_database
+from sqlalchemy import text
+
+def work(i):
+    database = open_database(ARGS[0])
+    with database.read() as connection:
+        found = connection.execute(text("SELECT version_num FROM alembic_version")).all()
+    database.close()
+    return [row[0] for row in found]
+"""

@@ -31,17 +31,6 @@ TABLES = [
     "job_items", "jobs", "keys", "maps", "models", "samples", "secrets", "signatures",
 ]  # fmt: skip
 
-OPENS = """
-from sceneprint.store import open_database
-from sqlalchemy import text
-
-def work(i):
-    database = open_database(ARGS[0])
-    with database.read() as connection:
-        found = connection.execute(text("SELECT version_num FROM alembic_version")).all()
-    database.close()
-    return [row[0] for row in found]
-"""
 
 AS_NOBODY = """
 import os, sqlite3, sys
@@ -95,9 +84,9 @@ def test_opening_again_changes_nothing(url: str, store: Store, hall: MapRow) -> 
 
 @pytest.mark.sqlite_only("a file")
 def test_four_processes_may_migrate_one_empty_database_at_once(
-    url: str, tmp_path: Path, race: Callable[..., list[Any]]
+    url: str, tmp_path: Path, race: Callable[..., list[Any]], opens: str
 ) -> None:
-    assert race(OPENS, 4, url) == [[known_revisions()[0]]] * 4
+    assert race(opens, 4, url) == [[known_revisions()[0]]] * 4
     with closing(sqlite3.connect(tmp_path / "truth.db")) as connection:
         assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
         names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()

@@ -6,15 +6,12 @@ import resource
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
 import pytest
-from alembic import command
-from alembic.config import Config
-from sqlalchemy import create_engine
 
-import migrations
 from sceneprint.store import open_database
 
 #: Largest file of the child, in pages of the database: less than any migration writes.
@@ -43,17 +40,13 @@ def schema(path: Path) -> set[tuple[str, ...]]:
 
 
 @pytest.mark.parametrize("before", ["", "0001"])
-def test_a_migration_that_finds_no_room_changes_nothing(tmp_path: Path, before: str) -> None:
+def test_a_migration_that_finds_no_room_changes_nothing(
+    tmp_path: Path, before: str, bring_to: Callable[[str, str], None]
+) -> None:
     path = tmp_path / "truth.db"
     url = f"sqlite:///{path}"
     if before:
-        config = Config()
-        config.set_main_option("script_location", str(Path(migrations.__file__).parent))
-        engine = create_engine(url)
-        with engine.begin() as connection:
-            config.attributes["connection"] = connection
-            command.upgrade(config, before)
-        engine.dispose()
+        bring_to(url, before)
     found = schema(path)
     done = subprocess.run(
         [sys.executable, "-c", OPENS, url], capture_output=True, text=True, check=True,

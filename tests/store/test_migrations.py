@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import pytest
 from sqlalchemy import text
 
 from sceneprint.schemas import FrameState
@@ -25,26 +27,11 @@ POSE = [[1.0, 0.0, 0.0, 1.5], [0.0, 1.0, 0.0, -2.5], [0.0, 0.0, 1.0, 3.25], [0.0
 FRAMES = [(["door", "lit"], POSE), ([], None), (["door", "door"], None)]
 
 
-def bring_to(path: Path, version: str) -> None:
-    """Let the migrations of a version and before it make or change a database."""
-    from alembic import command
-    from alembic.config import Config
-    from sqlalchemy import create_engine
-
-    import migrations
-
-    config = Config()
-    config.set_main_option("script_location", str(Path(migrations.__file__).parent))
-    engine = create_engine(f"sqlite:///{path}")
-    with engine.begin() as connection:
-        config.attributes["connection"] = connection
-        command.upgrade(config, version)
-    engine.dispose()
-
-
-def an_old_database(path: Path) -> None:
+@pytest.fixture
+def old(tmp_path: Path, bring_to: Callable[[str, str], None]) -> Path:
     """A database as migration 0001 left it."""
-    bring_to(path, "0001")
+    path = tmp_path / "truth.db"
+    bring_to(f"sqlite:///{path}", "0001")
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("INSERT INTO models VALUES ('m', 'compact', x'00', 1.0)")
         connection.execute(
@@ -68,11 +55,11 @@ def an_old_database(path: Path) -> None:
         # numbers that were given out to what has been removed since
         connection.execute("UPDATE sqlite_sequence SET seq = 70 WHERE name = 'frames'")
         connection.execute("UPDATE sqlite_sequence SET seq = 80 WHERE name = 'jobs'")
+    return path
 
 
-def test_what_is_searched_for_is_filled_in_from_what_was_stored(tmp_path: Path) -> None:
-    an_old_database(tmp_path / "truth.db")
-    database = open_database(f"sqlite:///{tmp_path / 'truth.db'}")
+def test_what_is_searched_for_is_filled_in_from_what_was_stored(old: Path) -> None:
+    database = open_database(f"sqlite:///{old}")
     with database.read() as connection:
         tags = connection.execute(frame_tags.select().order_by(*frame_tags.c)).all()
         rows = [frame_of(connection, number) for number in (1, 2, 3)]
@@ -85,9 +72,8 @@ def test_what_is_searched_for_is_filled_in_from_what_was_stored(tmp_path: Path) 
     assert {row.novelty for row in rows} == {None}
 
 
-def test_jobs_keys_and_numbers_go_on_where_they_were(tmp_path: Path) -> None:
-    an_old_database(tmp_path / "truth.db")
-    database = open_database(f"sqlite:///{tmp_path / 'truth.db'}")
+def test_jobs_keys_and_numbers_go_on_where_they_were(old: Path) -> None:
+    database = open_database(f"sqlite:///{old}")
     with database.write() as connection:
         found = [find_job(connection, f"j{number}") for number in (1, 2, 3)]
         assert [(job.number, job.frame, job.map_number) for job in found] \
@@ -106,10 +92,11 @@ def test_jobs_keys_and_numbers_go_on_where_they_were(tmp_path: Path) -> None:
     database.close()
 
 
-def test_frames_of_before_there_were_clouds_are_depth_images(tmp_path: Path) -> None:
-    an_old_database(tmp_path / "truth.db")
-    bring_to(tmp_path / "truth.db", "0003")
-    database = open_database(f"sqlite:///{tmp_path / 'truth.db'}")
+def test_frames_of_before_there_were_clouds_are_depth_images(
+    old: Path, bring_to: Callable[[str, str], None]
+) -> None:
+    bring_to(f"sqlite:///{old}", "0003")
+    database = open_database(f"sqlite:///{old}")
     with database.write() as connection:
         rows = [frame_of(connection, number) for number in (1, 2, 3)]
         assert [(row.tags, row.pose) for row in rows] == FRAMES
@@ -124,12 +111,12 @@ def test_frames_of_before_there_were_clouds_are_depth_images(tmp_path: Path) -> 
     database.close()
 
 
-def test_what_a_map_held_before_there_were_quotas_is_counted(tmp_path: Path) -> None:
-    path = tmp_path / "truth.db"
-    an_old_database(path)
-    bring_to(path, "0006")
+def test_what_a_map_held_before_there_were_quotas_is_counted(
+    old: Path, bring_to: Callable[[str, str], None]
+) -> None:
+    bring_to(f"sqlite:///{old}", "0006")
     states = ("indexed", "deleted", "redundant")
-    with closing(sqlite3.connect(path)) as connection, connection:
+    with closing(sqlite3.connect(old)) as connection, connection:
         for number, state in enumerate(states, 1):
             connection.execute(
                 "UPDATE frames SET state = ?, bytes = ?, blob = ? WHERE number = ?",
@@ -138,7 +125,7 @@ def test_what_a_map_held_before_there_were_quotas_is_counted(tmp_path: Path) -> 
         connection.execute("INSERT INTO events (at, kind, map, data) VALUES (1, 'x', 'gone', '{}')")
         connection.execute("INSERT INTO events (at, kind, map, data) VALUES (1, 'y', 'hall', '{}')")
         connection.execute("INSERT INTO events (at, kind, map, data) VALUES (1, 'z', 'gone', '{}')")
-    database = open_database(f"sqlite:///{path}")
+    database = open_database(f"sqlite:///{old}")
     with database.read() as connection:
         assert use_of(connection, 1) == counted_anew(connection, 1) == Use(1, 10)
         assert doomed_blobs(connection, 10) == ["blob-2"]

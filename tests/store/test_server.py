@@ -32,17 +32,6 @@ from sceneprint.store.tables import events, maps, metadata
 
 Race = Callable[..., list[Any]]
 
-OPENS = """
-from sceneprint.store import open_database
-from sqlalchemy import text
-
-def work(i):
-    database = open_database(ARGS[0])
-    with database.read() as connection:
-        found = connection.execute(text("SELECT version_num FROM alembic_version")).all()
-    database.close()
-    return [row[0] for row in found]
-"""
 SQLITE = """
 import sys
 from pathlib import Path
@@ -78,9 +67,11 @@ def keeper(postgres_url: str) -> Iterator[Callable[[], None]]:
     other.close()
 
 
-def test_two_processes_may_open_an_empty_database_at_once(empty_url: str, race: Race) -> None:
+def test_two_processes_may_open_an_empty_database_at_once(
+    empty_url: str, race: Race, opens: str
+) -> None:
     assert not is_there(empty_url)
-    assert race(OPENS, 2, empty_url) == [[known_revisions()[0]]] * 2
+    assert race(opens, 2, empty_url) == [[known_revisions()[0]]] * 2
     assert is_there(empty_url)
     made = open_database(empty_url)
     with made.read() as connection:

@@ -16,12 +16,9 @@ from pathlib import Path
 
 import psycopg
 import pytest
-from alembic import command
-from alembic.config import Config
 from pydantic import SecretStr
-from sqlalchemy import create_engine, insert
+from sqlalchemy import insert
 
-import migrations
 from sceneprint.cli.served import serving
 from sceneprint.engine import Engine
 from sceneprint.errors import DamagedSnapshot, SnapshotError, UnknownSnapshot, UnusableStore
@@ -170,16 +167,10 @@ def test_what_postgresql_cannot_hold_is_found_before(data, postgres, tmp_path, s
     assert not (tmp_path / "fleet" / "blobs").exists()
 
 
-def test_a_snapshot_of_an_earlier_schema(postgres, tmp_path, settings):
+def test_a_snapshot_of_an_earlier_schema(postgres, tmp_path, settings, bring_to):
     data = tmp_path / "data"
     (data / "blobs").mkdir(parents=True)
-    config = Config()
-    config.set_main_option("script_location", str(Path(migrations.__file__).parent))
-    engine = create_engine(f"sqlite:///{data}/sceneprint.db")
-    with engine.begin() as connection:
-        config.attributes["connection"] = connection
-        command.upgrade(config, "0001")
-    engine.dispose()
+    bring_to(f"sqlite:///{data}/sceneprint.db", "0001")
     changed(data, "INSERT INTO models VALUES ('m', 'm', x'00ff', 1.5)")
     take_snapshot(settings(data), tmp_path / "a.tar")
     url = postgres.create("earlier")

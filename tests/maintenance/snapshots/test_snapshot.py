@@ -20,11 +20,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from alembic import command
-from alembic.config import Config
-from sqlalchemy import create_engine
 
-import migrations
 from sceneprint.engine import Engine
 from sceneprint.errors import SnapshotError, UnusableStore
 from sceneprint.maintenance import taking
@@ -241,17 +237,11 @@ def test_a_database_that_could_not_be_restored_is_not_taken(data, tmp_path, sett
 
 
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
-def test_a_database_of_an_earlier_schema_is_taken_as_it_is(tmp_path, settings):
+def test_a_database_of_an_earlier_schema_is_taken_as_it_is(tmp_path, settings, bring_to):
     """Before an upgrade is when one wants a snapshot."""
     data = tmp_path / "data"
     (data / "blobs").mkdir(parents=True)
-    config = Config()
-    config.set_main_option("script_location", str(Path(migrations.__file__).parent))
-    engine = create_engine(f"sqlite:///{data}/sceneprint.db")
-    with engine.begin() as connection:
-        config.attributes["connection"] = connection
-        command.upgrade(config, "0001")
-    engine.dispose()
+    bring_to(f"sqlite:///{data}/sceneprint.db", "0001")
     before = (data / "sceneprint.db").read_bytes()
     taken = take_snapshot(settings(data), tmp_path / "a.tar")
     assert taken.manifest.schema_revision == "0001"
