@@ -86,9 +86,9 @@ fleet: $(STAMP)
 	$(BIN)/python -m benchmarks.fleet --page docs/reliability.md --asynchronous
 
 models: $(STAMP)
-	$(BIN)/sceneprint train --preset paper --out sceneprint/presets/paper.safetensors
-	$(BIN)/sceneprint train --preset compact --out sceneprint/presets/compact.safetensors
+	$(BIN)/sceneprint train --preset depth --out sceneprint/presets/depth.safetensors
 	$(BIN)/sceneprint train --preset lidar --out sceneprint/presets/lidar.safetensors
+	$(BIN)/sceneprint train --preset paper --out sceneprint/presets/paper.safetensors
 
 lock: $(STAMP)
 	$(BIN)/python -m pip install --quiet uv

@@ -13,10 +13,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks import dashboard, dpp, growth, readiness, registration, scan, search, service
+from benchmarks import dashboard, disk, dpp, readiness, registration, scan, search, service
 from benchmarks.encode import EncodeFigures, measure
-from benchmarks.growth_page import GrowthFigures
-from benchmarks.growth_page import table as growth_table
 from benchmarks.machine import (
     Machine,
     describe_machine,
@@ -32,8 +30,11 @@ from sceneprint.synth import synthesise_room
 from sceneprint.types import Frame
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Frames and bytes of the maps that are searched.
-SEARCHED = ((1_000, 12_800), (10_000, 12_800), (100_000, 12_800), (10_000, 125_000))
+#: Frames of the maps that are searched, and whether by inverted lists.
+SEARCHED = (
+    (10_000, search.FLAT), (100_000, search.FLAT), (1_000_000, search.FLAT),
+    (1_000_000, search.LISTS),
+)  # fmt: skip
 BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
 
 
@@ -107,7 +108,7 @@ class Rows:
     search: list[search.SearchFigures]
     service: service.ServiceFigures
     readiness: readiness.ReadinessFigures | None = None
-    growth: GrowthFigures | None = None
+    disk: list[disk.DiskFigures] | None = None
     dashboard: dashboard.DashboardFigures | None = None
 
 
@@ -128,7 +129,7 @@ def page(machine: Machine, rows: Rows, start: float) -> str:
     lines += dashboard.table(rows.dashboard)
     lines += [line for one in rows.scan for line in scan.table(one)] + search.table(rows.search)
     lines += dpp.table(rows.dpp) + registration.table(rows.registration)
-    lines += growth_table(rows.growth) if rows.growth is not None else []
+    lines += disk.table(rows.disk) if rows.disk is not None else []
     return "\n".join([*lines, f"`import sceneprint`: {start:.2f} s.", END])
 
 
@@ -140,6 +141,7 @@ def measure_all(n_frames: int, n_pairs: int) -> Rows:
     with service.frames_of(recording if recording.is_dir() else None) as served_frames:
         served = service.measure(served_frames)
         started = readiness.measure(served_frames[0], list(served_frames[1:201]))
+        stored = [disk.measure_new(served_frames[:40], preset) for preset in ("depth", "paper")]
     looked = dashboard.measure()
     pin_to_one_processor()  # the service above has all processors, as it would
     signers = {preset: open_signer(preset) for preset in PRESETS}
@@ -147,11 +149,11 @@ def measure_all(n_frames: int, n_pairs: int) -> Rows:
         encode={p: (measure(frames, s), peak_memory(frames, p)) for p, s in signers.items()},
         scan=[scan.measure(*size) for size in scan.SCANNED],
         dpp=dpp.measure(),
-        registration=registration.measure(pairs, signers["paper"].model),
-        search=[search.measure(*size) for size in SEARCHED],
+        registration=registration.measure(pairs, signers[PRESETS[0]].model),
+        search=[search.measure(n, flat_bytes=kind) for n, kind in SEARCHED],
         service=served,
         readiness=started,
-        growth=growth.measure_small(),
+        disk=stored,
         dashboard=looked,
     )
 
@@ -180,7 +182,7 @@ def main() -> int:
         "search": [asdict(one) for one in rows.search],
         "service": asdict(rows.service),
         "readiness": None if rows.readiness is None else asdict(rows.readiness),
-        "growth": None if rows.growth is None else asdict(rows.growth),
+        "disk": None if rows.disk is None else [asdict(one) for one in rows.disk],
         "dashboard": None if rows.dashboard is None else asdict(rows.dashboard),
     }
     options.json.write_text(json.dumps(result, indent=1) + "\n")

@@ -173,7 +173,7 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=16, help="how many of them")
     parser.add_argument("--json", type=Path)
     o = parser.parse_args()
-    signer, known, signers = open_signer("paper"), Known(), dict[int, Signer]()
+    signer, known, signers = open_signer("depth"), Known(), dict[int, Signer]()
     model, segmentation = signer.model, signer.model.parameters.segmentation
     for n in PATCHES:  # one mixture, and so one pair table, serves all
         p = replace(model.parameters, segmentation=replace(segmentation, n_patches=n))

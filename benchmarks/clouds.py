@@ -174,7 +174,7 @@ def main() -> int:
     queries = [r.read_depth() for r in references[650 : 1000 : options.query_step]]
     rows = []
     print("model     frames  own depth  own cloud  margin  queries  turned  margin  ms a cloud")
-    for model in options.model or ["paper"]:
+    for model in options.model or ["depth"]:
         signer, seen = open_signer(model), not options.fused
         there, back, margin, ms = same_points(room, chosen, signer, has_viewpoint=seen)
         same, change = turned(database, queries, signer, has_viewpoint=seen)

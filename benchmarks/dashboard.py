@@ -115,7 +115,7 @@ def measure(frames: int = FRAMES, runs: int = RUNS) -> DashboardFigures | None:
 
 
 def _make(client: httpx.Client, name: str) -> None:
-    client.post("/v1/maps", json={"name": name, "model": "compact"}).raise_for_status()
+    client.post("/v1/maps", json={"name": name, "model": "depth"}).raise_for_status()
 
 
 def _match(client: httpx.Client, name: str, made: list[Shot]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from sceneprint.client import Client
 from sceneprint.datasets import FrameReference
@@ -60,3 +61,24 @@ def measure(frames: Sequence[FrameReference], model: str, folder: Path) -> DiskF
         uploads=uploads / n,
         artifacts=(blobs_after - blobs_before - uploads) / n,
     )
+
+
+def measure_new(frames: Sequence[FrameReference], model: str) -> DiskFigures:
+    """As `measure`, in a folder that goes afterwards."""
+    with TemporaryDirectory() as folder:
+        return measure(frames, model, Path(folder))
+
+
+def table(figures: Sequence[DiskFigures]) -> list[str]:
+    """The figures as lines of Markdown."""
+    return [
+        "### Disk a frame, beside the index; bytes",
+        "",
+        "| signature | rows of the database | upload | geometry artifact |",
+        "|--:|--:|--:|--:|",
+        *(
+            f"| {f.signature_bytes:,} | {f.database:,.0f} | {f.uploads:,.0f} | {f.artifacts:,.0f} |"
+            for f in figures
+        ),
+        "",
+    ]

@@ -24,7 +24,7 @@ class Library:
     """
 
     def __init__(self, frames: Sequence[FrameReference]) -> None:
-        self._signer = open_signer("paper")
+        self._signer = open_signer("depth")
         self._signatures: list[Signature] = []
         self._artifacts: list[bytes] = []
         for frame in frames:

@@ -144,7 +144,7 @@ def main() -> int:
     parser.add_argument("data", type=Path, nargs="?", help="folder of recordings")
     parser.add_argument("--pairs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=5)
-    parser.add_argument("--model", default="paper")
+    parser.add_argument("--model", default="depth")
     options = parser.parse_args()
     n, seed, model = options.pairs, options.seed, read_model(options.model)
     kinds = {

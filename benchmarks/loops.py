@@ -216,7 +216,7 @@ def _filled(
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--model", default="compact")
+    parser.add_argument("--model", default="depth")
     parser.add_argument("--step", type=int, default=2, help="of the 1000 frames of redkitchen")
     parser.add_argument("--data", type=Path, help="folder to keep; default: one that is removed")
     options = parser.parse_args()

@@ -10,12 +10,16 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from zlib import crc32
 
 import numpy as np
+from sqlalchemy import insert, update
 
+from benchmarks.machine import own_bytes
 from sceneprint.cli.served import serving
 from sceneprint.client import Client
 from sceneprint.datasets import FrameReference, find_sequences
@@ -23,13 +27,13 @@ from sceneprint.engine import Engine
 from sceneprint.schemas import NewMap
 from sceneprint.schemas.maps import Preset
 from sceneprint.settings import Settings
-from sceneprint.store.frames import add_frame
 from sceneprint.store.maps import find_map
-from sceneprint.store.signatures import StoredSignature, index_frame
+from sceneprint.store.tables import frames as frame_table
+from sceneprint.store.tables import maps, signatures
 
 MAP = "bench"
 #: Frames that are written in one commit.
-_BLOCK = 500
+_BLOCK = 5_000
 
 
 @dataclass(frozen=True)
@@ -38,14 +42,17 @@ class ReadinessFigures:
 
     `ready`: until it answers; `first`: until the first query is answered; `bare`: the same with
     the index deleted, so that all signatures are read from the database; `bare_exact`: whether
-    that answer compared every frame. `signed`: frames a second by workers.
+    that answer compared every frame. `memory`: megabytes that the service has for itself then.
+    `signed`: frames a second by workers.
     """
 
     frames: int
     signature_bytes: int
     ready: float
     first: float
+    memory: float
     bare: float
+    bare_memory: float
     bare_exact: bool
     signed: dict[int, float]
 
@@ -57,7 +64,7 @@ class ReadinessFigures:
 
 def measure(
     frame: FrameReference, to_sign: list[FrameReference], frames: int = 10_000,
-    model: Preset = "paper",
+    model: Preset = "depth",
 ) -> ReadinessFigures:  # fmt: skip
     """Fill a map with random signatures, start a service on it, and ask; then let workers sign.
 
@@ -71,46 +78,68 @@ def measure(
     with TemporaryDirectory() as folder:
         data = Path(folder) / "large"
         length = _fill(data, frames, model)
-        ready, first, _ = _start(data, frame)
-        shutil.rmtree(data / "index")
-        _, bare, exact = _start(data, frame)
+        ready, first, memory, _ = _start(data, frame)
+        shutil.rmtree(data / "index", ignore_errors=True)  # of psi there is none
+        _, bare, bare_memory, exact = _start(data, frame)
         signed = {n: _sign(Path(folder) / f"by-{n}", to_sign, n, model) for n in (1, 2)}
-    return ReadinessFigures(frames, length, ready, first, bare, exact, signed)
+    return ReadinessFigures(frames, length, ready, first, memory, bare, bare_memory, exact, signed)
 
 
 def _fill(data: Path, frames: int, model: Preset) -> int:
+    """A map of frames with random signatures; returns the bytes of each."""
     rng = np.random.default_rng(0)
     with Engine(Settings(data_dir=data)) as engine:
         engine.create_map(NewMap(name=MAP, model=model))
         artifact = engine.store.blobs.put(b"none")
         length = engine.view(MAP)[1].signature_bytes
-        for start in range(0, frames, _BLOCK):
+        with engine.store.database.read() as connection:
+            row = find_map(connection, MAP)
+        frame = {
+            "map_number": row.number, "state": "indexed", "blob": artifact, "bytes": 4,
+            "intrinsics": {}, "depth_scale": 1000.0, "depth_along_ray": False, "tags": [],
+            "received_at": time.time(), "indexed_at": time.time(),
+        }  # fmt: skip
+        stored = {"model_id": row.model_id, "geometry": artifact, "n_patches": [1], "n_pairs": [1]}
+        for start in range(1, frames + 1, _BLOCK):
+            numbers = range(start, min(start + _BLOCK, frames + 1))
+            vectors = [rng.bytes(length) for _ in numbers]
             with engine.store.database.write() as connection:
-                row = find_map(connection, MAP)
-                for i in range(start, min(start + _BLOCK, frames)):
-                    values = {
-                        "content_id": f"{i:064x}", "blob": artifact, "bytes": 4, "robot": None,
-                        "intrinsics": {}, "depth_scale": 1000.0, "depth_along_ray": False,
-                        "session": None, "captured_at": None, "tags": [], "pose_parent": None,
-                        "pose": None,
-                    }  # fmt: skip
-                    added = add_frame(connection, row.number, values)
-                    vector = rng.integers(0, 256, length, np.uint8).tobytes()
-                    made = StoredSignature(row.model_id, vector, artifact, (1,), (1,))
-                    index_frame(connection, added, made)
-        engine.rebuild_index(MAP)
+                own = [{"number": n, "id": f"{n:032x}", "content_id": f"{n:064x}", "revision": n}
+                       for n in numbers]  # fmt: skip
+                connection.execute(insert(frame_table), [{**frame, **one} for one in own])
+                signed = [{"frame_number": n, "vector": v, "checksum": crc32(v)}
+                          for n, v in zip(numbers, vectors, strict=True)]  # fmt: skip
+                connection.execute(insert(signatures), [{**stored, **one} for one in signed])
+                now = {"revision": numbers[-1], "used_frames": numbers[-1]}
+                connection.execute(update(maps).where(maps.c.number == row.number).values(**now))
+        if engine.view(MAP)[1].metric == "l2":
+            engine.rebuild_index(MAP)
     return length
 
 
-def _start(data: Path, frame: FrameReference) -> tuple[float, float, bool]:
-    """Seconds until the service answers, and until it has answered a query; whether exactly."""
+def _start(data: Path, frame: FrameReference) -> tuple[float, float, float, bool]:
+    """Seconds until the service answers, and until it has answered a query; its memory; whether
+    it compared all.
+    """
     begun = time.perf_counter()
     with serving(data, workers=0) as url, Client(url) as client:
         while not client.healthy():
             time.sleep(0.02)
         ready = time.perf_counter() - begun
         answer = client.query(MAP, frame, stages=("retrieve",))
-        return ready, time.perf_counter() - begun, answer.exact
+        first = time.perf_counter() - begun
+        return ready, first, memory_of(data, "serve") / 1e6, answer.exact
+
+
+def memory_of(folder: Path, command: str) -> int:
+    """Bytes that the processes of a command on a data folder have for themselves."""
+    total = 0
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):  # it ended meanwhile
+            words = path.read_bytes().split(b"\0")
+            if str(folder).encode() in words and command.encode() in words:
+                total += own_bytes(path.parent)
+    return total
 
 
 def _sign(data: Path, frames: list[FrameReference], n: int, model: Preset) -> float:
@@ -144,11 +173,13 @@ def table(f: ReadinessFigures) -> list[str]:
     return [
         f"### A service with {f.frames:,} frames of {f.signature_bytes:,} bytes starts",
         "",
-        "| | s |",
+        "| | s, MB |",
         "|---|--:|",
         f"| until it answers | {f.ready:.1f} |",
         f"| until the first query is answered | {f.first:.1f} |",
         f"| the same with its index deleted, from the database, exactly | {f.bare:.1f} |",
+        f"| its own memory then | {f.memory:.0f} |",
+        f"| the same without its index | {f.bare_memory:.0f} |",
         "",
         f"One worker signs {f.signed[1]:.1f} frames a second, two {f.signed[2]:.1f}: "
         f"**{f.gain:.2f}** times as many.",

@@ -20,7 +20,9 @@ from tqdm import tqdm
 from sceneprint.datasets import Sequence, find_sequences
 from sceneprint.evaluation.overlap import overlaps, view_of
 from sceneprint.geometry.encoding import quantise
-from sceneprint.geometry.retrieval import distances
+from sceneprint.geometry.retrieval import cross_distances
+from sceneprint.geometry.whitening import UNITS, whiten
+from sceneprint.models import Model
 from sceneprint.signing import (
     Signer,
     describe,
@@ -53,21 +55,31 @@ class Figures:
     recall_at_10_of_float: float
 
 
-def float_signatures(frames: list[Frame], signer: Signer) -> Floats:
-    """(N, 25 G H) before quantisation."""
-    return np.stack(
-        [
-            float_signature(
-                [
-                    table_statistics(level, signer)
-                    for level in describe(f, signer.model.parameters).levels
-                ],
-                signer.model,
-                f.name,
-            )
-            for f in tqdm(frames, desc="sign", unit="frame", disable=None)
-        ]
-    )
+def psi_of(frames: list[Frame], signer: Signer) -> Floats:
+    """(N, D) psi of the levels of the model's signature, before any rounding."""
+    p, levels = signer.model.parameters, signer.model.levels
+    found = []
+    for f in tqdm(frames, desc="sign", unit="frame", disable=None):
+        patches = describe(f, p).levels
+        statistics = [table_statistics(patches[level], signer) for level in levels]
+        found.append(float_signature(statistics, signer.model, f.name))
+    return np.stack(found)
+
+
+def unrounded(psi: Floats, model: Model) -> Floats:
+    """(N, n) what stored signatures are rounded from: psi, or unit vectors."""
+    own = model.whitening
+    if own is None:
+        return psi
+    z = own.scales * (UNITS * psi @ own.basis.T.astype(float) - own.offsets)
+    unit: Floats = z / np.linalg.norm(z, axis=1, keepdims=True)
+    return unit
+
+
+def stored(psi: Floats, model: Model) -> Bytes:
+    """(N, n) signatures as a service stores them."""
+    own, step = model.whitening, model.quantiser_step
+    return np.stack([quantise(one, step) if own is None else whiten(one, own) for one in psi])
 
 
 def ranks(rows: Floats) -> NDArray[np.intp]:
@@ -97,13 +109,14 @@ def measure(split: str, sequence: Sequence, signer: Signer, every: int = 1) -> F
     database, queries = (
         [sequence.frames[i].read_depth() for i in part[::every]] for part in SPLITS[split]
     )
-    d, q = float_signatures(database, signer), float_signatures(queries, signer)
-    step = signer.model.quantiser_step
-    d8: Bytes = np.stack([quantise(one, step) for one in d])
-    stored = np.stack([distances(quantise(one, step), d8) for one in q]).astype(float)
-    exact = np.stack([np.abs(d - one).sum(axis=1) for one in q])
+    model = signer.model
+    d, q = psi_of(database, signer), psi_of(queries, signer)
+    ranked = cross_distances(stored(q, model), stored(d, model), model.metric).astype(float)
+    power = 1 if model.metric == "l1" else 2
+    d_exact, q_exact = unrounded(d, model), unrounded(q, model)
+    exact = np.stack([(np.abs(d_exact - one) ** power).sum(axis=1) for one in q_exact])
     truth = overlaps([view_of(f) for f in queries], [view_of(f) for f in database]).mean
-    found = np.take_along_axis(truth, ranks(stored), axis=1)
+    found = np.take_along_axis(truth, ranks(ranked), axis=1)
     best = truth.max(axis=1)
     return Figures(
         split=split,
@@ -116,7 +129,7 @@ def measure(split: str, sequence: Sequence, signer: Signer, every: int = 1) -> F
         oracle_mean_overlap=float(best.mean()),
         oracle_top1_overlap_50=float((best >= 0.5).mean()),
         random_mean_overlap=float(truth.mean()),
-        recall_at_10_of_float=recall_at_10(stored, exact),
+        recall_at_10_of_float=recall_at_10(ranked, exact),
     )
 
 
@@ -124,7 +137,7 @@ def main() -> int:
     """Print a row per split, and JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path, help="folder of 7-Scenes redkitchen")
-    parser.add_argument("--model", default="paper", help="preset or model file")
+    parser.add_argument("--model", default="depth", help="preset or model file")
     parser.add_argument("--split", choices=SPLITS, action="append")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()

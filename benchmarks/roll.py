@@ -75,7 +75,7 @@ def shares_of_d0(
 def main() -> int:
     """Print median and largest share for both lenses."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--model", default="paper", help="preset or model file")
+    parser.add_argument("--model", default="depth", help="preset or model file")
     parser.add_argument("--views", type=int, default=12)
     options = parser.parse_args()
     signer = open_signer(options.model)

@@ -129,7 +129,7 @@ def multiply(data: Path, source: str, name: str, count: int) -> None:
     """
     rng = np.random.default_rng(SEED)
     with Engine(Settings(data_dir=data)) as engine:
-        engine.create_map(NewMap(name=name, title=f"{count:,} frames", model="compact"))
+        engine.create_map(NewMap(name=name, title=f"{count:,} frames", model="depth"))
         with engine.store.database.read() as connection:
             row, other = find_map(connection, name), find_map(connection, source)
             of_other = frame_table.c.map_number == other.number

@@ -12,8 +12,8 @@ from sceneprint.geometry.retrieval import cross_distances, distances
 
 #: Queries that share one pass over the database.
 TOGETHER = 8
-#: Signatures, bytes of each and runs: little more than caches hold, and far more, of both presets.
-SCANNED = ((500, 125_000, 15), (4096, 125_000, 9), (40_000, 12_800, 9))
+#: Signatures, bytes of each and runs: far more than caches hold, whitened and of psi.
+SCANNED = ((1_000_000, 448, 9), (4096, 125_000, 9))
 
 
 @dataclass(frozen=True)

@@ -97,8 +97,8 @@ def take(out: Path) -> list[Path]:
 def fill(client: httpx.Client, data: Path, made: list[Shot]) -> None:
     """Upload all frames while nobody signs them, and damage one of them on the disk."""
     for name, title, model in (
-        (MAP, "Two rooms, two robots", "compact"), (HALL, "Hall 3", "lidar"),
-        (BOXES, "Rooms without furniture", "compact"), ("empty", None, "compact"),
+        (MAP, "Two rooms, two robots", "depth"), (HALL, "Hall 3", "lidar"),
+        (BOXES, "Rooms without furniture", "depth"), ("empty", None, "depth"),
     ):  # fmt: skip
         new = {"name": name, "title": title, "model": model}
         client.post("/v1/maps", json=new).raise_for_status()

@@ -1,11 +1,15 @@
-"""What a search of a published map costs from a shortlist, beside an exact scan of all of it.
+"""What a search costs by the number of frames in a map: all compared, and by inverted lists.
 
 `python -m benchmarks.search`
+
+Frames are clustered as a building is: places at random, and some fifty frames about each. Times are
+of one thread, warm. Memory is of a process of its own that opens the index and searches.
 """
 
 from __future__ import annotations
 
 import argparse
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -14,110 +18,178 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.encode import Clock
 from benchmarks.machine import pin_to_one_processor
-from sceneprint.index import SHORTLIST, Generation, Tail, publish, search
-from sceneprint.index.segments import Block
+from sceneprint.index import Generation, Tail, publish, search
+from sceneprint.models import PRESETS, read_model
 from sceneprint.types import Bytes
 
 #: Hits that are asked for: the longest ranking.
 SIZE = 200
+#: Frames of a place, and of a block.
+PLACE, BLOCK = 50, 1 << 16
+#: Bytes of a map from which inverted lists are made: never, and always.
+FLAT, LISTS = 1 << 62, 0
+
+#: Opens an index in a process of its own, searches, and prints milliseconds and bytes.
+_PROBE = """
+import sys, time
+from pathlib import Path
+import numpy as np
+from sceneprint.index import Tail, newest, search
+folder, asked = Path(sys.argv[1]), np.load(sys.argv[2])
+def held():
+    lines = dict(line.split()[:2] for line in open("/proc/self/smaps_rollup") if "kB" in line)
+    anonymous = int(lines["Anonymous:"])
+    return np.array([anonymous, int(lines["Rss:"]) - anonymous]) * 1024
+small = Tail(np.arange(2), asked[:2])
+search(asked[0], None, small, 2, metric="l2")
+import faiss
+before, begin = held(), time.perf_counter()
+generation = newest(folder, "bench", asked.shape[1])
+opened = time.perf_counter() - begin
+for query in asked:
+    search(query, generation, Tail.empty(asked.shape[1]), 200, metric="l2")
+print(1e3 * opened, *(held() - before))
+"""
 
 
 @dataclass(frozen=True)
 class SearchFigures:
-    """Medians over all runs, of one query against a map of `frames`; milliseconds.
+    """Of one query against a map of `frames`, medians over all runs; milliseconds and megabytes.
 
-    `ratio` is the time of the search over that of the exact scan within one run, of a query that
-    neither has seen; below 1 the shortlist pays. `spread` has its quartiles: the machine is shared,
-    and one turn of another process is longer than a search. `publish` is of one run.
+    `search` is as a service searches; `exact` compares every frame. `ratio` is the time of the one
+    over that of the other within one run. `probes` is 0 where there are no lists; then `recall` is
+    1 without being measured. `publish`, `append` (of a thousand frames) and `open` (all files read
+    and verified) are of one run. `held` is memory of the process alone, `shared` what processes
+    have in common.
     """
 
     frames: int
     signature_bytes: int
-    shortlist: int
+    probes: int
+    recall: float
     publish: float
-    exact: float
+    append: float
+    open: float
     search: float
-    code: float
-    nearest: float
+    exact: float
     ratio: float
-    spread: tuple[float, float]
+    held: float
+    shared: float
+
+
+def signatures(keys: NDArray[np.int64], length: int) -> Bytes:
+    """Signatures (n, length) of frames by their numbers: fifty about each place, none twice."""
+    places, frame = np.divmod(keys, PLACE)
+    rows = np.empty((len(keys), length))
+    for place in np.unique(places):
+        own = np.flatnonzero(places == place)
+        rng = np.random.default_rng(place)
+        centre = rng.normal(size=length)
+        rows[own] = centre + 0.7 * rng.normal(size=(PLACE, length))[frame[own]]
+    rows *= 26.0 * length**0.5 / np.linalg.norm(rows, axis=1, keepdims=True)
+    found: Bytes = (np.clip(np.rint(rows), -127, 127) + 128).astype(np.uint8)
+    return found
 
 
 def measure(
-    frames: int = 10_000, length: int = 12_800, runs: int = 15, shortlist: int = SHORTLIST
+    frames: int = 10_000, length: int | None = None, flat_bytes: int = FLAT, runs: int = 15
 ) -> SearchFigures:
-    """Search a map of random signatures, and scan it, in turn.
+    """Publish a map, and search it as a service does and by comparing every frame, in turn.
 
     Parameters
     ----------
     frames : of the map
-    length : of a signature, bytes
-    runs : of every row
-    shortlist : see `search`
+    length : bytes of a signature; default: of the default preset
+    flat_bytes : see `publish`; FLAT or LISTS
+    runs : queries, of which none is in the map
     """
-    rng = np.random.default_rng(0)
-    queries: Bytes = rng.integers(0, 256, (runs + 1, length), np.uint8)
-    none, tail = np.empty(0, np.int64), Tail.empty(length)
+    length = read_model(PRESETS[0]).signature_bytes if length is None else length
+    tail = Tail.empty(length)
+    # of places that the map has, but of frames that it has not
+    seen = (np.arange(runs + 1) * max(frames // (runs + 1), 1)) // PLACE * PLACE
+    queries = signatures(seen, length)
 
-    def blocks() -> Iterator[Block]:
-        for keys in np.array_split(np.arange(frames), max(frames * length >> 23, 1)):
-            yield keys, rng.integers(0, 256, (len(keys), length), np.uint8)
+    def blocks(first: int, last: int) -> Iterator[tuple[NDArray[np.int64], Bytes]]:
+        for start in range(first, last, BLOCK):
+            keys = np.arange(start, min(start + BLOCK, last))
+            keys = keys[keys % PLACE != 0]
+            if len(keys):
+                yield keys, signatures(keys, length)
 
-    def published(folder: Path) -> Generation:
-        made = publish(folder, model_id="bench", revision=0, blocks=blocks(), previous=None)
+    def published(folder: Path, previous: Generation | None, first: int, last: int) -> Generation:
+        made = publish(
+            folder, model_id="bench", revision=last, blocks=blocks(first, last), previous=previous,
+            flat_bytes=flat_bytes,
+        )  # fmt: skip
         if made is None:
             raise RuntimeError(f"{folder} is being built in")
         return made
 
     whole = Clock()
-    with tempfile.TemporaryDirectory() as folder:
-        generation = whole.run("publish", lambda: published(Path(folder)))
-    code = generation.code.encode(queries[:1])[0]
-    rows: dict[str, Callable[[Bytes], object]] = {
-        "exact": lambda query: search(query, generation, tail, SIZE, exact=True),
-        "search": lambda query: search(query, generation, tail, SIZE, shortlist=shortlist),
-        "code": lambda query: generation.code.encode(query[None]),
-        "nearest": lambda _: generation.coarse.nearest(code, shortlist, none),
-    }
-    times: dict[str, list[float]] = {name: [] for name in rows}
-    for run, query in enumerate(queries, -1):  # the first compiles, and touches the mapping
-        clock = Clock()
-        for name, call in rows.items():
-            clock.run(name, partial(call, query))
-            if run >= 0:
-                times[name].append(clock.stages[name])
-    ratios = np.divide(times["search"], times["exact"])
-    medians = {name: float(np.median(own)) for name, own in times.items()}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "index"
+        folder.mkdir()
+        generation = whole.run("publish", lambda: published(folder, None, 0, frames))
+        opened, held, shared = _probed(folder, queries)
+        grown = frames + 1000
+        whole.run("append", lambda: published(folder, generation, frames, grown))
+        rows: dict[str, Callable[[Bytes], object]] = {
+            "search": lambda query: search(query, generation, tail, SIZE, metric="l2"),
+            "exact": lambda query: search(query, generation, tail, SIZE, metric="l2", exact=True),
+        }
+        times: dict[str, list[float]] = {one: [] for one in rows}
+        for run, query in enumerate(queries, -1):  # the first warms up
+            clock = Clock()
+            for one, call in rows.items():
+                clock.run(one, partial(call, query))
+                if run >= 0:
+                    times[one].append(clock.stages[one])
     return SearchFigures(
-        frames=frames,
+        frames=len(generation),
         signature_bytes=length,
-        shortlist=shortlist,
+        probes=generation.recall.probes,
+        recall=generation.recall.share,
         publish=whole.stages["publish"],
-        ratio=float(np.median(ratios)),
-        spread=tuple(np.quantile(ratios, (0.25, 0.75))),
-        **medians,
+        append=whole.stages["append"],
+        open=opened,
+        search=float(np.median(times["search"])),
+        exact=float(np.median(times["exact"])),
+        ratio=float(np.median(np.divide(times["search"], times["exact"]))),
+        held=held / 1e6,
+        shared=shared / 1e6,
     )
+
+
+def _probed(folder: Path, queries: Bytes) -> list[float]:
+    asked = folder.parent / "asked.npy"
+    np.save(asked, queries)
+    command = [sys.executable, "-c", _PROBE, str(folder), str(asked)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return [float(value) for value in done.stdout.split()]
 
 
 def table(figures: list[SearchFigures]) -> list[str]:
     """The figures as lines of Markdown."""
     return [
-        f"### Search for {SIZE} frames from a shortlist, beside an exact scan: one thread, warm",
+        f"### Search for the {SIZE} nearest frames: one thread, warm",
         "",
-        "| frames | bytes | shortlist | exact, ms | search, ms | of it code | of it FAISS "
-        "| search / exact | quartiles |",
-        "|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
+        "| frames | bytes | compared | search, ms | all, ms | search / all | recall@10 "
+        "| publish, s | append 1,000, s | open and verify, s | memory: own, shared, MB |",
+        "|--:|--:|---|--:|--:|--:|--:|--:|--:|--:|--:|",
         *(
-            f"| {f.frames:,} | {f.signature_bytes:,} | {f.shortlist:,} | {f.exact:.2f} "
-            f"| {f.search:.2f} | {f.code:.2f} | {f.nearest:.2f} | **{f.ratio:.3f}** "
-            f"| {f.spread[0]:.3f} to {f.spread[1]:.3f} |"
+            f"| {f.frames:,} | {f.signature_bytes} "
+            f"| {f'{f.probes} lists' if f.probes else 'all'} | {f.search:.2f} | {f.exact:.2f} "
+            f"| {f.ratio:.2f} | {f.recall:.4f} | {f.publish / 1e3:.1f} | {f.append / 1e3:.1f} "
+            f"| {f.open / 1e3:.2f} | {f.held:.0f}, {f.shared:.0f} |"
             for f in figures
         ),
         "",
-        "A map no larger than the shortlist is compared whole, without code and FAISS.",
+        "A service compares all frames of a map up to 1 GiB of signatures, and uses inverted lists "
+        "beyond. Rows with lists below that size are for comparison.",
         "",
     ]
 
@@ -125,12 +197,14 @@ def table(figures: list[SearchFigures]) -> list[str]:
 def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, nargs="+", default=[1000, 10_000, 100_000])
-    parser.add_argument("--bytes", type=int, default=12_800, help="of a signature")
+    parser.add_argument("--frames", type=int, nargs="+", default=[10_000, 100_000, 1_000_000])
+    parser.add_argument("--lists", action="store_true", help="by inverted lists as well")
     parser.add_argument("--runs", type=int, default=15)
     options = parser.parse_args()
     pin_to_one_processor()
-    figures = [measure(n, options.bytes, options.runs) for n in options.frames]
+    kinds = (FLAT, LISTS) if options.lists else (FLAT,)
+    sizes = [(n, kind) for kind in kinds for n in options.frames]
+    figures = [measure(n, flat_bytes=kind, runs=options.runs) for n, kind in sizes]
     print("\n".join(table(figures)))
     return 0
 

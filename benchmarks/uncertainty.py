@@ -119,7 +119,7 @@ def main() -> None:
     asked = argparse.ArgumentParser(description="Errors beside their covariances.")
     asked.add_argument("--seed", type=int, default=6202)
     asked.add_argument("--rooms", type=int, default=60)
-    asked.add_argument("--model", default="compact")
+    asked.add_argument("--model", default="depth")
     options = asked.parse_args()
     model = read_model(options.model)
     rooms = tqdm(range(options.rooms), desc="rooms", disable=None)

@@ -82,7 +82,7 @@ def measure(frames: int = 400, clients: int = 8, batch: int = 0, workers: int = 
         serving(Path(folder), workers) as url,
         Client(url) as asked,
     ):
-        asked.create_map("hall", model="compact")
+        asked.create_map("hall", model="depth")
         place = urlsplit(url)
         context = get_context("spawn")  # what the clients take is theirs, as of robots elsewhere
         barrier, told = context.Barrier(clients + 1), context.SimpleQueue()

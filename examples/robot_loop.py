@@ -91,7 +91,7 @@ def run(client: Client) -> list[float]:
     walk = synthesise_room(seed=5, index=0, views=24, along_path=True).frames
     elsewhere = synthesise_room(seed=5, index=1, views=1).frames
     try:
-        client.create_map(MAP, "Example: a robot's own map", model="compact")
+        client.create_map(MAP, "Example: a robot's own map", model="depth")
     except MapExists:
         print(f"map {MAP} is there already, and is used")
     robot = Robot(client)

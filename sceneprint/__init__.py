@@ -1,6 +1,6 @@
 """sceneprint: place recognition from pure geometry.
 
-    signer = sceneprint.open_signer("paper")
+    signer = sceneprint.open_signer("depth")
     signature, geometry = sceneprint.prepare(frame, signer)
     ranking = sceneprint.retrieve(signature, signatures, signer.model)  # R
     selection = sceneprint.diversify(ranking, signatures)  # C

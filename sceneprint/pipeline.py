@@ -15,6 +15,7 @@ from sceneprint.geometry.acceptance import Mode
 from sceneprint.geometry.diversity import DiversityParameters, Selection
 from sceneprint.geometry.diversity import diversify as select
 from sceneprint.geometry.retrieval import (
+    Metric,
     Ranking,
     distances,
     pairwise_distances,
@@ -54,7 +55,7 @@ __all__ = [
 
 
 def sign(frame: AnyFrame, signer: Signer) -> Signature:
-    """The signature psi of a frame: Sec. III-A, III-B, III-F.
+    """The stored signature of a frame: Sec. III-A, III-B, III-F; whitened where its model says so.
 
     Parameters
     ----------
@@ -101,14 +102,14 @@ def geometry_of(seen: Surface, model: Model) -> Geometry:
 
 
 def distance(a: Signature, b: Signature) -> int:
-    """L1 distance of two stored signatures, in units of a byte: -s(X, Y) of Sec. III-C.
+    """Distance of two stored signatures in their model's metric: -s(X, Y) of Sec. III-C.
 
     Raises
     ------
     ModelMismatch : they are of two models.
     """
     _same_model(a, b)
-    return int(distances(a.vector, b.vector[None])[0])
+    return int(distances(a.vector, b.vector[None], a.metric)[0])
 
 
 def retrieve(
@@ -132,7 +133,8 @@ def retrieve(
         _same_model(query, one)
     size = ranking_size(len(database)) if size is None else size
     stored = _stacked(database) if len(database) else np.empty((0, len(query.vector)), np.uint8)
-    return rank(distances(query.vector, stored), size, model.unrelated_distance)
+    found = distances(query.vector, stored, model.metric)
+    return rank(found, size, model.unrelated_distance)
 
 
 def diversify(
@@ -154,7 +156,9 @@ def diversify(
     -------
     selection : positions in R, the top-ranked first, in the order of R
     """
-    among = pairwise_distances(_stacked([database[i] for i in ranking.indices]))
+    ranked = [database[i] for i in ranking.indices]
+    metric: Metric = ranked[0].metric if ranked else "l2"
+    among = pairwise_distances(_stacked(ranked), metric)
     return select(ranking.distances, among, k, p)
 
 

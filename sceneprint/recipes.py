@@ -13,20 +13,27 @@ from sceneprint.errors import TrainingError
 from sceneprint.geometry.hierarchy import HierarchyParameters
 from sceneprint.geometry.mixture import MixtureParameters
 from sceneprint.geometry.scaling import scaled
+from sceneprint.geometry.whitening import WhiteningParameters
 from sceneprint.models import ModelParameters
 
 #: Synthetic scenes: rooms seen by a depth camera, or sites scanned by a laser.
 Scenes = Literal["rooms", "sites"]
 
 #: Sizes of the presets: G components, H levels.
-PRESET_SIZES = {"paper": (1250, 4), "compact": (256, 2), "lidar": (256, 4)}
+PRESET_SIZES = {"depth": (256, 2), "lidar": (256, 4), "paper": (1250, 4)}
+#: Levels of psi that stored signatures are made of, how, and the number of scenes that the
+#: whitening is fitted to; `paper` stores psi itself.
+PRESET_WHITENINGS = {
+    "depth": ((1,), WhiteningParameters(448, exponent=0.75), 500),
+    "lidar": ((1, 2, 3), WhiteningParameters(448, exponent=0.75), 400),
+}
 
 
 def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
     """Parameters of a preset.
 
-    `paper` has the sizes of Sec. III-F, `compact` a tenth of them; both suit depth cameras
-    indoors. `lidar` has longer lengths, for scanners that see tens of metres.
+    `depth` suits depth cameras indoors, and is what to take by default. `lidar` has longer
+    lengths, for scanners that see tens of metres. `paper` has the sizes of Sec. III-F.
 
     Raises
     ------
@@ -39,6 +46,16 @@ def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
     g, h = PRESET_SIZES[preset]
     model = _lidar() if preset == "lidar" else ModelParameters()
     return replace(model, hierarchy=HierarchyParameters(h)), MixtureParameters(g)
+
+
+def preset_whitening(preset: str) -> tuple[tuple[int, ...], WhiteningParameters, int]:
+    """Levels of psi that stored signatures are made of, how, and the scenes that teach it.
+
+    No scenes where psi itself is stored.
+    """
+    if preset not in PRESET_WHITENINGS:
+        return (0,), WhiteningParameters(), 0
+    return PRESET_WHITENINGS[preset]
 
 
 def preset_scenes(preset: str) -> tuple[Scenes, int]:

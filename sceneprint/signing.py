@@ -26,31 +26,42 @@ from sceneprint.geometry.hierarchy import hierarchy
 from sceneprint.geometry.normals import surface
 from sceneprint.geometry.projection import project
 from sceneprint.geometry.properties import neighbour_pairs, pair_properties
+from sceneprint.geometry.retrieval import Metric
 from sceneprint.geometry.segmentation import patches_of, segment
 from sceneprint.geometry.supervoxels import supervoxels
 from sceneprint.geometry.table import PairTable
 from sceneprint.geometry.voxels import Voxels, voxels
 from sceneprint.geometry.weights import patch_weights
-from sceneprint.models import Model, ModelParameters, build_table, open_table, read_model
+from sceneprint.geometry.whitening import whiten
+from sceneprint.models import (
+    PRESETS,
+    Model,
+    ModelParameters,
+    build_table,
+    open_table,
+    read_model,
+)
 from sceneprint.types import AnyFrame, Bytes, Cloud, Floats, Hierarchy, Patches, Surface
 
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """psi of one frame, as it is stored and compared.
+    """The signature of one frame, as it is stored and compared.
 
     Parameters
     ----------
-    vector : (25 G H,) uint8
+    vector : (d,) uint8, whitened; or (25 G H,), psi itself, of a model without a whitening
     model_id : of the model that made it; signatures of two models are never compared
-    n_patches : patches of each level, finest first
-    n_pairs : ordered pairs of each level
+    n_patches : patches of each level that it is made of, finest first
+    n_pairs : ordered pairs of each of these levels
+    metric : by which vectors of that model are compared
     """
 
     vector: Bytes
     model_id: str
     n_patches: tuple[int, ...]
     n_pairs: tuple[int, ...]
+    metric: Metric
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +79,7 @@ class Signer:
 
 
 def open_signer(
-    model: str | Path | Model = "paper",
+    model: str | Path | Model = PRESETS[0],
     cache_dir: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
     *,
@@ -80,7 +91,7 @@ def open_signer(
 
     Parameters
     ----------
-    model : "paper", "compact", "lidar", the path of a model file, or a model
+    model : "depth", "lidar", "paper", the path of a model file, or a model
     cache_dir : folder of derived files; default: the user's cache folder
     progress : called with bins done and their total while the table is being built
     cached : False for a model that will not be seen again: nothing is read or written
@@ -164,26 +175,28 @@ def patches_for_validation(seen: Surface, p: ModelParameters) -> Patches:
 
 
 def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
-    """Quantised signature of a hierarchy of patches: Sec. III-A and III-B.
+    """Stored signature of a hierarchy of patches: Sec. III-A and III-B.
 
     Parameters
     ----------
-    patches : H levels
+    patches : all levels that the model's signature is made of
     signer : see `open_signer`
     name : of the frame, for errors
 
     Raises
     ------
-    UselessFrame : the finest level has no pair of patches within reach.
+    UselessFrame : the finest of these levels has no pair of patches within reach.
     """
-    model = signer.model
-    levels = [table_statistics(level, signer) for level in patches.levels]
+    model, whitening = signer.model, signer.model.whitening
+    used = [patches.levels[level] for level in model.levels]
+    levels = [table_statistics(level, signer) for level in used]
     psi = float_signature(levels, model, name)
     return Signature(
-        vector=quantise(psi, model.quantiser_step),
+        vector=quantise(psi, model.quantiser_step) if whitening is None else whiten(psi, whitening),
         model_id=model.id,
-        n_patches=tuple(len(level) for level in patches.levels),
+        n_patches=tuple(len(level) for level in used),
         n_pairs=tuple(level.n_pairs for level in levels),
+        metric=model.metric,
     )
 
 
@@ -205,13 +218,13 @@ def exact_statistics(level: Patches, model: Model) -> Statistics:
 
 
 def float_signature(levels: list[Statistics], model: Model, name: str = "") -> Floats:
-    """psi before quantisation: Eq. (2) of every level, rooted, normalised, end to end.
+    """psi before quantisation: Eq. (2) of each level, rooted, normalised, end to end.
 
     A coarse level without pairs says nothing, and its part of psi is zero.
 
     Parameters
     ----------
-    levels : H, finest first
+    levels : one or more, finest first
     model : see Model
     name : of the frame, for errors
 

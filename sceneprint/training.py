@@ -2,8 +2,8 @@
 
     rooms or sites, frames  --train-->  Model
 
-What is learnt (projection, mixture) lives with its stage in `geometry`; here the stages are
-put in order, and the quantiser and d0 are fixed from the signatures that come out.
+What is learnt (projection, mixture, whitening) lives with its stage in `geometry`; here the
+stages are put in order, and the quantiser and d0 are fixed from the signatures that come out.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from multiprocessing import get_context
 from typing import Any, Literal
@@ -24,12 +24,21 @@ from sceneprint.geometry.encoding import quantise
 from sceneprint.geometry.mixture import MixtureParameters, fit_mixture
 from sceneprint.geometry.projection import fit_projection, project
 from sceneprint.geometry.properties import neighbour_pairs, pair_properties
-from sceneprint.geometry.retrieval import distances
+from sceneprint.geometry.retrieval import Metric, pairwise_distances
 from sceneprint.geometry.surroundings import fit_compression, surroundings
 from sceneprint.geometry.weights import patch_weights
+from sceneprint.geometry.whitening import (
+    UNITS,
+    Ints16,
+    WhiteningParameters,
+    fit_whitening,
+    psi_units,
+    whiten,
+)
 from sceneprint.models import Model, ModelParameters
 from sceneprint.recipes import Scenes
 from sceneprint.signing import (
+    Signer,
     float_signature,
     hierarchy_of,
     open_signer,
@@ -57,6 +66,9 @@ class TrainingParameters:
     histograms: int = 40_000  #: of surroundings, that their compression is fitted to
     clipped_share: float = 0.0005  #: of signature components, beyond the quantiser's range
     scenes: Scenes = "rooms"  #: seen by a depth camera, or by a laser
+    whitening_rooms: int = 0  #: that the whitening is fitted to; 0: signatures are psi itself
+    levels: tuple[int, ...] = (0,)  #: that whitened signatures are made of
+    whitening: WhiteningParameters = field(default_factory=WhiteningParameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,14 +150,18 @@ def train(
         "pairs_used": len(features),
     }
     fitted = Model(name, model_p, projection, mixture, compression, 1.0, 1.0, seen)
-    return calibrated(fitted, lessons, p)
+    model = calibrated(fitted, lessons, p)
+    return whitened(model, p, references, jobs, tell) if p.whitening_rooms else model
 
 
 def _written(p: TrainingParameters) -> dict[str, Any]:
-    """As provenance has them: of rooms nothing is said, as before there were other scenes."""
+    """As provenance has them: of defaults that came later nothing is said, as before them."""
     written = asdict(p)
     if p.scenes == "rooms":
         del written["scenes"]
+    if not p.whitening_rooms:
+        for name in ("whitening_rooms", "levels", "whitening"):
+            del written[name]
     return written
 
 
@@ -170,12 +186,90 @@ def calibrated(model: Model, lessons: Sequence[Lesson], p: TrainingParameters) -
     ]
     step = float(np.quantile(np.abs(np.stack(psi)), 1.0 - p.clipped_share)) / 127
     stored = np.stack([quantise(one, step) for one in psi])
-    return replace(model, quantiser_step=step, unrelated_distance=_median_distance(stored))
+    d0 = _median_distance(stored, "l1")
+    return replace(model, quantiser_step=step, psi_unrelated_distance=d0)
 
 
-def _median_distance(stored: Bytes) -> float:
-    rows = [distances(one, stored[i + 1 :]) for i, one in enumerate(stored[:-1])]
-    return float(np.median(np.concatenate(rows)))
+def whitened(
+    model: Model, p: TrainingParameters, references: Sequence[tuple[str, FrameReference]],
+    jobs: int, report: Report,
+) -> Model:  # fmt: skip
+    """The model with a whitening, fitted to more rooms than the rest, and frames of one's own.
+
+    Parameters
+    ----------
+    model : calibrated
+    p, references, jobs, report : see `train`
+
+    Raises
+    ------
+    TrainingError : too few frames for the dimension of the whitening, or no such level.
+    """
+    from threadpoolctl import threadpool_limits
+
+    if max(p.levels) >= (n_levels := model.parameters.hierarchy.n_levels):
+        raise TrainingError(f"There is no level {max(p.levels)}: the hierarchy has {n_levels}.")
+    psi, places = list[Ints16](), list[str]()
+    context = get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, _open_signer, (model, p.levels)) as pool:
+        rooms = pool.map(partial(_room_psi, p), range(p.whitening_rooms))
+        for done, (place, found) in enumerate(rooms, 1):
+            report("whitening", done, p.whitening_rooms)
+            psi += found
+            places += [place] * len(found)
+        for place, found in pool.map(_own_psi, references, chunksize=4):
+            psi += found
+            places += [place] * len(found)
+    if len(psi) <= p.whitening.dimension:
+        raise TrainingError(
+            f"{len(psi)} usable frames are too few for signatures of {p.whitening.dimension} "
+            "bytes. Add --rooms, or frames of your own."
+        )
+    with threadpool_limits(1):
+        fit = fit_whitening(np.stack(psi), p.levels, p.whitening)
+    first = {place: i for i, place in reversed(list(enumerate(places)))}
+    stored = np.stack([whiten(psi[i] / UNITS, fit) for _, i in sorted(first.items())])
+    own = replace(fit, unrelated_distance=_median_distance(stored, "l2"))
+    # coarser levels taught the mixture; no frame needs them any more
+    h = replace(model.parameters.hierarchy, n_levels=max(p.levels) + 1)
+    return replace(model, parameters=replace(model.parameters, hierarchy=h), whitening=own)
+
+
+#: What a process signs with while the whitening is fitted: its model, and the levels of psi.
+_signing: list[tuple[Signer, tuple[int, ...]]] = []
+
+
+def _open_signer(model: Model, levels: tuple[int, ...]) -> None:
+    _signing[:] = [(open_signer(model, cached=False), levels)]
+
+
+def _room_psi(p: TrainingParameters, index: int) -> tuple[str, list[Ints16]]:
+    name, frames = _scene(p, index)
+    return name, [one for frame in frames for one in _psi(frame)]
+
+
+def _own_psi(reference: tuple[str, FrameReference]) -> tuple[str, list[Ints16]]:
+    place, frame = reference
+    try:
+        return place, _psi(frame.read())
+    except FrameError:  # one bad frame of a recording teaches nothing; that is all
+        return place, []
+
+
+def _psi(frame: AnyFrame) -> list[Ints16]:
+    """psi of some levels of a frame; of a frame that cannot be signed, none."""
+    (signer, levels), p = _signing[0], _signing[0][0].model.parameters
+    try:
+        patches = hierarchy_of(see(frame, p), p).levels
+        statistics = [table_statistics(patches[level], signer) for level in levels]
+        return [psi_units(float_signature(statistics, signer.model))]
+    except FrameError:
+        return []
+
+
+def _median_distance(stored: Bytes, metric: Metric) -> float:
+    among = pairwise_distances(stored, metric)
+    return float(np.median(among[np.triu_indices(len(stored), 1)]))
 
 
 def _lessons(

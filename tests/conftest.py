@@ -29,6 +29,7 @@ from sceneprint.geometry.mixture import Mixture
 from sceneprint.geometry.projection import Projection
 from sceneprint.geometry.segmentation import SegmentationParameters
 from sceneprint.geometry.surroundings import Compression, SurroundingsParameters
+from sceneprint.geometry.whitening import Whitening
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer
 from sceneprint.settings import Settings
@@ -46,6 +47,8 @@ LONG = (
 )  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
+#: Seconds for a test that takes long by its nature; `timeout` of pyproject.toml is for all others.
+THOROUGH_S = 1800
 #: Whether Settings without a database mean PostgreSQL: `make test-postgres`.
 ON_POSTGRES = os.environ.get("SCENEPRINT_TEST_DATABASE") == "postgresql"
 #: The database that new ones of a test are copied from.
@@ -74,6 +77,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put long files first."""
     places = {name: place for place, name in enumerate(LONG)}
     items.sort(key=lambda item: places.get(item.path.name, len(LONG)))
+    for item in items:
+        if item.get_closest_marker("thorough") is not None:
+            item.add_marker(pytest.mark.timeout(THOROUGH_S))
     for item in items if ON_POSTGRES else ():
         if (only := item.get_closest_marker("sqlite_only")) is not None:
             item.add_marker(pytest.mark.skip(reason=f"SQLite's own: {only.args[0]}"))
@@ -290,9 +296,18 @@ def small_model() -> Model:
         mixture=Mixture(np.full(8, 0.125), rng.normal(size=(8, 12)), np.full((8, 12), 0.7)),
         compression=Compression(np.full(bins, 0.01, np.float32), axes),
         quantiser_step=0.002,
-        unrelated_distance=1000.0,
+        psi_unrelated_distance=1000.0,
         provenance={"made": "by a test"},
     )
+
+
+@pytest.fixture(scope="session")
+def small_whitened(small_model: Model) -> Model:
+    """The small model with signatures of 24 bytes, of its coarse level."""
+    rng = np.random.default_rng(6)
+    basis = rng.integers(-127, 128, (24, small_model.level_length)).astype(np.int8)
+    own = Whitening((1,), basis, np.full(24, 1e-6), np.zeros(24), 500_000.0)
+    return replace(small_model, name="small-whitened", whitening=own)
 
 
 @pytest.fixture(scope="session")

@@ -16,18 +16,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import dpp, readiness, registration, scan, search, service
+from benchmarks import disk, dpp, readiness, registration, scan, search, service
 from benchmarks.__main__ import BEGIN, END, Rows, page
 from benchmarks.encode import EncodeFigures, points_of
 from benchmarks.machine import Machine
 from benchmarks.pairs import FramePair, pairs_among, real_pairs, synthetic_pairs
-from sceneprint.datasets import Camera, write_depth_png, write_intrinsics
+from sceneprint.artifacts import write_geometry
+from sceneprint.datasets import Camera, find_sequences, write_depth_png, write_intrinsics
 from sceneprint.errors import MissingDependency
 from sceneprint.evaluation.registration_baselines import register
 from sceneprint.geometry.diversity import diversify
 from sceneprint.geometry.retrieval import distances, pairwise_distances, rank
 from sceneprint.libraries import open3d
 from sceneprint.models import Model
+from sceneprint.pipeline import open_signer, prepare
 from sceneprint.types import Floats, Frame, Intrinsics
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
@@ -178,10 +180,15 @@ def test_page_and_json_hold_every_row() -> None:
         registration.RegistrationFigures(
             20, 0.5, {"validation": 20.0}, 20.0, 1.0, {"RANSAC": 200.0}, 200.0, 0.9, 0.1, 0.1, ""
         ),
-        [search.SearchFigures(1000, 12_800, 500, 5.0, 1.5, 1.0, 0.1, 0.2, 0.6, (0.5, 0.75))],
+        [
+            search.SearchFigures(
+                1000, 384, 16, 0.996, 5000.0, 900.0, 20.0, 1.5, 3.0, 0.5, 7.0, 384.0
+            )
+        ],
         service.ServiceFigures(
             300, 20, {"decode": 5.0}, 200.0, 210.0, 1.05, (1.0, 2.0), (9.0, 30.0), 7.5
         ),
+        disk=[disk.DiskFigures(60, 384, 1500.0, 76e3, 174e3)],
     )
     section = page(Machine("a processor", 2, 8.0, "3.11", {"numpy": "2"}), rows, 0.1)
     assert section.startswith(BEGIN)
@@ -190,7 +197,8 @@ def test_page_and_json_hold_every_row() -> None:
         "### A query over HTTP, 300 frames in the map",
         "| **HTTP / library** | **1.05** |",
         "| /healthz while 4 clients query and a worker signs: p50, p99 | 9.0, 30.0 |",
-        "| 1,000 | 12,800 | 500 | 1.50 | 1.00 | 0.10 | 0.20 | **0.600** | 0.500 to 0.750 |",
+        "| 1,000 | 384 | 16 lists | 1.50 | 3.00 | 0.50 | 0.9960 | 5.0 | 0.9 | 0.02 | 7, 384 |",
+        "| 384 | 1,500 | 76,000 | 174,000 |",
         "### Signing, `paper`",
         "### Exact scan of 500 signatures of 125,000 bytes (62.5 MB)",
         "### Exact scan of 4096 signatures of 125,000 bytes (512.0 MB)",
@@ -203,8 +211,9 @@ def test_page_and_json_hold_every_row() -> None:
         assert wanted in section
     for one in (rows.dpp, rows.registration):
         assert json.loads(json.dumps(asdict(one))) == asdict(one)
-    for one in (*rows.scan, *rows.search):
+    for one in rows.scan:
         assert json.loads(json.dumps(asdict(one)))["spread"]
+    assert json.loads(json.dumps(asdict(rows.search[0]))) == asdict(rows.search[0])
 
 
 @pytest.fixture
@@ -262,19 +271,50 @@ def test_a_load_that_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> N
     assert (stop.is_set(), stuck.exitcode) == (True, -signal.SIGTERM)
 
 
-def test_a_search_from_a_shortlist_is_compared_with_the_scan_of_all() -> None:
-    found = search.measure(frames=300, length=512, runs=2, shortlist=50)
-    assert (found.frames, found.signature_bytes, found.shortlist) == (300, 512, 50)
-    assert min(found.publish, found.exact, found.search, found.code, found.nearest) > 0
-    assert 0 < found.spread[0] <= found.ratio <= found.spread[1]
+@pytest.mark.parametrize("flat_bytes", [search.FLAT, search.LISTS])
+def test_a_search_is_compared_with_the_scan_of_all(flat_bytes: int) -> None:
+    found = search.measure(frames=1000, length=64, flat_bytes=flat_bytes, runs=2)
+    assert (found.frames, found.signature_bytes) == (980, 64)  # one of each place is asked for
+    assert min(found.publish, found.append, found.open, found.exact, found.search) > 0
+    assert found.ratio > 0
+    assert (found.probes > 0) == (flat_bytes == search.LISTS)
+    assert found.recall >= 0.995
+
+
+def test_signatures_of_a_place_are_near_each_other() -> None:
+    rows = search.signatures(np.arange(200), 64)
+    assert rows.dtype == np.uint8
+    np.testing.assert_array_equal(search.signatures(np.array([57]), 64)[0], rows[57])
+    among = pairwise_distances(rows, "l2").astype(float)
+    same = np.arange(200)[:, None] // search.PLACE == np.arange(200) // search.PLACE
+    np.fill_diagonal(among, np.nan)
+    assert np.nanmax(among[same]) < np.nanmin(among[~same])
+
+
+def test_disk_of_a_frame(room_frames: tuple[Frame, ...], tmp_path: Path) -> None:
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    write_intrinsics(folder, Camera(room_frames[0].intrinsics, 1000.0, along_ray=False))
+    for i, frame in enumerate(room_frames):
+        write_depth_png(folder / f"{i}.png", frame.depth, 1000.0)
+    frames = [f for s in find_sequences(folder) for f in s.frames]
+    assert len(frames) == 6
+    found = disk.measure(frames, "depth", tmp_path / "data")
+    assert (found.frames, found.signature_bytes) == (5, 448)
+    assert found.uploads == np.mean([frame.path.stat().st_size for frame in frames[1:]])
+    assert 448 <= found.database < 50_000  # five frames fill few pages
+    signer = open_signer("depth")
+    sizes = [len(write_geometry(prepare(f.read(), signer)[1])) for f in frames[1:]]
+    assert found.artifacts == np.mean(sizes)
 
 
 @pytest.mark.thorough
 def test_a_start_is_measured_with_and_without_the_index(building: Path) -> None:
     with service.frames_of(building, 25) as frames:
-        found = readiness.measure(frames[0], list(frames[1:]), 60, "compact")
-    assert (found.frames, found.signature_bytes) == (60, 12_800)
+        found = readiness.measure(frames[0], list(frames[1:]), 60, "depth")
+    assert (found.frames, found.signature_bytes) == (60, 448)
     assert 0 < found.ready < found.first
+    assert 20 < found.memory < 2000
     assert found.bare > 0
     assert set(found.signed) == {1, 2}
     assert min(found.signed.values()) > 0

@@ -39,7 +39,7 @@ def test_without_open3d_the_row_says_so_and_the_rest_runs(
     assert "libgomp1" in lines  # among what Debian lacks
 
 
-@pytest.mark.parametrize("preset", ["paper", "compact"])
+@pytest.mark.parametrize("preset", ["paper", "depth"])
 def test_signing_stays_under_its_memory(
     preset: str, room_frames: tuple[Frame, ...], tmp_path: Path
 ) -> None:

@@ -70,7 +70,7 @@ def test_commands_in_their_order(primary: Server, run: Run, tmp_path: Path) -> N
     run(made)
     one, there_and, back = tmp_path / "one", *blocks("From one machine to a fleet, and back")
     with Engine(Settings(data_dir=one)) as engine:
-        engine.create_map(NewMap(name="building", model="compact"))
+        engine.create_map(NewMap(name="building", model="depth"))
     url = database(primary.port)
     run(there_and, ONE_MACHINE=str(one), SCENEPRINT_DATABASE_URL=url)
     assert primary.execute("SELECT name FROM maps", "sceneprint") == [("building",)]
@@ -86,7 +86,7 @@ def test_commands_in_their_order(primary: Server, run: Run, tmp_path: Path) -> N
         url = database(primary.port, standby.port)
         said = run(node, SCENEPRINT_DATABASE_URL=url)
         assert "WRONG" not in said, said
-        assert len(re.findall(r"\bsp_\w+", said)) == 2, said
+        assert len(re.findall(r"\bsp_[\w-]+", said)) == 2, said
         primary.kill()
         (promote,) = blocks("When the primary dies")
         assert re.findall(r"^ (t|on|off)$", run(promote, **told), re.MULTILINE) == ["t", "off"]

@@ -147,7 +147,7 @@ def test_what_is_not_there_is_seen(
     monkeypatch.setattr(checking, "EVENTS_S", 0.0)
     [walk] = walks(building, 1, 5)
     with Client.embedded(tmp_path) as client:
-        client.create_map("fleet", model="compact")
+        client.create_map("fleet", model="depth")
         added = [client.upload("fleet", one.png, one.meta, wait_s=60) for one in walk[:4]]
         waiting = client.upload("fleet", walk[4].png, walk[4].meta)
         kept = [
@@ -220,7 +220,7 @@ def test_the_page_is_rewritten_between_its_marks(tmp_path: Path) -> None:
 
 def test_what_is_on_paper_is_multiplied_right() -> None:
     costs = Costs(
-        model="compact", signature_bytes=12_800, frames=50,
+        model="depth", signature_bytes=12_800, frames=50,
         upload=Work(30.0, 12.0, 2.0, 3.0, (1.0, 0.0), 3_000.0),
         sign=Work(90.0, 60.0, 3.0, 5.0, (1.0, 1.0), 27_000.0),
         query=Work(200.0, 180.0, 1.0, 0.0, (0.0, 0.0), 0.0),
@@ -239,6 +239,6 @@ def test_what_is_on_paper_is_multiplied_right() -> None:
     )
     assert told["| rows of the database"] == "160 GB |"
     assert told["| blobs"] == "2.5 TB |"
-    assert told["| codes and their graph in the database, to be held in its memory"] == "9 GB |"
-    assert told["| linking all of them anew (a refit), one processor"] == "1.4 h |"
+    assert told["| vectors and their graph in the database, to be held in its memory"] == "9 GB |"
+    assert told["| linking all of them anew, one processor"] == "1.4 h |"
     assert told["| of one that asks all maps"] == "1.3 GB, 130 GB |"

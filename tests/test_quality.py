@@ -22,7 +22,7 @@ from sceneprint.signing import (
 from sceneprint.types import Floats, Frame
 
 
-@pytest.fixture(scope="module", params=["paper", "compact"])
+@pytest.fixture(scope="module", params=["paper", "depth"])
 def signer(request: pytest.FixtureRequest) -> Signer:
     return open_signer(request.param)
 

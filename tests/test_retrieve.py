@@ -34,7 +34,7 @@ from sceneprint.types import Floats, Frame, Geometry, Intrinsics
 
 
 def signature(*values: int, model_id: str = "a" * 64) -> Signature:
-    return Signature(np.array(values, np.uint8), model_id, (5,), (20,))
+    return Signature(np.array(values, np.uint8), model_id, (5,), (20,), "l1")
 
 
 def outcome(

@@ -90,13 +90,13 @@ def test_the_demo_prints_the_figures_of_evaluate(building: Path, tmp_path: Path)
     """The first half of a walk, signed with the smaller preset."""
     half = tmp_path / "half"
     shutil.copytree(building, half, ignore=shutil.ignore_patterns("frame-0000[5-9]*"))
-    figures = evaluate(tmp_path, str(half), "--preset", "compact", "--jobs", "1")
+    figures = evaluate(tmp_path, str(half), "--preset", "depth", "--jobs", "1")
     choice = choose_frames(half)
     assert (len(choice.database), len(choice.queries)) == (15, 10)
     data = tmp_path / "data"
     data.mkdir()
     with serving(data, workers=1) as url, Client(url) as client:
-        known = fill(client, "compact", choice)
+        known = fill(client, "depth", choice)
         asked: list[Asked] = ask(client, choice)
     places = {key: place for key, one in known.items() if (place := place_of(one)) is not None}
     rows = answer_rows(

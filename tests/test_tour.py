@@ -180,7 +180,7 @@ def test_operators_see_what_goes_on(outputs: dict[str, list[str]]) -> None:
     assert documents(operations[: operations.index("# HELP")])[0]["status"] == "ready"
     assert 'sceneprint_answers_total{status="found"}' in operations
     coming, standing = one(outputs, "Another model")[:2]
-    assert coming["reencoding"]["model"].startswith("compact")
+    assert coming["reencoding"]["model"].startswith("paper")
     assert standing["name"] == "building"
     assert one(outputs, "Snapshots")[-1]["items"]
     made, listed, me = one(outputs, "Keys")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from sceneprint.geometry.hierarchy import HierarchyParameters
 from sceneprint.geometry.mixture import MixtureParameters
 from sceneprint.geometry.segmentation import SegmentationParameters, patches_of, segment
 from sceneprint.geometry.surroundings import surroundings
+from sceneprint.geometry.whitening import WhiteningParameters
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import distance, open_signer, sign
-from sceneprint.recipes import preset_parameters
+from sceneprint.recipes import preset_parameters, preset_whitening
 from sceneprint.signing import see
 from sceneprint.synth import synthesise_room
 from sceneprint.training import TrainingParameters, train
@@ -98,10 +100,53 @@ def test_too_little_data(parameters: TrainingParameters, message: str) -> None:
         train("tiny", MODEL, MIXTURE, parameters)
 
 
+@pytest.fixture(scope="module")
+def whitened_model() -> Model:
+    p = replace(
+        TRAINING, whitening_rooms=12, levels=(1,), whitening=WhiteningParameters(dimension=12)
+    )
+    return train("tiny", MODEL, MIXTURE, p, jobs=2)
+
+
+def test_a_whitening_is_learnt_from_more_rooms(
+    trained: tuple[Model, object], whitened_model: Model
+) -> None:
+    """The rest of the model is as without; signatures are short, and unrelated rooms d0 apart."""
+    plain = trained[0]
+    assert whitened_model.mixture.means.tolist() == plain.mixture.means.tolist()
+    assert (whitened_model.metric, whitened_model.signature_bytes) == ("l2", 12)
+    assert (whitened_model.levels, whitened_model.parameters.hierarchy.n_levels) == ((1,), 2)
+    signer = open_signer(whitened_model, cached=False)
+    signed = [sign(synthesise_room(99, i, 1).frames[0], signer) for i in range(10)]
+    assert {one.vector.shape for one in signed} == {(12,)}
+    assert {len(one.n_pairs) for one in signed} == {1}
+    between = [distance(a, b) for i, a in enumerate(signed) for b in signed[:i]]
+    assert np.median(between) / whitened_model.unrelated_distance == pytest.approx(1.0, abs=0.35)
+    # unit vectors: unrelated ones are at right angles
+    assert whitened_model.unrelated_distance == pytest.approx(2 * 26**2 * 12, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"whitening_rooms": 3}, "6 usable frames are too few for signatures of 12 bytes"),
+        ({"levels": (2,)}, "There is no level 2: the hierarchy has 2"),
+    ],
+)
+def test_too_little_for_a_whitening(changes: dict[str, Any], message: str) -> None:
+    p = replace(
+        TRAINING, whitening_rooms=4, levels=(0,), whitening=WhiteningParameters(dimension=12)
+    )
+    with pytest.raises(TrainingError, match=message):
+        train("tiny", MODEL, MIXTURE, replace(p, **changes))
+
+
 def test_presets() -> None:
     model, mixture = preset_parameters("paper")
     assert (mixture.n_components, model.hierarchy.n_levels) == (1250, 4)
-    model, mixture = preset_parameters("compact")
+    model, mixture = preset_parameters("depth")
     assert (mixture.n_components, model.hierarchy.n_levels) == (256, 2)
-    with pytest.raises(TrainingError, match=r"no preset .large.\. Choose .* compact, lidar\."):
+    assert preset_whitening("paper")[2] == 0  # psi itself is stored
+    assert preset_whitening("depth")[0] == (1,)
+    with pytest.raises(TrainingError, match=r"no preset .large.\. Choose .* lidar, paper\."):
         preset_parameters("large")

@@ -34,7 +34,7 @@ def test_provenance_says_sites(trained: Model) -> None:
 
 
 def test_scenes_and_lengths_are_the_presets_own() -> None:
-    assert [preset_scenes(name) for name in ("paper", "compact", "lidar")] == [
+    assert [preset_scenes(name) for name in ("paper", "depth", "lidar")] == [
         ("rooms", 6), ("rooms", 6), ("sites", 3),
     ]  # fmt: skip
     lidar, mixture = preset_parameters("lidar")
@@ -65,4 +65,4 @@ def test_the_preset_ships_as_its_recipe_says() -> None:
     assert model.parameters == preset_parameters("lidar")[0]
     assert model.provenance["training"]["scenes"] == "sites"
     assert model.provenance["own_frames"] == 0
-    assert model.id not in {read_model(name).id for name in ("paper", "compact")}
+    assert model.id not in {read_model(name).id for name in ("paper", "depth")}

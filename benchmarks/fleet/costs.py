@@ -30,13 +30,13 @@ from sceneprint.engine import Engine
 from sceneprint.models import read_model
 from sceneprint.schemas import NewMap, Query
 from sceneprint.settings import Settings
-from sceneprint.store import fits, graphs
+from sceneprint.store import vectors
 from sceneprint.store.database import Database
 
 BEGIN, END = "<!-- fleet-costs:begin -->", "<!-- fleet-costs:end -->"
 MAP = "costs"
-#: Commits that are timed, and codes that are linked.
-COMMITS, CODES, DIMENSION = 300, 30_000, 128
+#: Commits that are timed, and vectors that are linked.
+COMMITS, VECTORS, DIMENSION = 300, 30_000, 384
 
 
 def measure(folder: Path, data: Path, n: int, model: str) -> Costs:
@@ -173,34 +173,38 @@ def _commits(database: Database) -> tuple[float, float]:
 
 
 def _linked(database: Database) -> tuple[float, float, float] | None:
-    """Codes a second that enter the graph; bytes a code of the table, and of the graph.
+    """Vectors a second that enter the graph; bytes a vector of the table, and of the graph.
 
     None where the database has no pgvector.
     """
     from sqlalchemy import text
 
-    # as codes are: most of their length along few axes
-    axes = np.exp(-np.arange(DIMENSION) / 40)
-    drawn = np.random.default_rng(0).normal(size=(CODES, DIMENSION)) * 40 * axes
+    drawn = np.rint(np.random.default_rng(0).normal(size=(VECTORS, DIMENSION)) * 28).astype(int)
+    size = text("SELECT pg_total_relation_size('vectors_timed')")
     with database.write(unchecked=True) as connection:
-        if fits.prepare(connection) is not None:
+        if vectors.make_table(connection, DIMENSION) is not None:
             return None
-        fit = fits.add_fit(connection, "costs", "costs", b"", DIMENSION, CODES)
-        rows = [
-            {"n": i, "code": "[" + ",".join(f"{x:.5g}" for x in one) + "]"}
-            for i, one in enumerate(drawn)
-        ]
-        insert = text(f"INSERT INTO {fit.table} VALUES (:n, 0, CAST(:code AS halfvec))")
-        for i in range(0, CODES, 1000):
+        connection.execute(
+            text(f"CREATE TABLE vectors_timed (LIKE vectors_{DIMENSION} INCLUDING INDEXES)")
+        )
+        insert = text("INSERT INTO vectors_timed VALUES (:n, '', 0, CAST(:vector AS halfvec))")
+        rows = [{"n": i, "vector": f"[{','.join(map(str, one))}]"}
+                for i, one in enumerate(drawn.clip(-127, 127).tolist())]  # fmt: skip
+        for i in range(0, VECTORS, 1000):
             connection.execute(insert, rows[i : i + 1000])
-        size = text(f"SELECT pg_total_relation_size('{fit.table}')")
         plain = int(connection.execute(size).scalar_one())
         begun = time.perf_counter()
-        graphs.add_graph(connection, fit)
+        connection.execute(
+            text(
+                "CREATE INDEX ON vectors_timed USING hnsw (vector halfvec_l2_ops) "
+                f"WITH (m = {vectors.LINKS}, ef_construction = {vectors.LOOKED_AT})"
+            )
+        )
         seconds = time.perf_counter() - begun
         graph = int(connection.execute(size).scalar_one()) - plain
-        fits.drop_fit(connection, fit.number)
-    return CODES / seconds, plain / CODES, graph / CODES
+        connection.execute(text("DROP TABLE vectors_timed"))
+        vectors.drop_tables(connection)
+    return VECTORS / seconds, plain / VECTORS, graph / VECTORS
 
 
 def table(found: Costs) -> list[str]:
@@ -235,7 +239,7 @@ def table(found: Costs) -> list[str]:
     if found.linked is not None:
         rate, plain, graph = found.linked
         lines.append(
-            f"| codes (`halfvec({DIMENSION})`): entering the graph (HNSW); bytes a frame of table, "
+            f"| `halfvec({DIMENSION})`: vectors entering the graph (HNSW); bytes of each in table, "
             f"of graph | {rate:,.0f} a second; {plain:,.0f}, {graph:,.0f} |"
         )
     for name, size in sorted(found.memory.items()):
@@ -247,7 +251,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Measure, and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=100)
-    parser.add_argument("--model", default="compact")
+    parser.add_argument("--model", default="depth")
     parser.add_argument("--data", type=Path, help="folder of recordings; default: synthetic rooms")
     parser.add_argument("--page", type=Path, help="whose figures to replace")
     options = parser.parse_args(arguments)

@@ -26,7 +26,7 @@ from benchmarks.fleet.saboteur import Kill, Promotion, Saboteur, schedule
 from sceneprint.client import Client
 
 #: The map that most robots share; every so many robots have one of their own.
-MAP, MODEL, OWN = "fleet", "compact", 4
+MAP, MODEL, OWN = "fleet", "depth", 4
 #: Seconds that a robot may take to have its last frame acknowledged.
 PATIENCE_S = 240.0
 

@@ -69,8 +69,8 @@ def measure(frames: int, maps: int, runs: int, model: Model, folder: Path) -> li
     found = []
     with _server(folder) as url:
         for proposer, more in (
-            ("FAISS, SQLite", {"shortlist": "local", "tail_frames": 10}),
-            ("pgvector", {"shortlist": "database", "database_url": url}),
+            ("FAISS, SQLite", {"search": "local", "tail_frames": 10}),
+            ("pgvector", {"search": "database", "database_url": url}),
         ):
             given: dict[str, Any] = {"data_dir": folder / proposer[:5], **more}
             with Engine(Settings.model_validate(given)) as engine:
@@ -82,7 +82,7 @@ def measure(frames: int, maps: int, runs: int, model: Model, folder: Path) -> li
                 engine.publish_due()
                 while engine.publish_due():
                     pass
-                while engine._coding.run():
+                while engine._vector_tables.run():
                     pass
                 found.append(_figures(proposer, engine, ids, many, frames, model))
     return found
@@ -173,7 +173,7 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=10_000)
     parser.add_argument("--maps", type=int, default=50)
     parser.add_argument("--runs", type=int, default=20)
-    parser.add_argument("--model", default="compact")
+    parser.add_argument("--model", default="depth")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         model = read_model(options.model)

@@ -17,6 +17,7 @@ from typing import cast
 from sqlalchemy import Connection
 
 from benchmarks.fleet.pair import Pair
+from benchmarks.machine import own_bytes
 from sceneprint.cli.served import serving
 from sceneprint.client import Client
 from sceneprint.datasets import FrameReference
@@ -122,7 +123,7 @@ def memory_of(folder: Path, frames: Sequence[FrameReference]) -> dict[str, int]:
     """Bytes that a service and its worker have for themselves, after uploads and queries."""
     (folder / "memory").mkdir()
     with serving(folder / "memory", workers=1) as url, Client(url) as client:
-        client.create_map("memory", model="compact")
+        client.create_map("memory", model="depth")
         added = [client.upload("memory", frame) for frame in frames[:30]]
         client.wait([one.job_id for one in added])
         for frame in frames[:5]:
@@ -133,9 +134,9 @@ def memory_of(folder: Path, frames: Sequence[FrameReference]) -> dict[str, int]:
                 line = path.read_bytes()
                 parent = int((path.parent / "stat").read_text().rpartition(")")[2].split()[1])
                 if str(folder / "memory").encode() in line and b"serve" in line:
-                    found["service"] = _own_bytes(path.parent)
+                    found["service"] = own_bytes(path.parent)
                 elif b"spawn_main" in line and _serves(parent, folder / "memory"):
-                    found["worker"] = _own_bytes(path.parent)
+                    found["worker"] = own_bytes(path.parent)
             except OSError:  # it ended meanwhile
                 continue
     return found
@@ -143,8 +144,3 @@ def memory_of(folder: Path, frames: Sequence[FrameReference]) -> dict[str, int]:
 
 def _serves(process: int, folder: Path) -> bool:
     return str(folder).encode() in Path(f"/proc/{process}/cmdline").read_bytes()
-
-
-def _own_bytes(process: Path) -> int:
-    lines = (process / "smaps_rollup").read_text().splitlines()
-    return sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Private_"))

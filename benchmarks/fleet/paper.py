@@ -31,7 +31,7 @@ class Costs:
     tables : bytes a frame of tables with their indexes, by name
     blobs : bytes a frame of uploads, and of geometry artifacts
     commit_ms : p50 and p99 of the smallest write in its turn, without and with a standby
-    linked : codes a second that enter the graph (HNSW), and its bytes a code with the table
+    linked : vectors a second that enter the graph (HNSW), and bytes a vector of table and graph
     memory : bytes that a service and a worker have for themselves, after some work
     """
 
@@ -88,10 +88,10 @@ def paper(found: Costs) -> list[str]:
     if found.linked is not None:
         speed, plain, graph = found.linked
         lines += [
-            "| codes and their graph in the database, to be held in its memory | "
+            "| vectors and their graph in the database, to be held in its memory | "
             f"{plain:,.0f} + {graph:,.0f} bytes a frame | "
             f"{FRAMES * (plain + graph) / 1e9:.0f} GB |",
-            f"| linking all of them anew (a refit), one processor | {speed:,.0f} a second | "
+            f"| linking all of them anew, one processor | {speed:,.0f} a second | "
             f"{FRAMES / speed / 3600:.1f} h |",
         ]
     each = FRAMES / MAPS

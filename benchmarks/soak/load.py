@@ -28,7 +28,7 @@ from sceneprint.types import Intrinsics
 STRIDE = 4
 #: Frames that are taken in one room.
 VIEWS = 5
-MAP, MODEL = "soak", "compact"
+MAP, MODEL = "soak", "depth"
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,7 @@ def _connections(told: Mapping[str, object], settings: Settings) -> Finding:
 
 
 def _vector(told: Mapping[str, object], settings: Settings) -> Finding:
-    wanted = settings.shortlist == "database"
+    wanted = settings.search == "database"
     if told["vector"] is not None:
         return Finding("ok", "pgvector", f"{told['vector']}")
     if told["installable"] is not None and told["creates"]:
@@ -135,7 +135,7 @@ def _vector(told: Mapping[str, object], settings: Settings) -> Finding:
     )
     verdict: Verdict = "WRONG" if wanted else "note"
     return Finding(verdict, "pgvector", f"{text}." if not wanted else f"{text}, or set "
-                   "SCENEPRINT_SHORTLIST=auto.")  # fmt: skip
+                   "SCENEPRINT_SEARCH=auto.")  # fmt: skip
 
 
 def _clock(before: float, there: float, after: float, settings: Settings) -> Finding:

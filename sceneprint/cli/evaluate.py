@@ -20,6 +20,7 @@ from sceneprint.writing import check_writable, write_whole
 
 if TYPE_CHECKING:
     from sceneprint.evaluation.protocol import Protocol
+    from sceneprint.models import Model
 
 T = TypeVar("T")
 
@@ -107,9 +108,18 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
 
 
 def _add_method(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--metric", choices=("l1", "l2"), default="l1", help="default: l1")
     command.add_argument(
-        "--levels", type=positive, metavar="H", help="levels of the signature to use (default: all)"
+        "--signature",
+        choices=("stored", "psi"),
+        default="stored",
+        help="rank by what a service stores, or by psi as the paper does: of the model, or of the "
+        "preset paper where none is named (default: stored)",
+    )
+    command.add_argument(
+        "--metric", choices=("l1", "l2"), help="default: l2, and of psi l1, as in the paper"
+    )
+    command.add_argument(
+        "--levels", type=positive, metavar="H", help="levels of psi to use (default: all)"
     )
     add_judging_options(command)
     command.add_argument(
@@ -169,8 +179,13 @@ def run(options: argparse.Namespace) -> int:
     protocol = _protocol(options)
     baselines = _baselines(options.baselines)
     own = Settings()
-    signer = open_for(options, own)
-    if (options.levels or 1) > (most := signer.model.parameters.hierarchy.n_levels):
+    signer = open_for(options, own, psi=options.signature == "psi")
+    if options.levels is not None and signer.model.whitening is not None:
+        raise DatasetError(
+            f"--levels {options.levels}: the signatures of model {signer.model.label} are not of "
+            "levels end to end. Add --signature psi, or leave it out."
+        )
+    if (options.levels or 1) > (most := len(signer.model.levels)):
         raise DatasetError(
             f"--levels {options.levels}: model {signer.model.label} has {most} levels. "
             f"Choose from 1 to {most}."
@@ -196,7 +211,7 @@ def run(options: argparse.Namespace) -> int:
         evaluation = evaluate(protocol, signer, store, settings, _watch)
         database = evaluation.prepared.database
         found = figures(
-            evaluation, lambda match: store.frame(database[match]), _asked(options, signer.model.id)
+            evaluation, lambda match: store.frame(database[match]), _asked(options, signer.model)
         )
         # figures first: a picture that cannot be drawn must not cost an hour's work
         if options.json is not None:
@@ -260,7 +275,7 @@ def _baselines(names: list[str] | None) -> tuple[str, ...]:
     return tuple(name for name in BASELINES if name in names or not names)
 
 
-def _asked(options: argparse.Namespace, model_id: str) -> dict[str, Any]:
+def _asked(options: argparse.Namespace, model: Model) -> dict[str, Any]:
     """Everything that is needed to repeat the evaluation."""
     from sceneprint import __version__
 
@@ -275,6 +290,7 @@ def _asked(options: argparse.Namespace, model_id: str) -> dict[str, Any]:
         "gap_m",
         "within",
         "baselines",
+        "signature",
         "metric",
         "levels",
         "mode",
@@ -283,9 +299,10 @@ def _asked(options: argparse.Namespace, model_id: str) -> dict[str, Any]:
         "seed",
     )
     asked = {key: getattr(options, key) for key in keys}
+    asked["metric"] = options.metric or model.metric
     return {
         "version": __version__,
-        "model_id": model_id,
+        "model_id": model.id,
         **asked,
         "distractors": [str(path) for path in options.distractors],
     }

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from sceneprint.cli.existing import require_database
 from sceneprint.cli.numbers import whole
 from sceneprint.cli.serve import add_data_option, settings_of
+from sceneprint.errors import InvalidRequest
 
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
@@ -85,8 +86,9 @@ def _stats(engine: Engine, name: str, options: argparse.Namespace) -> int:
 
 
 def _lines(s: IndexStats) -> list[str]:
-    index = "no index: compared whole" if s.generation == 0 else f"generation {s.generation}"
-    recall = "compared whole, so 1" if s.recall is None else f"{s.recall:.3f}"
+    index = "no index" if s.generation == 0 else f"generation {s.generation}"
+    recall = "1: queries compare every frame" if s.recall is None else f"{s.recall:.3f}"
+    lists = f", {s.probes} lists compared" if s.probes else ""
     spread = "" if s.spread is None else f"; 100th neighbour at {s.spread:.2f} of the 10th"
     return [
         f"map {s.map}, {s.model}",
@@ -94,7 +96,7 @@ def _lines(s: IndexStats) -> list[str]:
         f"  lag         {s.lag_frames} frames, {s.lag_s:.0f} s; {s.deleted} deleted ones in it",
         f"  bytes       {s.bytes_beyond_upload} a frame beside its upload of {s.upload_bytes}: "
         f"signature {s.signature_bytes}, artifact {s.artifact_bytes}, index {s.index_bytes}",
-        f"  recall@10   {recall} (shortlist {s.shortlist}, {s.sample} frames){spread}",
+        f"  recall@10   {recall}{lists} ({s.sample} frames){spread}",
     ]
 
 
@@ -111,8 +113,13 @@ def _verify(engine: Engine, name: str, _: argparse.Namespace) -> int:
     return int(bool(wrong))
 
 
-def _rebuild(engine: Engine, name: str, _: argparse.Namespace) -> int:
-    print(f"map {name}: generation {engine.rebuild_index(name)}")
+def _rebuild(engine: Engine, name: str, options: argparse.Namespace) -> int:
+    try:
+        print(f"map {name}: generation {engine.rebuild_index(name)}")
+    except InvalidRequest as error:  # of all maps, those are passed over that can have none
+        if options.map:
+            raise
+        print(f"map {name}: {error}")
     return 0
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from sceneprint.cli.signer import add_model_options
 from sceneprint.datasets import find_sequences
 from sceneprint.errors import DatasetError
-from sceneprint.models import read_model
+from sceneprint.models import PRESETS, read_model
 
 
 def add_to(commands: Any) -> None:
@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
             f"Choose --frame from 0 to {len(frames) - 1}."
         )
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    model = read_model(options.model or options.preset)
+    model = read_model(options.model or options.preset or PRESETS[0])
     save_picture(frames[options.frame].read(), model, options.out)
     print(f"{frames[options.frame].path} drawn to {options.out}")
     return 0

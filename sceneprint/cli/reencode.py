@@ -34,7 +34,7 @@ def add_to(commands: Any) -> None:
     )
     command.add_argument("map", metavar="MAP")
     what = command.add_mutually_exclusive_group(required=True)
-    what.add_argument("--model", metavar="MODEL", help="paper, compact, lidar, or a model file")
+    what.add_argument("--model", metavar="MODEL", help="depth, lidar, paper, or a model file")
     what.add_argument("--status", action="store_true", help="say how far it has come")
     what.add_argument(
         "--cancel", action="store_true", help="keep the model, and remove what was made for another"

@@ -32,6 +32,12 @@ def add_to(commands: Any) -> None:
     command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
     add_model_options(command)
     command.add_argument(
+        "--psi",
+        action="store_true",
+        help="sign with psi itself, the Fisher vectors of the paper: of the model, or of the "
+        "preset paper where none is named",
+    )
+    command.add_argument(
         "--out",
         type=Path,
         metavar="DIR",
@@ -81,7 +87,7 @@ def named_frames(paths: list[Path]) -> list[tuple[str, FrameReference]]:
 def run(options: argparse.Namespace) -> int:
     """Sign; returns 2 where a frame could not be signed."""
     frames = named_frames(options.paths)
-    signer = open_for(options, Settings())
+    signer = open_for(options, Settings(), psi=options.psi)
     if options.out is not None:
         _claim(options.out, signer)
     done: list[Signed] = []
@@ -161,6 +167,7 @@ def _write_index(folder: Path, done: list[Signed], signer: Signer) -> None:
             "name": model.name,
             "id": model.id,
             "signature_bytes": model.signature_bytes,
+            "metric": model.metric,
             "unrelated_distance": model.unrelated_distance,
         },
         "frames": [_entry(one) for one in done],

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from sceneprint.errors import FrameError
 from sceneprint.geometry.counting import compiled_at
-from sceneprint.models import PRESETS
+from sceneprint.models import PRESETS, Model, read_model
 from sceneprint.pipeline import Signer, open_signer, sign
 from sceneprint.settings import Settings
 from sceneprint.types import Frame, Intrinsics
@@ -26,16 +26,21 @@ def add_model_options(command: argparse.ArgumentParser) -> None:
     choice.add_argument(
         "--preset",
         choices=PRESETS,
-        default=PRESETS[0],
         help=f"model that ships with sceneprint (default: {PRESETS[0]})",
     )
     choice.add_argument("--model", type=Path, metavar="FILE", help="a model of your own")
 
 
-def open_for(options: argparse.Namespace, settings: Settings) -> Signer:
+def open_for(options: argparse.Namespace, settings: Settings, *, psi: bool = False) -> Signer:
     """The signer the options ask for, its code loaded and its table open.
 
     Says so before the machine goes quiet to compile, and shows the table being built.
+
+    Parameters
+    ----------
+    options : of `add_model_options`
+    settings : see Settings
+    psi : sign with psi itself; of the preset `paper` where no model is named
 
     Raises
     ------
@@ -43,7 +48,9 @@ def open_for(options: argparse.Namespace, settings: Settings) -> Signer:
     """
     if _is_new():
         _print("first use of this installation: compiling (once, about half a minute)")
-    signer = _opened(options.model or options.preset, settings)
+    chosen = options.model or options.preset or ("paper" if psi else PRESETS[0])
+    model = read_model(chosen)
+    signer = _opened(model.of_psi if psi else model, str(chosen), settings)
     with suppress(FrameError):  # a model of another range may see nothing there
         sign(_wall(), signer)  # so that the first frame's time is that of signing, not of loading
     return signer
@@ -64,14 +71,14 @@ def prepare_presets(settings: Settings, say: Callable[[str], None] | None = None
     if _is_new():
         tell, begun = say or _print, time.monotonic()
         tell("first use of this installation: compiling for depth images (about 40 seconds)")
-        signer = _opened(PRESETS[0], settings)
+        signer = _opened(read_model(PRESETS[0]), PRESETS[0], settings)
         warm(signer)
         spent = time.monotonic() - begun
         tell(f"compiled for depth images in {spent:.0f} s; now for clouds (about 15 seconds)")
         warm(signer, clouds=True)
         tell(f"compiled, once for all, in {time.monotonic() - begun:.0f} s")
     for preset in PRESETS:
-        _opened(preset, settings)
+        _opened(read_model(preset), preset, settings)
 
 
 def _is_new() -> bool:
@@ -84,8 +91,8 @@ def _print(text: str) -> None:
     print(f"sceneprint: {text}", file=sys.stderr)
 
 
-def _opened(model: str | Path, settings: Settings) -> Signer:
-    name = f"pair table of {model}"
+def _opened(model: Model, name: str, settings: Settings) -> Signer:
+    name = f"pair table of {name}"
     # no bar among the lines of a log
     with tqdm(desc=name, unit="bin", unit_scale=True, delay=0.5, disable=None) as bar:
 

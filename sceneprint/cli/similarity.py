@@ -36,7 +36,7 @@ def add_to(commands: Any) -> None:
     command.add_argument(
         "--seed", type=whole, default=0, metavar="S", help="of the random choices (default: 0)"
     )
-    command.add_argument("--model", help="that signs two images (default: paper)")
+    command.add_argument("--model", help="that signs two images (default: depth)")
     command.add_argument("--json", action="store_true", help="print the record")
     add_service_options(command)
     command.set_defaults(run=run)

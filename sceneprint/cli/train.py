@@ -14,7 +14,7 @@ from tqdm import tqdm
 from sceneprint.cli.numbers import metres, positive, whole
 from sceneprint.datasets import FrameReference, find_sequences
 from sceneprint.errors import TrainingError
-from sceneprint.models import ModelParameters, save_model
+from sceneprint.models import PRESETS, ModelParameters, save_model
 
 
 def add_to(commands: Any) -> None:
@@ -29,9 +29,9 @@ def add_to(commands: Any) -> None:
     command.add_argument("--out", type=Path, required=True, metavar="FILE", help="model file")
     command.add_argument(
         "--preset",
-        choices=("paper", "compact", "lidar"),
-        default="paper",
-        help="size and, of lidar, lengths and scenes (default: paper)",
+        choices=PRESETS,
+        default=PRESETS[0],
+        help=f"size and, of lidar, lengths and scenes (default: {PRESETS[0]})",
     )
     command.add_argument(
         "--rooms",
@@ -39,6 +39,13 @@ def add_to(commands: Any) -> None:
         default=100,
         metavar="N",
         help="synthetic rooms, or sites (default: 100)",
+    )
+    command.add_argument(
+        "--whitening-rooms",
+        type=whole,
+        metavar="N",
+        help="synthetic rooms, or sites, that the whitening of signatures is fitted to; 0 to store "
+        "psi itself (default: 500; of paper 0)",
     )
     command.add_argument("--seed", type=whole, default=0, metavar="S")
     command.add_argument(
@@ -71,7 +78,7 @@ def add_to(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Train and write the model."""
-    from sceneprint.recipes import preset_parameters, preset_scenes
+    from sceneprint.recipes import preset_parameters, preset_scenes, preset_whitening
     from sceneprint.training import TrainingParameters, train
 
     references: list[tuple[str, FrameReference]] = [
@@ -84,12 +91,18 @@ def run(options: argparse.Namespace) -> int:
     if options.out.is_dir():
         raise TrainingError(f"{options.out}: is a folder. Name the file that the model shall be.")
     scenes, views = preset_scenes(options.preset)
+    levels, whitening, whitening_rooms = preset_whitening(options.preset)
+    if options.whitening_rooms is not None:
+        whitening_rooms = options.whitening_rooms
     p = TrainingParameters(
         rooms=options.rooms,
         views=views,
         seed=options.seed,
         projection=options.projection,
         scenes=scenes,
+        whitening_rooms=whitening_rooms,
+        levels=levels,
+        whitening=whitening,
     )
     model_p, mixture_p = preset_parameters(options.preset)
     if options.range is not None:

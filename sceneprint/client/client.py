@@ -108,7 +108,7 @@ class Client(
     # maps
 
     def create_map(
-        self, name: str, title: str | None = None, model: str = "paper", **limits: float | None
+        self, name: str, title: str | None = None, model: str = "depth", **limits: float | None
     ) -> Map:
         """Make a map, or find that it is there as wanted.
 

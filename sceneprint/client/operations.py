@@ -105,7 +105,7 @@ class Operations(Events):
         Parameters
         ----------
         map_name : of the map
-        model : `paper`, `compact`, `lidar`, or the id or label of one of `models`
+        model : `depth`, `lidar`, `paper`, or the id or label of one of `models`
 
         Raises
         ------

@@ -13,8 +13,6 @@ from sceneprint.engine.again import Again
 from sceneprint.engine.associating import Associating
 from sceneprint.engine.associations import Associations
 from sceneprint.engine.audit import Audit
-from sceneprint.engine.choosing import Choosing
-from sceneprint.engine.coding import Coding
 from sceneprint.engine.imports import Imports
 from sceneprint.engine.inspecting import Inspection
 from sceneprint.engine.keeping import open_kept
@@ -33,6 +31,7 @@ from sceneprint.engine.sweeping import sweep_deleted
 from sceneprint.engine.tasks import Tasks
 from sceneprint.engine.upkeep import Upkeep
 from sceneprint.engine.uploads import Uploads
+from sceneprint.engine.vector_tables import VectorTables
 from sceneprint.engine.warming import warm
 from sceneprint.engine.wire import tell_map
 from sceneprint.errors import ModelError
@@ -78,9 +77,8 @@ class Administration:
             self.store, self.signers, settings.indexes, settings.tail_frames, settings.scrub_s
         )
         self._reencoding = Reencoding(self.store, self._upkeep)
-        choosing = Choosing(settings.shortlist, settings.purge_s)
-        self._readers = Readers(self.signers, settings.indexes, choosing)
-        self._coding = Coding(self.store.database, choosing)
+        self._readers = Readers(self.signers, settings.indexes, settings.search)
+        self._vector_tables = VectorTables(self.signers, settings.search)
         self.kept = open_kept(
             settings, self.store.blobs, lambda kept: Standing(self.store).asked(kept)
         )

@@ -70,7 +70,7 @@ def answer(
     if "diversify" in query.stages:
         if query.diversity is not None:
             scales = DiversityParameters(query.diversity.sigma, query.diversity.omega)
-        among = pairwise_distances(searched.signatures())
+        among = pairwise_distances(searched.signatures(), model.metric)
         selection = diversify(ranking.distances, among, wanted, scales)
     clock.stage("diversify")
     chosen = range(min(wanted, len(ranking))) if selection is None else selection.indices.tolist()

@@ -16,11 +16,11 @@ from sceneprint.artifacts import read_geometry
 from sceneprint.engine.concluding import conclude
 from sceneprint.engine.healing import sign_again
 from sceneprint.engine.readers import Readers
-from sceneprint.engine.shortlists import Shortlist
 from sceneprint.engine.sides import Plan, eligible, runs_of
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.slices import Outcome, Task
 from sceneprint.engine.validating import thresholds
+from sceneprint.engine.views import MapView
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
 from sceneprint.geometry.diversity import diversify
 from sceneprint.geometry.retrieval import Ranking, pairwise_distances, ranking_size, similarity
@@ -115,7 +115,7 @@ class Associating:
             return [], 0
         shares = similarity(hits.distances, model.unrelated_distance)
         ranking = Ranking(hits.keys.astype(np.intp), hits.distances, shares)
-        distances = pairwise_distances(view.signatures(hits.keys))
+        distances = pairwise_distances(view.signatures(hits.keys), view.metric)
         chosen = diversify(ranking.distances, distances, asked.candidates).indices.tolist()
         matches = associate(
             geometry, ranking, chosen, lambda key: opened.geometry(row, key), asked.k,
@@ -132,7 +132,7 @@ class Associating:
         ]
         return edges, len(matches)
 
-    def _view(self, of: MapRow) -> tuple[MapRow, Model, Shortlist]:
+    def _view(self, of: MapRow) -> tuple[MapRow, Model, MapView]:
         """The map as it is now: frames of it may be deleted, and its model may change.
 
         Raises

@@ -67,7 +67,7 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
 
 def _compared(a: Asked, b: Asked, signer: Signer, how: Comparison) -> Similarity:
     start = time.perf_counter()
-    distance = distances(a.vector, b.vector[None])
+    distance = distances(a.vector, b.vector[None], signer.model.metric)
     made, T, p = None, None, signer.model.parameters.validation
     if a.geometry is not None and b.geometry is not None:
         found = validate(b.geometry, a.geometry, how.seed, *thresholds(how.validation, p))

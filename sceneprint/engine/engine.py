@@ -188,7 +188,7 @@ class Engine(Administration):
         self._reencoding.run()
         self.retiring.run()
         published = self._upkeep.run()
-        self._coding.run()
+        self._vector_tables.run()
         self.operations.tidy()
         self.imports.tidy()
         if self.purging.run() is not None:

@@ -80,20 +80,19 @@ class Growing:
 
     def after(self, revision: int) -> Growing:
         """Those indexed after a revision, in arrays of their own."""
-        own = self._revisions[: len(self)]
-        places = np.flatnonzero(own > revision)
-        kept = Growing(self._rows.shape[1], self._folder, len(places))
-        for place in places.tolist():
-            change = Change(int(self._keys[place]), "", int(own[place]), None)
-            kept.append(change, self._rows[place])
-        return kept
+        return self._only(self._revisions[: len(self)] > revision)
 
     def without(self, keys: Collection[int]) -> Growing:
         """All but some, in arrays of their own."""
-        kept = Growing(self._rows.shape[1], self._folder, len(self))
-        for other, place in self._places.items():
-            if other not in keys:
-                kept.append(Change(other, "", int(self._revisions[place]), None), self._rows[place])
+        return self._only(~np.isin(self._keys[: len(self)], list(keys)))
+
+    def _only(self, wanted: NDArray[np.bool_]) -> Growing:
+        places = np.flatnonzero(wanted)
+        n = len(places)
+        kept = Growing(self._rows.shape[1], self._folder, n)
+        kept._keys[:n], kept._revisions[:n] = self._keys[places], self._revisions[places]
+        np.take(self._rows, places, axis=0, out=kept._rows[:n], mode="clip")  # no copy beside
+        kept._places = {key: place for place, key in enumerate(kept._keys[:n].tolist())}
         return kept
 
     def revision_of(self, key: int) -> int:

@@ -89,7 +89,7 @@ class Inspection:
             [kept.vector, *(np.frombuffer(vectors[n], np.uint8) for n in there)]
         )
         model = self._signers(kept.model_id).model
-        shares = similarity(pairwise_distances(stacked), model.unrelated_distance)
+        shares = similarity(pairwise_distances(stacked, model.metric), model.unrelated_distance)
         return Similarities(
             query_id=query_id,
             model=kept.answer.model,

@@ -14,9 +14,8 @@ import numpy as np
 from sqlalchemy import Connection
 
 from sceneprint.engine.readers import Readers
-from sceneprint.engine.searching import compares_all
 from sceneprint.errors import LostLease, UnknownMap
-from sceneprint.geometry.retrieval import distances
+from sceneprint.geometry.retrieval import Metric, distance_share, distances, share_distance
 from sceneprint.models import Model
 from sceneprint.store import Database
 from sceneprint.store.frames import frame_of
@@ -71,7 +70,7 @@ def look(database: Database, readers: Readers, row: MapRow, made: StoredSignatur
         if now.number != row.number or now.model_id != made.model_id:
             return None
         (view,) = readers.views(connection, database, [now])
-    hits = view.search(_vector(made), 1, dead=view.dead, exact=compares_all(view, view.size))
+    hits = view.search(_vector(made), 1, dead=view.dead)
     if len(hits) == 0:
         return Look(view.revision, None)
     return Look(view.revision, Near(int(hits.keys[0]), int(hits.distances[0])))
@@ -98,12 +97,13 @@ def judge(
     row = map_of(connection, frame.map_number)
     if novelty is None or seen is None or row.model_id != made.model_id:
         return None
-    nearest = _nearest_now(connection, row, _vector(made), seen)
+    nearest = _nearest_now(connection, row, _vector(made), seen, model.metric)
     if nearest is None:
         return None
-    share = nearest.distance / model.unrelated_distance
-    if share > novelty:
+    if nearest.distance > share_distance(novelty, model.unrelated_distance, model.metric):
         return None
+    distance = np.array(nearest.distance)
+    share = float(distance_share(distance, model.unrelated_distance, model.metric))
     there = frame_of(connection, nearest.number).id
     return (
         f"the map has this place: frame {there} is at {share:.3f} of the distance of unrelated "
@@ -111,7 +111,9 @@ def judge(
     )
 
 
-def _nearest_now(connection: Connection, row: MapRow, vector: Bytes, seen: Look) -> Near | None:
+def _nearest_now(
+    connection: Connection, row: MapRow, vector: Bytes, seen: Look, metric: Metric
+) -> Near | None:
     nearest = seen.nearest
     for block in changes_since(connection, row, seen.revision):
         for change in block:
@@ -119,7 +121,7 @@ def _nearest_now(connection: Connection, row: MapRow, vector: Bytes, seen: Look)
                 raise Stale
             if change.vector is not None:
                 stored = np.frombuffer(change.vector, np.uint8)
-                distance = int(distances(vector, stored[None])[0])
+                distance = int(distances(vector, stored[None], metric)[0])
                 if nearest is None or distance < nearest.distance:
                     nearest = Near(change.number, distance)
     return nearest

@@ -33,8 +33,8 @@ from sceneprint.store.maps import find_maps, list_maps, model_names, unknown_map
 from sceneprint.store.records import MapRow
 from sceneprint.store.replica import asked
 
-#: Maps that `*` asks at once where the database has their codes: by one statement, whatever their
-#: number. Without codes this node holds what is asked, and there are MOST_MAPS.
+#: Maps that `*` asks at once where the database searches: by one statement, whatever their number.
+#: Otherwise this node holds what is asked, and there are MOST_MAPS.
 FLEET_MAPS = 1000
 
 
@@ -148,7 +148,7 @@ class Queries:
         with self._store.database.read() as connection:
             names = [row.name for row in list_maps(connection) if may_read(row.name)]
             most = MOST_MAPS
-            if len(names) > most and self._readers.choosing.has_codes(connection):
+            if len(names) > most and self._readers.asks_database(connection):
                 most = FLEET_MAPS
         if not names:
             raise UnknownMap("There is no map to ask yet. Make one, or name one that is there.")

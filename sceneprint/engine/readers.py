@@ -2,6 +2,8 @@
 
 A `Reader` holds one map: the newest generation of its index, and the tail of frames indexed after
 it. What it hands out is a `View`, which never changes; catching up makes a new one beside it.
+A map of which a node would have to read much first is left to PostgreSQL, where that has vectors.
+Signatures compared by L1 have neither index nor vectors: they are all tail.
 """
 
 from __future__ import annotations
@@ -17,30 +19,28 @@ from pathlib import Path
 import numpy as np
 from sqlalchemy import Connection, select
 
-from sceneprint.engine.choosing import Choosing
 from sceneprint.engine.growing import Growing
-from sceneprint.engine.shortlists import WHOLE, Shortlist
 from sceneprint.engine.signers import Signers
-from sceneprint.engine.views import View
+from sceneprint.engine.stored import StoredMaps
+from sceneprint.engine.vector_tables import READ_MOST, Setting
+from sceneprint.engine.views import MapView, View
 from sceneprint.index import Generation, newest, newest_number
-from sceneprint.store import Database
+from sceneprint.models import Model
+from sceneprint.store import Database, vectors
 from sceneprint.store.events import holds_anchor
 from sceneprint.store.maps import list_maps
 from sceneprint.store.records import MapRow
 from sceneprint.store.replica import require_primary
 from sceneprint.store.signatures import Change, changes_since, count_indexed
 from sceneprint.store.tables import maps
-from sceneprint.store.vectors import count_newer
 
 log = logging.getLogger(__name__)
 
 #: Memory of all tails above which maps that were not asked for long are forgotten.
 HELD_BYTES = 1 << 30
-#: Seconds between two looks for a newer generation.
-_LOOK_S = 1.0
-#: Bytes of a generation's signatures up to which all are verified when it is opened: it takes a
-#: second a gigabyte. Larger ones are verified by workers, in the background.
-VERIFIED_BYTES = 256 << 20
+#: Seconds between two looks for a newer generation, and until one that is damaged, or out of reach
+#: for a moment, is read again.
+_LOOK_S, _AGAIN_S = 1.0, 60.0
 #: Seconds between two looks for maps that are held and no longer there.
 _TIDY_S = 10.0
 
@@ -77,18 +77,19 @@ class Reader:
     connection : of the database
     row : of the map
     folder : of its index
-    length : bytes of a signature
+    model : of the map
     """
 
-    def __init__(self, connection: Connection, row: MapRow, folder: Path, length: int) -> None:
-        self._folder, self._length, self._model_id = folder, length, row.model_id
+    def __init__(self, connection: Connection, row: MapRow, folder: Path, model: Model) -> None:
+        self._folder, self._model = folder, model
         self._looked = time.monotonic()
         self._lock = threading.Lock()
-        self._tail = Growing(length, folder)
+        self._tail = Growing(model.signature_bytes, folder)
         self._dead: dict[int, int] = {}  # what was deleted after the generation, and when
         self._damaged: set[int] = set()
-        self._unsound: int | None = None  # number of a generation that was found damaged
-        self._view = self._begin(self._newest(connection, row, None))
+        self._unsound = 0, 0.0  # number of a generation that cannot be used, until the next try
+        found = self._newest(connection, row, None)
+        self._publish(found, 0 if found is None else found.revision)
 
     @property
     def bytes_held(self) -> int:
@@ -99,13 +100,17 @@ class Reader:
         """How many frames it has yet to read; None: with these it would hold too many."""
         view = self._view
         newer = max(row.revision - view.revision, 0)
-        if len(view.tail) + newer > WHOLE:
-            newer = count_newer(connection, row.number, view.revision, WHOLE + 1)
-        return newer if len(view.tail) + newer <= WHOLE else None
+        if len(view.tail) + newer > READ_MOST:
+            newer = count_indexed(connection, row.number, view.revision, READ_MOST + 1)
+        return newer if len(view.tail) + newer <= READ_MOST else None
 
     def is_outdated(self) -> bool:
         """Whether there is an index that this reader does not use."""
-        return newest_number(self._folder) not in (None, self._view.number, self._unsound)
+        number = newest_number(self._folder) if self._model.metric == "l2" else None
+        unsound, until = self._unsound
+        return number not in (None, self._view.number) and (
+            number != unsound or time.monotonic() > until
+        )
 
     def view(self, connection: Connection, row: MapRow) -> View:
         """The map as of the row's revision, or later."""
@@ -137,11 +142,6 @@ class Reader:
     def _is_time(self) -> bool:
         return time.monotonic() - self._looked >= _LOOK_S
 
-    def _begin(self, generation: Generation | None) -> View:
-        revision = 0 if generation is None else generation.revision
-        size = len(generation or ())
-        return View(self._model_id, revision, generation, self._tail.tail(), frozenset(), size)
-
     def _catch_up(self, connection: Connection, row: MapRow) -> None:
         view = self._view
         self._tail.reserve(count_indexed(connection, row.number, view.revision))
@@ -169,14 +169,15 @@ class Reader:
         """Take another generation, if a worker has published one, and keep the rest as tail."""
         self._looked = time.monotonic()
         view = self._view
-        number, since = (0, 0) if view.generation is None else (
-            view.generation.number, view.generation.revision
-        )  # fmt: skip
-        if newest_number(self._folder) in (None, number, self._unsound):
+        if not self.is_outdated():
             return
         found = self._newest(connection, row, view.generation)
+        since = 0 if view.generation is None else view.generation.revision
         # one of the same revision stands for one that was found damaged
-        if found is None or found.number == number or not since <= found.revision <= view.revision:
+        if (
+            found is None or found.number == view.number
+            or not since <= found.revision <= view.revision
+        ):  # fmt: skip
             return
         self._tail = self._tail.after(found.revision)
         self._dead = {n: deleted for n, deleted in self._dead.items() if deleted > found.revision}
@@ -185,29 +186,26 @@ class Reader:
     def _newest(
         self, connection: Connection, row: MapRow, known: Generation | None
     ) -> Generation | None:
-        found = newest(self._folder, row.model_id, self._length, known=known)
-        if found is not None:
-            old = set() if known is None else set(map(id, known.segments))
-            new = [each for each in found.segments if id(each) not in old]
-            small = sum(each.size for each in new) <= VERIFIED_BYTES
-            if small and not all(each.is_sound() for each in new):
-                log.error("a damaged index is not used", extra={"map": row.name})
-                self._unsound = found.number
-                return None
+        number = newest_number(self._folder) if self._model.metric == "l2" else None
+        if number is None:
+            return None
+        length = self._model.signature_bytes
+        found = newest(self._folder, row.model_id, length, known=known)
+        if found is None or found.number < number:
+            self._unsound = number, time.monotonic() + _AGAIN_S
         return trusted(connection, row, found)
 
     def _publish(self, generation: Generation | None, revision: int) -> None:
+        tail, both = self._tail.tail(), 0
         deleted = np.fromiter(self._dead, np.int64, len(self._dead))
-        held = np.isin(deleted, self._tail.tail().keys)
+        held = np.isin(deleted, tail.keys)
         if generation is not None:
             held |= generation.places.of(deleted) >= 0
+            both = int((generation.places.of(tail.keys) >= 0).sum())  # signed anew since
         dead = frozenset(deleted[held].tolist())
-        tail, both = self._tail.tail(), 0
-        if generation is not None:  # signed anew since
-            both = int((generation.places.of(tail.keys) >= 0).sum())
         size = len(generation or ()) + len(tail) - both - len(dead)
-        damaged = frozenset(self._damaged)
-        self._view = View(self._model_id, revision, generation, tail, dead, size, damaged)
+        model, damaged = self._model, frozenset(self._damaged)
+        self._view = View(model.id, model.metric, revision, generation, tail, dead, size, damaged)
 
 
 class Readers:
@@ -217,12 +215,13 @@ class Readers:
     ----------
     signers : see Signers
     indexes : folder of all indexes
-    choosing : which maps are searched in the database; none where it is not given
+    setting : `local` never asks the database; `database` wherever it can; `auto` where much is
+        missing here
     """
 
-    def __init__(self, signers: Signers, indexes: Path, choosing: Choosing | None = None) -> None:
-        self._signers, self._indexes = signers, indexes
-        self.choosing = choosing or Choosing("local")
+    def __init__(self, signers: Signers, indexes: Path, setting: Setting = "local") -> None:
+        self._signers, self._indexes, self._setting = signers, indexes, setting
+        self._stored = StoredMaps()
         self._database, self._history = signers.database, signers.database.history
         self._lock = threading.Lock()
         self._open: OrderedDict[str, tuple[tuple[int, str], Reader]] = OrderedDict()
@@ -230,7 +229,7 @@ class Readers:
 
     def views(
         self, connection: Connection, database: Database, rows: Sequence[MapRow]
-    ) -> list[Shortlist]:
+    ) -> list[MapView]:
         """Maps of one model as of their rows' revisions, or later, each where it is searched best.
 
         Parameters
@@ -238,18 +237,27 @@ class Readers:
         connection : a reading transaction of `database`
         rows : of the maps, one or more
         """
-        found: dict[int, Shortlist] = {}
-        if self.choosing.is_possible(connection):
-            asked = self._others(connection, rows)
-            length = self._signers(rows[0].model_id).model.signature_bytes if asked else 0
-            found.update(self.choosing.stored(connection, database, asked, length))
+        model = self._signers(rows[0].model_id).model
+        found: dict[int, MapView] = {}
+        if model.metric == "l2" and model.signature_bytes in self._searched_there(connection):
+            others = self._others(connection, rows)
+            found.update(self._stored.views(connection, database, others, model))
         return [found.get(row.number) or self.view(connection, row) for row in rows]
+
+    def asks_database(self, connection: Connection) -> bool:
+        """Whether the database searches, so that a query may name very many maps."""
+        return bool(self._searched_there(connection))
+
+    def _searched_there(self, connection: Connection) -> frozenset[int]:
+        if self._setting == "local":
+            return frozenset()
+        return vectors.complete_dimensions(connection)
 
     def _others(self, connection: Connection, rows: Sequence[MapRow]) -> list[MapRow]:
         """Maps of which this node would have to read much before it could search them."""
-        if self.choosing.setting == "database":
+        if self._setting == "database":
             return list(rows)
-        others, left = [], WHOLE
+        others, left = [], READ_MOST
         for row in rows:
             reader = self._reader(connection, row)
             lacking = reader.lacks(connection, row)
@@ -265,7 +273,7 @@ class Readers:
     def view(self, connection: Connection, row: MapRow) -> View:
         """A map as of the row's revision, or later, on this node."""
         reader = self._reader(connection, row)
-        if self._is_time_to_tidy():
+        if time.monotonic() - self._tidied >= _TIDY_S:
             self.tidy(connection)
         return reader.view(connection, row)
 
@@ -277,22 +285,16 @@ class Readers:
             held, reader = self._open.get(row.name, (None, None))
             wanted = (row.number, row.model_id)
             if reader is None or held != wanted:  # made anew, or signed with another model
-                length = self._signers(row.model_id).model.signature_bytes
-                folder = index_folder(self._indexes, row)
-                reader = Reader(connection, row, folder, length)
+                model = self._signers(row.model_id).model
+                reader = Reader(connection, row, index_folder(self._indexes, row), model)
                 self._open[row.name] = (wanted, reader)
             self._open.move_to_end(row.name)
             # the one that was asked longest ago first, and never the one that is asked now
-            while len(self._open) > 1 and self._bytes_held() > HELD_BYTES:
-                self._open.popitem(last=False)
+            held_bytes = sum(one.bytes_held for _, one in self._open.values())
+            while len(self._open) > 1 and held_bytes > HELD_BYTES:
+                _, (_, oldest) = self._open.popitem(last=False)
+                held_bytes -= oldest.bytes_held
             return reader
-
-    def _is_time_to_tidy(self) -> bool:
-        with self._lock:
-            return time.monotonic() - self._tidied >= _TIDY_S
-
-    def _bytes_held(self) -> int:
-        return sum(reader.bytes_held for _, reader in self._open.values())
 
     def forget(self, name: str) -> None:
         """Give up what is held of a map that was deleted."""
@@ -317,7 +319,6 @@ class Readers:
         """
         asked = select(maps.c.name, maps.c.number, maps.c.model_id)
         there = {row.name: (row.number, row.model_id) for row in connection.execute(asked)}
-        self.choosing.remembered.tidy()
         with self._lock:
             self._tidied = time.monotonic()
             for name in [name for name, (held, _) in self._open.items() if there.get(name) != held]:

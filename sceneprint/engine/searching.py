@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.engine.asking import Asked
-from sceneprint.engine.shortlists import WHOLE, Shortlist
 from sceneprint.engine.stored import Stored, search_stored
+from sceneprint.engine.views import MapView
 from sceneprint.geometry.retrieval import Ranking, ranking_size, similarity
 from sceneprint.index import Hits
 from sceneprint.index.keys import Keys
@@ -25,17 +25,13 @@ from sceneprint.store.filters import passing
 from sceneprint.store.records import MapRow
 from sceneprint.types import Bytes
 
-#: Maps of WHOLE frames that are compared whole in one query. Of more frames together, a map is
-#: compared whole up to CHEAP of its own: its code costs as much as comparing 512 frames.
-MANY_WHOLE, CHEAP = 4, 1000
-
 
 @dataclass(frozen=True, eq=False)
 class Place:
     """A map that is asked: its row, and its frames as of one revision."""
 
     row: MapRow
-    view: Shortlist
+    view: MapView
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +44,12 @@ class Part:
     dead : frames that may not be found: deleted ones, and the query itself
     among : frames that pass the filter; None without one
     size : frames that can be found
-    exact : every frame that passes is compared, whatever the index would propose
     """
 
     place: Place
     dead: frozenset[int]
     among: Keys | None
     size: int
-    exact: bool
 
     @property
     def passed(self) -> int:
@@ -118,11 +112,6 @@ def search_maps(
     model : of all of them
     """
     parts = tuple(_part(store, place, asked, query) for place in places)
-    together = sum(part.passed for part in parts if part.place.view.kind == "local")
-    parts = tuple(
-        replace(part, exact=query.exact or compares_all(part.place.view, part.passed, together))
-        for part in parts
-    )
     size = ranking_size(sum(part.passed for part in parts))
     hits = _searched(asked.vector, parts, size, query.exact)
     keys = np.concatenate([one.keys for one in hits])
@@ -133,27 +122,6 @@ def search_maps(
     shares = similarity(distances, model.unrelated_distance)
     return Searched(parts, hits, Ranking(keys[first].astype(np.intp), distances, shares),
                     owners[first], size)  # fmt: skip
-
-
-def compares_all(view: Shortlist, passed: int, together: int = 0) -> bool:
-    """Whether so few frames of a map are compared whole; the database, which sends each, decides
-    that itself.
-
-    Parameters
-    ----------
-    view : of the map
-    passed : frames of it that may be found
-    together : such frames of all maps that are asked; of very many small maps are compared whole
-    """
-    most = WHOLE if together <= MANY_WHOLE * WHOLE else min(WHOLE, CHEAP)
-    return view.kind == "local" and passed <= most
-
-
-def is_shortlisted(searched: Searched, asked: Asked, part: Part, number: int) -> bool:
-    """Whether the search compared a frame with the query, or its shortlist missed it."""
-    return part.place.view.is_compared(
-        asked.vector, searched.size, number, dead=part.dead, among=part.among, exact=part.exact
-    )
 
 
 def rank_among_all(searched: Searched, asked: Asked, number: int, distance: int) -> int:
@@ -177,13 +145,16 @@ def _searched(vector: Bytes, parts: Sequence[Part], size: int, exact: bool) -> t
         if stored else ()
     )  # fmt: skip
     return tuple(
-        next(found)
+        _counted(next(found), part)
         if isinstance(part.place.view, Stored)
-        else part.place.view.search(
-            vector, size, dead=part.dead, among=part.among, exact=part.exact
-        )
+        else part.place.view.search(vector, size, dead=part.dead, among=part.among, exact=exact)
         for part in parts
     )
+
+
+def _counted(hits: Hits, part: Part) -> Hits:
+    """The database counts the query itself, where it is of the map."""
+    return replace(hits, compared=min(hits.compared, part.passed))
 
 
 def _part(store: Store, place: Place, asked: Asked, query: Query) -> Part:
@@ -194,7 +165,7 @@ def _part(store: Store, place: Place, asked: Asked, query: Query) -> Part:
     among = None
     if query.filter is not None:
         among = _among(store, place, dead, asked, query.filter)
-    return Part(place, dead, among, size, query.exact)
+    return Part(place, dead, among, size)
 
 
 def _among(store: Store, place: Place, dead: frozenset[int], asked: Asked, wanted: Filter) -> Keys:

@@ -20,6 +20,7 @@ from sceneprint.engine.readers import index_folder, is_index_folder, trusted
 from sceneprint.engine.scrubbing import Scrubber
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import BusyIndex, InvalidRequest, SceneprintError, UnknownMap
+from sceneprint.geometry.retrieval import Metric
 from sceneprint.index import Generation, clear, manifests, newest, newest_number, publish
 from sceneprint.store import Store
 from sceneprint.store.events import anchor_of
@@ -32,6 +33,9 @@ from sceneprint.types import Bytes
 
 log = logging.getLogger(__name__)
 
+#: A map is published when so large a share of it is new, or deleted: to publish writes all of it,
+#: so that what is written in all stays proportional to the map.
+SHARE = 1 / 16
 #: In the folder of an index: read from its times, when it was purged, and when it may be again.
 _REST = ".rest"
 
@@ -43,7 +47,8 @@ class Upkeep:
     ----------
     store, signers : see there
     indexes : folder of all indexes
-    tail_frames : frames that a generation may lack, and deleted ones that it may hold
+    tail_frames : frames that a generation may lack, and deleted ones that it may hold; of a large
+        map SHARE of its frames
     scrub_s : seconds after which all files are read again, to see that they are sound
     """
 
@@ -52,8 +57,9 @@ class Upkeep:
     ) -> None:
         self._store, self._signers = store, signers
         self._indexes, self._tail_frames = indexes, tail_frames
-        # map and model: number of their index, revision
-        self._published: dict[tuple[int, str], tuple[int, int]] = {}
+        # map and model: number of their index, revision, frames
+        self._published: dict[tuple[int, str], tuple[int, int, int]] = {}
+        self._metrics: dict[str, Metric | None] = {}
         self._scrubber = Scrubber(indexes, scrub_s)
 
     def run(self) -> int:
@@ -63,10 +69,12 @@ class Upkeep:
         frame: queries read from the database what no index holds.
         """
         with self._store.database.read() as connection:
-            rows = list_maps(connection)
+            listed = list_maps(connection)
+        rows = [row for row in listed if self._metric(row.model_id) == "l2"]
+        with self._store.database.read() as connection:
             due = [row for row in rows if self._due(connection, row)]
         published = sum(self._tried(row) for row in due)
-        self._clean(rows)
+        self._clean(listed)
         damaged = self._scrubber.step([index_folder(self._indexes, row) for row in rows])
         for row in rows:
             if index_folder(self._indexes, row) == damaged:
@@ -79,9 +87,15 @@ class Upkeep:
         Raises
         ------
         UnknownMap : the map is gone.
-        InvalidRequest : there is no indexed frame in it.
+        InvalidRequest : there is no indexed frame in it, or its model's signatures are psi itself.
         OSError : it cannot be written; what was there stays.
         """
+        if self._signers(row.model_id).model.metric != "l2":
+            raise InvalidRequest(
+                f"Map {row.name!r} has no index to rebuild: its model keeps whole Fisher vectors, "
+                "and queries compare all of them. If the map is too large for that, change its "
+                "model with `sceneprint reencode`."
+            )
         return self._publish(row, anyway=True, anew=True)
 
     def ahead(self, row: MapRow) -> Generation | None:
@@ -91,7 +105,7 @@ class Upkeep:
 
         Returns
         -------
-        the newest generation of that model, if there is any
+        the newest generation of that model, if there is any; none of a model that has no index
 
         Raises
         ------
@@ -99,6 +113,8 @@ class Upkeep:
         BusyIndex : another process is building it.
         """
         coming = _coming(row)
+        if self._signers(coming.model_id).model.metric != "l2":
+            return None
         try:
             if self._publish(coming) is None:
                 with self._store.database.read() as connection:
@@ -122,17 +138,28 @@ class Upkeep:
             log.error("no index published", extra={"map": row.name, "error": str(error)})
             return False
 
-    def _due(self, connection: Connection, row: MapRow) -> bool:
-        number, known = self._published.get((row.number, row.model_id), (None, 0))
-        if newest_number(index_folder(self._indexes, row)) != number:
-            known = 0  # published by another process, or removed: to be looked at
-        return self._is_long(connection, row, known)
+    def _metric(self, model_id: str) -> Metric | None:
+        """Of a model's signatures; None where another version made it, which looks after it."""
+        if model_id not in self._metrics:
+            try:
+                self._metrics[model_id] = self._signers(model_id).model.metric
+            except SceneprintError:
+                self._metrics[model_id] = None
+        return self._metrics[model_id]
 
-    def _is_long(self, connection: Connection, row: MapRow, since: int) -> bool:
-        if row.revision - since <= self._tail_frames:  # spares the counting
+    def _due(self, connection: Connection, row: MapRow) -> bool:
+        number, since, frames = self._published.get((row.number, row.model_id), (None, 0, 0))
+        if newest_number(index_folder(self._indexes, row)) != number:
+            since = frames = 0  # published by another process, or removed: to be looked at
+        return self._is_long(connection, row, since, frames)
+
+    def _is_long(self, connection: Connection, row: MapRow, since: int, frames: int) -> bool:
+        """Whether a generation of that revision and size lacks, or holds too much, too many."""
+        most = max(self._tail_frames, int(SHARE * frames))
+        if row.revision - since <= most:  # spares the counting
             return False
-        return count_indexed(connection, row.number, since) > self._tail_frames or (
-            count_gone(connection, row.number, since) > self._tail_frames
+        return count_indexed(connection, row.number, since) > most or (
+            count_gone(connection, row.number, since) > most
         )
 
     def purge(self, row: MapRow) -> bool:
@@ -145,11 +172,16 @@ class Upkeep:
         OSError : it cannot be written; what was there stays.
         """
         folder = index_folder(self._indexes, row)
+        if self._metric(row.model_id) == "l1":  # version 0.1 may have left one
+            left = any(folder.glob("*.json"))
+            shutil.rmtree(folder, ignore_errors=True)
+            return left
         listed = manifests(folder)
         if not listed:
             return False
-        length = self._signers(row.model_id).model.signature_bytes
-        found = newest(folder, row.model_id, length)  # before a connection waits for it
+        model = self._signers(row.model_id).model
+        # before a connection waits for it
+        found = newest(folder, row.model_id, model.signature_bytes)
         with self._store.database.read() as connection:
             allow(connection, 0)
             now = find_map(connection, row.name)
@@ -164,8 +196,7 @@ class Upkeep:
         elif found is None:
             return False
         else:
-            in_use = len(found) - int((found.places.of(np.fromiter(gone, np.int64)) >= 0).sum())
-            if sum(map(len, found.segments)) > in_use:
+            if (found.places.of(np.fromiter(gone, np.int64)) >= 0).any():
                 done = self._publish(row, anyway=True, clean=True) is not None
             elif older:
                 done = clear(folder, but=found.number)
@@ -213,8 +244,8 @@ class Upkeep:
                 previous = trusted(connection, now, newest(folder, now.model_id, length))
             since = 0 if previous is None else previous.revision
             if previous is not None:
-                self._published[now.number, now.model_id] = (previous.number, since)
-            if not anyway and not self._is_long(connection, now, since):
+                self._note(now, previous)
+            if not anyway and not self._is_long(connection, now, since, len(previous or ())):
                 return None  # another worker was first
             if previous is None and count_indexed(connection, now.number, 0) == 0:
                 if anew:
@@ -235,20 +266,25 @@ class Upkeep:
         sign_again(self._store, now, damaged, now.model_id)
         if generation is None:
             return None
-        self._published[now.number, now.model_id] = (generation.number, generation.revision)
+        self._note(now, generation)
         log.info(
             "index published",
             extra={"map": now.name, "generation": generation.number, "frames": len(generation)},
         )
         return generation
 
+    def _note(self, row: MapRow, found: Generation) -> None:
+        own = (found.number, found.revision, len(found))
+        self._published[row.number, row.model_id] = own
+
     def _clean(self, rows: Sequence[MapRow]) -> None:
-        """Remove the indexes of maps that are no more, and of models that they had."""
+        """Remove the indexes of maps that are no more, of models that they had, and of psi."""
         if not self._indexes.is_dir():
             return
         with self._store.database.read() as connection:  # a map may have been made since
             known = [*rows, *list_maps(connection)]
         known += [_coming(row) for row in known if row.next_model_id is not None]
+        known = [row for row in known if self._metric(row.model_id) != "l1"]
         kept = {index_folder(self._indexes, row).name for row in known}
         for folder in self._indexes.iterdir():
             if is_index_folder(folder.name) and folder.name not in kept:

@@ -34,13 +34,14 @@ def warm(signer: Signer, *, clouds: bool = False) -> bool:
     """
     unfilter(np.frombuffer(bytes(5), np.uint8).reshape(1, 5))  # of a PNG
     corner, p = _corner(), signer.model.parameters.validation
+    metric = signer.model.metric
     with suppress(FrameError):
         signature, seen = prepare(corner, signer)
         rows = signature.vector[None].copy()
-        search(signature.vector, None, Tail(np.zeros(1, np.int64), rows), 1)
-        pairwise_distances(rows)
-        rows.flags.writeable = False  # as a mapped segment is: another compilation
-        distances(signature.vector.copy(), rows)
+        search(signature.vector, None, Tail(np.zeros(1, np.int64), rows), 1, metric=metric)
+        pairwise_distances(rows, metric)
+        rows.flags.writeable = False  # as a mapped file is: another compilation
+        distances(signature.vector.copy(), rows, metric)
         geometry = read_geometry(write_geometry(seen))
         drawn = sampled(geometry.surface, 1)  # as a page asks for them
         patches_at(drawn, geometry.patches)

@@ -13,7 +13,7 @@ from sceneprint.artifacts import read_geometry
 from sceneprint.engine.asking import Asked
 from sceneprint.engine.deadlines import Deadline
 from sceneprint.engine.explaining import figures
-from sceneprint.engine.searching import Part, Searched, is_shortlisted, rank_among_all
+from sceneprint.engine.searching import Part, Searched, rank_among_all
 from sceneprint.engine.telling import Found, tell_validation
 from sceneprint.engine.transforms import transform
 from sceneprint.engine.validating import Validated, thresholds
@@ -72,15 +72,20 @@ def why(asking: Asking, frame_id: str) -> ExplainedFrame:
         )  # fmt: skip
     view, number = part.place.view, np.array([row.number], np.int64)
     stored = view.signatures(number)
-    distance = distances(asking.asked.vector, stored)
+    distance = distances(asking.asked.vector, stored, view.metric)
     rank = rank_among_all(asking.searched, asking.asked, row.number, int(distance[0]))
     at = np.flatnonzero(asking.searched.ranking.indices == row.number).tolist()
     passes = part.among is None or row.number in part.among
-    shortlisted = is_shortlisted(asking.searched, asking.asked, part, row.number)
+    # an approximate index cannot be asked what it compared: what it should have ranked, it did not
+    missed = not at and passes and not asking.searched.exact and rank <= asking.searched.size
     selected = bool(at) and at[0] in asking.tried.chosen
     validation, T = _aligned(asking, part, row)
-    proposer = "the index" if view.kind == "local" else "pgvector in the database"
-    lost, reason = _lost(asking, row, rank, passes, shortlisted, bool(at), selected, proposer)
+    if missed:
+        index = "the index" if view.kind == "local" else "pgvector in the database"
+        lost: Lost | None = "shortlist"
+        reason = f"{index} missed it, though it has rank {rank}: ask with `exact`"
+    else:
+        lost, reason = _lost(asking, row, rank, passes, bool(at), selected)
     early = lost not in (None, "validation")
     if early and validation is not None and validation.status != "skipped":
         reason += f"; aligned for this all the same, it is {figures(validation)}"
@@ -93,7 +98,7 @@ def why(asking: Asking, frame_id: str) -> ExplainedFrame:
         similarity=float(similarity(distance, asking.model.unrelated_distance)[0]),
         rank=rank,
         of=sum(one.passed for one in asking.searched.parts),
-        shortlisted=shortlisted,
+        shortlisted=not missed,
         ranked=bool(at),
         selected=selected,
         validation=validation,
@@ -144,17 +149,12 @@ def _absent(asking: Asking, part: Part, row: FrameRow) -> tuple[Lost, str] | Non
 
 
 def _lost(
-    asking: Asking, row: FrameRow, rank: int, passes: bool, shortlisted: bool, ranked: bool,
-    selected: bool, proposer: str,
-) -> tuple[Lost | None, str]:  # fmt: skip
+    asking: Asking, row: FrameRow, rank: int, passes: bool, ranked: bool, selected: bool
+) -> tuple[Lost | None, str]:
     """Where, and why in words."""
     size, tried = len(asking.searched.ranking), asking.tried
     if not passes:
         return "filter", "it does not pass the filter"
-    if not shortlisted:
-        return "shortlist", (
-            f"{proposer} did not propose it, though it has rank {rank}: ask with `exact`"
-        )
     if not ranked:
         return "ranking", f"it has rank {rank}, and {size} frames are ranked"
     if not selected:

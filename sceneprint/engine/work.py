@@ -191,8 +191,7 @@ def _store(
     blobs : that a frame refers to no more which was not to be kept: its map has the place
     """
     if work.again:
-        return _store_again(store, readers, work, made)
-    coded = readers.choosing.coded(store.database, made.model_id, made.vector)
+        return _store_again(store, work, made)
     while True:
         seen = None
         if work.frame.novelty is not None:
@@ -212,14 +211,13 @@ def _store(
             if not store.blobs.holds(made.geometry):  # nothing referred to it until now
                 raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
             index_frame(connection, work.frame, made)
-            readers.choosing.keep(connection, work.frame.number, coded)
             if row.next_model_id is not None:
                 enqueue_all(connection, row, [work.frame.number])
             tell_of(connection, "frame.indexed", work)
             return []
 
 
-def _store_again(store: Store, readers: Readers, work: Work, made: StoredSignature) -> list[str]:
+def _store_again(store: Store, work: Work, made: StoredSignature) -> list[str]:
     """Signature and artifact of an indexed frame, beside those of another model or in the place
     of damaged ones, and the end of the job in one commit.
 
@@ -228,7 +226,6 @@ def _store_again(store: Store, readers: Readers, work: Work, made: StoredSignatu
     blobs : that the frame refers to no more
     """
     number = work.frame.number
-    coded = readers.choosing.coded(store.database, made.model_id, made.vector)
     with store.database.write() as connection:
         queue.finish(connection, work.claim, JobState.SUCCEEDED)
         row = map_of(connection, work.frame.map_number)
@@ -238,7 +235,6 @@ def _store_again(store: Store, readers: Readers, work: Work, made: StoredSignatu
         if not store.blobs.holds(made.geometry):
             raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
         before = geometry_blobs(connection, [number], made.model_id).values()
-        changed = replace_signature(connection, work.frame, made)
-        readers.choosing.keep(connection, number, coded, anew=changed)
+        replace_signature(connection, work.frame, made)
         tell_of(connection, "frame.reencoded", work)
         return [blob for blob in before if blob != made.geometry]

@@ -17,6 +17,7 @@ from sceneprint.errors import FrameError
 from sceneprint.evaluation.protocol import Chosen
 from sceneprint.evaluation.records import Member
 from sceneprint.evaluation.workers import Watch, map_over, unwatched
+from sceneprint.geometry.retrieval import Metric
 from sceneprint.geometry.validation import ValidationParameters
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, open_signer, prepare
@@ -74,7 +75,7 @@ class Prepared:
     queries, database : in the order of the protocol
     left_out : (name, reason) of the others
     milliseconds : median time to sign a frame and work out its geometry; None without frames
-    validation : of the model
+    validation, metric : of the model
     """
 
     queries: list[Member]
@@ -82,6 +83,7 @@ class Prepared:
     left_out: list[tuple[str, str]]
     milliseconds: float | None
     validation: ValidationParameters = field(default_factory=ValidationParameters)
+    metric: Metric = "l2"
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +121,7 @@ def prepare_all(
     chosen : see Protocol
     signer : see `open_signer`
     store : an empty one
-    levels : how many levels of the signatures to keep, finest first; None for all
+    levels : how many levels of psi to keep, finest first; None for all, or what is stored
     jobs : processes
     cache_dir : of derived files of the model
     watch : told of each frame
@@ -141,8 +143,11 @@ def prepare_all(
                     by_use[use].append(done.member)
             spent.append(done.milliseconds)
     median = float(np.median(spent)) if spent else None
-    validation = signer.model.parameters.validation
-    return Prepared(by_use["query"], by_use["database"], left_out, median, validation)
+    model = signer.model
+    return Prepared(
+        by_use["query"], by_use["database"], left_out, median, model.parameters.validation,
+        model.metric,
+    )  # fmt: skip
 
 
 def _open(model: Signer | Model, cache_dir: Path | None, store: Store) -> tuple[Signer, Store]:

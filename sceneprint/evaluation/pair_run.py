@@ -112,7 +112,6 @@ def evaluate_pairs(
         chosen,
         signer,
         store,
-        levels=1,
         jobs=settings.jobs,
         cache_dir=settings.cache_dir,
         watch=watch,

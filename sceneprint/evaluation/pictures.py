@@ -47,9 +47,8 @@ def save_pictures(
     """
     outcomes, prepared = evaluation.outcomes, evaluation.prepared
     used = figures["settings"]
-    levels = used["levels"] or model.parameters.hierarchy.n_levels
-    share = levels / model.parameters.hierarchy.n_levels
-    d0 = model.unrelated_distance * share if used["metric"] == "l1" else None
+    share = (used["levels"] or len(model.levels)) / len(model.levels)
+    d0 = model.unrelated_distance * share if used["metric"] == model.metric else None
 
     def query(number: int) -> AnyFrame:
         return store.frame(prepared.queries[number])

@@ -21,7 +21,7 @@ from sceneprint.geometry.retrieval import (
     pairwise_distances,
     ranking_size,
 )
-from sceneprint.types import Bytes, Floats
+from sceneprint.types import Bytes
 
 #: Queries scanned at once.
 BLOCK = 64
@@ -53,7 +53,7 @@ def rank(
     database: Bytes,
     allowed: NDArray[np.bool_],
     *,
-    metric: Metric = "l1",
+    metric: Metric,
     candidates: int = 10,
     watch: Watch = unwatched,
 ) -> list[Ranked]:
@@ -91,7 +91,7 @@ def rank(
         else:
             within = among[np.ix_(ranking, ranking)]
         start = time.perf_counter()
-        selection = diversify(_plain(row[ranking], metric), _plain(within, metric), candidates)
+        selection = diversify(row[ranking], within, candidates)
         ms["diversify"] = 1e3 * (time.perf_counter() - start)
         chosen = ranking[selection.indices]
         found.append(Ranked(ranking.tolist(), row[ranking], chosen.tolist(), ms))
@@ -106,9 +106,3 @@ def _rows(queries: Bytes, database: Bytes, metric: Metric) -> Iterable[tuple[Int
         spent = 1e3 * (time.perf_counter() - start) / len(block)
         for row in block:
             yield row, spent
-
-
-def _plain(distances: Ints64, metric: Metric) -> Floats:
-    """Distances as the kernel of Eq. (3) takes them; of L2 not the squares."""
-    found: Floats = distances.astype(float)
-    return np.sqrt(found) if metric == "l2" else found

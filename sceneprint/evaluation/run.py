@@ -40,8 +40,8 @@ class Settings:
 
     Parameters
     ----------
-    metric : of signatures
-    levels : of the signatures to use, finest first; None for all
+    metric : of signatures; None for the model's
+    levels : of psi to use, finest first; None for all
     mode, matching : of validation
     candidates : size of C, and of the part of R that is validated
     max_overlap : a query may find only database frames that overlap it by less (by the smaller
@@ -57,7 +57,7 @@ class Settings:
     cache_dir : of derived files of the model; None for the user's
     """
 
-    metric: Metric = "l1"
+    metric: Metric | None = None
     levels: int | None = None
     mode: Mode = "full"
     matching: Matching = "histograms"
@@ -223,7 +223,7 @@ def _ask(
         np.stack([q.signature for q in queries]),
         np.stack([d.signature for d in database]),
         allowed,
-        metric=settings.metric,
+        metric=settings.metric or prepared.metric,
         candidates=settings.candidates,
         watch=watch,
     )

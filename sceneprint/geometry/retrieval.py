@@ -165,6 +165,28 @@ def similarity(distances: Ints64, unrelated_distance: float) -> Floats:
     return shares
 
 
+def distance_share(distances: Ints64, unrelated_distance: float, metric: Metric) -> Floats:
+    """How far frames are, as a share of how far unrelated ones are: of squared distances the root.
+
+    Parameters
+    ----------
+    distances : (...) of a metric
+    unrelated_distance : d0, see `similarity`
+    metric : see `distances`
+
+    Returns
+    -------
+    (...) 0 for equal signatures, about 1 for unrelated ones
+    """
+    shares: Floats = np.asarray(distances, np.float64) / unrelated_distance
+    return shares if metric == "l1" else np.sqrt(shares)
+
+
+def share_distance(share: float, unrelated_distance: float, metric: Metric) -> float:
+    """The distance that is such a share: the inverse of `distance_share`."""
+    return (share if metric == "l1" else share**2) * unrelated_distance
+
+
 def rank(distances: Ints64, size: int, unrelated_distance: float) -> Ranking:
     """The nearest `size` of a database, ties by index: R of Sec. III-C.
 

@@ -8,25 +8,26 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import mmap
 import os
 import re
 import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.writing import write_durable
+from sceneprint.writing import sync_folder
 
-#: What a segment, a FAISS index, the rows it stands for, and a code are called.
-KINDS = ("segment", "faiss", "rows", "code")
+#: What the keys, the FAISS index and the inverted file of a generation are called.
+KINDS = ("keys", "faiss", "lists")
+#: Bytes that are read at once where a file is checked.
+BLOCK_BYTES = 8 << 20
 _NAME = re.compile(rf"[0-9a-f]{{64}}\.({'|'.join(KINDS)})")
-_PART = re.compile(r"\.[0-9a-f]{12}\.part")
-
-
-def name_of(data: bytes, kind: str) -> str:
-    """The name of the file that holds these bytes."""
-    return f"{hashlib.sha256(data).hexdigest()}.{kind}"
+#: What version 0.1 left, manifests too, and what a killed builder left.
+_LEFT = re.compile(
+    r"[0-9a-f]{64}\.(segment|rows|code)|\d{10}-[0-9a-f]{32}\.json|\.[0-9a-f]{12}\.part"
+)
 
 
 def is_name(name: str, kind: str) -> bool:
@@ -36,8 +37,8 @@ def is_name(name: str, kind: str) -> bool:
 
 
 def is_ours(name: str) -> bool:
-    """Whether a file was made here and may be removed: by content, or left by a killed builder."""
-    return bool(_NAME.fullmatch(name) or _PART.fullmatch(name))
+    """Whether a file was made here, and may be removed where no manifest needs it."""
+    return bool(_NAME.fullmatch(name) or _LEFT.fullmatch(name))
 
 
 def unfinished(folder: Path) -> Path:
@@ -45,55 +46,86 @@ def unfinished(folder: Path) -> Path:
     return folder / f".{secrets.token_hex(6)}.part"
 
 
-def put(folder: Path, data: bytes, kind: str) -> str:
+def put(
+    folder: Path, kind: str, write: Callable[[Callable[[bytes], None]], object]
+) -> tuple[str, int]:
     """Write a file durably under the name that its bytes give.
 
     Parameters
     ----------
     folder : must exist
-    data : all of the file
     kind : one of KINDS
+    write : is called with what takes the bytes of the file, one block after the other
 
     Returns
     -------
-    the name
+    the name, and how many bytes it has
 
     Raises
     ------
-    OSError : it cannot be written.
+    OSError : it cannot be written; nothing is left behind.
     """
-    name = name_of(data, kind)
+    part, digest = unfinished(folder), hashlib.sha256()
     try:
-        get(folder, name, len(data))
-    except DamagedIndex:  # absent, or something happened to it
-        write_durable(folder / name, data)
-    return name
+        with part.open("xb") as file:
+
+            def take(data: bytes) -> None:
+                file.write(data)
+                digest.update(data)
+
+            write(take)
+            size = file.tell()
+            file.flush()
+            os.fsync(file.fileno())  # before its name: a name must never lead to half a file
+        name = f"{digest.hexdigest()}.{kind}"
+        os.replace(part, folder / name)  # noqa: PTH105  (the one call that is atomic by contract)
+        sync_folder(folder)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    return name, size
 
 
-def get(folder: Path, name: str, size: int) -> bytes:
-    """The bytes of a file, checked against its name.
+def check(folder: Path, name: str, size: int) -> Iterator[None]:
+    """Read a file, and see that its bytes are those that its name was given for.
 
-    Parameters
-    ----------
-    folder, name : of the file
-    size : that it must have, bytes; another is refused unread
+    Yields
+    ------
+    None after each block that was read, so that the caller may stop in between
 
     Raises
     ------
     DamagedIndex : missing, unreadable, of another size, or with bytes that give another name.
     """
-    path = folder / name
+    path, digest = folder / name, hashlib.sha256()
     try:
         with path.open("rb") as file:
             found = os.fstat(file.fileno()).st_size
-            data = file.read() if found == size else b""
+            if found != size:
+                raise DamagedIndex(f"{path}: {found} bytes, where {size} were written.")
+            while block := file.read(BLOCK_BYTES):
+                digest.update(block)
+                yield
     except OSError as error:
         raise DamagedIndex(f"{path}: cannot be read ({error.strerror or error}).") from error
-    if found != size:
-        raise DamagedIndex(f"{path}: {found} bytes, where {size} were written.")
-    if name_of(data, name.rpartition(".")[2]) != name:
+    if digest.hexdigest() != name.partition(".")[0]:
         raise DamagedIndex(f"{path}: its bytes are not those that were written.")
-    return data
+
+
+def mapped(path: Path) -> mmap.mmap | bytes:
+    """A file in memory that processes share, also after it is unlinked.
+
+    Raises
+    ------
+    DamagedIndex : missing or unreadable.
+    """
+    try:
+        with path.open("rb") as file:
+            if os.fstat(file.fileno()).st_size == 0:
+                return b""
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except OSError as error:
+        raise DamagedIndex(f"{path}: cannot be read ({error.strerror or error}).") from error
 
 
 @contextmanager

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index.coarse import Coarse, read_coarse
-from sceneprint.index.codes import Code, read_code
-from sceneprint.index.files import get
+from sceneprint.geometry.retrieval import distances
+from sceneprint.index.files import check, mapped
+from sceneprint.index.flat import codes_of, map_index
 from sceneprint.index.keys import Keys, Places
-from sceneprint.index.manifests import Manifest, manifests, read_manifest
-from sceneprint.index.segments import Segment, open_segment
+from sceneprint.index.lists import Lists, map_lists
+from sceneprint.index.manifests import Manifest, Recall, manifests, read_manifest
+from sceneprint.types import Bytes
+
+if TYPE_CHECKING:
+    from faiss import IndexScalarQuantizer
 
 _log = logging.getLogger(__name__)
 
@@ -25,72 +31,102 @@ _log = logging.getLogger(__name__)
 class Generation:
     """One published state of the cache: immutable, and usable by any number of threads.
 
-    It stays usable after its files have been removed: they are mapped or in memory.
+    It stays usable after its files have been removed: they are mapped, and processes share them.
 
     Parameters
     ----------
-    number : of the generation in its folder
-    revision : of the map, up to which the generation holds its frames
-    model_id : of the model that signed them
-    code : of the coarse index
-    fitted_on : frames that the map had when the code was fitted
-    anchor : as given to `publish`
-    segments : stored signatures, also of frames that are gone
-    rows : (N,) int64, rising: the row of each frame, counted through all segments
-    keys : (N,) int64 of the frames, none twice
-    coarse : codes of the frames, in the same order
+    manifest : see Manifest
+    keys : (N,) int64 of the frames, rising
+    index : of FAISS, over their signatures in the same order
+    lists : the inverted file of a very large map; None where all of it is compared
+    inodes : of the files by their names: another may have taken a name since
     """
 
-    number: int
-    revision: int
-    model_id: str
-    code: Code
-    fitted_on: int
-    anchor: str
-    segments: tuple[Segment, ...]
-    rows: NDArray[np.int64]
+    manifest: Manifest
     keys: Keys
-    coarse: Coarse
+    index: IndexScalarQuantizer
+    lists: Lists | None
+    inodes: Mapping[str, int]
 
     def __len__(self) -> int:
         return len(self.keys)
 
     @property
+    def number(self) -> int:
+        """Of the generation in its folder."""
+        return self.manifest.number
+
+    @property
+    def revision(self) -> int:
+        """Of the map, up to which the generation holds its frames."""
+        return self.manifest.revision
+
+    @property
+    def model_id(self) -> str:
+        """Of the model that signed them."""
+        return self.manifest.model_id
+
+    @property
+    def anchor(self) -> str:
+        """As given to `publish`."""
+        return self.manifest.anchor
+
+    @property
+    def recall(self) -> Recall:
+        """What a search finds that does not compare all."""
+        return self.manifest.recall
+
+    @property
     def dimension(self) -> int:
         """D, bytes of a signature."""
-        return len(self.code.mean)
+        return self.manifest.dimension
+
+    @cached_property
+    def vectors(self) -> Bytes:
+        """Signatures (N, D) uint8 where they are mapped, read-only, in the order of the keys."""
+        return codes_of(self.index)
 
     @cached_property
     def places(self) -> Places:
-        """Positions of the frames by their keys."""
+        """Rows of the frames by their keys."""
         return Places(self.keys)
 
+    def vectors_of(self, keys: Keys) -> Bytes:
+        """Signatures (r, D) of some frames, a copy.
 
-def newest_number(folder: Path) -> int | None:
-    """Number of the newest manifest in a folder, sound or not: a cheap sign of something new."""
-    return next((number for number, _ in manifests(folder)), None)
+        Raises
+        ------
+        ValueError : there is no such frame in it.
+        """
+        at = self.places.of(keys)
+        if (at < 0).any():
+            raise ValueError(f"no frames {keys[at < 0][:5].tolist()} in this index")
+        return self.vectors[at]
+
+    def distances(self, query: Bytes) -> NDArray[np.int64]:
+        """Exact squared Euclidean distances (N,) of a query (D,) to all, in the order of the keys.
+
+        Raises
+        ------
+        ValueError : see `geometry.retrieval.distances`.
+        """
+        return distances(query, self.vectors, "l2")
 
 
 def newest(
-    folder: Path,
-    model_id: str,
-    dimension: int,
-    *,
-    verify: bool = False,
-    known: Generation | None = None,
+    folder: Path, model_id: str, dimension: int, *, known: Generation | None = None
 ) -> Generation | None:
     """Open the newest sound generation of a folder.
 
-    A damaged one is skipped with a warning in the log, and an older one is used. The checksums
-    of all small files are verified always.
+    Every file is read and verified before it is used. A damaged one is skipped with a warning in
+    the log, and an older one is used.
 
     Parameters
     ----------
     folder : of the map; it need not exist
     model_id, dimension : of the signatures; generations of others are passed over
-    verify : read all signatures and verify them too
-    known : a generation of this folder that is open: what is unchanged is taken from there, so
-        that memory which has been mapped and read stays so
+    known : a generation of this folder that is open: files that it has are not verified again,
+        and where it is the newest it is returned itself
 
     Returns
     -------
@@ -102,7 +138,7 @@ def newest(
             try:
                 manifest = read_manifest(path)
                 if (manifest.model_id, manifest.dimension) == (model_id, dimension):
-                    found = _open(folder, manifest, verify, known)
+                    found = open_generation(folder, manifest, known)
                     break
             except DamagedIndex as error:
                 errors.append(error)
@@ -113,48 +149,45 @@ def newest(
             return found
 
 
-def _open(folder: Path, manifest: Manifest, verify: bool, known: Generation | None) -> Generation:
-    shared = {} if known is None or verify else {each.name: each for each in known.segments}
-    segments = []
-    for name, size in manifest.of_kind("segment"):
-        segment = shared.get(name)
-        if segment is None or _inode(folder / name) != segment.inode:
-            segment = open_segment(folder / name, verify=verify)
-        if segment.size != size or segment.signatures.shape[1] != manifest.dimension:
-            raise DamagedIndex(f"{folder / name}: not the segment that its manifest means.")
-        segments.append(segment)
-    rows = np.frombuffer(get(folder, *manifest.of_kind("rows")[0]), "<i8").astype(np.int64)
-    stored = sum(map(len, segments))
-    if (rows[1:] <= rows[:-1]).any() or (len(rows) and not 0 <= rows[0] <= rows[-1] < stored):
-        raise DamagedIndex(f"{folder}: generation {manifest.number} has rows of no segment.")
-    if known is not None and not verify and known.code.id == manifest.code_id:
-        code = known.code
-    else:
-        code = read_code(get(folder, *manifest.of_kind("code")[0]))
-    if (code.id, len(code.mean)) != (manifest.code_id, manifest.dimension):
-        raise DamagedIndex(f"{folder}: generation {manifest.number} has another code.")
-    index = get(folder, *manifest.of_kind("faiss")[0])
-    return Generation(
-        number=manifest.number,
-        revision=manifest.revision,
-        model_id=manifest.model_id,
-        code=code,
-        fitted_on=manifest.fitted_on,
-        anchor=manifest.anchor,
-        segments=tuple(segments),
-        rows=rows,
-        keys=keys_of(segments)[rows],
-        coarse=read_coarse(index, len(code.matrix), len(rows)),
-    )
+def open_generation(
+    folder: Path, manifest: Manifest, known: Generation | None = None,
+    written: Mapping[str, int] | None = None,
+) -> Generation:  # fmt: skip
+    """Open the files of a generation.
+
+    Parameters
+    ----------
+    folder, manifest : of the generation
+    known : see `newest`
+    written : inodes, by name, of files that were verified as they were written
+
+    Raises
+    ------
+    DamagedIndex : one of them is missing or damaged.
+    """
+    sound = {} if known is None else dict(known.inodes)
+    inodes = {name: _inode(folder / name) for name, _ in manifest.files}
+    if known is not None and known.manifest == manifest and known.inodes == inodes:
+        return known
+    sound.update(written or {})
+    for name, size in manifest.files:
+        if inodes[name] != sound.get(name, -1):
+            for _ in check(folder, name, size):
+                pass
+    names = {name.rpartition(".")[2]: folder / name for name, _ in manifest.files}
+    keys = np.frombuffer(mapped(names["keys"]), "<i8")
+    if (keys[1:] <= keys[:-1]).any():
+        raise DamagedIndex(f"{names['keys']}: its keys are not in order.")
+    n, lists = len(keys), None
+    index = map_index(names["faiss"], n, manifest.dimension)
+    if "lists" in names:
+        lists = map_lists(names["lists"], n, manifest.dimension, manifest.recall.probes)
+    return Generation(manifest, keys, index, lists, inodes)
 
 
-def _inode(path: Path) -> int | None:
+def _inode(path: Path) -> int:
+    """0 where there is no such file."""
     try:
         return path.stat().st_ino
     except OSError:
-        return None
-
-
-def keys_of(segments: list[Segment]) -> Keys:
-    """Keys (rows of all segments,), also of frames that are gone."""
-    return np.concatenate([np.empty(0, np.int64), *(each.keys for each in segments)])
+        return 0

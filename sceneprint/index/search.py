@@ -1,8 +1,7 @@
-"""Search: the nearest frames of a map by exact L1 distance of signatures, Sec. III-C.
+"""Search: the nearest frames of a map by exact distance of signatures, Sec. III-C.
 
-A small map is compared whole. In a large one the compact codes propose a shortlist, and only the
-shortlist and the tail are compared; what the shortlist misses is missed, which is why it is many
-times longer than any ranking.
+The tail is compared whole, and so is a generation; of one with an inverted file only the lists
+that are nearest to the query. What they miss is missed, and measured when it is published.
 """
 
 from __future__ import annotations
@@ -12,14 +11,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.retrieval import distances
+from sceneprint.geometry.retrieval import Metric, distances
+from sceneprint.index.flat import nearest
 from sceneprint.index.generations import Generation
 from sceneprint.index.keys import Keys, Places
 from sceneprint.index.tails import Tail, check_lengths
 from sceneprint.types import Bytes
 
-#: Frames that the codes propose.
-SHORTLIST = 500
+#: Where fewer than one in this many frames may be found, they are compared one by one: FAISS reads
+#: all of them.
+FEW = 8
+#: Longest answer that FAISS gives: of a longer one, ordering costs more than comparing.
+LONGEST = 2048
+
+Found = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,15 +34,17 @@ class Hits:
     Parameters
     ----------
     keys : (r,) int64 of the frames
-    distances : (r,) int64, exact L1, rising; equal ones by key
+    distances : (r,) int64, exact, rising; equal ones by key
     exact : every frame of the map was compared, so that these are the nearest
     compared : frames whose exact distance was computed
+    vectors : (r, D) uint8, their signatures, where whoever searched had them in hand
     """
 
     keys: Keys
     distances: NDArray[np.int64]
     exact: bool
     compared: int
+    vectors: Bytes | None = None
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -49,10 +56,10 @@ def search(
     tail: Tail,
     size: int,
     *,
+    metric: Metric,
     dead: frozenset[int] = frozenset(),
     among: Keys | None = None,
     exact: bool = False,
-    shortlist: int = SHORTLIST,
 ) -> Hits:
     """Find the nearest frames of a map. Any number of threads may search one generation.
 
@@ -62,70 +69,34 @@ def search(
     generation : or None where there is none
     tail : frames newer than that; where a frame is in both, this one counts
     size : of the answer; all frames where there are fewer
+    metric : of the model of the map; a generation is of "l2"
     dead : keys of frames that were deleted since
     among : keys of the frames that may be found, where not all may; others are no matter
     exact : compare every frame, of those that may be found
-    shortlist : frames that the codes propose, raised to `size`; where no more may be found in the
-        generation, they are all compared
 
     Raises
     ------
-    ValueError : no signature of that length, a negative size, or a shortlist below 1.
+    ValueError : no signature of that length, a negative size, or a generation under "l1".
     """
-    if query.ndim != 1 or query.dtype != np.uint8 or size < 0 or shortlist < 1:
-        raise ValueError(f"{size} of {shortlist} for a query {query.dtype} {query.shape}")
+    if query.ndim != 1 or query.dtype != np.uint8 or size < 0:
+        raise ValueError(f"{size} for a query {query.dtype} {query.shape}")
     check_lengths(len(query), generation, tail)
     gone = np.fromiter(dead, np.int64, len(dead))
     alive = np.flatnonzero(_free(tail, gone, among))
-    keys, found, whole = tail.keys[alive], distances(query, tail.signatures, rows=alive), True
+    keys, found, whole = tail.keys[alive], distances(query, tail.signatures, metric, alive), True
+    compared = len(alive)
     if generation is not None and len(generation):
+        if metric != "l2":
+            raise ValueError(f"an index of metric 'l2' searched by {metric!r}")
         free = _free(generation, np.concatenate([gone, tail.keys]), among)
-        positions, whole = _proposed(query, generation, free, max(shortlist, size), exact)
-        keys = np.concatenate([keys, generation.keys[positions]])
-        found = np.concatenate([found, _compare(query, generation, positions)])
+        count = int(free.sum())
+        own, whole = _candidates(query, generation, free, count, size, exact)
+        compared += count if own is None else len(own)
+        rows, distant = _compared(query, generation, free, count, size, own)
+        keys = np.concatenate([keys, generation.keys[rows]])
+        found = np.concatenate([found, distant])
     first = _nearest(keys, found, size)
-    return Hits(keys[first], found[first], whole, len(keys))
-
-
-def is_compared(
-    query: Bytes,
-    generation: Generation | None,
-    tail: Tail,
-    size: int,
-    key: int,
-    *,
-    dead: frozenset[int] = frozenset(),
-    among: Keys | None = None,
-    exact: bool = False,
-    shortlist: int = SHORTLIST,
-) -> bool:
-    """Whether `search` computes the exact distance of one frame, or its shortlist misses it.
-
-    Parameters
-    ----------
-    key : of the frame
-    query, generation, tail, size, dead, among, exact, shortlist : as of `search`
-    """
-    gone, wanted = np.fromiter(dead, np.int64, len(dead)), np.array([key], np.int64)
-    at = _known(tail.places, wanted)
-    if len(at):
-        return bool(_free(tail, gone, among)[at[0]])
-    if generation is None or not len(at := _known(generation.places, wanted)):
-        return False
-    free = _free(generation, np.concatenate([gone, tail.keys]), among)
-    positions, _ = _proposed(query, generation, free, max(shortlist, size), exact)
-    return bool(free[at[0]]) and at[0] in positions
-
-
-def _proposed(
-    query: Bytes, generation: Generation, free: NDArray[np.bool_], most: int, exact: bool
-) -> tuple[NDArray[np.int64], bool]:
-    """Positions in a generation that are compared, rising, and whether these are all."""
-    positions = np.flatnonzero(free)
-    if exact or len(positions) <= most:
-        return positions, True
-    code = generation.code.encode(query[None])[0]
-    return np.sort(generation.coarse.nearest(code, most, np.flatnonzero(~free))), False
+    return Hits(keys[first], found[first], whole, compared)
 
 
 def _free(part: Generation | Tail, gone: Keys, among: Keys | None) -> NDArray[np.bool_]:
@@ -133,7 +104,8 @@ def _free(part: Generation | Tail, gone: Keys, among: Keys | None) -> NDArray[np
     free = np.full(len(part), among is None)
     if among is not None:
         free[_known(part.places, among)] = True
-    free[_known(part.places, gone)] = False
+    if len(gone):
+        free[_known(part.places, gone)] = False
     return free
 
 
@@ -142,19 +114,33 @@ def _known(places: Places, keys: Keys) -> NDArray[np.int64]:
     return at[at >= 0]
 
 
-def _compare(
-    query: Bytes, generation: Generation, positions: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Distances (r,) to frames at rising positions, where they are mapped: no copies."""
-    rows = generation.rows[positions]
-    starts = np.cumsum([0, *map(len, generation.segments)])
-    edges = np.searchsorted(rows, starts)
-    return np.concatenate(
-        [
-            distances(query, segment.signatures, rows=rows[edges[i] : edges[i + 1]] - starts[i])
-            for i, segment in enumerate(generation.segments)
-        ]
-    )
+def _candidates(
+    query: Bytes, generation: Generation, free: NDArray[np.bool_], count: int, size: int,
+    exact: bool,
+) -> tuple[NDArray[np.int64] | None, bool]:  # fmt: skip
+    """Rows that are compared one by one, None for all that are free; and whether these are all."""
+    if count < len(generation) // FEW:
+        return np.flatnonzero(free), True
+    if generation.lists is None or exact:
+        return None, True
+    all_free = count == len(generation)
+    rows = generation.lists.candidates(query, min(size, count), None if all_free else free)
+    return rows, len(rows) == count
+
+
+def _compared(
+    query: Bytes, generation: Generation, free: NDArray[np.bool_], count: int, size: int,
+    rows: NDArray[np.int64] | None,
+) -> Found:  # fmt: skip
+    """Rows among which the nearest are, and their distances."""
+    if rows is None and size <= LONGEST:
+        all_free = count == len(generation)
+        found = nearest(generation.index, query, min(size, count), None if all_free else free)
+        if found is not None:
+            return found
+    if rows is None:
+        rows = np.flatnonzero(free)
+    return rows, distances(query, generation.vectors, "l2", rows)
 
 
 def _nearest(keys: Keys, found: NDArray[np.int64], size: int) -> NDArray[np.intp]:

@@ -8,8 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from sceneprint.index.generations import Generation
-from sceneprint.index.keys import Keys, Places
-from sceneprint.index.segments import check_block, gather
+from sceneprint.index.keys import Keys, Places, check_block
 from sceneprint.types import Bytes
 
 
@@ -71,13 +70,11 @@ def signatures_of(keys: Keys, generation: Generation | None, tail: Tail) -> Byte
     in_tail = tail.places.of(keys)
     result = np.empty((len(keys), tail.signatures.shape[1]), np.uint8)
     result[in_tail >= 0] = tail.signatures[in_tail[in_tail >= 0]]
-    others = np.flatnonzero(in_tail < 0)
-    if len(others) == 0:
-        return result
-    at = np.full(len(others), -1) if generation is None else generation.places.of(keys[others])
-    if generation is None or (at < 0).any():
-        raise ValueError(f"no frames {keys[others][at < 0][:5].tolist()} in this index")
-    result[others] = gather(generation.segments, generation.rows[at])
+    others = keys[in_tail < 0]
+    if len(others) and generation is None:
+        raise ValueError(f"no frames {others[:5].tolist()} in this index")
+    if len(others) and generation is not None:
+        result[in_tail < 0] = generation.vectors_of(others)
     return result
 
 

@@ -17,11 +17,9 @@ from sqlalchemy import select
 
 from sceneprint.engine.readers import index_folder, is_index_folder, trusted
 from sceneprint.errors import DamagedIndex, StoreError
-from sceneprint.index import Generation, newest, signatures_of
-from sceneprint.index.files import building, get, is_name, is_ours
+from sceneprint.index import Generation, newest
+from sceneprint.index.files import building, check, is_ours
 from sceneprint.index.manifests import Manifest, manifests, read_manifest
-from sceneprint.index.segments import open_segment
-from sceneprint.index.tails import Tail
 from sceneprint.maintenance.files import WRITING_S, changed_at
 from sceneprint.maintenance.findings import Finding, Folder
 from sceneprint.schemas import FrameState
@@ -92,10 +90,9 @@ def _wrong_files(path: Path, seen: set[str], *, quick: bool) -> list[tuple[Path,
 
 
 def _read(place: Path, name: str, size: int, *, verify: bool) -> None:
-    if not is_name(name, "segment"):
-        get(place, name, size)
-    elif open_segment(place / name, verify=verify).size != size:
-        raise DamagedIndex(f"{place / name}: of another size than was written.")
+    for _ in check(place, name, size):
+        if not verify:  # its size is what was written
+            return
 
 
 def _remove_file(file: Path) -> str:
@@ -165,7 +162,7 @@ def _differing(folder: Folder, row: MapRow, place: Path) -> Iterator[Finding]:
 
 def _differences(folder: Folder, row: MapRow, generation: Generation) -> list[str]:
     """Ids of frames whose signature is another in the index, or is not there."""
-    empty, wrong, after = Tail.empty(generation.dimension), list[str](), 0
+    wrong, after = list[str](), 0
     here = (
         (frames.c.map_number == row.number)
         & (frames.c.state == FrameState.INDEXED)
@@ -181,7 +178,7 @@ def _differences(folder: Folder, row: MapRow, generation: Generation) -> list[st
         after = block[-1].number
         keys = np.array([each.number for each in block], np.int64)
         held = generation.places.of(keys) >= 0
-        rows = signatures_of(keys[held], generation, empty)
+        rows = generation.vectors_of(keys[held])
         indexed = dict(zip(keys[held].tolist(), rows, strict=True))
         for number, frame_id in block:
             # one that is damaged there is a finding of its own

@@ -16,6 +16,7 @@ from sceneprint.maintenance.columns import Form, Row, Sum, rows_of_file
 from sceneprint.maintenance.exporting import rows_of_server
 from sceneprint.store.postgres import allow
 from sceneprint.store.tables import metadata, secrets
+from sceneprint.store.vectors import drop_tables
 
 #: What a database of which nobody has made use holds: its secret, and what a service counts.
 _OF_ITSELF = ("secrets", "samples")
@@ -35,6 +36,7 @@ def copy_into(connection: Connection, file: sqlite3.Connection) -> None:
     """
     allow(connection, 0)
     check_empty(connection)
+    drop_tables(connection)  # of vectors, which a copy of signatures does not make
     for name in _OF_ITSELF:
         connection.exec_driver_sql(f"DELETE FROM {name}")
     # foreign keys ask for the order

@@ -16,16 +16,8 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 
 from sceneprint.engine.readers import index_folder, trusted
-from sceneprint.index import (
-    SHORTLIST,
-    Generation,
-    newest,
-    newest_number,
-    scrub,
-    search,
-    signatures_of,
-)
-from sceneprint.index.codes import draw
+from sceneprint.index import Generation, newest, newest_number, scrub, signatures_of
+from sceneprint.index.keys import draw
 from sceneprint.store.signatures import changes_since
 from sceneprint.store.tables import frames, signatures
 
@@ -54,12 +46,11 @@ class IndexStats:
     lag_frames : that no index holds: they are compared one by one with every query
     lag_s : seconds since the first of them was indexed; 0 where there are none
     deleted : frames that are in the index and not in the map any more
-    fitted_on : frames that the map had when the code was fitted
     upload_bytes, signature_bytes, artifact_bytes, index_bytes : per frame
     sample : frames that were looked up
-    shortlist : frames that the codes propose
-    recall : share of the 10 nearest by the exact scan that the shortlist finds; None where a map
-        is too small for a shortlist to leave anything out, or has no index
+    probes : lists of the inverted file that a query compares; 0 where it compares every frame
+    recall : share of the 10 nearest by the exact scan that a query finds; None where it compares
+        every frame
     spread : distance of the 100th neighbour over that of the 10th, median: near 1 is hard
     """
 
@@ -70,13 +61,12 @@ class IndexStats:
     lag_frames: int
     lag_s: float
     deleted: int
-    fitted_on: int
     upload_bytes: int
     signature_bytes: int
     artifact_bytes: int
     index_bytes: int
     sample: int
-    shortlist: int
+    probes: int
     recall: float | None
     spread: float | None
 
@@ -120,13 +110,12 @@ def describe_index(
         lag_frames=len(view.tail),
         lag_s=lag_s,
         deleted=len(view.dead),
-        fitted_on=0 if generation is None else generation.fitted_on,
         upload_bytes=sizes[0],
         signature_bytes=model.signature_bytes,
         artifact_bytes=sizes[1],
         index_bytes=round(on_disk / max(len(generation or ()), 1)),
         sample=looked_up,
-        shortlist=SHORTLIST,
+        probes=0 if generation is None else generation.recall.probes,
         recall=recall,
         spread=spread,
     )
@@ -164,15 +153,13 @@ def verify_index(engine: Engine, map_name: str) -> list[str]:
 
 def _differing(connection: Connection, row: MapRow, found: Generation, folder: Path) -> list[str]:
     """Signatures of the index that are not those of the database."""
-    from sceneprint.index import Tail
-
-    none, wrong = Tail.empty(found.dimension), []
+    wrong = []
     for block in changes_since(connection, row, 0):
         own = [one for one in block if one.vector is not None and one.revision <= found.revision]
         held = found.places.of(np.array([one.number for one in own], np.int64)) >= 0
         own = [one for one, is_held in zip(own, held.tolist(), strict=True) if is_held]
         if own:
-            stored = signatures_of(np.array([one.number for one in own]), found, none)
+            stored = found.vectors_of(np.array([one.number for one in own]))
             wrong += [
                 f"{folder}: the signature of frame {one.frame_id} is not that of the database"
                 for one, vector in zip(own, stored, strict=True)
@@ -195,8 +182,8 @@ def _recall(
         progress(done, len(chosen))
         (query,) = signatures_of(np.array([key]), view.generation, view.tail)
         dead = view.dead | {key}
-        exact = search(query, view.generation, view.tail, FAR, dead=dead, exact=True)
-        listed = search(query, view.generation, view.tail, NEAR, dead=dead)
+        exact = view.search(query, FAR, dead=dead, exact=True)
+        listed = view.search(query, NEAR, dead=dead)
         short |= not listed.exact
         # an equal distance is as good: which of two equal frames is meant is nobody's concern
         limit = exact.distances[:NEAR].max(initial=-1)

@@ -106,7 +106,7 @@ def _fits(model: Model | None, vector: bytes, counts: list[str]) -> bool:
         told = [json.loads(each) for each in counts]
     except ValueError:
         return False
-    levels = model.parameters.hierarchy.n_levels
+    levels = len(model.levels)
     return len(vector) == model.signature_bytes and all(
         isinstance(one, list) and len(one) == levels and all(isinstance(n, int) for n in one)
         for one in told

@@ -16,9 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidRequest, NotFound
-from sceneprint.geometry.retrieval import cross_distances, pairwise_distances
+from sceneprint.geometry.retrieval import (
+    cross_distances,
+    distance_share,
+    distances,
+    pairwise_distances,
+    share_distance,
+)
 from sceneprint.geometry.summary import novel, summarise
-from sceneprint.index import search, signatures_of
+from sceneprint.index import signatures_of
 from sceneprint.index.keys import Keys
 from sceneprint.schemas import FrameState
 from sceneprint.store.thinning import Weight, weights_of
@@ -48,7 +54,7 @@ class Loss:
     ----------
     frame_id : of the frame
     like : the frame that stays in its place
-    share : their distance, as a share of d0, that of unrelated frames
+    share : their distance, as a share of that of unrelated frames
     """
 
     frame_id: str
@@ -93,7 +99,7 @@ def propose(
     engine : see Engine
     map_name : of the map
     keep : how many frames shall stay, or
-    novelty : the share of d0 within which a frame repeats another
+    novelty : the share of the distance of unrelated frames within which a frame repeats another
     session : only frames of this session are looked at, as if they were all there is
     seed : of the frames that give `keep` its scale
     progress : told of the steps
@@ -117,12 +123,12 @@ def propose(
         nearest, to_nearest = _most_telling(view, keys, keep, seed, tell)
     else:
         assert novelty is not None
-        nearest, to_nearest = _first_of_each(view, keys, novelty * d0, tell)
+        limit = share_distance(novelty, d0, model.metric)
+        nearest, to_nearest = _first_of_each(view, keys, limit, tell)
     lost = np.flatnonzero(nearest != np.arange(len(keys)))
     names = [weights[int(key)] for key in keys]
-    losses = [
-        Loss(names[i].frame_id, names[nearest[i]].frame_id, float(to_nearest[i]) / d0) for i in lost
-    ]
+    shares = distance_share(to_nearest, d0, model.metric)
+    losses = [Loss(names[i].frame_id, names[nearest[i]].frame_id, float(shares[i])) for i in lost]
     freed = sum(_bytes(engine, names[i]) + model.signature_bytes for i in lost)
     return Proposal(row.name, model.label, len(keys), tuple(losses), freed)
 
@@ -162,7 +168,7 @@ def _most_telling(
         )
     rng = np.random.default_rng(seed)
     drawn = np.sort(rng.choice(n, min(SAMPLE, n), replace=False))
-    among = pairwise_distances(_rows(view, keys[drawn]))
+    among = pairwise_distances(_rows(view, keys[drawn]), view.metric)
     sigma = float(np.median(among[np.triu_indices(len(drawn), 1)]))
     asked = 0
 
@@ -188,12 +194,12 @@ def _first_of_each(
         rows = _rows(view, keys[new])
         for low in range(0, len(kept), KEPT_BLOCK):
             some = np.array(kept[low : low + KEPT_BLOCK])
-            found = cross_distances(rows, _rows(view, keys[some]))
+            found = cross_distances(rows, _rows(view, keys[some]), view.metric)
             best = np.argmin(found, axis=1)
             least = found[np.arange(len(new)), best]
             nearer = least < to_nearest[new]
             nearest[new[nearer]], to_nearest[new[nearer]] = some[best[nearer]], least[nearer]
-        among = pairwise_distances(rows)
+        among = pairwise_distances(rows, view.metric)
         stays, within = novel(to_nearest[new], among, limit)
         inside = np.flatnonzero(within >= 0)
         nearest[new[inside]] = new[within[inside]]
@@ -206,11 +212,12 @@ def _first_of_each(
 
 def _distances_to_all(view: View, keys: Keys, index: int) -> Ints64:
     """Distances (n,) of one frame to all, in the order of `keys`."""
-    query = _rows(view, keys[index : index + 1])[0]
-    hits = search(query, view.generation, view.tail, view.size, dead=view.dead, exact=True)
-    order = np.argsort(hits.keys)
-    at = order[np.searchsorted(hits.keys, keys, sorter=order)]
-    found: Ints64 = hits.distances[at]
+    query, in_tail = _rows(view, keys[index : index + 1])[0], view.tail.places.of(keys)
+    rows, found = in_tail[in_tail >= 0], np.empty(len(keys), np.int64)
+    found[in_tail >= 0] = distances(query, view.tail.signatures, view.metric, rows)
+    if view.generation is not None:
+        rows = view.generation.places.of(keys[in_tail < 0])
+        found[in_tail < 0] = distances(query, view.generation.vectors, view.metric, rows)
     return found
 
 

@@ -38,6 +38,24 @@ BOUNDS = {
 }
 
 
+#: Most bytes of a whitened signature.
+MAXIMUM_DIMENSION = 1024
+
+
+def check_whitening(levels: tuple[object, ...], n_levels: int, dimension: int) -> None:
+    """See that a whitening is of levels that there are, and short.
+
+    Raises
+    ------
+    ValueError : it is not.
+    """
+    known = [level for level in range(n_levels) if level in levels]
+    if not known or list(levels) != known or any(isinstance(level, bool) for level in levels):
+        raise ValueError(f"a whitening of levels {list(levels)} of {n_levels}")
+    if not 1 <= dimension <= MAXIMUM_DIMENSION:
+        raise ValueError(f"{dimension} bytes of a signature are not from 1 to {MAXIMUM_DIMENSION}")
+
+
 def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> None:
     """See that no frame can take unbounded memory or time with these parameters.
 

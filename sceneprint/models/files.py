@@ -16,12 +16,15 @@ from sceneprint.geometry.mixture import Mixture
 from sceneprint.geometry.projection import DIMENSION, Projection
 from sceneprint.geometry.properties import DIMENSION as PROPERTY_DIMENSION
 from sceneprint.geometry.surroundings import Compression
-from sceneprint.models.bounds import check_bounds
-from sceneprint.models.model import SCHEMA_VERSION, Model, parameters_of
+from sceneprint.geometry.whitening import Whitening
+from sceneprint.models.bounds import check_bounds, check_whitening
+from sceneprint.models.model import PSI_SCHEMA_VERSION, SCHEMA_VERSION, Model, parameters_of
 from sceneprint.writing import write_whole
 
-#: Names of the models that ship with the package.
-PRESETS = ("paper", "compact", "lidar")
+#: Names of the models that ship with the package, the default first.
+PRESETS = ("depth", "lidar", "paper")
+#: Presets of earlier versions, and what takes their place.
+FORMER_PRESETS = {"compact": "depth"}
 #: A model of the most components fits; a larger file is refused unread.
 MAXIMUM_BYTES = 16 << 20
 
@@ -67,6 +70,11 @@ def read_model(model: str | Path) -> Model:
         source = resources.files("sceneprint") / "presets" / f"{model}.safetensors"
         return parse_model(source.read_bytes(), f"preset {model}")
     path = Path(model)
+    if str(model) in FORMER_PRESETS and not path.exists():
+        raise UnreadableModel(
+            f"There is no preset {model!r} any more. Use {FORMER_PRESETS[str(model)]!r} instead. "
+            "Maps made with it are still served, and `sceneprint reencode` moves them."
+        )
     try:
         if path.stat().st_size > MAXIMUM_BYTES:
             raise UnreadableModel(
@@ -106,10 +114,11 @@ def parse_model(data: bytes, name: str) -> Model:
             f"{name}: not a model file ({type(error).__name__}: {error}). "
             "Give the path of a file that `sceneprint train` wrote."
         ) from error
-    if header.get("schema_version") != SCHEMA_VERSION:
+    schema = SCHEMA_VERSION if "whitening" in header else PSI_SCHEMA_VERSION
+    if header.get("schema_version") != schema:
         raise UnreadableModel(
-            f"{name}: schema {header.get('schema_version')} is not {SCHEMA_VERSION}, the one "
-            "this version of sceneprint reads. Train it again, or use the version that wrote it."
+            f"{name}: schema {header.get('schema_version')} is not {schema}, the one this version "
+            "of sceneprint reads. Train it again, or use the version that wrote it."
         )
     try:
         model, given = _assemble(header, tensors), str(header["id"])
@@ -166,6 +175,31 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
         ),
         compression=Compression(tensors["compression.mean"], tensors["compression.matrix"]),
         quantiser_step=step,
-        unrelated_distance=d0,
+        psi_unrelated_distance=d0,
         provenance=dict(header["provenance"]),
+        whitening=_whitening(header, tensors, 25 * g, parameters.hierarchy.n_levels),
     )
+
+
+def _whitening(
+    header: dict[str, Any], tensors: dict[str, np.ndarray], level_length: int, n_levels: int
+) -> Whitening | None:
+    """The whitening of a file; None of a model that has none."""
+    if "whitening" not in header:
+        return None
+    told, basis = header["whitening"], tensors["whitening.basis"]
+    levels, d0 = tuple(told["levels"]), float(told["unrelated_distance"])
+    check_whitening(levels, n_levels, len(basis))
+    shapes = {
+        "basis": ("int8", (len(basis), level_length * len(levels))),
+        "scales": ("float64", (len(basis),)),
+        "offsets": ("float64", (len(basis),)),
+    }
+    for name, (kind, shape) in shapes.items():
+        tensor = tensors[f"whitening.{name}"]
+        if tensor.shape != shape or tensor.dtype != kind or not np.isfinite(tensor).all():
+            raise ValueError(f"whitening.{name} should be finite {kind} {shape}")
+    if not (math.isfinite(d0) and d0 > 0):
+        raise ValueError("the unrelated distance of the whitening should be positive")
+    scales, offsets = tensors["whitening.scales"], tensors["whitening.offsets"]
+    return Whitening(levels, basis, scales, offsets, d0)

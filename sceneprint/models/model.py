@@ -21,14 +21,17 @@ from sceneprint.geometry.mixture import Mixture
 from sceneprint.geometry.normals import NormalParameters
 from sceneprint.geometry.projection import Projection
 from sceneprint.geometry.properties import PropertyParameters
+from sceneprint.geometry.retrieval import Metric
 from sceneprint.geometry.segmentation import SegmentationParameters
 from sceneprint.geometry.surroundings import Compression, SurroundingsParameters
 from sceneprint.geometry.validation import ValidationParameters
 from sceneprint.geometry.weights import WeightParameters
+from sceneprint.geometry.whitening import Ints8, Whitening
 from sceneprint.types import Floats32
 
-#: Of the file and of what the numbers in it mean. Raise it when code changes signatures.
-SCHEMA_VERSION = 2
+#: Of the file and of what the numbers in it mean. Raise it when code changes signatures. Models
+#: without a whitening keep the schema, and so the ids, that version 0.1 gave them.
+SCHEMA_VERSION, PSI_SCHEMA_VERSION = 3, 2
 
 #: Groups of which a file, and an id, hold only the numbers that differ from their defaults: they
 #: came after the first models, which know nothing of them. So their defaults never change.
@@ -58,17 +61,21 @@ class ModelParameters:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Projection, mixture, quantiser, compression, and the parameters they were made with.
+    """Projection, mixture, quantiser, compression, whitening, and the parameters of each stage.
+
+    Signatures are whitened, a few hundred bytes compared by L2; or, of a model without a
+    whitening, psi itself, compared by L1 as in Sec. III-C.
 
     Parameters
     ----------
     name : what people call it; not part of its identity
     parameters : see ModelParameters
     projection, mixture, compression : see there
-    quantiser_step : one unit of a stored byte
-    unrelated_distance : d0, the median L1 distance of stored signatures of unrelated training
-        frames, in units of a byte; similarity = 1 - d / d0
+    quantiser_step : one unit of a byte of psi
+    psi_unrelated_distance : the median L1 distance of psi of unrelated training frames, in units
+        of a byte
     provenance : what the model was trained on and with; not part of its identity
+    whitening : see Whitening; None where psi itself is stored
     """
 
     name: str
@@ -77,11 +84,31 @@ class Model:
     mixture: Mixture
     compression: Compression
     quantiser_step: float
-    unrelated_distance: float
+    psi_unrelated_distance: float
     provenance: Mapping[str, Any]
+    whitening: Whitening | None = None
 
     @property
-    def tensors(self) -> dict[str, NDArray[np.float64] | Floats32]:
+    def metric(self) -> Metric:
+        """How stored signatures are compared."""
+        return "l1" if self.whitening is None else "l2"
+
+    @property
+    def unrelated_distance(self) -> float:
+        """d0: the median distance of unrelated training frames; similarity = 1 - d / d0."""
+        if self.whitening is None:
+            return self.psi_unrelated_distance
+        return self.whitening.unrelated_distance
+
+    @property
+    def levels(self) -> tuple[int, ...]:
+        """Levels of the hierarchy that signatures are made of, rising; 0 is the finest."""
+        if self.whitening is None:
+            return tuple(range(self.parameters.hierarchy.n_levels))
+        return self.whitening.levels
+
+    @property
+    def tensors(self) -> dict[str, NDArray[np.float64] | Floats32 | Ints8]:
         """The learnt arrays by the names they have in the file."""
         arrays = {
             "projection.mean": self.projection.mean,
@@ -94,21 +121,34 @@ class Model:
             "compression.mean": self.compression.mean,
             "compression.matrix": self.compression.matrix,
         }
+        bytes_: dict[str, Ints8] = {}
+        if self.whitening is not None:
+            bytes_["whitening.basis"] = self.whitening.basis
+            arrays["whitening.scales"] = self.whitening.scales
+            arrays["whitening.offsets"] = self.whitening.offsets
         # safetensors writes memory as it lies: a Fortran-ordered matrix would come back garbled
         return {
             **{name: np.ascontiguousarray(array, "<f8") for name, array in arrays.items()},
             **{name: np.ascontiguousarray(array, "<f4") for name, array in small.items()},
+            **{name: np.ascontiguousarray(array, "i1") for name, array in bytes_.items()},
         }
 
     @property
     def header(self) -> dict[str, Any]:
         """Everything but the arrays that changes a signature, an artifact or their meaning."""
-        return {
-            "schema_version": SCHEMA_VERSION,
+        told = {
+            "schema_version": PSI_SCHEMA_VERSION,
             "parameters": to_mapping(self.parameters),
             "quantiser_step": self.quantiser_step,
-            "unrelated_distance": self.unrelated_distance,
+            "unrelated_distance": self.psi_unrelated_distance,
         }
+        if self.whitening is None:
+            return told
+        own = {
+            "levels": list(self.whitening.levels),
+            "unrelated_distance": self.whitening.unrelated_distance,
+        }
+        return told | {"schema_version": SCHEMA_VERSION, "whitening": own}
 
     @cached_property
     def id(self) -> str:
@@ -131,8 +171,15 @@ class Model:
 
     @property
     def signature_bytes(self) -> int:
-        """Bytes of a stored signature: 25 G H."""
-        return self.level_length * self.parameters.hierarchy.n_levels
+        """Bytes of a stored signature: d of the whitening, or 25 G H of psi."""
+        if self.whitening is None:
+            return self.level_length * len(self.levels)
+        return self.whitening.dimension
+
+    @property
+    def of_psi(self) -> Model:
+        """The same model without its whitening: signatures are psi of all levels."""
+        return replace(self, whitening=None)
 
 
 def to_mapping(parameters: ModelParameters) -> dict[str, Any]:

@@ -49,7 +49,8 @@ class ExplainedFrame(Told):
     )
     of: int | None = Field(description="How many frames pass the filter.")
     shortlisted: bool | None = Field(
-        description="The index proposed it, or all were compared: what is not is never ranked."
+        description="False where an approximate index missed a frame that is near enough to be "
+        "ranked."
     )
     ranked: bool | None = Field(description="It is in the ranking R.")
     selected: bool | None = Field(

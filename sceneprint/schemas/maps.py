@@ -45,10 +45,10 @@ class NewMap(Given):
     )
     title: Note | None = Field(default=None, description="For people.")
     model: Preset = Field(
-        default="paper",
+        default="depth",
         description="The model that signs its frames, until `sceneprint reencode` changes it: "
-        "`paper` or, a tenth as large, `compact` for rooms; `lidar` for the "
-        "ranges of a LiDAR.",
+        "`depth` for depth cameras indoors, `lidar` for the ranges of a LiDAR, `paper` for "
+        "research: it stores the long signatures of the paper and compares them all.",
     )
     quota_frames: Quota | None = Field(
         default=None,

@@ -6,7 +6,7 @@ from sceneprint.errors import InvalidRequest
 
 #: Where `if_novel` is just true: consecutive frames of a slow Kinect lie nearer than this, mostly
 #: by the noise of their depth, and what is left of a recording answers as well (docs/).
-NOVEL = 0.3
+NOVEL = 0.25
 
 
 def novelty_of(given: bool | float | str | None) -> float | None:

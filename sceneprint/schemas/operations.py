@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
+from sceneprint.geometry.retrieval import Metric
 from sceneprint.schemas.base import Given, Label, Told
 
 
@@ -31,20 +32,25 @@ class Sizes(Told):
 
 
 class IndexRecall(Told):
-    """What the shortlist of an index finds, by which a large map is searched without `exact`."""
+    """What a query without `exact` finds by an index, measured when the index was published."""
 
     share: float = Field(
-        description="Of the `near` nearest frames by the exact scan that the shortlist finds too, "
-        "measured before filters when the generation was published, or one before it that had "
-        "about as many frames."
+        description="Share of the `near` nearest frames that such a query finds. 1 where it "
+        "compares every frame."
     )
-    near: int
+    near: int = Field(description="How many of the nearest frames were looked for.")
     sample: int = Field(
-        description="Frames of the map that were looked up for this, each without itself; 0 where "
-        "the shortlist leaves nothing out, so that every frame is compared."
+        description="Frames of the map that were looked up to measure it, each without itself; 0 "
+        "where a query compares every frame, so that there is nothing to measure."
     )
-    shortlist: int = Field(description="Frames that the codes propose.")
-    frames: int = Field(description="Frames that the index had when this was measured.")
+    probes: int = Field(
+        description="Inverted lists that a query compares, of a very large map; 0 where it "
+        "compares every frame."
+    )
+    frames: int = Field(
+        description="Frames that the index had when this was measured: it is measured anew when "
+        "they have changed by a tenth."
+    )
 
 
 class IndexState(Told):
@@ -52,7 +58,8 @@ class IndexState(Told):
 
     map: str
     generation: int | None = Field(
-        description="Null: the map has none; it is searched without, which is right for small ones."
+        description="Null: the map has none, and a query compares every frame. Small maps need "
+        "none, and models that store psi have none."
     )
     tail: int = Field(
         description="Indexed frames that the generation lacks. Above the setting `tail_frames`, "
@@ -60,8 +67,7 @@ class IndexState(Told):
     )
     recall: IndexRecall | None = Field(
         default=None,
-        description="Null where the map has no index, so that every frame is compared, or where an "
-        "earlier version published it and measured nothing.",
+        description="Null where the map has no index: a query compares every frame.",
     )
 
 
@@ -167,8 +173,13 @@ class ModelInfo(Told):
     name: str
     preset: bool = Field(description="Whether it ships with this version.")
     components: int = Field(description="G, of the mixture.")
-    levels: int = Field(description="H, of the hierarchy of patches.")
-    signature_bytes: int = Field(description="25 G H.")
+    levels: int = Field(description="Of the hierarchy of patches, that signatures are made of.")
+    signature_bytes: int = Field(
+        description="Of a stored signature: its length d, or 25 G H where psi itself is stored."
+    )
+    metric: Metric = Field(
+        description="Of distances: `l2`, squared, or `l1` where psi itself is stored."
+    )
     unrelated_distance: float = Field(
         description="d0, median distance of unrelated frames: similarity = 1 - distance / d0."
     )
@@ -183,9 +194,9 @@ class NewModel(Given):
     """Which model a map is to be signed with from now on."""
 
     model: Label = Field(
-        description="`paper`, `compact`, `lidar`, or the id or label of a model that GET "
+        description="`depth`, `lidar`, `paper`, or the id or label of a model that GET "
         "/v1/models lists.",
-        examples=["compact"],
+        examples=["depth"],
     )
 
 

@@ -65,7 +65,7 @@ class Diversity(Given):
 class ValidationOptions(Given):
     """What a match must stand to be accepted.
 
-    What is left out is as the map's model has it; the defaults told are those of `paper`.
+    What is left out is as the map's model has it; the defaults told are those of `depth`.
     """
 
     mode: Mode = Field(

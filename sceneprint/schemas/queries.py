@@ -37,7 +37,9 @@ class Query(Given):
         description="R, DR, VR or VDR of the paper: always from `retrieve`, in this order.",
     )
     exact: bool = Field(
-        default=False, description="Compare every frame of the map that passes the filter."
+        default=False,
+        description="Compare every frame of the map that passes the filter. Most queries do so "
+        "anyway: only in a very large map, or where PostgreSQL searches, are some left out.",
     )
     filter: Filter | None = Field(
         default=None,
@@ -129,7 +131,7 @@ class Counts(Told):
 
     map: int = Field(description="Frames of the map that can be found.")
     passed: int = Field(description="Of them those that pass the filter; all without one.")
-    compared: int = Field(description="Of these compared by their whole signature.")
+    compared: int = Field(description="Of these those whose distance was computed.")
     ranked: int
     selected: int
     validated: int
@@ -139,7 +141,9 @@ class Counts(Told):
 class OfMap(Told):
     """What one of several maps had of a query."""
 
-    index_generation: int = Field(description="0 where it is scanned without an index.")
+    index_generation: int = Field(
+        description="0 where it was searched without an index of this node."
+    )
     counts: Counts
 
 
@@ -160,7 +164,8 @@ class Answer(Told):
     seed: int
     model: str
     index_generation: int = Field(
-        description="0 where the map is scanned without an index; of several maps the least."
+        description="0 where the map was searched without an index of this node: a small one, "
+        "one that PostgreSQL searched, or one whose model stores psi. Of several maps the least."
     )
     exact: bool = Field(description="Every frame that passes the filter was compared.")
     counts: Counts

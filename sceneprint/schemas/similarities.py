@@ -35,7 +35,7 @@ class Comparison(Given):
     )
     model: Preset | None = Field(
         default=None,
-        description="That signs two uploads; default: `paper`; of a LiDAR, `lidar`. A stored frame "
+        description="That signs two uploads; default: `depth`; of a LiDAR, `lidar`. A stored frame "
         "brings its own.",
     )
 
@@ -43,7 +43,9 @@ class Comparison(Given):
 class Similarity(Told):
     """How alike two frames are."""
 
-    distance: int = Field(description="L1 distance of their signatures.")
+    distance: int = Field(
+        description="Of their signatures: squared L2, or L1 where psi itself is stored."
+    )
     similarity: float = Field(description="1 - distance / that of unrelated frames, 0 to 1.")
     model: str
     a: FrameName | None = Field(description="The stored frame; null for an upload.")

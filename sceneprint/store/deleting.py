@@ -25,7 +25,6 @@ from sqlalchemy import (
 
 from sceneprint.schemas import FrameState, JobState
 from sceneprint.store.clock import now
-from sceneprint.store.codes import forget_codes
 from sceneprint.store.quotas import ROOMLESS, count_on
 from sceneprint.store.records import MapRow
 from sceneprint.store.tables import doomed, events, frame_tags, frames, jobs, maps, signatures
@@ -80,7 +79,6 @@ def delete_frames(
         ),
         [{"of": n, "at": last - len(living) + i} for i, n in enumerate(living, 1)],
     )  # fmt: skip
-    forget_codes(connection, living)  # after the rows are held: nobody puts one there any more
     at, data = time.time(), {} if reason is None else {"reason": reason}
     connection.execute(
         insert(events),

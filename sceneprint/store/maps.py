@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from sqlalchemy import Connection, delete, func, insert, select, update
 
 from sceneprint.errors import UnknownMap
-from sceneprint.store.codes import forget_map
 from sceneprint.store.deleting import doom_found
 from sceneprint.store.events import tell
 from sceneprint.store.former import inherited, remember
@@ -137,7 +136,6 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     connection.execute(delete(jobs).where(jobs.c.map_number == row.number))
     connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(own)))
     connection.execute(delete(frames).where(frames.c.map_number == row.number))
-    forget_map(connection, row.number)
     connection.execute(delete(maps).where(maps.c.number == row.number))
     tell(connection, "map.deleted", row.name)
     remember(connection, row)

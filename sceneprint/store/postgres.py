@@ -21,8 +21,8 @@ from sceneprint.store.sqlite import BUSY_S
 LOCKS = 0x5CE7E
 #: Whose turn it is to write; uploads that are stored or removed (see `objects`).
 TURN, BLOBS = 1, 2
-#: Who fits codes and fills their tables (see `codes`).
-CODES = 7
+#: Who links vectors (see `vectors`).
+VECTORS = 7
 #: Seconds for one statement, and for a transaction in which nothing is asked: a client that fell
 #: silent must not keep the turn from all others.
 STATEMENT_S, IDLE_S = 60.0, 30.0

@@ -11,6 +11,7 @@ from sqlalchemy import Connection, delete, func, insert, select, update
 
 from sceneprint.errors import DamagedSignature
 from sceneprint.schemas import FrameState
+from sceneprint.store import vectors
 from sceneprint.store.blocks import among, blocks
 from sceneprint.store.maps import next_revision
 from sceneprint.store.records import FrameRow, MapRow
@@ -73,6 +74,7 @@ def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) 
             n_patches=list(made.n_patches), n_pairs=list(made.n_pairs),
         )
     )  # fmt: skip
+    vectors.put(connection, frame.number, made.model_id, len(made.vector))
     revision = next_revision(connection, frame.map_number)
     connection.execute(
         update(frames)
@@ -105,6 +107,7 @@ def replace_signature(connection: Connection, frame: FrameRow, made: StoredSigna
         )
     else:
         connection.execute(update(signatures).where(own).values(**values))
+    vectors.put(connection, frame.number, made.model_id, len(made.vector))
     # a checksum that does not fit made readers pass the frame over, whatever its bytes
     if before is not None and tuple(before) == (made.vector, values["checksum"]):
         return False
@@ -150,16 +153,20 @@ def _change(
     return Change(number, frame_id, revision, vector if sound else None)
 
 
-def count_indexed(connection: Connection, map_number: int, revision: int) -> int:
-    """How many frames of a map were indexed after a revision."""
-    counted = connection.execute(
-        select(func.count()).where(
+def count_indexed(
+    connection: Connection, map_number: int, revision: int, most: int | None = None
+) -> int:
+    """How many frames of a map were indexed after a revision, counted no farther than `most`."""
+    newer = (
+        select(frames.c.number)
+        .where(
             frames.c.map_number == map_number,
             frames.c.revision > revision,
             frames.c.state == FrameState.INDEXED,
         )
+        .limit(most)
     )
-    return int(counted.scalar_one())
+    return int(connection.execute(select(func.count()).select_from(newer.subquery())).scalar_one())
 
 
 def deleted_since(connection: Connection, map_number: int, revision: int) -> frozenset[int]:

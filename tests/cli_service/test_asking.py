@@ -24,7 +24,7 @@ def maps(service_url: str, rooms: Path) -> dict[str, list[str]]:
     frames = [one for sequence in find_sequences(rooms) for one in sequence.frames]
     with Client(service_url) as client:
         for name, which in (("near", (0, 1)), ("far", (0, 3))):
-            client.create_map(name, model="compact")
+            client.create_map(name, model="depth")
             added = [client.upload(name, frames[i], wait_s=60) for i in which]
             found[name] = [one.frame_id for one in added]
     return found
@@ -74,7 +74,7 @@ def test_two_frames_are_compared(sceneprint: Run, maps: dict[str, list[str]], ro
     image = rooms / "room-0" / "seq-01" / "frame-000000.depth.png"
     own, far = f"near:{maps['near'][0]}", f"far:{maps['far'][1]}"
     same = sceneprint("similarity", own, image).stdout
-    assert same.startswith("similarity 1.000 (distance 0, compact-")
+    assert same.startswith("similarity 1.000 (distance 0, depth-")
     assert "; accepted strong: " in same
     assert same.rstrip().endswith("; b lies at 0.000 0.000 0.000 m of a")
     told = json.loads(sceneprint("similarity", own, far, "--json", expect=1).stdout)

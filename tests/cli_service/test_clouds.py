@@ -41,7 +41,7 @@ def scans(room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFacto
 
 
 def test_a_folder_of_scans_is_uploaded_and_found(sceneprint: Run, scans: Path, rooms: Path) -> None:
-    done = sceneprint("upload", "scanned", scans, "--model", "compact", expect=2)
+    done = sceneprint("upload", "scanned", scans, "--model", "depth", expect=2)
     assert "3 frames: 2 received, 0 already there, 1 refused; 2 indexed" in done.stdout
     assert "walk/2: " in done.stderr
     images = rooms / "room-0" / "seq-01"
@@ -56,7 +56,7 @@ def test_a_folder_of_scans_is_uploaded_and_found(sceneprint: Run, scans: Path, r
 
 
 def test_scans_are_signed_where_they_lie(sceneprint: Run, scans: Path) -> None:
-    done = sceneprint("sign", scans, "--preset", "compact", expect=2)
+    done = sceneprint("sign", scans, "--preset", "depth", expect=2)
     lines = done.stdout.splitlines()
     assert [line.split()[0] for line in lines if line.startswith("walk/")][:2] \
         == ["walk/0", "walk/1"]  # fmt: skip

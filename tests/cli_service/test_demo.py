@@ -137,7 +137,7 @@ def test_what_comes_twice_is_left_out_once(
     choice = choose_frames(twice)
     assert len(choice.database) == 3
     with Client.embedded(tmp_path / "data") as client:
-        known = fill(client, "compact", choice)
+        known = fill(client, "depth", choice)
     assert len(known) == 2
     said = capsys.readouterr()
     assert re.search(r"left out: .*frame-00000[01]: Frame \w+ has the same content", said.out)
@@ -150,7 +150,7 @@ def test_frames_that_are_not_signed_in_time_end_it(
     waited = [SimpleNamespace(state=one) for one in (JobState.SUCCEEDED, JobState.RUNNING)]
     monkeypatch.setattr(Client, "wait", lambda *_, **__: waited)
     with Client.embedded(tmp_path) as client, pytest.raises(ServiceError, match="1 of 2 frames"):
-        fill(client, "compact", choose_frames(rooms))
+        fill(client, "depth", choose_frames(rooms))
 
 
 def test_signals_that_are_ignored_stay_so_and_others_are_given_back() -> None:

@@ -36,7 +36,7 @@ def test_a_sound_machine(sceneprint: Run, data_folder: Path, service_url: str) -
     done = sceneprint("doctor", "--data", data_folder)
     found = verdicts(done.stdout)
     assert list(found) == [
-        "python", "sqlite", "kernels", "table paper", "table compact", "table lidar", "data folder",
+        "python", "sqlite", "kernels", "table depth", "table lidar", "table paper", "data folder",
         "disk", "database", "embreex", "open3d libraries", "service", "workers",
     ]  # fmt: skip
     for needed in ("python", "sqlite", "data folder", "database", "service", "workers"):
@@ -57,7 +57,7 @@ def test_a_machine_where_nothing_was_used_yet(
     monkeypatch.setattr(counting, "compiled_at", lambda: (str(tmp_path / "numba"), "*.nbi"))
     done = sceneprint("doctor", "--data", tmp_path / "new" / "data")
     found = verdicts(done.stdout)
-    for made_later in ("kernels", "table paper", "table compact", "service"):
+    for made_later in ("kernels", "table depth", "table paper", "service"):
         assert found[made_later] == "note"
     assert (found["data folder"], found["database"]) == ("ok", "ok")
     assert "none yet" in done.stdout

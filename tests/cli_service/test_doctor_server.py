@@ -64,7 +64,7 @@ def test_a_user_who_may_not_make_extensions(postgres: Server) -> None:
     assert "this user may not make it" in found["pgvector"].text
     assert found["connections"].verdict == "note"
     assert "Raise max_connections, or run fewer" in found["connections"].text
-    assert found_in(mine, shortlist="database")["pgvector"].verdict == "WRONG"
+    assert found_in(mine, search="database")["pgvector"].verdict == "WRONG"
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,9 @@ Run = Callable[..., tuple[str, str]]
 
 def test_events_are_listed(sceneprint: Run, service_url: str) -> None:
     with Client(service_url) as client:
-        client.create_map("events-a", model="compact")
+        client.create_map("events-a", model="depth")
         before = client.event_page(limit=1).newest
-        client.create_map("events-b", model="compact")
+        client.create_map("events-b", model="depth")
         client.delete_map("events-b")
         made, gone = [
             client.event_page(kinds=[kind], limit=1).items[0] for kind in ("map.cr", "map.del")
@@ -49,7 +49,7 @@ def test_events_are_followed_line_by_line(service_url: str) -> None:
         assert process.stderr is not None
         try:
             for name in ("followed-1", "followed-2"):
-                client.create_map(name, model="compact")
+                client.create_map(name, model="depth")
                 assert json.loads(process.stdout.readline())["map"] == name
         finally:
             process.send_signal(2)

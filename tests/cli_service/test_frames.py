@@ -20,7 +20,7 @@ def name() -> str:
 def test_lists_files_and_edits(
     sceneprint: Callable[..., object], rooms: Path, name: str, tmp_path: Path
 ) -> None:
-    sceneprint("upload", name, rooms / "room-0", "--model", "compact", "--robot", "r1")
+    sceneprint("upload", name, rooms / "room-0", "--model", "depth", "--robot", "r1")
     frames = [json.loads(line) for line in sceneprint("frames", name, "--json").stdout.splitlines()]
     ids = [one["frame_id"] for one in frames]
     assert len(ids) == 3

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +12,8 @@ from sqlalchemy import update
 
 from sceneprint.cli import main
 from sceneprint.engine import Engine
-from sceneprint.index import Generation, Tail, newest, search
-from sceneprint.index.codes import draw
+from sceneprint.index import Generation, Tail, lists, newest, publication, search
+from sceneprint.index.keys import draw
 from sceneprint.maintenance import indexes
 from sceneprint.schemas import NewMap
 from sceneprint.settings import Settings
@@ -23,16 +22,16 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import StoredSignature, index_frame
 from sceneprint.store.tables import signatures
 
-N, LENGTH = 60, 12_800
+N, LENGTH = 60, 448
 
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """A map of sixty frames like nothing else: their order by codes is not that by signatures."""
+    """A map of sixty frames like nothing else, and an empty one."""
     vectors = np.random.default_rng(5).integers(0, 256, (N, LENGTH), np.uint8)
     with Engine(Settings(data_dir=tmp_path / "data")) as engine:
-        engine.create_map(NewMap(name="hall", model="compact"))
-        engine.create_map(NewMap(name="empty", model="compact"))
+        engine.create_map(NewMap(name="hall", model="depth"))
+        engine.create_map(NewMap(name="empty", model="depth"))
         artifact = engine.store.blobs.put(b"artifact" * 10)
         upload = engine.store.blobs.put(b"upload" * 50)
         with engine.store.database.write() as connection:
@@ -72,7 +71,8 @@ def test_rebuild_stats_and_verify(data: Path, capsys: pytest.CaptureFixture[str]
     assert told(capsys, "rebuild", "hall", "--data", data) == (0, "map hall: generation 1\n")
     code, out = told(capsys, "stats", "hall", "--data", data, "--json")
     after = json.loads(out)
-    assert (code, after["generation"], after["lag_frames"], after["fitted_on"]) == (0, 1, 0, N)
+    assert (code, after["generation"], after["lag_frames"], after["probes"]) == (0, 1, 0, 0)
+    assert after["recall"] is None  # every frame is compared
     assert (after["upload_bytes"], after["artifact_bytes"]) == (300, 80)
     on_disk = sum(path.stat().st_size for path in data.glob("index/hall-*/*"))
     assert after["index_bytes"] == round(on_disk / N)
@@ -80,31 +80,31 @@ def test_rebuild_stats_and_verify(data: Path, capsys: pytest.CaptureFixture[str]
     assert told(capsys, "verify", "hall", "--data", data) == (0, "map hall: sound\n")
     code, out = told(capsys, "stats", "--data", data)  # for people, and of all maps
     assert code == 0
-    assert out.startswith("map empty, compact")
+    assert out.startswith("map empty, depth")
     assert "generation 1" in out
 
 
-def test_recall_is_of_the_shortlist_and_counts_what_it_misses(
+def test_recall_counts_what_an_inverted_file_misses(
     data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(publication.publish, "__kwdefaults__",
+                        publication.publish.__kwdefaults__ | {"flat_bytes": 0})  # fmt: skip
+    monkeypatch.setattr(lists, "ENOUGH", 0.1)  # so that it does miss some
     told(capsys, "rebuild", "hall", "--data", data)
-
-    def shortened(*arguments: Any, **more: Any) -> Any:
-        return search(*arguments, **{"shortlist": 4, **more})
-
-    monkeypatch.setattr(indexes, "search", shortened)
-    monkeypatch.setattr(indexes, "NEAR", 4)
     with Engine(Settings(data_dir=data)) as engine:
-        told_recall = indexes.describe_index(engine, "hall", 20, seed=3).recall
+        stats = indexes.describe_index(engine, "hall", 20, seed=3)
     generation, none, hits = generation_of(data), Tail.empty(LENGTH), 0
-    for i in draw(N, 20, 3):  # four by the codes, against four by the signatures
-        row, own = generation.segments[0].signatures[i], frozenset([int(generation.keys[i])])
-        near = search(row, generation, none, 4, dead=own, shortlist=4)
-        exact = np.abs(generation.segments[0].signatures.astype(int) - row).sum(1)
-        limit = np.sort(np.delete(exact, i))[3]
+    for i in draw(N, 20, 3):
+        row, own = generation.vectors[i], frozenset([int(generation.keys[i])])
+        near = search(row, generation, none, 10, metric="l2", dead=own)
+        exact = ((generation.vectors.astype(int) - row) ** 2).sum(1)
+        limit = np.sort(np.delete(exact, i))[9]
         hits += int((near.distances <= limit).sum())
-    assert told_recall == hits / 80
-    assert 0 < told_recall < 1  # it does miss some
+    assert stats.recall == hits / 200
+    assert 0 < stats.recall < 1
+    assert stats.probes == generation.recall.probes > 0
+    _, out = told(capsys, "stats", "hall", "--data", data)
+    assert f", {stats.probes} lists compared (60 frames)" in out
 
 
 @pytest.mark.parametrize("what", ["signature", "database"])
@@ -113,9 +113,9 @@ def test_verify_names_what_is_wrong_and_rebuild_mends_it(
 ) -> None:
     told(capsys, "rebuild", "hall", "--data", data)
     if what == "signature":
-        (path,) = data.glob("index/hall-*/*.segment")
+        (path,) = data.glob("index/hall-*/*.faiss")
         content = bytearray(path.read_bytes())
-        content[4096 + 7 * LENGTH + 3] ^= 1
+        content[7 * LENGTH + 3] ^= 1
         path.write_bytes(content)
         expected = f"map hall: {path}: damaged or missing"
     else:  # sound files, that are not those of this database
@@ -144,3 +144,9 @@ def test_what_cannot_be_done_is_said_in_one_line(
     assert "has no indexed frame" in capsys.readouterr().err
     assert main(["index", "stats", "nowhere", "--data", str(data)]) == 2
     assert "There is no map 'nowhere'" in capsys.readouterr().err
+    with Engine(Settings(data_dir=data)) as engine:
+        engine.create_map(NewMap(name="research", model="paper"))
+    assert main(["index", "rebuild", "research", "--data", str(data)]) == 2
+    assert "'research' has no index to rebuild" in capsys.readouterr().err
+    assert main(["index", "stats", "research", "--data", str(data)]) == 0
+    assert main(["index", "verify", "research", "--data", str(data)]) == 0

@@ -31,7 +31,7 @@ def test_a_mesh_and_a_picture(
     sceneprint: Run, service_url: str, walk: Path, tmp_path: Path, with_open3d: None
 ) -> None:
     with Client(service_url) as client:
-        client.create_map("walk", model="compact")
+        client.create_map("walk", model="depth")
     first, *rest = sorted(walk.glob("*.png"))
     for path in rest:
         sceneprint("upload", "walk", path)
@@ -60,7 +60,7 @@ def test_a_mesh_and_a_picture(
 
 def test_what_cannot_be_reconstructed(sceneprint: Run, service_url: str, walk: Path) -> None:
     with Client(service_url) as client:
-        client.create_map("nothing", model="compact")
+        client.create_map("nothing", model="depth")
     first = min(walk.glob("*.png"))
     said = sceneprint("reconstruct", "nothing", first, expect=1)
     assert said.stdout == f"{first}: not found, so there is nothing to fuse\n"

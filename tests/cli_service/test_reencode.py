@@ -26,8 +26,8 @@ def test_a_map_is_signed_anew_while_its_service_runs(
     def reencode(*arguments: object, expect: int = 0) -> Any:
         return sceneprint("reencode", "anew", *arguments, "--data", data_folder, expect=expect)
 
-    sceneprint("upload", "anew", rooms, "--model", "compact")
-    assert re.fullmatch(r"map anew, model compact-[0-9a-f]{12}\n", reencode("--status").stdout)
+    sceneprint("upload", "anew", rooms, "--model", "depth")
+    assert re.fullmatch(r"map anew, model depth-[0-9a-f]{12}\n", reencode("--status").stdout)
     said = reencode("--model", "paper", "--wait").stdout
     assert re.fullmatch(r"map anew, model paper-[0-9a-f]{12}\n", said)
     assert reencode("--status").stdout == said
@@ -52,13 +52,13 @@ def test_what_is_given_up_and_what_breaks_down_is_said(sceneprint: Run, tmp_path
     missing = reencode("--model", "paper", expect=2).stderr
     assert missing.startswith("sceneprint reencode: There is no map 'hall'")
     with Client.embedded(tmp_path) as client:
-        model = client.create_map("hall", model="compact").model
+        model = client.create_map("hall", model="depth").model
     first = f"map hall, model {model}\n"
     begun = reencode("--model", "paper").stdout
     coming = r"to come: paper-[0-9a-f]{12}; 0 frames are signed with it, 0 wait\n"
     assert re.fullmatch(first + coming, begun)
     assert reencode("--status").stdout == begun
-    refused = reencode("--model", "compact", expect=2).stderr
+    refused = reencode("--model", "depth", expect=2).stderr
     assert re.search(r"Map 'hall' is being signed with paper-.* --cancel", refused)
     assert reencode("--cancel").stdout == first
     assert "not being signed with another model" in reencode("--cancel", expect=2).stderr
@@ -71,7 +71,7 @@ def test_waiting_ends_where_it_is_no_use(
     """No worker runs, or a frame broke down in every try."""
     monkeypatch.setattr(command, "STALL_S", 0.5)
     with Client.embedded(tmp_path) as client:
-        client.create_map("hall", model="compact")
+        client.create_map("hall", model="depth")
         reference = find_sequences(rooms)[0].frames[0]
         added, _ = client.add("hall", reference, meta_of(reference))
         client.wait([added.job_id])

@@ -21,7 +21,7 @@ def test_what_can_go_is_said_and_with_yes_it_goes(
     def thin(*arguments: object, expect: int = 0) -> Any:
         return sceneprint("thin", "thick", *arguments, "--data", data_folder, expect=expect)
 
-    sceneprint("upload", "thick", rooms, "--model", "compact")
+    sceneprint("upload", "thick", rooms, "--model", "depth")
     with Client(service_url) as client:
         model = client.map("thick").model
         said = thin("--keep", 2, "--json", tmp_path / "out.json").stdout

@@ -92,10 +92,10 @@ def test_bad_frames_stop_no_others(
 
 
 def test_upload_without_waiting(sceneprint: Run, service_url: str, rooms: Path) -> None:
-    done = sceneprint("upload", "later", rooms, "--no-wait", "--model", "compact", "--parallel", 2)
+    done = sceneprint("upload", "later", rooms, "--no-wait", "--model", "depth", "--parallel", 2)
     assert "6 received" in done.stdout
     with Client(service_url) as client:
-        assert client.map("later").model.startswith("compact-")
+        assert client.map("later").model.startswith("depth-")
         ids = [one.job_id for one in client.frames("later")]
         assert {job.state for job in client.wait(ids, timeout_s=60)} == {"succeeded"}
 
@@ -120,7 +120,7 @@ def test_poses_lead_to_the_frame_that_is_named(
 def test_upload_refuses_what_would_mix(
     sceneprint: Run, house: str, rooms: Path, tmp_path: Path
 ) -> None:
-    done = sceneprint("upload", house, rooms, "--model", "compact", expect=2)
+    done = sceneprint("upload", house, rooms, "--model", "depth", expect=2)
     assert re.search(r"Map house is there, with model paper-\w+\. Leave --model out", done.stderr)
     done = sceneprint("upload", "absent", rooms, "--no-create", expect=2)
     assert "There is no map 'absent'" in done.stderr
@@ -216,13 +216,13 @@ def test_queries_that_cannot_be_asked(
 
 
 def test_maps_are_listed_made_and_deleted(sceneprint: Run, house: str) -> None:
-    sceneprint("maps", "--create", "hall", "--title", "Hall 2", "--model", "compact")
+    sceneprint("maps", "--create", "hall", "--title", "Hall 2", "--model", "depth")
     rows = [line.split() for line in sceneprint("maps").stdout.splitlines()]
     assert rows[0] == ["map", "indexed", "waiting", "rejected", "failed", "model", "title"]
     by_name = {row[0]: row for row in rows[1:]}
     assert by_name[house][1:5] == ["6", "0", "0", "0"]
     assert by_name["hall"][1:5] == ["0", "0", "0", "0"]
-    assert by_name["hall"][5].startswith("compact-")
+    assert by_name["hall"][5].startswith("depth-")
     assert by_name["hall"][6:] == ["Hall", "2"]
     told = [
         Map.model_validate_json(line) for line in sceneprint("maps", "--json").stdout.splitlines()
@@ -255,7 +255,7 @@ def test_an_archive_is_uploaded_as_its_folder_is(
     done = sceneprint("upload", house, made, "--robot", "r1")
     assert done.stdout.startswith("6 frames: 0 received, 6 already there; 6 indexed, ")
     base = ("--base", "0,0,0.5,0,0,0,1", "--base-frame", "base")
-    done = sceneprint("upload", "shed", made, "--model", "compact", "--every", 3, *base)
+    done = sceneprint("upload", "shed", made, "--model", "depth", "--every", 3, *base)
     assert done.stdout.splitlines()[1].startswith(
         "2 frames: 2 received, 0 already there; 2 indexed"
     )
@@ -291,8 +291,8 @@ def test_a_query_goes_on_after_a_file_that_is_not_taken(
 
 
 def test_a_map_has_limits(sceneprint: Run, house: str) -> None:
-    made = sceneprint("maps", "--create", "small", "--model", "compact", "--quota-frames", "2")
-    assert re.fullmatch(r"map small, compact-\w{12}, 0 of 2 frames\n", made.stdout)
+    made = sceneprint("maps", "--create", "small", "--model", "depth", "--quota-frames", "2")
+    assert re.fullmatch(r"map small, depth-\w{12}, 0 of 2 frames\n", made.stdout)
     changes = ("--quota-frames", "none", "--quota-bytes", "1500000", "--retention-days", "30")
     done = sceneprint("maps", "--edit", "small", "--title", "Small", *changes).stdout
     assert done.endswith(", 0.0 of 1.5 MB, kept 30 days\n")

@@ -57,7 +57,7 @@ class Filled:
 
 
 def filled(client: Client, sent: list[Sent]) -> Filled:
-    client.create_map(MAP, model="compact")
+    client.create_map(MAP, model="depth")
     ids = [client.upload(MAP, one.data, one.meta, wait_s=60).frame_id for one in sent]
     assert {frame.state for frame in client.frames(MAP)} == {"indexed"}
     return Filled(client, {frame_id: i for i, frame_id in enumerate(ids)})

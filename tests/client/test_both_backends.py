@@ -28,15 +28,15 @@ from sceneprint.schemas import FrameState, JobState
 
 
 def test_maps(client: Client, map_name: str) -> None:
-    made = client.create_map(map_name, "Hall 2", "compact")
+    made = client.create_map(map_name, "Hall 2", "depth")
     assert (made.name, made.title, made.revision) == (map_name, "Hall 2", 0)
-    assert made.model.startswith("compact-")
+    assert made.model.startswith("depth-")
     assert made.model.endswith(made.model_id[:12])
-    assert client.create_map(map_name, "Hall 2", "compact") == made
+    assert client.create_map(map_name, "Hall 2", "depth") == made
     assert client.map(map_name) == made
     assert made in client.maps()
     with pytest.raises(MapExists, match="another title or model"):
-        client.create_map(map_name, "Hall 3", "compact")
+        client.create_map(map_name, "Hall 3", "depth")
     client.delete_map(map_name)
     with pytest.raises(UnknownMap, match=map_name):
         client.map(map_name)
@@ -98,7 +98,7 @@ def test_jobs_are_waited_for(
 def test_jobs_that_are_over(
     client: Client, map_name: str, references: tuple[FrameReference, ...], bare_wall: Path
 ) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     good = client.upload(map_name, references[0], wait_s=30, priority=-10)
     wall = client.upload(map_name, bare_wall, wait_s=30)
     assert [client.job(one.job_id).priority for one in (good, wall)] == [-10, 0]
@@ -129,7 +129,7 @@ def test_jobs_that_are_over(
 def test_a_job_is_cancelled_before_anybody_waits_for_it(
     embedded: Client, references: tuple[FrameReference, ...]
 ) -> None:
-    embedded.create_map("m", model="compact")
+    embedded.create_map("m", model="depth")
     first = embedded.upload("m", references[0])
     assert embedded.cancel_job(first.job_id).state is JobState.CANCELLED
     late = embedded.upload("m", references[1], priority=5)
@@ -143,7 +143,7 @@ def test_a_job_is_cancelled_before_anybody_waits_for_it(
 
 
 def test_many_jobs_come_in_pages(embedded: Client, references: tuple[FrameReference, ...]) -> None:
-    embedded.create_map("m", model="compact")
+    embedded.create_map("m", model="depth")
     added = [embedded.upload("m", references[0]).job_id]
     while len(added) < 103:
         embedded.cancel_job(added[-1])
@@ -212,7 +212,7 @@ def test_requests_that_make_no_sense(
     with pytest.raises(InvalidRequest, match="name: String should match") as told:
         client.create_map("Big Hall")
     assert [place for place, _ in told.value.fields] == ["name"]
-    with pytest.raises(InvalidRequest, match="model: Input should be 'paper', 'compact' or"):
+    with pytest.raises(InvalidRequest, match="model: Input should be 'depth', 'lidar' or"):
         client.create_map(map_name, model="huge")
     client.create_map(map_name)
     with pytest.raises(InvalidRequest, match="less than or equal to 50") as told:
@@ -234,7 +234,7 @@ def test_requests_that_make_no_sense(
 def test_threads_share_a_client(
     client: Client, map_name: str, references: tuple[FrameReference, ...]
 ) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     with ThreadPoolExecutor(6) as pool:
         both = (*references, *references)  # each frame twice at the same time
         added = list(pool.map(lambda one: client.add(map_name, one), both))

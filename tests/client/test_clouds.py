@@ -48,7 +48,7 @@ def folder(
 
 
 def test_a_folder_of_scans(client: Client, map_name: str, folder: Path, seen: list[Floats]) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     [sequence] = find_sequences(folder)
     for reference in sequence.frames:
         assert client.upload(map_name, reference, wait_s=60).state == "indexed"
@@ -62,7 +62,7 @@ def test_a_folder_of_scans(client: Client, map_name: str, folder: Path, seen: li
     # asked by bytes alone: the same numbers as of the library
     data = write_ply(seen[0])
     answer = client.query(map_name, data, k=2)
-    signer = open_signer("compact")
+    signer = open_signer("depth")
     own, two = (sign(decode_cloud(one), signer) for one in map(write_ply, seen))
     told = {match.frame_id: match for match in answer.matches}
     apart = int(distances(own.vector, two.vector[None])[0])
@@ -77,7 +77,7 @@ def test_a_folder_of_scans(client: Client, map_name: str, folder: Path, seen: li
 def test_a_cloud_of_many_views_says_so_on_its_way(
     client: Client, map_name: str, seen: list[Floats], room_frames: tuple[Frame, ...]
 ) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     T = room_frames[0].pose
     assert T is not None
     placed = write_ply(seen[0] @ T[:3, :3].T + T[:3, 3])
@@ -94,7 +94,7 @@ def test_a_cloud_of_many_views_says_so_on_its_way(
 
 
 def test_what_is_none_is_refused_alike(client: Client, map_name: str, seen: list[Floats]) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     with pytest.raises(UnreadableCloud, match="PLY"):
         client.upload(map_name, write_ply(seen[0])[:-7], FrameMeta())
     with pytest.raises(InvalidRequest, match="intrinsics") as caught:

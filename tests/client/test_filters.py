@@ -17,7 +17,7 @@ References = tuple[FrameReference, ...]
 def test_only_what_passes_is_searched(
     client: Client, map_name: str, references: References
 ) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     added = [
         client.upload(map_name, one, meta_of(one, robot=f"r{i % 2}", tags=[f"t{i}"]), wait_s=60)
         for i, one in enumerate(references)
@@ -45,7 +45,7 @@ def test_only_what_passes_is_searched(
 def test_what_the_map_has_is_not_kept(
     client: Client, map_name: str, references: References
 ) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     first = client.upload(map_name, references[0], wait_s=60, if_novel=True)
     assert first.state is FrameState.INDEXED
     second = client.upload(map_name, references[1], wait_s=60, if_novel=1.0)

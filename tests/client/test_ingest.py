@@ -65,7 +65,7 @@ def done(client: Client, map_name: str, archive: Any, options: ImportOptions | N
 def test_a_frame_put_under_an_id(
     client: Client, map_name: str, references: tuple[FrameReference, ...]
 ) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     meta = meta_of(references[0], base=BASE)
     added = client.put_frame(map_name, "a.0-1_b", references[0], meta, wait_s=30)
     assert (added.frame_id, added.state) == ("a.0-1_b", "indexed")
@@ -86,7 +86,7 @@ def test_a_frame_put_under_an_id(
 
 
 def test_a_batch(client: Client, map_name: str, references: tuple[FrameReference, ...]) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     known = [meta_of(one) for one in references]
     sent: list[Any] = [references[0], b"none", references[1].path, references[0]]
     items = client.upload_batch(map_name, sent, [known[0], known[0], known[1], known[0]])
@@ -105,7 +105,7 @@ def test_a_batch(client: Client, map_name: str, references: tuple[FrameReference
 def test_an_archive_gives_what_an_upload_of_the_folder_gives(
     client: Client, map_name: str, rooms: Path, references: tuple[FrameReference, ...]
 ) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     options = ImportOptions(robot="r1", tags=["x,y"], T_base_sensor=BASE, name="rooms")
     extra = {"room-0__seq-01__frame-000900.depth": b"none", "..__up": b"x"}
     job, items = done(client, map_name, packed(rooms, **extra), options)
@@ -140,7 +140,7 @@ def test_an_archive_gives_what_an_upload_of_the_folder_gives(
 def test_what_is_no_archive_is_refused_at_the_door(
     client: Client, map_name: str, rooms: Path, tmp_path: Path
 ) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     for data, reason in (
         (b"no archive at all", "no archive that is read"),
         (packed(rooms).getvalue()[:-400], "ends early"),

@@ -72,7 +72,7 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Cl
 GIVEN: dict[str, Any] = {
     "map_name": "hall", "name": "hall", "frame_id": ID, "job_id": ID, "query_id": ID,
     "association_id": ID, "snapshot_id": ID, "session": "s", "changes": {"title": "x"},
-    "model": "compact", "grants": {"*": "read"}, "query": ID, "job_ids": [ID],
+    "model": "depth", "grants": {"*": "read"}, "query": ID, "job_ids": [ID],
     "a": ("hall", ID), "b": ("hall", ID),
 }  # fmt: skip
 #: Answered without a key, or of no service.
@@ -121,10 +121,10 @@ def test_each_key_does_what_it_may(
     keyed: Callable[..., Client], references: tuple[FrameReference, ...]
 ) -> None:
     boss, robot, screen, other = (keyed(name) for name in KEYS)
-    boss.create_map("hall", model="compact")
+    boss.create_map("hall", model="depth")
     with pytest.raises(Forbidden, match="a map named 'yard'"):
         robot.create_map("yard")
-    other.create_map("yard", model="compact")  # its own, though it was not there
+    other.create_map("yard", model="depth")  # its own, though it was not there
     added = robot.upload("hall", references[0], wait_s=60)
     assert added.state == FrameState.INDEXED
     assert [one.frame_id for one in screen.frames("hall")] == [added.frame_id]

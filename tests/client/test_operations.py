@@ -19,7 +19,7 @@ from sceneprint.schemas.events import Event
 def test_events_that_are_kept(
     client: Client, map_name: str, references: tuple[FrameReference, ...]
 ) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     added = client.upload(map_name, references[0], wait_s=60)
     client.delete_frame(map_name, added.frame_id)
     found = list(client.events(map_name, follow=False))
@@ -54,13 +54,13 @@ def test_events_that_are_kept(
 
 def test_events_as_they_happen(client: Client, map_name: str) -> None:
     before = client.event_page().newest
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     (made,) = client.events(map_name, follow=False)
     names = [f"{map_name[:18]}{i}" for i in range(3)]
 
     def write() -> None:
         for name in names:
-            client.create_map(name, model="compact")
+            client.create_map(name, model="depth")
 
     stream = client.events(kinds=["map.created"], after=before)
     assert next(stream) == made
@@ -73,7 +73,7 @@ def test_events_as_they_happen(client: Client, map_name: str) -> None:
 
 
 def test_figures(client: Client, map_name: str, references: tuple[FrameReference, ...]) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     client.upload(map_name, references[0], wait_s=60)
     own = client.stats(map_name, minutes=2)
     assert (own.map, own.maps, own.frames, own.jobs) == (
@@ -95,17 +95,17 @@ def test_figures(client: Client, map_name: str, references: tuple[FrameReference
 
 
 def test_models_and_reencoding(client: Client, map_name: str) -> None:
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     listed = client.models()
     assert [one.name for one in listed][: len(PRESETS)] == list(PRESETS)
-    compact = next(one for one in listed if one.name == "compact")
-    assert compact.model_id == read_model("compact").id
-    assert map_name in compact.maps
+    depth = next(one for one in listed if one.name == "depth")
+    assert depth.model_id == read_model("depth").id
+    assert map_name in depth.maps
     told = client.reencode(map_name, "paper")
     if told.reencoding is not None:  # no frame waits: a worker may have switched it already
         assert told.reencoding.model_id == read_model("paper").id
         with pytest.raises(Conflict):
-            client.reencode(map_name, compact.model_id)
+            client.reencode(map_name, depth.model_id)
     for wrong in ("small", "/etc/passwd"):
         with pytest.raises(InvalidRequest, match="There is no model"):
             client.reencode(map_name, wrong)
@@ -117,7 +117,7 @@ def test_models_and_reencoding(client: Client, map_name: str) -> None:
 
 def test_reencoding_is_given_up(embedded: Client, map_name: str) -> None:
     """Where nobody works, so that it is surely under way."""
-    made = embedded.create_map(map_name, model="compact")
+    made = embedded.create_map(map_name, model="depth")
     embedded.reencode(map_name, read_model("paper").label)
     assert embedded.cancel_reencoding(map_name) == made
     with pytest.raises(Conflict, match="nothing is to be given up"):
@@ -127,7 +127,7 @@ def test_reencoding_is_given_up(embedded: Client, map_name: str) -> None:
 def test_both_tell_the_same_events(remote: Client, embedded: Client, map_name: str) -> None:
     told = []
     for client in (remote, embedded):
-        client.create_map(map_name, model="compact")
+        client.create_map(map_name, model="depth")
         client.delete_map(map_name)
         kept = client.event_page(kinds=["map."], limit=50)
         told.append([(one.kind, one.data) for one in kept.items if one.map == map_name])

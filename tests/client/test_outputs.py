@@ -21,7 +21,7 @@ START = datetime(2026, 11, 16, 9, 30, tzinfo=UTC)
 @pytest.fixture
 def ids(client: Client, map_name: str, references: tuple[FrameReference, ...]) -> list[str]:
     """Three frames of a map, taken a second apart."""
-    client.create_map(map_name, model="compact")
+    client.create_map(map_name, model="depth")
     found = []
     for i, one in enumerate(references[:3]):
         meta = meta_of(one, robot="r2", tags=["door"] if i else [])
@@ -83,7 +83,7 @@ def test_what_a_frame_is_made_of(
 
 
 def test_what_is_not_signed_yet(embedded: Client, references: tuple[FrameReference, ...]) -> None:
-    embedded.create_map("m", model="compact")
+    embedded.create_map("m", model="depth")
     added = embedded.upload("m", references[0])
     with pytest.raises(NotIndexed, match="is received"):
         embedded.preview("m", added.frame_id)
@@ -139,7 +139,7 @@ def test_both_give_the_same_bytes(
     """But for the ids that are in them."""
     made = []
     for client in (remote, embedded):
-        client.create_map(map_name, model="compact")
+        client.create_map(map_name, model="depth")
         name = client.upload(map_name, references[4], wait_s=60).frame_id
         files = [
             client.cloud(map_name, name), client.cloud(map_name, name, "parent"),

@@ -50,7 +50,7 @@ def both(
     clients = [Client(service_url), Client.embedded(tmp_path_factory.mktemp("rebuilt"))]
     found = []
     for client in clients:
-        client.create_map(NAME, model="compact")
+        client.create_map(NAME, model="depth")
         for view in views[1:]:
             assert client.upload(NAME, view, wait_s=60).state == "indexed"
         answer = client.query(NAME, views[0], k=4)
@@ -182,7 +182,7 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
     views: list[FrameReference], tmp_path: Path
 ) -> None:
     with Client.embedded(tmp_path) as client:
-        client.create_map(NAME, model="compact")
+        client.create_map(NAME, model="depth")
         client.wait([client.upload(NAME, view).job_id for view in views[1:]])
         answer = client.query(NAME, views[0], k=4)
         accepted = sorted(

@@ -129,7 +129,7 @@ def test_all_ways_of_asking_are_equal(
             client.localize(map_name, frame_id=ids[3]),
             client.similarity((map_name, ids[0]), (other, added.frame_id), seed=1),
             client.similarity(NamedFrame(map=other, frame_id=added.frame_id), references[0]),
-            client.similarity(references[0], references[1], validate=False, model="compact"),
+            client.similarity(references[0], references[1], validate=False, model="depth"),
         ]
         told.append([comparable(one.model_dump(mode="json"), numbers) for one in answers])
         frames.append(answers)
@@ -154,11 +154,11 @@ def test_what_cannot_be_asked_is_refused_alike(
     client: Client = request.getfixturevalue(which)
     client.create_map(map_name)
     for name in ("x", "y"):
-        client.create_map(f"{map_name}-{name}", model="compact")
+        client.create_map(f"{map_name}-{name}", model="depth")
     frame = references[0]
     with pytest.raises(InvalidRequest, match="maps"):
         client.query(maps=[], frame=frame)
-    with pytest.raises(InvalidRequest, match=r"has paper-.* has compact-"):
+    with pytest.raises(InvalidRequest, match=r"has paper-.* has depth-"):
         client.query(maps=[map_name, f"{map_name}-x"], frame=frame)
     with pytest.raises(UnknownMap, match="'nowhere'"):
         client.query(maps=[map_name, "nowhere"], frame=frame)

@@ -23,7 +23,7 @@ def test_a_snapshot_taken_over_the_service_restores_to_the_same_answers(
     remote: Client, service_url: str, map_name: str, references: tuple[FrameReference, ...],
     tmp_path: Path,
 ) -> None:  # fmt: skip
-    remote.create_map(map_name, model="compact")
+    remote.create_map(map_name, model="depth")
     for reference in references[:4]:
         remote.upload(map_name, reference, wait_s=60)
     before = {one.snapshot_id for one in remote.snapshots()}
@@ -65,7 +65,7 @@ def test_only_the_newest_are_kept_and_fsck_has_nothing_to_say(
 ) -> None:
     data = tmp_path / "data"
     with Client.embedded(data) as client:
-        client.create_map("hall", model="compact")
+        client.create_map("hall", model="depth")
         client.upload("hall", references[0], wait_s=60)
         job = client.take_snapshot()
         assert client.take_snapshot().job_id == job.job_id  # the one that waits is enough

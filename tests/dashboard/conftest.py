@@ -105,7 +105,7 @@ class Station:
 
     def make_map(self, name: str, **more: object) -> str:
         """Make a map; its path."""
-        made = self.client.post("/v1/maps", json={"name": name, "model": "compact", **more})
+        made = self.client.post("/v1/maps", json={"name": name, "model": "depth", **more})
         assert made.status_code == 201, made.text
         return f"/v1/maps/{name}"
 
@@ -172,7 +172,7 @@ def station(chromium: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     del chromium  # asked for first: without a browser nothing needs to be made
     with running(tmp_path_factory.mktemp("station"), 2) as found:
         found.client.post(
-            "/v1/maps", json={"name": "building", "title": "Two rooms", "model": "compact"}
+            "/v1/maps", json={"name": "building", "title": "Two rooms", "model": "depth"}
         )
         metas, files = [], []
         for meta, png in _shots(tmp_path_factory.mktemp("shots")):

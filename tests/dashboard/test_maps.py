@@ -29,7 +29,7 @@ def test_a_card_tells_what_the_api_does(station: Any, page: Page, settle: Settle
     sizes = station.client.get("/v1/stats", params={"map": "building"}).json()["bytes"]
     used = sum(sizes[part] for part in ("database", "blobs", "index"))
     expect(one.locator("dd").last).to_have_text(f"{used / 1e6:.1f} MB")
-    expect(one).to_contain_text("not needed yet")  # 16 frames are searched one by one
+    expect(one).to_contain_text("none needed")  # a query compares all 16 frames
     expect(one.get_by_role("img")).to_have_attribute(
         "aria-label", "Indexed frames since it was made: from 0 to 16"
     )
@@ -61,12 +61,12 @@ def test_a_map_is_made(
         expect(name).to_be_focused()
     name.fill("made-here")
     page.get_by_role("textbox", name="Title").fill("Made by hand")
-    page.get_by_label("Rooms, compact").check()
+    page.get_by_role("radio", name="Rooms").check()
     page.keyboard.press("Enter")
     expect(page).to_have_url(f"{station.home}#/maps/made-here")
     expect(page.get_by_role("status").filter(has_text="made-here was made")).to_be_visible()
     made = station.client.get("/v1/maps/made-here").json()
-    assert (made["title"], made["model"].partition("-")[0]) == ("Made by hand", "compact")
+    assert (made["title"], made["model"].partition("-")[0]) == ("Made by hand", "depth")
 
 
 def test_a_map_is_retitled_and_an_edit_of_another_not_overwritten_unseen(

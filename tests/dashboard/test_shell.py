@@ -184,7 +184,7 @@ def test_a_service_without_maps_goes_and_comes_back(
         assert axe(page) == []
         page.get_by_role("button", name="New map").last.click()  # the one of the empty page
         page.get_by_role("textbox", name="Name").fill("first")
-        page.get_by_label("Rooms, compact").check()
+        page.get_by_role("radio", name="Rooms").check()
         page.get_by_role("button", name="Create map").click()
         expect(page).to_have_url(f"{alone.home}#/maps/first")
         page.goto(alone.home + "#/")

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from sqlalchemy import select, update
 
 from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.datasets import decode_frame, write_depth_png
 from sceneprint.engine import Engine
+from sceneprint.geometry.whitening import Whitening
+from sceneprint.models import Model
 from sceneprint.pipeline import Signature, Signer, open_signer, prepare
 from sceneprint.schemas import CameraIntrinsics, FrameMeta, GivenPose, JobState, NewMap
 from sceneprint.settings import Settings
@@ -59,7 +62,20 @@ def uploads(make_upload: Callable[..., Upload]) -> tuple[Upload, ...]:
 
 @pytest.fixture(scope="session")
 def signer() -> Signer:
-    return open_signer("compact")
+    return open_signer("depth")
+
+
+@pytest.fixture(scope="session")
+def whitened_model(small_model: Model) -> Model:
+    """The small model with signatures of 64 bytes that are compared by L2."""
+    axes = np.random.default_rng(1).integers(-127, 128, (64, small_model.signature_bytes))
+    ones = np.ones(64)
+    return replace(
+        small_model,
+        whitening=Whitening(
+            small_model.levels, axes.astype(np.int8), ones / 1000, 0 * ones, 500_000.0
+        ),
+    )
 
 
 @pytest.fixture(scope="session")
@@ -104,7 +120,7 @@ def signed_folder(
     """A data folder whose map `hall` holds all uploads, signed in their order."""
     folder = tmp_path_factory.mktemp("signed") / "data"
     with Engine(Settings(data_dir=folder)) as engine:
-        engine.create_map(NewMap(name="hall", model="compact"))
+        engine.create_map(NewMap(name="hall", model="depth"))
         for each in uploads:
             engine.add_frame("hall", each.data, each.meta)
         assert work_off(engine) == [JobState.SUCCEEDED] * len(uploads)
@@ -122,7 +138,7 @@ def full(signed_folder: Path, tmp_path: Path, make_engine: Callable[..., Engine]
 def empty(make_engine: Callable[..., Engine]) -> Engine:
     """An engine with the empty map `hall`."""
     engine = make_engine()
-    engine.create_map(NewMap(name="hall", model="compact"))
+    engine.create_map(NewMap(name="hall", model="depth"))
     return engine
 
 

@@ -177,7 +177,7 @@ def test_an_empty_map_finds_nothing(empty: Engine, uploads: Any, stages: Any) ->
 
 
 def test_what_is_not_there_cannot_be_asked(full: Engine, uploads: Any) -> None:
-    full.create_map(NewMap(name="other", model="compact"))
+    full.create_map(NewMap(name="other", model="depth"))
     added, _ = full.add_frame("other", uploads[0].data, uploads[0].meta)
     with pytest.raises(UnknownMap, match="'attic'"):
         full.query_upload("attic", uploads[0].data, uploads[0].meta, Query())

@@ -51,7 +51,7 @@ def two_runs(
     folder = tmp_path_factory.mktemp("runs") / "data"
     room = synthesise_room(21, 0, 12, along_path=True)
     with Engine(Settings(data_dir=folder)) as engine:
-        engine.create_map(NewMap(name="hall", model="compact"))
+        engine.create_map(NewMap(name="hall", model="depth"))
         for i, frame in enumerate(room.frames):
             robot, session = (("ann", "a"), ("bob", "b"))[i % 2]
             assert frame.pose is not None
@@ -368,7 +368,7 @@ def test_a_map_that_is_deleted_meanwhile_ends_the_job_quietly(engine: Engine) ->
     task = engine.claim("w")
     assert isinstance(task, Task)
     engine.delete_map("hall")
-    engine.create_map(NewMap(name="hall", model="compact"))
+    engine.create_map(NewMap(name="hall", model="depth"))
     broke: list[bool] = []
     assert engine.run(task, lambda: broke.append(True)) is None
     assert broke == []

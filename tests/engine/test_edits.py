@@ -239,7 +239,7 @@ def test_a_map_has_a_title(full: Engine) -> None:
     for bad in ({"name": "x"}, {"title": "x" * 201}, {"title": 5}):
         with pytest.raises(InvalidRequest):
             edit_map(full.store, "hall", bad)
-    full.create_map(NewMap(name="other", model="compact"))
+    full.create_map(NewMap(name="other", model="depth"))
     assert full.get_map("other").etag != full.get_map("hall").etag
     with pytest.raises(UnknownMap):
         edit_map(full.store, "nowhere", {"title": "x"})

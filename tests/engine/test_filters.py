@@ -110,7 +110,7 @@ def passes(one: Known, wanted: Filter, own: Known) -> bool:
 def ranked(frames: list[Known], own: Known, wanted: Filter) -> list[tuple[str, int]]:
     """The oracle: all that pass, nearest first, ties as they came."""
     found = [
-        (int(np.abs(one.vector.astype(int) - own.vector).sum()), i, one.id)
+        (int(((one.vector.astype(int) - own.vector) ** 2).sum()), i, one.id)
         for i, one in enumerate(frames)
         if one.id != own.id and passes(one, wanted, own)
     ]
@@ -160,7 +160,7 @@ def test_a_filter_leaves_what_plain_python_leaves(make_engine: Make, published: 
     """With a tail alone and with a generation; frames come and go; another map is beside it."""
     engine = make_engine(tail_frames=50)
     for name in ("hall", "other"):
-        engine.create_map(NewMap(name=name, model="compact"))
+        engine.create_map(NewMap(name=name, model="depth"))
     frames = fill(engine, 120, 1)
     fill(engine, 20, 4, "other")
     if published:
@@ -185,7 +185,7 @@ def test_a_filter_leaves_what_plain_python_leaves(make_engine: Make, published: 
 
 def test_each_condition_alone(make_engine: Make) -> None:
     engine = make_engine()
-    engine.create_map(NewMap(name="hall", model="compact"))
+    engine.create_map(NewMap(name="hall", model="depth"))
     frames = fill(engine, 100, 5)
     times = [one.at for one in frames]
     whole = [one for one in frames if None not in (one.session, one.robot, one.at)]
@@ -284,7 +284,7 @@ def test_frames_between_view_and_filter_do_no_harm(
     from sceneprint.engine import searching
 
     engine = make_engine()
-    engine.create_map(NewMap(name="hall", model="compact"))
+    engine.create_map(NewMap(name="hall", model="depth"))
     frames = fill(engine, 20, 6)
     passing, gone = searching.passing, frames[3]
 

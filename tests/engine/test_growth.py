@@ -41,7 +41,7 @@ def grown(full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch) -> Engine:
         failed = update(frames).where(frames.c.id == names[3])
         connection.execute(failed.values(state="failed"))
     full.delete_frame("hall", names[2])
-    full.create_map(NewMap(name="shop", model="compact"))
+    full.create_map(NewMap(name="shop", model="depth"))
     return full
 
 
@@ -73,7 +73,7 @@ def test_a_clock_that_was_set_back_loses_no_frame(grown: Engine, ids: Ids) -> No
 
 
 def test_a_map_is_weighed(full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch) -> None:
-    full.create_map(NewMap(name="shop", model="compact"))
+    full.create_map(NewMap(name="shop", model="depth"))
     full.rebuild_index("hall")
     names = ids(full)
     with full.store.database.read() as connection:

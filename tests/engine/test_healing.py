@@ -62,7 +62,7 @@ def damage_signature(engine: Engine, frame_id: str) -> bytes:
     """Change a byte of the vector, and return the sound one."""
     sound: bytes = column(engine, frame_id, "vector")
     data = bytearray(sound)
-    data[1000] ^= 8
+    data[100] ^= 8
     own = signatures.c.frame_number == number_of(engine, frame_id)
     with engine.store.database.write() as connection:
         connection.execute(update(signatures).where(own).values(vector=bytes(data)))

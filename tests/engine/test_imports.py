@@ -154,7 +154,7 @@ def test_a_map_that_is_made_anew_takes_nothing_of_an_import_into_the_one_before(
 
     def make_anew() -> None:
         empty.delete_map("hall")
-        empty.create_map(NewMap(name="hall", model="compact"))
+        empty.create_map(NewMap(name="hall", model="depth"))
 
     until: Any = Between(make_anew)
     with pytest.raises(LostLease):

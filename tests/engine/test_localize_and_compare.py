@@ -117,7 +117,7 @@ def test_two_frames_are_compared_as_the_library_does(
     near = full.queries.compare(side(0, True), side(1, True), how)
     T = np.linalg.inv(uploads[0].pose) @ uploads[1].pose
     assert np.linalg.norm(np.array(near.transform.matrix)[:3, 3] - T[:3, 3]) < 0.05
-    sent = full.queries.compare(side(0, False), side(1, False), Comparison(model="compact"))
+    sent = full.queries.compare(side(0, False), side(1, False), Comparison(model="depth"))
     assert (sent.distance, sent.model) == (near.distance, full.get_map("hall").model)
     bare = full.queries.compare(side(0, True), side(1, True), Comparison(validate=False))
     assert (bare.validation, bare.transform, bare.distance) == (None, None, near.distance)
@@ -135,7 +135,7 @@ def test_frames_that_cannot_be_compared(
     other = NamedFrame(map="big", frame_id=big.frame_id)
     stored = NamedFrame(map="hall", frame_id=ids(full)[0])
     sent = (uploads[1].data, uploads[1].meta)
-    with pytest.raises(InvalidRequest, match=r"map hall has compact-.* and map big has paper-"):
+    with pytest.raises(InvalidRequest, match=r"map hall has depth-.* and map big has paper-"):
         full.queries.compare(stored, other, Comparison())
     with pytest.raises(InvalidRequest, match="another model than 'paper'"):
         full.queries.compare(stored, sent, Comparison(model="paper"))

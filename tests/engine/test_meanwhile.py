@@ -135,7 +135,7 @@ def test_matches_that_are_deleted_while_they_are_validated_are_not_found(
 
 
 def test_maps_are_never_mixed(full: Engine, uploads: Any, work_off: Any) -> None:
-    full.create_map(NewMap(name="other", model="compact"))
+    full.create_map(NewMap(name="other", model="depth"))
     added, _ = full.add_frame("other", uploads[5].data, uploads[5].meta)
     work_off(full)
     for name, count in (("other", 1), ("hall", 12)):

@@ -35,7 +35,7 @@ def share(prepared: Prepared, signer: Signer) -> Callable[[int, int], float]:
 
     def of(i: int, j: int) -> float:
         a, b = (prepared[k][0].vector.astype(np.int64) for k in (i, j))
-        return int(np.abs(a - b).sum()) / signer.model.unrelated_distance
+        return int(((a - b) ** 2).sum()) / signer.model.unrelated_distance
 
     return of
 
@@ -138,7 +138,7 @@ def test_what_is_gone_is_no_place_and_a_frame_may_come_again(
 
 
 def test_another_map_has_other_places(empty: Engine, uploads: Any, send: Any) -> None:
-    empty.create_map(NewMap(name="other", model="compact"))
+    empty.create_map(NewMap(name="other", model="depth"))
     send(empty, 0)
     assert send(empty, 1, 1.0, "other").state == FrameState.INDEXED
     not_kept = send(empty, 1, 1.0)
@@ -172,7 +172,7 @@ def test_of_two_that_are_signed_at_once_one_is_kept(
 ) -> None:
     """Two workers look at an empty map, and only then either stores what it made."""
     engines = [make_engine(), make_engine()]
-    engines[0].create_map(NewMap(name="hall", model="compact"))
+    engines[0].create_map(NewMap(name="hall", model="depth"))
     for which in (0, 1):
         engines[0].add_frame("hall", uploads[which].data, uploads[which].meta, if_novel=1.0)
     looked = threading.Barrier(2)

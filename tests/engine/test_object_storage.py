@@ -40,7 +40,7 @@ def test_what_one_node_takes_another_works_on(
 ) -> None:
     one, other = nodes
     objects = open_objects(f"{bucket}/fleet")
-    one.create_map(NewMap(name="hall", model="compact"))
+    one.create_map(NewMap(name="hall", model="depth"))
     added = [one.add_frame("hall", each.data, each.meta)[0] for each in uploads[:2]]
     assert len(keys(objects, "blobs/")) == 2
     assert work_off(other) == ["succeeded"] * 2
@@ -69,7 +69,7 @@ def test_an_archive_is_read_where_it_lies(
     nodes: tuple[Engine, Engine], uploads: Any, work_off: Callable[[Engine], list[Any]], bucket: str
 ) -> None:
     one, other = nodes
-    one.create_map(NewMap(name="hall", model="compact"))
+    one.create_map(NewMap(name="hall", model="depth"))
     made = io.BytesIO()
     camera = uploads[0].meta.intrinsics.model_dump(exclude={"distortion"})
     with tarfile.open(fileobj=made, mode="w:gz") as archive:
@@ -96,7 +96,7 @@ def test_what_ends_with_a_process_is_for_one_process_alone(
     make_engine: Callable[..., Engine], uploads: Any, work_off: Callable[[Engine], list[Any]]
 ) -> None:
     engine = make_engine(blob_url="memory:///")
-    engine.create_map(NewMap(name="hall", model="compact"))
+    engine.create_map(NewMap(name="hall", model="depth"))
     engine.add_frame("hall", uploads[0].data, uploads[0].meta)
     assert work_off(engine) == ["succeeded"]
     with pytest.raises(UnusableStore, match=r"memory:///.*Client.embedded"):

@@ -97,7 +97,7 @@ def test_history_is_that_of_all_processes(make_engine, noon):
 def test_what_waits_and_who_works(make_engine, uploads):
     engine = make_engine()
     for name in ("hall", "shop"):
-        engine.create_map(NewMap(name=name, model="compact"))
+        engine.create_map(NewMap(name=name, model="depth"))
     for i in range(3):
         engine.add_frame("shop" if i else "hall", uploads[i].data, uploads[i].meta)
     with engine.store.database.write() as connection:
@@ -136,7 +136,7 @@ def test_indexes_and_sizes_are_told(data, make_engine):
     (index,) = engine.operations.statistics.tell(1).indexes
     assert (index.generation, index.tail) == (1, 0)
     assert index.recall == IndexRecall(  # compared whole
-        share=1, near=10, sample=0, shortlist=500, frames=indexed
+        share=1, near=10, sample=0, probes=0, frames=indexed
     )
     told = measuring.sizes(engine.settings, engine.store)
     assert told.index == sum(p.stat().st_size for p in (data / "index").rglob("*") if p.is_file())
@@ -222,19 +222,19 @@ def test_a_map_that_another_process_deleted_is_let_go(data, make_engine, monkeyp
 def test_models_are_listed_with_the_maps_that_may_be_named(make_engine, small_model):
     engine = make_engine()
     for name in ("hall", "shop"):
-        engine.create_map(NewMap(name=name, model="compact"))
+        engine.create_map(NewMap(name=name, model="depth"))
     engine.reencode("shop", small_model)
     found = {one.name: one for one in engine.operations.models(lambda name: name != "hall")}
     assert list(found) == [*PRESETS, "small"]
-    compact, small = read_model("compact"), found["small"]
-    assert found["compact"].maps == ["shop"]
-    assert (small.maps, small.preset, found["compact"].preset) == (["shop"], False, True)
+    depth, small = read_model("depth"), found["small"]
+    assert found["depth"].maps == ["shop"]
+    assert (small.maps, small.preset, found["depth"].preset) == (["shop"], False, True)
     assert found["paper"].maps == []
     assert (small.components, small.levels, small.signature_bytes) == (8, 2, 25 * 8 * 2)
     assert small.unrelated_distance == 1000.0
     assert small.parameters["segmentation"]["n_patches"] == 150
     assert small.provenance == {"made": "by a test"}
-    assert found["compact"].model_id == compact.id
+    assert found["depth"].model_id == depth.id
     for name in ("small", "/etc/passwd", "", small_model.id[:12]):
         with pytest.raises(InvalidRequest, match="There is no model"):
             engine.operations.catalogue.find(name)
@@ -243,6 +243,6 @@ def test_models_are_listed_with_the_maps_that_may_be_named(make_engine, small_mo
         assert engine.operations.catalogue.find(name, "shop".__eq__).id == small_model.id
         with pytest.raises(InvalidRequest, match="There is no model"):  # another's alone
             engine.operations.catalogue.find(name, "hall".__eq__)
-    assert engine.operations.catalogue.find(compact.label, lambda _: False).id == compact.id
+    assert engine.operations.catalogue.find(depth.label, lambda _: False).id == depth.id
     with pytest.raises(Conflict, match="is being signed with"):
         engine.reencode("shop", engine.operations.catalogue.find("paper"))

@@ -81,7 +81,9 @@ def test_a_cloud_at_its_pose_lies_on_the_floor_and_within_the_walls(
     assert floors > 3
 
 
-def test_a_preview_is_that_of_the_artifact(full: Engine, ids: Ids, prepared: Prepared) -> None:
+def test_a_preview_is_that_of_the_artifact(
+    full: Engine, ids: Ids, uploads: tuple[Any, ...], prepared: Prepared, signer: Signer
+) -> None:
     name, surface = ids(full)[0], prepared[0][1].surface
     views: dict[View, Any] = {"depth": depth_view, "normals": normals_view}
     for view, make in views.items():
@@ -94,7 +96,7 @@ def test_a_preview_is_that_of_the_artifact(full: Engine, ids: Ids, prepared: Pre
     data = full.outputs.preview("hall", name, "patches", 640).make()
     with Image.open(io.BytesIO(data)) as image:
         assert image.size[0] == 640
-        own = prepared[0][0].n_patches[0]
+        own = len(describe(uploads[0].frame, signer.model.parameters).levels[0].means)
         assert image.text["patches"] == str(own)  # type: ignore[attr-defined]
         assert len(np.unique(np.asarray(image).reshape(-1, 3), axis=0)) in (own, own + 1)
 
@@ -105,7 +107,8 @@ def test_patches_are_those_that_were_signed(
     told = full.outputs.patches("hall", ids(full)[3]).make()
     signature, geometry = prepared[3]
     levels = describe(uploads[3].frame, signer.model.parameters).levels
-    assert tuple(len(one.mean) for one in told.levels) == signature.n_patches
+    sizes = [len(one.mean) for one in told.levels]
+    assert tuple(sizes[level] for level in signer.model.levels) == signature.n_patches
     assert told.frame == f"{ids(full)[3]}.optical"
     for one, level in zip(
         (*told.levels, told.validation), (*levels, geometry.patches), strict=True
@@ -285,5 +288,5 @@ def test_pages_of_sessions(empty: Engine, uploads: Any) -> None:
             list_sessions(empty.store, "hall", bad, 2)
     with pytest.raises(UnknownMap):
         list_sessions(empty.store, "nowhere", None, 2)
-    empty.create_map(NewMap(name="new", model="compact"))
+    empty.create_map(NewMap(name="new", model="depth"))
     assert list_sessions(empty.store, "new", None, 2).items == []

@@ -22,6 +22,7 @@ from sceneprint.engine.uploads import Upload
 from sceneprint.errors import BusyIndex, UnknownJob, UnknownQuery
 from sceneprint.index import newest, newest_number
 from sceneprint.index.files import building
+from sceneprint.models import read_model
 from sceneprint.schemas import NewMap, Query
 from sceneprint.schemas.reconstructions import NewReconstruction
 from sceneprint.store import postgres
@@ -29,7 +30,10 @@ from sceneprint.store.editing import write_frame
 from sceneprint.store.frames import delete_frame, find_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import geometry_blobs, stored_vector
+from sceneprint.store.vectors import table_of
 
+#: Where PostgreSQL keeps the vectors of signatures.
+VECTORS = table_of(read_model("depth").signature_bytes)
 #: Bytes of a piece that is looked for, and pieces of each thing.
 PIECE, MANY = 24, 40
 
@@ -52,7 +56,7 @@ def files(folder: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def rows(engine: Engine) -> Iterator[tuple[str, bytes]]:
-    """All tables of a server's database, those of codes with them, as bytes and as text."""
+    """All tables of a server's database, those of vectors with them, as bytes and as text."""
     if engine.store.database.is_sqlite:
         return  # it is one of the files
     with engine.store.database.read() as connection:
@@ -77,8 +81,9 @@ def places(engine: Engine, folder: Path, wanted: list[bytes]) -> set[str]:
 def lived_in(make_engine, store_url, uploads, work_off, tmp_path):
     """A map whose index was published twice."""
     (tmp_path / "data" / "blobs").mkdir(parents=True)  # of a database that is there nobody makes it
-    engine = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2)
-    engine.create_map(NewMap(name="hall", model="compact"))
+    given = {"database_url": store_url, "tail_frames": 2, "search": "database"}
+    engine = make_engine(tmp_path / "data", **given)
+    engine.create_map(NewMap(name="hall", model="depth"))
     for one in uploads[:6]:
         meta = one.meta.model_copy(update={"tags": ["by-the-door"], "session": "one-morning"})
         engine.uploads.add("hall", Upload(one.data, meta))
@@ -102,13 +107,12 @@ def secret(lived_in, ids, uploads):
     generation = newest(folder, row.model_id, len(vectors[0]))
     assert generation is not None
     assert len(generation) == len(numbers)
-    codes = generation.coarse.index.reconstruct_n(0, len(numbers)).astype(np.uint8)
-    place = int(generation.places.of(np.array(numbers[:1]))[0])
+    numbers_of = (np.frombuffer(vectors[0], np.uint8).astype(int) - 128).tolist()
     return {
         "upload": pieces(uploads[0].data, [one.data for one in uploads[1:]]),
         "signature": pieces(vectors[0], vectors[1:]),
         "artifact": pieces(artifacts[0], artifacts[1:]),
-        "code": [codes[place].tobytes()],
+        "vector": [",".join(map(str, numbers_of[:PIECE])).encode()],
         "tag": [b"by-the-door"],
     }
 
@@ -129,9 +133,10 @@ def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
     truth = "sceneprint.db" if engine.store.database.is_sqlite else "table signatures"
     found = {what: places(engine, tmp_path, wanted) for what, wanted in secret.items()}
     assert found["upload"] == {"blobs"}
-    assert found["signature"] == {truth, "queries", "index .segment"}
+    assert found["signature"] == {truth, "queries", "index .faiss"}
     assert found["artifact"] == {"blobs", "queries"}
-    assert found["code"] == {"index .faiss"}
+    is_sqlite = engine.store.database.is_sqlite
+    assert found["vector"] == (set() if is_sqlite else {f"table {VECTORS}"})
 
     with engine.store.database.write() as connection:  # of the others, which stay
         row = find_map(connection, "hall")

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 import time
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,8 +18,11 @@ from sceneprint.engine.deadlines import FIRST_S, Deadline
 from sceneprint.errors import UnknownFrame
 from sceneprint.geometry.diversity import DiversityParameters, diversify
 from sceneprint.geometry.retrieval import distances, pairwise_distances
+from sceneprint.index import Hits
 from sceneprint.pipeline import Signature, Signer, retrieve, validate
 from sceneprint.schemas import Answer, Query
+from sceneprint.store.frames import find_frame
+from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames
 from sceneprint.types import Geometry
 
@@ -70,11 +71,11 @@ def test_the_scales_of_diversity_are_those_of_the_library(
 ) -> None:
     names, chosen = ids(full), {}
     vectors = np.stack([one.vector for one, _ in prepared[1:]])
-    d = distances(prepared[0][0].vector, vectors)
+    d = distances(prepared[0][0].vector, vectors, "l2")
     order = np.argsort(d, kind="stable")
     for omega in (0.01, 4.0, 1000.0):
         p = DiversityParameters(0.7, omega)
-        taken = diversify(d[order], pairwise_distances(vectors[order]), 4, p)
+        taken = diversify(d[order], pairwise_distances(vectors[order], "l2"), 4, p)
         pairs = zip(taken.indices, taken.gains, strict=True)
         wanted = {names[1 + order[i]]: gain for i, gain in pairs}
         stages = ["retrieve", "diversify"]
@@ -204,11 +205,11 @@ def test_every_frame_of_the_ranking_is_explained(
     outcomes = set()
     for one in found:
         outcomes.add(one.outcome)
-        assert one.distance == distances(vectors[names[0]], vectors[one.frame_id][None])[0]
+        assert one.distance == distances(vectors[names[0]], vectors[one.frame_id][None], "l2")[0]
         if one.frame_id not in matches:
             assert (one.stage, one.outcome) == ("retrieve", "not_selected")
             nearest = min(
-                (distances(vectors[one.frame_id], vectors[name][None])[0], match.rank, name)
+                (distances(vectors[one.frame_id], vectors[name][None], "l2")[0], match.rank, name)
                 for name, match in matches.items()
             )
             said = f"most like frame {nearest[2]} of the selection (distance {nearest[0]})"
@@ -247,7 +248,7 @@ def test_a_frame_is_explained_where_it_was_lost(
     def right(one: Any) -> None:
         """Its figures are those of the library, whatever the query did."""
         i = index[one.frame_id]
-        d = distances(prepared[0][0].vector, prepared[i][0].vector[None])[0]
+        d = distances(prepared[0][0].vector, prepared[i][0].vector[None], "l2")[0]
         v = validate(prepared[0][1], prepared[i][1])
         assert (one.distance, one.rank, one.of) == (d, rank[one.frame_id], 11)
         assert (one.validation.status, one.validation.overlap) == (v.status, v.overlap)
@@ -284,33 +285,34 @@ def test_a_frame_is_explained_where_it_was_lost(
     assert (bare.validation, bare.transform, bare.lost_at) == (None, None, "ranking")
 
 
-def test_what_the_shortlist_missed_is_said(
-    signed_folder: Path, tmp_path: Path, make_engine: Callable[..., Engine], ids: Ids,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    shutil.copytree(signed_folder, tmp_path / "data")
-    engine = make_engine(tail_frames=1)
-    assert engine.publish_due() == 1
-    for name in ("search", "is_compared"):
-        few = partial(getattr(views, name), shortlist=3)
-        monkeypatch.setattr(views, name, few)
+def test_what_an_approximate_index_missed_is_said(
+    full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ids(full)
+    near = [one.frame_id for one in ask(full, names[0], stages=["retrieve"], k=11).matches]
+    real, lost = views.search, near[1]
+    with full.store.database.read() as connection:
+        number = find_frame(connection, find_map(connection, "hall"), lost).number
+
+    def search(*given: Any, dead: frozenset[int], exact: bool, **more: Any) -> Hits:
+        if exact:
+            return real(*given, dead=dead, exact=True, **more)
+        return replace(real(*given, dead=dead | {number}, exact=False, **more), exact=False)
+
+    monkeypatch.setattr(views, "search", search)
     monkeypatch.setattr(searching, "ranking_size", lambda n: min(n, 3))
-    monkeypatch.setattr(searching, "WHOLE", 0)
-    names, held = ids(engine), set()
-    for name in names[1:]:
-        answer = ask(engine, names[0], explain_frame=name, stages=["retrieve"], k=3)
-        assert (answer.exact, answer.counts.compared) == (False, 3)
+    for rank, name in enumerate(near, 1):
+        answer = ask(full, names[0], explain_frame=name, stages=["retrieve"], k=3)
+        assert (answer.exact, answer.counts.compared) == (False, 10)
         one = answer.explained_frame
-        assert one.ranked is (name in {match.frame_id for match in answer.matches})
-        if one.shortlisted:
-            held.add(name)
-            assert one.lost_at is None
-        else:
+        assert (one.rank, one.shortlisted) == (rank, name != lost)
+        if name == lost:
             assert (one.lost_at, one.ranked) == ("shortlist", False)
-            assert one.reason.startswith(
-                f"the index did not propose it, though it has rank {one.rank}"
-            )
-    assert held == {match.frame_id for match in answer.matches}
+            assert one.reason == "the index missed it, though it has rank 2: ask with `exact`"
+        elif rank <= 4:  # one place is free
+            assert (one.lost_at, one.ranked) == (None, True)
+        else:
+            assert (one.lost_at, one.ranked) == ("ranking", False)
 
 
 def test_a_frame_that_is_not_searched_is_explained(full: Engine, ids: Ids) -> None:

@@ -159,7 +159,7 @@ def test_a_map_made_anew_has_none_of_the_old_frames(
     assert len(found(ask(reader, uploads))) == len(found(ask(other, uploads))) == 12
     assert other.publish_due() == 1
     other.delete_map("hall")
-    other.create_map(NewMap(name="hall", model="compact"))
+    other.create_map(NewMap(name="hall", model="depth"))
     for engine in (reader, other, make_engine(data, tail_frames=5)):
         assert found(ask(engine, uploads)) == []
     added, _ = other.add_frame("hall", uploads[7].data, uploads[7].meta)

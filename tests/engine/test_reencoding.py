@@ -244,13 +244,13 @@ def test_what_cannot_be_begun(full: Engine, short_sighted: Path) -> None:
         full.reencode("nowhere", "paper")
     with pytest.raises(UnreadableModel):
         full.reencode("hall", "/nowhere.safetensors")
-    with pytest.raises(Conflict, match=r"is signed with compact-.*: nothing is to be done"):
-        full.reencode("hall", "compact")
+    with pytest.raises(Conflict, match=r"is signed with depth-.*: nothing is to be done"):
+        full.reencode("hall", "depth")
     with pytest.raises(Conflict, match="not being signed with another model"):
         full.cancel_reencode("hall")
     full.reencode("hall", short_sighted)
     assert full.reencode("hall", short_sighted).reencoding is not None  # the same again
     assert len(queued(full)) == 12
-    for other in ("paper", "compact"):
+    for other in ("paper", "depth"):
         with pytest.raises(Conflict, match=r"is being signed with short-.* --cancel"):
             full.reencode("hall", other)

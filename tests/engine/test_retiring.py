@@ -25,7 +25,7 @@ def aged(full, ids):
         for i, name in enumerate(ids(full)):
             when = {"received_at": time.time() - DAY_S * (12 - i) + 3600}
             connection.execute(update(frames).where(frames.c.id == name).values(when))
-    full.create_map(NewMap(name="attic", model="compact"))
+    full.create_map(NewMap(name="attic", model="depth"))
     return full
 
 
@@ -121,7 +121,7 @@ def test_the_oldest_are_found_without_reading_those_that_are_gone(aged):
 def test_a_host_whose_clock_is_wrong_deletes_nothing(make_engine, postgres_url, uploads, tmp_path):
     (tmp_path / "data" / "blobs").mkdir(parents=True)
     engine = make_engine(tmp_path / "data", database_url=postgres_url)
-    engine.create_map(NewMap(name="hall", model="compact", retention_days=1))
+    engine.create_map(NewMap(name="hall", model="depth", retention_days=1))
     right, one = time.time, uploads[0]
     with pytest.MonkeyPatch.context() as patch:  # a robot that has not been told the time yet
         patch.setattr(time, "time", lambda: right() - 30 * DAY_S)

@@ -153,12 +153,12 @@ def test_what_is_no_rigid_transform_is_no_pose() -> None:
 
 def test_maps_are_made_once(make_engine: Callable[..., Engine]) -> None:
     engine = make_engine()
-    made, new = engine.create_map(NewMap(name="hall", title="Hall", model="compact"))
+    made, new = engine.create_map(NewMap(name="hall", title="Hall", model="depth"))
     assert (new, made.revision, made.frames, made.title) == (True, 0, {}, "Hall")
-    assert made.model == f"compact-{made.model_id[:12]}"
-    assert engine.create_map(NewMap(name="hall", title="Hall", model="compact")) == (made, False)
+    assert made.model == f"depth-{made.model_id[:12]}"
+    assert engine.create_map(NewMap(name="hall", title="Hall", model="depth")) == (made, False)
     for other in ({"title": "Room"}, {"model": "paper"}, {"title": None}):
-        given = {"name": "hall", "title": "Hall", "model": "compact"} | other
+        given = {"name": "hall", "title": "Hall", "model": "depth"} | other
         with pytest.raises(MapExists, match="'hall' with another title or model"):
             engine.create_map(NewMap.model_validate(given))
     assert engine.list_maps().items == [made]

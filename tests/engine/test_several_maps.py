@@ -19,7 +19,7 @@ MAPS = ["hall", "lab"]
 @pytest.fixture
 def two(full: Engine, uploads: Any, work_off: Any) -> Engine:
     """`hall` with all twelve frames, and `lab` with two of each room."""
-    full.create_map(NewMap(name="lab", model="compact"))
+    full.create_map(NewMap(name="lab", model="depth"))
     for i in (1, 4, 7, 10):
         full.add_frame("lab", uploads[i].data, uploads[i].meta)
     work_off(full)
@@ -98,7 +98,7 @@ def test_a_stored_frame_does_not_find_itself_and_finds_others(two: Engine, ids: 
 def test_two_maps_may_call_their_frames_alike(full: Engine, uploads: Any, work_off: Any) -> None:
     maps = ["attic", "cellar"]
     for name, places in zip(maps, ((0, 1), (1, 2)), strict=True):
-        full.create_map(NewMap(name=name, model="compact"))
+        full.create_map(NewMap(name=name, model="depth"))
         for frame_id, i in zip(("a", "b"), places, strict=True):
             upload = Upload(uploads[i].data, uploads[i].meta, frame_id=frame_id)
             full.uploads.add(name, upload)
@@ -138,11 +138,11 @@ def test_two_maps_may_call_their_frames_alike(full: Engine, uploads: Any, work_o
 
 def test_maps_of_two_models_are_not_asked_as_one(two: Engine, uploads: Any, ids: Ids) -> None:
     two.create_map(NewMap(name="big", model="paper"))
-    with pytest.raises(InvalidRequest, match=r"hall has compact-.*big has paper-") as caught:
+    with pytest.raises(InvalidRequest, match=r"hall has depth-.*big has paper-") as caught:
         ask(two, ["hall", "big"], uploads[0])
     assert [field for field, _ in caught.value.fields] == ["maps.hall", "maps.big"]
     stored = NamedFrame(map="hall", frame_id=ids(two)[0])
-    with pytest.raises(InvalidRequest, match=r"big has paper-.*hall has compact-"):
+    with pytest.raises(InvalidRequest, match=r"big has paper-.*hall has depth-"):
         two.queries.stored(["big"], stored, Query())
     with pytest.raises(UnknownMap, match="'attic'"):
         ask(two, ["hall", "attic"], uploads[0])
@@ -162,6 +162,6 @@ def test_maps_are_chosen_by_who_asks(two: Engine) -> None:
     with pytest.raises(UnknownMap, match="no map to ask"):
         of("*")
     for i in range(63):
-        two.create_map(NewMap(name=f"m{i}", model="compact"))
+        two.create_map(NewMap(name=f"m{i}", model="depth"))
     with pytest.raises(InvalidRequest, match="65 maps, and 64"):
         of("*", "hall", "lab", *(f"m{i}" for i in range(63)))

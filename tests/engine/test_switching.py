@@ -23,7 +23,7 @@ from sceneprint.engine.readers import index_folder
 from sceneprint.errors import Busy, ModelMismatch, UselessFrame
 from sceneprint.geometry.retrieval import distances
 from sceneprint.models import Model, save_model
-from sceneprint.pipeline import Signer, prepare
+from sceneprint.pipeline import Signer, open_signer, prepare
 from sceneprint.schemas import FrameState, JobState, Query
 from sceneprint.store.signatures import StoredSignature, replace_signature
 from sceneprint.store.tables import signatures
@@ -32,22 +32,29 @@ from sceneprint.types import Bytes
 Make = Callable[..., Engine]
 WorkOff = Callable[[Engine], list[JobState | None]]
 R = Query(stages=("retrieve",), k=50, exact=True)
-COMPACT = "compact"
+DEPTH = "depth"
 
 
 @pytest.fixture(scope="module")
-def small_file(small_model: Model, tmp_path_factory: pytest.TempPathFactory) -> str:
+def whitened_signer(whitened_model: Model) -> Signer:
+    return open_signer(whitened_model, cached=False)
+
+
+@pytest.fixture(scope="module")
+def small_file(whitened_model: Model, tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("model") / "small.safetensors"
-    save_model(small_model, path)
+    save_model(whitened_model, path)
     return str(path)
 
 
 @pytest.fixture(scope="module")
-def by_model(uploads: Any, signer: Signer, small_signer: Signer) -> dict[str, tuple[Signer, Bytes]]:
+def by_model(
+    uploads: Any, signer: Signer, whitened_signer: Signer
+) -> dict[str, tuple[Signer, Bytes]]:
     """By the label of each model its signer, and its signatures of all uploads."""
     return {
         one.model.label: (one, np.stack([prepare(each.frame, one)[0].vector for each in uploads]))
-        for one in (signer, small_signer)
+        for one in (signer, whitened_signer)
     }
 
 
@@ -72,7 +79,7 @@ def right(
 ) -> list[tuple[str, int]]:
     """What a query by upload must find in a map of the model."""
     vectors = by_model[label][1]
-    apart = distances(vectors[asked].copy(), vectors)
+    apart = distances(vectors[asked].copy(), vectors, "l2")
     return [(names[i], int(apart[i])) for i in np.argsort(apart, kind="stable")]
 
 
@@ -110,7 +117,7 @@ def test_no_answer_mixes_models_while_a_map_goes_to_and_fro(
     for thread in threads:
         thread.start()
     try:
-        for model in (small_file, COMPACT) * 2:
+        for model in (small_file, DEPTH) * 2:
             switch(full, model, work_off)
             label, end = full.get_map("hall").model, time.monotonic() + 60
             while not all(mine and mine[-1] == label for mine in seen) and not raised:
@@ -129,7 +136,7 @@ def test_a_query_signed_before_the_switch_is_signed_again(
     by_model: dict[str, tuple[Signer, Bytes]], monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """The map switches between the signing of a query and its search, and behind the search."""
-    names, models = ids(full), [small_file, COMPACT, small_file, COMPACT]
+    names, models = ids(full), [small_file, DEPTH, small_file, DEPTH]
 
     def then_switch(step: Callable[..., Any]) -> Callable[..., Any]:
         def run(*given: Any, **more: Any) -> Any:
@@ -148,33 +155,33 @@ def test_a_query_signed_before_the_switch_is_signed_again(
     assert found(full.query_upload("hall", uploads[4].data, uploads[4].meta, R)) == right(
         names, by_model, answer.model, 4
     )
-    models[:] = [COMPACT]
+    models[:] = [DEPTH]
     answer = full.query_frame("hall", names[4], R)
-    assert answer.model.startswith("compact-")
+    assert answer.model.startswith("depth-")
     assert found(answer) == right(names, by_model, answer.model, 4)[1:]
     monkeypatch.undo()
     monkeypatch.setattr(querying, "answer", then_switch(querying.answer))
     models[:] = [small_file]
     answer = full.query_upload("hall", uploads[4].data, uploads[4].meta, R)
     assert answer.model.startswith("small-")
-    models[:] = [COMPACT, small_file] * 5
+    models[:] = [DEPTH, small_file] * 5
     with pytest.raises(Busy, match="again and again"):
         full.query_upload("hall", uploads[4].data, uploads[4].meta, R)
 
 
 def test_signatures_of_two_models_are_not_compared_whatever_their_length(
-    full: Engine, uploads: Any, small_model: Model, signer: Signer
+    full: Engine, uploads: Any, whitened_model: Model, signer: Signer
 ) -> None:
     row = full._row("hall")
     asked = querying.ask_upload(uploads[0].data, uploads[0].meta, signer, R)
     given = ([row], asked, R, Deadline(None))
     assert full.queries.answer(*given).matches[0].distance == 0
     with pytest.raises(ModelMismatch, match="two models cannot be compared"):
-        full.queries.answer([row], replace(asked, model_id=small_model.id), R, Deadline(None))
+        full.queries.answer([row], replace(asked, model_id=whitened_model.id), R, Deadline(None))
 
 
 def test_what_was_being_signed_at_the_switch_is_signed_with_the_new_model(
-    empty: Engine, uploads: Any, work_off: WorkOff, small_file: str, small_model: Model,
+    empty: Engine, uploads: Any, work_off: WorkOff, small_file: str, whitened_model: Model,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     for each in uploads[:2]:
@@ -194,7 +201,7 @@ def test_what_was_being_signed_at_the_switch_is_signed_with_the_new_model(
     added, _ = empty.add_frame("hall", uploads[3].data, uploads[3].meta)
     held = empty.claim("slow")
     assert held is not None
-    switch(empty, COMPACT, work_off)
+    switch(empty, DEPTH, work_off)
     with monkeypatch.context() as patch:
         patch.setattr(working, "prepare", useless)
         assert empty.run(held) == JobState.QUEUED
@@ -228,7 +235,7 @@ def test_the_index_of_the_next_model_is_there_at_the_switch(
     assert set(work_off(engine)) == {JobState.SUCCEEDED}
     for asked in (engine, full):
         answer = asked.query_frame("hall", names[1], R)
-        assert (answer.index_generation, answer.model[:8]) == (1, "compact-")
+        assert (answer.index_generation, answer.model[:6]) == (1, "depth-")
     engine.publish_due()
     answer = engine.query_upload("hall", uploads[4].data, uploads[4].meta, R)
     assert (answer.index_generation, answer.counts.map) == (1, 12)
@@ -254,7 +261,7 @@ def test_an_index_that_cannot_be_written_does_not_hold_the_switch_up(
 
 def test_what_an_index_of_the_next_model_lacks_is_found_after_the_switch(
     full: Engine, make_engine: Make, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
-    small_signer: Signer, by_model: dict[str, tuple[Signer, Bytes]],
+    whitened_signer: Signer, by_model: dict[str, tuple[Signer, Bytes]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """A frame that could not be signed when the index was published, and was before the switch."""
@@ -273,7 +280,7 @@ def test_what_an_index_of_the_next_model_lacks_is_found_after_the_switch(
     coming = replace(engine._row("hall"), model_id=blind.model_id)
     assert index_folder(engine.settings.indexes, coming).is_dir()  # and is not cleared away
     at = names.index(blind.frame.id)
-    signature, _ = prepare(uploads[at].frame, small_signer)
+    signature, _ = prepare(uploads[at].frame, whitened_signer)
     made = StoredSignature(
         signature.model_id, signature.vector.tobytes(), engine.store.blobs.put(b"artifact"),
         signature.n_patches, signature.n_pairs,
@@ -304,7 +311,7 @@ def test_a_rejected_frame_is_gone_for_readers_that_knew_it(
     work_off(full)
     full.publish_due()
     assert full.get_frame("hall", blind.frame.id).reason == "nothing"
-    switch(full, COMPACT, work_off)
+    switch(full, DEPTH, work_off)
     at = names.index(blind.frame.id)
     asked = (at + 1) % 12
     wanted = right(names, by_model, full.get_map("hall").model, asked)
@@ -417,6 +424,6 @@ def test_a_frame_is_signed_again_by_a_model_that_the_map_goes_back_to(
         patch.setattr(working, "prepare", refuse)
         switch(full, small_file, work_off)
         assert full.get_frame("hall", name).state == "rejected"
-        switch(full, COMPACT, work_off)
+        switch(full, DEPTH, work_off)
         work_off(full)
     assert full.get_frame("hall", name).state == "indexed"

@@ -23,7 +23,7 @@ from sceneprint.store.tables import events, jobs
 @pytest.fixture
 def engine(make_engine: Callable[..., Engine]) -> Engine:
     engine = make_engine()
-    engine.create_map(NewMap(name="hall", model="compact"))
+    engine.create_map(NewMap(name="hall", model="depth"))
     return engine
 
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine, administration, readers, searching, views
-from sceneprint.errors import UnreadableModel
-from sceneprint.index import search
+from sceneprint.engine import Engine, administration, readers, upkeep
+from sceneprint.errors import InvalidRequest, UnreadableModel
 from sceneprint.schemas import JobState, NewMap, Query
+from sceneprint.store.maps import find_map
 from sceneprint.store.tables import models
 
 Make = Callable[..., Engine]
@@ -33,7 +33,7 @@ def test_an_index_of_a_history_that_was_undone_is_not_believed(
     """Put back to two frames, the database gives the numbers of the next three out again."""
     data, kept = tmp_path / "data", tmp_path / "kept"
     engine = make_engine(data, tail_frames=2)
-    engine.create_map(NewMap(name="hall", model="compact"))
+    engine.create_map(NewMap(name="hall", model="depth"))
     fill(engine, uploads, work_off, range(2))
     engine.close()
     shutil.copytree(data, kept)
@@ -62,7 +62,7 @@ def test_an_index_that_cannot_be_written_costs_no_frame(
 ) -> None:
     (tmp_path / "file").write_text("in the way")
     engine = make_engine(index_dir=tmp_path / "file" / "index", tail_frames=1)
-    engine.create_map(NewMap(name="hall", model="compact"))
+    engine.create_map(NewMap(name="hall", model="depth"))
     names = fill(engine, uploads, work_off, range(3))
     assert engine.publish_due() == 0
     assert [r.message for r in caplog.records if r.levelname == "ERROR"] == ["no index published"]
@@ -74,7 +74,7 @@ def test_indexes_of_deleted_maps_are_removed_and_nothing_else(
     make_engine: Make, uploads: Any, work_off: Any, tmp_path: Path
 ) -> None:
     engine = make_engine(tail_frames=1)
-    engine.create_map(NewMap(name="hall", model="compact"))
+    engine.create_map(NewMap(name="hall", model="depth"))
     fill(engine, uploads, work_off, range(3))
     assert engine.publish_due() == 1
     (folder,) = engine.settings.indexes.glob("[!.]*")
@@ -93,7 +93,7 @@ def test_what_was_not_asked_for_long_is_not_held(
 ) -> None:
     engine = make_engine()
     for name in ("hall", "other"):
-        engine.create_map(NewMap(name=name, model="compact"))
+        engine.create_map(NewMap(name=name, model="depth"))
         engine.add_frame(name, uploads[0].data, uploads[0].meta)
     work_off(engine)
 
@@ -104,7 +104,7 @@ def test_what_was_not_asked_for_long_is_not_held(
         return list(engine._readers._open)
 
     assert held() == ["other", "hall"]
-    monkeypatch.setattr(readers, "HELD_BYTES", 2 * 64 * 12_800 - 1)  # 64 rows are set aside at once
+    monkeypatch.setattr(readers, "HELD_BYTES", 2 * 64 * 448 - 1)  # 64 rows are set aside at once
     assert held() == ["hall"]
 
 
@@ -112,7 +112,7 @@ def test_a_model_that_cannot_be_read_costs_its_maps_alone(
     make_engine: Make, uploads: Any, work_off: Any, caplog: Any
 ) -> None:
     engine = make_engine()
-    for name, model in (("hall", "compact"), ("old", "paper")):
+    for name, model in (("hall", "depth"), ("old", "paper")):
         engine.create_map(NewMap(name=name, model=model))
     old = engine.get_map("old").model_id
     with engine.store.database.write() as connection:
@@ -127,21 +127,88 @@ def test_a_model_that_cannot_be_read_costs_its_maps_alone(
         fresh.query_upload("old", uploads[0].data, uploads[0].meta, ALL)
 
 
-@pytest.mark.parametrize(
-    ("whole", "exact", "compared"), [(12, False, 12), (11, True, 12), (11, False, 3)]
-)
-def test_a_shortlist_is_taken_in_large_maps_alone_and_where_exactness_is_not_asked_for(
-    signed_folder: Path, tmp_path: Path, make_engine: Make, uploads: Any,
-    monkeypatch: pytest.MonkeyPatch, whole: int, exact: bool, compared: int,
+def test_a_large_map_is_published_by_its_share(
+    signed_folder: Path, tmp_path: Path, make_engine: Make, uploads: Any, work_off: Any,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
+    """Of 12 frames a fourth: what is written in all is proportional to the map."""
     shutil.copytree(signed_folder, tmp_path / "data")
     engine = make_engine(tmp_path / "data", tail_frames=1)
+    monkeypatch.setattr(upkeep, "SHARE", 0.25)
     assert engine.publish_due() == 1
-    monkeypatch.setattr(views, "search", partial(search, shortlist=3))
-    monkeypatch.setattr(searching, "ranking_size", lambda n: min(n, 3))
-    monkeypatch.setattr(searching, "WHOLE", whole)
-    query = Query(stages=("retrieve",), k=3, exact=exact)
-    answer = engine.query_upload("hall", uploads[4].data, uploads[4].meta, query)
-    assert (answer.counts.map, answer.counts.compared) == (12, compared)
-    assert (answer.exact, answer.index_generation) == (compared == 12, 1)
-    assert answer.matches[0].distance == 0
+    names = [one.frame_id for one in engine.list_frames("hall").items]
+    due = []
+    for name in names[:4]:
+        engine.delete_frame("hall", name)
+        other = make_engine(tmp_path / "data", tail_frames=1)  # who knows nothing of the index
+        due.append((engine.publish_due(), other.publish_due()))
+    assert due == [(0, 0), (0, 0), (0, 0), (1, 0)]
+    answer = engine.query_upload("hall", uploads[11].data, uploads[11].meta, ALL)
+    assert (answer.counts.map, answer.index_generation) == (8, 2)
+
+
+def test_maps_of_whole_fisher_vectors_have_no_index(
+    make_engine: Make, uploads: Any, work_off: Any, tmp_path: Path
+) -> None:
+    engine = make_engine(tail_frames=1)
+    engine.create_map(NewMap(name="hall", model="paper"))
+    names = fill(engine, uploads, work_off, range(3))
+    assert engine.publish_due() == 0
+    assert list(engine.settings.indexes.glob("hall*/*.json")) == []
+    with pytest.raises(InvalidRequest, match="has no index to rebuild"):
+        engine.rebuild_index("hall")
+    with engine.store.database.read() as connection:
+        folder = readers.index_folder(engine.settings.indexes, find_map(connection, "hall"))
+
+    def left() -> None:
+        """What version 0.1 had made of such a map."""
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"0000000001-{'0' * 32}.json").write_bytes(b"{}")
+        (folder / f"{'0' * 64}.segment").write_bytes(b"of deleted frames")
+
+    left()
+    assert engine.publish_due() == 0
+    assert not folder.exists()
+    left()
+    assert engine.purging.now().indexes == 1
+    assert not folder.exists()
+    answer = engine.query_upload("hall", uploads[1].data, uploads[1].meta, ALL)
+    assert (answer.matches[0].frame_id, answer.index_generation) == (names[1], 0)
+
+
+def test_a_model_of_another_version_keeps_its_index(
+    make_engine: Make, uploads: Any, work_off: Any
+) -> None:
+    """Who made it looks after it."""
+    engine = make_engine(tail_frames=1)
+    engine.create_map(NewMap(name="hall", model="depth"))
+    fill(engine, uploads, work_off, range(3))
+    assert engine.publish_due() == 1
+    (folder,) = engine.settings.indexes.glob("hall*")
+    with engine.store.database.write() as connection:
+        connection.execute(update(models).values(content=b"of another version"))
+    other = make_engine(tail_frames=1)
+    assert other.publish_due() == 0
+    assert len(list(folder.glob("*.json"))) == 1
+
+
+def test_purging_leaves_no_byte_of_what_was_deleted(
+    make_engine: Make, uploads: Any, work_off: Any
+) -> None:
+    engine = make_engine(tail_frames=2)
+    engine.create_map(NewMap(name="hall", model="depth"))
+    names = fill(engine, uploads, work_off, range(5))
+    assert engine.publish_due() == 1
+    (folder,) = engine.settings.indexes.glob("hall*")
+    (path,) = folder.glob("*.faiss")
+    number = engine.view("hall")[2].generation.keys[1]
+    row = engine.view("hall")[2].generation.vectors_of(np.array([number])).tobytes()
+    assert row in path.read_bytes()
+    assert engine.purging.now().indexes == 0  # nothing was deleted
+    engine.delete_frame("hall", names[1])
+    assert engine.purging.now().indexes == 1
+    assert all(row not in one.read_bytes() for one in folder.iterdir())
+    assert engine.purging.now().indexes == 0
+    answer = engine.query_upload("hall", uploads[1].data, uploads[1].meta, ALL)
+    assert names[1] not in [one.frame_id for one in answer.matches]
+    assert answer.counts.map == 4

@@ -95,7 +95,7 @@ def test_other_samples_another_camera_and_another_map_are_other_frames(
     empty: Engine, uploads: Any
 ) -> None:
     data, meta = uploads[0].data, uploads[0].meta
-    empty.create_map(NewMap(name="other", model="compact"))
+    empty.create_map(NewMap(name="other", model="depth"))
     image = np.array(Image.open(io.BytesIO(data)))
     image[np.unravel_index(image.argmax(), image.shape)] -= 1  # one millimetre of one pixel
     out = io.BytesIO()
@@ -156,7 +156,7 @@ def test_a_deleted_frame_is_found_no_more_and_may_come_again(
 def test_blobs_stay_while_another_map_refers_to_them(
     empty: Engine, uploads: Any, work_off: WorkOff, how: str
 ) -> None:
-    empty.create_map(NewMap(name="other", model="compact"))
+    empty.create_map(NewMap(name="other", model="depth"))
     added = {}
     for name in ("hall", "other"):
         added[name], _ = empty.add_frame(name, uploads[0].data, uploads[0].meta)

@@ -186,7 +186,7 @@ def test_an_artifact_swept_before_its_commit_is_not_referred_to(
     empty: Engine, uploads: Any, due_now: DueNow, work_off: WorkOff
 ) -> None:
     """Another map's frame with the same artifact is deleted while this one is signed."""
-    empty.create_map(NewMap(name="other", model="compact"))
+    empty.create_map(NewMap(name="other", model="depth"))
     other, _ = empty.add_frame("other", uploads[0].data, uploads[0].meta)
     assert work_off(empty) == [JobState.SUCCEEDED]
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)

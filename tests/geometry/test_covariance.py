@@ -220,7 +220,7 @@ def test_a_place_from_its_votes() -> None:
 
 def test_errors_are_as_large_as_is_told() -> None:
     """On rooms that nothing was fitted to: seed 6303, where the scale is of 6101."""
-    model = read_model("compact")
+    model = read_model("depth")
     votes = [one for room in (2, 3) for one in votes_of(6303, room, model) if near(one.error)]
     found = np.array([square(one.error, one.covariance) for one in votes]) / 6
     assert len(found) >= 25

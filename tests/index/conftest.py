@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sceneprint.index import Generation, publish
-from sceneprint.index.segments import Block
+from sceneprint.index.keys import Keys
 from sceneprint.types import Bytes
 
-Keys = NDArray[np.int64]
 Walk = Callable[..., Bytes]
 Publish = Callable[..., Generation]
 
@@ -44,15 +42,6 @@ def walk() -> Walk:
     return make
 
 
-@pytest.fixture(scope="session")
-def in_blocks() -> Callable[[Keys, Bytes, int], Iterator[Block]]:
-    def cut(keys: Keys, signatures: Bytes, step: int = 37) -> Iterator[Block]:
-        for start in range(0, len(keys), step):
-            yield keys[start : start + step], signatures[start : start + step]
-
-    return cut
-
-
 @pytest.fixture
 def published(tmp_path: Path) -> Publish:
     """Publish keys and signatures as the next generation of one folder."""
@@ -64,6 +53,7 @@ def published(tmp_path: Path) -> Publish:
         folder: Path = tmp_path / "map",
         revision: int = 0,
         drop: frozenset[int] = frozenset(),
+        **more: Any,
     ) -> Generation:
         generation = publish(
             folder,
@@ -72,6 +62,7 @@ def published(tmp_path: Path) -> Publish:
             blocks=[(keys, signatures)],
             previous=previous,
             drop=drop,
+            **more,
         )
         assert generation is not None
         return generation
@@ -86,25 +77,8 @@ def nearest() -> Callable[..., tuple[list[int], list[int]]]:
     def find(query: Bytes, frames: dict[int, Bytes], size: int) -> tuple[list[int], list[int]]:
         asked = query.astype(np.int64)
         found = sorted(
-            (int(np.abs(x.astype(np.int64) - asked).sum()), k) for k, x in frames.items()
+            (int(((x.astype(np.int64) - asked) ** 2).sum()), k) for k, x in frames.items()
         )
         return [k for _, k in found[:size]], [d for d, _ in found[:size]]
 
     return find
-
-
-@pytest.fixture(scope="session")
-def fingerprints() -> Callable[[Path], dict[str, tuple[int, int, str]]]:
-    """Inode, time of change and content of every segment in a folder."""
-
-    def take(folder: Path) -> dict[str, tuple[int, int, str]]:
-        return {
-            path.name: (
-                path.stat().st_ino,
-                path.stat().st_mtime_ns,
-                hashlib.sha256(path.read_bytes()).hexdigest(),
-            )
-            for path in folder.glob("*.segment")
-        }
-
-    return take

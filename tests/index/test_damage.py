@@ -7,11 +7,14 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
+import faiss
 import numpy as np
 import pytest
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index import Generation, newest
+from sceneprint.index import Generation, files, newest, newest_number, scrub
+from sceneprint.index.flat import map_index
+from sceneprint.index.lists import map_lists
 from sceneprint.index.manifests import Manifest, manifests, read_manifest
 from sceneprint.types import Bytes
 
@@ -20,48 +23,50 @@ Publish = Callable[..., Generation]
 LENGTH = 32
 
 
+KINDS = ["json", "keys", "faiss", "lists"]
+
+
 @pytest.fixture
 def folder(walk: Walk, published: Publish, tmp_path: Path) -> Path:
-    """Two generations, of 20 and of 45 frames: refitted, so that they share a segment alone."""
+    """Two generations, of 20 and of 45 frames, which share no file."""
     signatures = walk(45, LENGTH)
-    first = published(np.arange(20), signatures[:20])
-    published(np.arange(20, 45), signatures[20:], first)
+    first = published(np.arange(20), signatures[:20], flat_bytes=0)
+    published(np.arange(20, 45), signatures[20:], first, flat_bytes=0)
     return tmp_path / "map"
 
 
-def number_of(folder: Path, verify: bool = False) -> int | None:
-    found = newest(folder, "model", LENGTH, verify=verify)
+def number_of(folder: Path) -> int | None:
+    found = newest(folder, "model", LENGTH)
     return None if found is None else found.number
 
 
 def own_files(folder: Path) -> dict[str, Path]:
-    """Files of the second generation alone, by kind."""
-    (_, second), (_, first) = manifests(folder)
-    shared = {name for name, _ in read_manifest(first).files}
-    own = [folder / name for name, _ in read_manifest(second).files if name not in shared]
-    return {"json": second} | {path.suffix[1:]: path for path in own}
+    """Files of the second generation, by kind."""
+    (_, path), *_ = manifests(folder)
+    own = [folder / name for name, _ in read_manifest(path).files]
+    return {"json": path} | {path.suffix[1:]: path for path in own}
 
 
-@pytest.mark.parametrize("kind", ["json", "faiss", "code", "rows", "segment"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_changed_file_is_passed_over(
     folder: Path, kind: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert number_of(folder, verify=True) == 2
+    assert number_of(folder) == 2
     path = own_files(folder)[kind]
     data = bytearray(path.read_bytes())
     ends = range(min(len(data), 120)), range(max(len(data) - 120, 0), len(data))
     for at in sorted({*ends[0], *ends[1], *range(0, len(data), 211)}):
         data[at] ^= 1 << at % 8
         path.write_bytes(data)
-        assert number_of(folder, verify=True) == 1, at
+        assert number_of(folder) == 1, at
         data[at] ^= 1 << at % 8
     path.write_bytes(data)
-    assert number_of(folder, verify=True) == 2
+    assert number_of(folder) == 2
     assert caplog.record_tuples[0][:2] == ("sceneprint.index.generations", logging.WARNING)
     assert path.name in caplog.text
 
 
-@pytest.mark.parametrize("kind", ["json", "faiss", "code", "rows", "segment"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_short_long_or_missing_file_is_passed_over(folder: Path, kind: str) -> None:
     path = own_files(folder)[kind]
     data = path.read_bytes()
@@ -79,7 +84,7 @@ def test_a_short_long_or_missing_file_is_passed_over(folder: Path, kind: str) ->
 def test_what_is_open_does_not_vouch_for_what_is_gone(folder: Path) -> None:
     """The next generation must not name a file that is mapped here and nowhere else."""
     second = newest(folder, "model", LENGTH)
-    own_files(folder)["segment"].unlink()
+    own_files(folder)["faiss"].unlink()
     found = newest(folder, "model", LENGTH, known=second)
     assert found is not None
     assert found.number == 1
@@ -109,15 +114,6 @@ def test_files_removed_while_they_are_opened_are_not_damaged(
     assert caplog.record_tuples == []
 
 
-def test_rows_of_signatures_are_read_on_demand_only(folder: Path) -> None:
-    path = own_files(folder)["segment"]
-    data = bytearray(path.read_bytes())
-    data[4096 + 5] ^= 1
-    path.write_bytes(data)
-    assert number_of(folder) == 2
-    assert number_of(folder, verify=True) == 1
-
-
 def test_without_a_sound_generation_there_is_none(
     folder: Path, walk: Walk, published: Publish
 ) -> None:
@@ -126,7 +122,7 @@ def test_without_a_sound_generation_there_is_none(
     assert number_of(folder) is None
     signatures = walk(45, LENGTH)
     assert published(np.arange(45), signatures).number == 3
-    assert number_of(folder, verify=True) == 3
+    assert number_of(folder) == 3
 
 
 def test_publishing_goes_on_from_the_older_and_keeps_it(
@@ -138,9 +134,9 @@ def test_publishing_goes_on_from_the_older_and_keeps_it(
     assert older.number == 1
     assert published(np.arange(20, 45), walk(45, LENGTH)[20:], older).number == 3
     assert [number for number, _ in manifests(folder)] == [3, 1]
-    assert number_of(folder, verify=True) == 3
-    own_files(folder)["rows"].write_bytes(b"")
-    assert number_of(folder, verify=True) == 1
+    assert number_of(folder) == 3
+    own_files(folder)["keys"].write_bytes(b"")
+    assert number_of(folder) == 1
 
 
 def test_a_damaged_file_is_written_again_when_its_content_is(
@@ -148,21 +144,23 @@ def test_a_damaged_file_is_written_again_when_its_content_is(
 ) -> None:
     """Names come from content, so that a name may be there already, with other bytes."""
     for path in folder.iterdir():
-        if path.suffix in {".faiss", ".code", ".rows"}:
+        if path.suffix in {".faiss", ".keys", ".lists"}:
             path.write_bytes(b"damaged")
     signatures = walk(45, LENGTH)
-    published(np.arange(20), signatures[:20])  # the very bytes of the first generation
-    assert number_of(folder, verify=True) == 3
+    # the very bytes of the first generation
+    published(np.arange(20), signatures[:20], flat_bytes=0)
+    assert number_of(folder) == 3
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"schema_version": 2},
+        {"schema_version": 3},
         {"files": []},
         {"files": [["../../etc/passwd", 1]]},
         {"number": None, "unknown": 1},
         {"files": 3},
+        {"recall": None},
     ],
 )
 def test_a_manifest_that_means_something_else_is_refused(
@@ -173,8 +171,80 @@ def test_a_manifest_that_means_something_else_is_refused(
 
     path = own_files(folder)["json"]
     data = json.dumps(json.loads(path.read_bytes()) | change).encode()
-    other = path.with_name(f"0000000009-{hashlib.sha256(data).hexdigest()[:32]}.json")
+    other = path.with_name(f"0000000009-{hashlib.sha256(data).hexdigest()[:32]}.2.json")
     other.write_bytes(data)
     with pytest.raises(DamagedIndex):
         read_manifest(other)
     assert number_of(folder) == 2
+
+
+def test_what_version_0_1_left_is_no_damage(
+    folder: Path, walk: Walk, published: Publish, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its manifests and files are passed over in silence, and the next builder removes them."""
+    old = [folder / f"0000000009-{'a' * 32}.json"]
+    old += [folder / f"{'b' * 64}.{kind}" for kind in ("segment", "rows", "code", "faiss")]
+    for path in old:
+        path.write_bytes(b'{"schema_version": 1}')
+    found = newest(folder, "model", LENGTH)
+    assert found is not None
+    assert (found.number, newest_number(folder)) == (2, 2)
+    assert [path for path in scrub(folder) if path is not None] == []
+    assert caplog.record_tuples == []
+    assert published(np.arange(45, 50), walk(50, LENGTH)[45:], found).number == 3
+    assert not any(path.exists() for path in old)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_scrubbing_names_what_is_damaged(folder: Path, kind: str) -> None:
+    assert set(scrub(folder)) == {None}
+    path = own_files(folder)[kind]
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    assert [each for each in scrub(folder) if each is not None] == [path]
+    path.unlink()
+    assert [each for each in scrub(folder) if each is not None] == [path] * (kind != "json")
+
+
+def test_scrubbing_stops_between_blocks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "BLOCK_BYTES", 100)
+    steps = list(scrub(folder))
+    sizes = [size for _, size in read_manifest(manifests(folder)[0][1]).files]
+    assert len(steps) == sum(-(-size // 100) for size in sizes)
+
+
+@pytest.mark.parametrize(
+    ("kind", "dimension", "qtype", "n"),
+    [
+        ("IndexFlat", LENGTH, None, 45),
+        ("IndexScalarQuantizer", LENGTH, "QT_8bit", 45),
+        ("IndexScalarQuantizer", LENGTH, "QT_8bit_direct", 44),
+        ("IndexScalarQuantizer", LENGTH - 1, "QT_8bit_direct", 45),
+    ],
+)
+def test_another_kind_of_faiss_index_is_refused(
+    tmp_path: Path, kind: str, dimension: int, qtype: str | None, n: int
+) -> None:
+    """Sound bytes, of somebody's own making."""
+    rows = np.random.default_rng(0).integers(0, 256, (n, dimension)).astype(np.float32)
+    more = () if qtype is None else (getattr(faiss.ScalarQuantizer, qtype),)
+    index = getattr(faiss, kind)(dimension, *more)
+    index.train(rows)
+    index.add(rows)
+    faiss.write_index(index, str(tmp_path / "other"))
+    with pytest.raises(DamagedIndex, match="no FAISS index of 45"):
+        map_index(tmp_path / "other", 45, LENGTH)
+
+
+def test_lists_of_other_signatures_are_refused(folder: Path) -> None:
+    path = own_files(folder)["lists"]
+    assert len(map_lists(path, 45, LENGTH, 1)) > 1
+    for n, dimension in ((44, LENGTH), (45, LENGTH + 1)):
+        with pytest.raises(DamagedIndex, match="no lists of"):
+            map_lists(path, n, dimension, 1)
+    data = path.read_bytes()
+    for wrong in (b"", data[:20], data[:-1], b"X" + data[1:], data[:6] + b"\x09" + data[7:]):
+        path.write_bytes(wrong)
+        with pytest.raises(DamagedIndex, match="no lists of"):
+            map_lists(path, 45, LENGTH, 1)

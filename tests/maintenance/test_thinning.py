@@ -31,8 +31,8 @@ N = 60
 def vectors() -> Bytes:
     """Signatures of places, each seen a few times from a little further, in mixed order."""
     rng = np.random.default_rng(3)
-    places = rng.integers(0, 30, (12, 12_800))
-    seen = [places[i % 12] + rng.integers(0, 1 + i // 12, 12_800) for i in range(N - 2)]
+    places = rng.integers(0, 30, (12, 448))
+    seen = [places[i % 12] + rng.integers(0, 1 + i // 12, 448) for i in range(N - 2)]
     seen += [seen[5], seen[40]]
     return np.stack(seen).astype(np.uint8)
 
@@ -43,7 +43,7 @@ def filled(vectors: Bytes, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("filled") / "data"
     camera = {"width": 4, "height": 3, "fx": 1.0, "fy": 1.0, "cx": 1.5, "cy": 1.0}
     with Engine(Settings(data_dir=folder)) as engine:
-        engine.create_map(NewMap(name="hall", model="compact"))
+        engine.create_map(NewMap(name="hall", model="depth"))
         blobs = [[engine.store.blobs.put(bytes([i, kind]) * half)
                   for kind, half in ((0, 50), (1, 10))] for i in range(N)]  # fmt: skip
         with engine.store.database.write() as connection:
@@ -129,20 +129,22 @@ def test_novelty_is_what_its_sentence_says(
     engine = make()
     names = ids(engine)
     d0 = engine.view("hall")[1].unrelated_distance
-    among = pairwise_distances(vectors)
-    for share in (0.0, 0.05, 0.1, 0.15, 0.3):
+    among = pairwise_distances(vectors, "l2")
+    for share in (0.0, 0.2, 0.3, 0.4, 0.55):
         kept: list[int] = []
         expected = []
         for i in range(N):
             near = [among[i, j] for j in kept]
-            if not near or min(near) > share * d0:
+            if not near or np.sqrt(min(near) / d0) > share:
                 kept.append(i)
             else:
-                expected.append((names[i], names[kept[int(np.argmin(near))]], min(near) / d0))
+                expected.append(
+                    (names[i], names[kept[int(np.argmin(near))]], np.sqrt(min(near) / d0))
+                )
         steps: list[tuple[int, int]] = []
         proposal = propose(engine, "hall", novelty=share, progress=noted(steps))
         assert [(one.frame_id, one.like, one.share) for one in proposal.losses] == expected
-        assert proposal.freed_bytes == len(expected) * (100 + 20 + 12_800)
+        assert proposal.freed_bytes == len(expected) * (100 + 20 + 448)
         assert steps == [(min(i + 7, N), N) for i in range(0, N, 7)]
         shares = [share for _, _, share in expected]
         assert proposal.shares == (np.median(shares), max(shares))
@@ -157,7 +159,7 @@ def test_the_most_telling_are_those_of_the_determinant(
     engine = make()
     names = ids(engine)
     d0 = engine.view("hall")[1].unrelated_distance
-    among = pairwise_distances(vectors)
+    among = pairwise_distances(vectors, "l2")
     for keep in (1, 5, 12, 57):
         chosen = diversify(np.full(N, 1.0), among, keep).indices
         steps: list[tuple[int, int]] = []
@@ -165,7 +167,7 @@ def test_the_most_telling_are_those_of_the_determinant(
         lost = [i for i in range(N) if i not in chosen]
         assert [one.frame_id for one in proposal.losses] == [names[i] for i in lost]
         for i, one in zip(lost, proposal.losses, strict=True):
-            assert one.share == among[i, chosen].min() / d0
+            assert one.share == np.sqrt(among[i, chosen].min() / d0)
         assert steps == [(i + 1, keep) for i in range(keep)]
     # of 60 two are exact duplicates: they go, whatever is asked for
     assert [one.frame_id for one in propose(engine, "hall", keep=59).losses] == names[-2:]
@@ -190,7 +192,7 @@ def test_the_scale_is_that_of_a_sample_by_its_seed(
     assert one == same
     assert scales[0] == scales[1] != scales[2]
     drawn = np.sort(np.random.default_rng(1).choice(N, 4, replace=False))
-    among = pairwise_distances(vectors[drawn])
+    among = pairwise_distances(vectors[drawn], "l2")
     assert scales[0] == np.median(among[np.triu_indices(4, 1)])
     assert len(other.losses) == 40
 

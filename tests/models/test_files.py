@@ -56,9 +56,63 @@ def test_id_is_the_content_not_the_name(small_model: Model) -> None:
         replace(small_model, parameters=depth),
         replace(small_model, mixture=bent),
         replace(small_model, quantiser_step=0.003),
-        replace(small_model, unrelated_distance=1001.0),
+        replace(small_model, psi_unrelated_distance=1001.0),
     ]
     assert len({small_model.id, *(other.id for other in others)}) == 9
+
+
+def test_a_whitening_is_part_of_the_content(small_model: Model, small_whitened: Model) -> None:
+    own = small_whitened.whitening
+    assert own is not None
+    others = [
+        replace(small_whitened, whitening=changed)
+        for changed in (
+            replace(own, levels=(0,)),
+            replace(own, basis=-own.basis),
+            replace(own, scales=2 * own.scales),
+            replace(own, offsets=own.offsets + 1),
+            replace(own, unrelated_distance=499_999.0),
+        )
+    ]
+    assert len({small_model.id, small_whitened.id, *(other.id for other in others)}) == 7
+    assert small_whitened.of_psi.id == small_model.id
+
+
+def test_round_trip_of_a_whitening(small_whitened: Model, tmp_path: Path) -> None:
+    save_model(small_whitened, tmp_path / "m")
+    read = read_model(tmp_path / "m")
+    assert read.id == small_whitened.id
+    assert (read.metric, read.levels, read.signature_bytes) == ("l2", (1,), 24)
+    assert (read.unrelated_distance, read.psi_unrelated_distance) == (500_000.0, 1000.0)
+
+
+def test_whitenings_that_are_none(small_whitened: Model, tmp_path: Path) -> None:
+    save_model(small_whitened, tmp_path / "m")
+    good = (tmp_path / "m").read_bytes()
+
+    def put(**values: object) -> bytes:
+        def change(header: dict[str, object]) -> None:
+            told = header["whitening"]
+            assert isinstance(told, dict)
+            told.update(values)
+
+        return with_header(good, change)
+
+    files = [
+        put(levels=[]), put(levels=[2]), put(levels=[1, 0]), put(levels=[1, 1]), put(levels=[True]),
+        put(levels=[0, 1]),  # the basis is of one level
+        put(unrelated_distance=0), put(unrelated_distance="x"),
+        with_tensors(good, whitening_basis=np.zeros((24, 199), np.int8)),
+        with_tensors(good, whitening_basis=np.zeros((24, 200), np.int16)),
+        with_tensors(good, whitening_basis=np.zeros((1025, 200), np.int8)),
+        with_tensors(good, whitening_scales=np.full(24, np.nan)),
+        with_tensors(good, whitening_offsets=np.zeros(23)),
+    ]  # fmt: skip
+    for file in files:
+        with pytest.raises(UnreadableModel, match="missing or misshapen"):
+            parse_model(file, "a file")
+    with pytest.raises(UnreadableModel, match="schema 2 is not 3"):
+        parse_model(with_header(good, lambda header: header.update(schema_version=2)), "a file")
 
 
 def test_sizes(small_model: Model) -> None:
@@ -66,11 +120,14 @@ def test_sizes(small_model: Model) -> None:
     assert small_model.signature_bytes == 25 * 8 * 2
 
 
-@pytest.mark.parametrize(("preset", "g", "h"), [("paper", 1250, 4), ("compact", 256, 2)])
-def test_presets_ship(preset: str, g: int, h: int) -> None:
+@pytest.mark.parametrize(
+    ("preset", "g", "size", "metric"),
+    [("depth", 256, 448, "l2"), ("paper", 1250, 125_000, "l1")],
+)
+def test_presets_ship(preset: str, g: int, size: int, metric: str) -> None:
     model = read_model(preset)
     assert model.name == preset
-    assert model.signature_bytes == 25 * g * h
+    assert (len(model.mixture), model.signature_bytes, model.metric) == (g, size, metric)
     assert model.mixture.weights.sum() == pytest.approx(1.0, abs=1e-12)
     assert model.parameters.properties.radius == 3.0
     # descriptors of 128 bytes, by axes at right angles to each other
@@ -217,9 +274,7 @@ def test_a_parameter_that_is_no_number(data: bytes) -> None:
 
 
 def test_paths_that_hold_no_model(tmp_path: Path) -> None:
-    with pytest.raises(
-        UnreadableModel, match=r"cannot be read .*presets \(paper, compact, lidar\)"
-    ):
+    with pytest.raises(UnreadableModel, match=r"cannot be read .*presets \(depth, lidar, paper\)"):
         read_model(tmp_path / "none")
     with pytest.raises(UnreadableModel, match="cannot be read"):
         read_model(tmp_path)
@@ -228,3 +283,15 @@ def test_paths_that_hold_no_model(tmp_path: Path) -> None:
         file.truncate(17 << 20)
     with pytest.raises(UnreadableModel, match="more than any model has"):
         read_model(large)
+
+
+def test_a_former_preset_names_its_successor() -> None:
+    with pytest.raises(UnreadableModel, match=r"no preset 'compact' any more. Use 'depth'"):
+        read_model("compact")
+
+
+def test_models_of_version_0_1_keep_their_ids() -> None:
+    """Maps of earlier versions hold them: signatures of another id are never compared."""
+    model = read_model("paper")
+    assert model.id.startswith("c8883ac257b4")
+    assert (model.unrelated_distance, model.levels) == (2206302.5, (0, 1, 2, 3))

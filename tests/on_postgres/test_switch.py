@@ -40,11 +40,11 @@ def test_a_folder_has_a_database_and_its_copy_a_copy(tmp_path: Path) -> None:
     first, copy = tmp_path / "first", tmp_path / "copy"
     with opened(first) as engine:
         assert engine.store.database.dialect == "postgresql"
-        engine.create_map(NewMap(name="hall", model="compact"))
+        engine.create_map(NewMap(name="hall", model="depth"))
     shutil.copytree(first, copy)
     with opened(copy) as engine:
         assert names(engine) == ["hall"]
-        engine.create_map(NewMap(name="attic", model="compact"))
+        engine.create_map(NewMap(name="attic", model="depth"))
     with opened(first) as engine, opened(tmp_path / "other") as other:
         assert (names(engine), names(other)) == (["hall"], [])
     told = subprocess.run(
@@ -56,7 +56,7 @@ def test_a_folder_has_a_database_and_its_copy_a_copy(tmp_path: Path) -> None:
 
 def test_a_folder_that_was_removed_begins_anew(tmp_path: Path) -> None:
     with opened(tmp_path / "data") as engine:
-        engine.create_map(NewMap(name="hall", model="compact"))
+        engine.create_map(NewMap(name="hall", model="depth"))
     shutil.rmtree(tmp_path / "data")
     with opened(tmp_path / "data") as engine:
         assert names(engine) == []

@@ -89,7 +89,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, until: Callable[..., Any]) -
 def test_nothing_acknowledged_is_lost_and_all_goes_on_by_itself(
     fleet: Fleet, small: list[Any], until: Callable[..., Any]
 ) -> None:
-    assert fleet.ask("POST", "/v1/maps", json={"name": "hall", "model": "compact"}).is_success
+    assert fleet.ask("POST", "/v1/maps", json={"name": "hall", "model": "depth"}).is_success
     kept = []
     views = [
         {"frame": ("a.png", one.png), "meta": (None, one.meta.model_dump_json(exclude_unset=True))}

@@ -68,7 +68,10 @@ def test_a_crowd_of_rings_is_one_connection_and_few_notices(
             assert listener.wait(FOREVER)
         assert threading.active_count() < 20
         with server_store.database.read() as connection:
-            asked = "SELECT count(*) FROM pg_stat_activity WHERE query LIKE 'NOTIFY%'"
+            asked = (
+                "SELECT count(*) FROM pg_stat_activity WHERE query LIKE 'NOTIFY%' "
+                "AND datname = current_database()"
+            )
             assert connection.execute(text(asked)).scalar_one() == 1
 
 

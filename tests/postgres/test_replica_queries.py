@@ -66,7 +66,7 @@ def ids(answer: Answer) -> list[str]:
 def test_queries_are_answered_from_the_replica_as_from_the_database(
     engine: Engine, follower: Server, small: list[Any], until: Until
 ) -> None:
-    engine.create_map(NewMap(name="hall", model="compact"))
+    engine.create_map(NewMap(name="hall", model="depth"))
     kept = [engine.add_frame("hall", *one)[0].frame_id for one in small[:3]]
     work_off(engine)
     catch_up(engine, until)

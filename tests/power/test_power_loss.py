@@ -18,9 +18,8 @@ from sqlalchemy import Connection, event
 
 from sceneprint import writing
 from sceneprint.engine import Engine
-from sceneprint.index import Generation, Tail, newest, publish, signatures_of
-from sceneprint.index import publishing as index_publishing
-from sceneprint.index.manifests import Recall
+from sceneprint.index import Generation, newest, publication, publish
+from sceneprint.index.manifests import Manifest
 from sceneprint.schemas import CameraIntrinsics, FrameMeta, JobState, NewMap
 from sceneprint.settings import Settings
 from sceneprint.store import FolderBlobs
@@ -142,7 +141,7 @@ def test_no_commit_refers_to_a_blob_that_may_be_lost(
     root = tmp_path / "data" / "blobs"
     commits: list[tuple[int, set[str]]] = []
     with Engine(Settings(data_dir=tmp_path / "data", database_url=None)) as engine:
-        engine.create_map(NewMap(name="hall", model="compact"))
+        engine.create_map(NewMap(name="hall", model="depth"))
         with recorded(root) as disk:
 
             def note(connection: Connection) -> None:  # before SQLite is asked to commit
@@ -180,31 +179,31 @@ def signatures_at(keys: NDArray[np.int64]) -> Bytes:
     return np.stack([np.random.default_rng(k).integers(0, 256, LENGTH, np.uint8) for k in keys])
 
 
-#: Keys that each generation adds, and those it drops: a first, an appended, a refit that has
-#: doubled, one of deletions that rewrites the segments, an appended.
+#: Keys that each generation adds, those it drops, and bytes up to which it has no inverted file:
+#: a first, an appended, one in lists, one of deletions with fewer lists, one without.
 STEPS = (
-    (range(20), frozenset()),
-    (range(20, 26), frozenset({3})),
-    (range(26, 60), frozenset()),
-    (range(60, 62), frozenset(range(5, 50))),
-    (range(62, 70), frozenset()),
+    (range(20), frozenset[int](), 1 << 30),
+    (range(20, 26), frozenset({3}), 1 << 30),
+    (range(26, 60), frozenset[int](), 0),
+    (range(60, 62), frozenset(range(5, 50)), 0),
+    (range(62, 70), frozenset[int](), 1 << 30),
 )
 
 
 def expected(number: int) -> list[int]:
     """Keys of a generation, by hand."""
     keys: list[int] = []
-    for new, dropped in STEPS[:number]:
+    for new, dropped, _ in STEPS[:number]:
         keys = [key for key in [*keys, *new] if key not in dropped]
     return keys
 
 
 def publish_step(folder: Path, number: int, previous: Generation | None) -> Generation:
-    new, dropped = STEPS[number - 1]
+    new, dropped, flat_bytes = STEPS[number - 1]
     keys = np.array(new)
     made = publish(
         folder, model_id="model", revision=10 * number, blocks=[(keys, signatures_at(keys))],
-        previous=previous, drop=dropped,
+        previous=previous, drop=dropped, flat_bytes=flat_bytes,
     )  # fmt: skip
     assert made is not None
     return made
@@ -212,13 +211,12 @@ def publish_step(folder: Path, number: int, previous: Generation | None) -> Gene
 
 def read(folder: Path) -> Generation | None:
     """The newest generation, which holds just what it should."""
-    found = newest(folder, "model", LENGTH, verify=True)
+    found = newest(folder, "model", LENGTH)
     if found is not None:
         number = found.revision // 10
         assert found.keys.tolist() == expected(number)
-        stored = signatures_of(found.keys, found, Tail.empty(LENGTH))
-        np.testing.assert_array_equal(stored, signatures_at(found.keys))
-        assert len(found.coarse) == len(found.keys)
+        np.testing.assert_array_equal(found.vectors, signatures_at(found.keys))
+        assert (found.lists is None) == (STEPS[number - 1][2] > 0)
     return found
 
 
@@ -278,14 +276,14 @@ def test_who_does_not_sync_an_index_is_found_out(
 def test_old_generations_removed_too_early_are_found_out(
     lost_generations: Callable[..., set[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write = index_publishing._write
+    write = publication.write_manifest
 
-    def remove_first(folder: Path, generation: Generation, recall: Recall) -> Path:
+    def remove_first(folder: Path, manifest: Manifest) -> Path:
         for path in folder.glob("*.json"):
             path.unlink()
-        return write(folder, generation, recall)
+        return write(folder, manifest)
 
-    monkeypatch.setattr(index_publishing, "_write", remove_first)
+    monkeypatch.setattr(publication, "write_manifest", remove_first)
     assert any(one.startswith("none after 1") for one in lost_generations(steps=2))
 
 

@@ -230,7 +230,7 @@ def small_shots(room_frames: tuple[Frame, ...], shoot: Callable[..., Shot]) -> l
 def make_map() -> Callable[..., str]:
     """Make a map on a server; its path is returned."""
 
-    def make(server: Server, name: str, model: str = "compact") -> str:
+    def make(server: Server, name: str, model: str = "depth") -> str:
         made = server.client.post("/v1/maps", json={"name": name, "model": model})
         assert made.status_code == 201, made.text
         return f"/v1/maps/{name}"

@@ -113,7 +113,7 @@ def test_two_frames_are_compared(served, maps, shots):
     form = {"a": ("a.png", shots[0].png), "b": ("b.png", shots[1].png)}
     meta = {f"meta_{name}": json.dumps({"intrinsics": shots[0].camera}) for name in "ab"}
     both = served.client.post(
-        "/v1/similarity", files=form, data=meta | {"model": "compact", "seed": "2"}
+        "/v1/similarity", files=form, data=meta | {"model": "depth", "seed": "2"}
     )
     mixed = served.client.post(
         "/v1/similarity",
@@ -186,7 +186,7 @@ def test_what_cannot_be_asked_is_refused(served, maps, shots, refused, make_map)
 def test_what_a_key_may_not_read_is_not_there(wall, shots):
     held = wall({"robot": {"ask-a": "read"}, "boss": {"*": "admin"}}, "--workers", "0")
     for name in ("ask-a", "secret"):
-        made = held.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
+        made = held.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
         assert made.status_code == 201
     there = []
     for hidden in ("secret", "nowhere"):

@@ -135,7 +135,7 @@ def test_a_cloud_finds_the_image_of_its_place_and_an_image_the_cloud(served, hal
 def test_two_uploads_are_compared_whatever_they_are(served, shots, clouds):
     files = {"a": ("a", shots[0].png), "b": ("b", write_ply(clouds[0]))}
     metas = {"meta_a": json.dumps({"intrinsics": shots[0].camera}), "meta_b": "{}"}
-    said = {**metas, "model": "compact"}
+    said = {**metas, "model": "depth"}
     told = served.client.post("/v1/similarity", files=files, data=said).json()
     assert told["validation"]["status"] == "accepted", told
     assert (told["transform"]["parent_frame"], told["transform"]["child_frame"]) \

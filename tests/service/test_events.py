@@ -37,7 +37,7 @@ def keys(guarded) -> dict[str, dict[str, str]]:
         made = {name: engine.create_key(name, granted).secret for name, granted in grants.items()}
     headers = {name: {"Authorization": f"Bearer {secret}"} for name, secret in made.items()}
     for name in ("mine", "theirs"):
-        path, body = "/v1/maps", {"name": name, "model": "compact"}
+        path, body = "/v1/maps", {"name": name, "model": "depth"}
         assert guarded.client.post(path, json=body, headers=headers["admin"]).status_code == 201
     return headers
 
@@ -169,7 +169,7 @@ def test_a_key_is_told_of_its_maps_alone(guarded, keys, refused):
         assert next(came) == ["retry: 1000"]
         assert next(came)[0] == ": alive"
         assert event(next(came))["map"] == "mine"
-        body = {"name": "theirs-too", "model": "compact"}
+        body = {"name": "theirs-too", "model": "depth"}
         guarded.client.post("/v1/maps", json=body, headers=keys["admin"])
         guarded.client.post("/v1/maps/mine/reencoding", json={"model": "paper"}, **asks(keys))
         assert event(next(came))["kind"] == "map.reencoding"

@@ -73,7 +73,7 @@ def test_all_figures_are_there(served, make_map):
     ] == len(served.workers)
     assert values["sceneprint_workers_began"] >= 1
     received = 'sceneprint_received_bytes_total{route="/v1/maps"}'
-    assert values[received] >= len(json.dumps({"name": "plain", "model": "compact"}))
+    assert values[received] >= len(json.dumps({"name": "plain", "model": "depth"}))
     with Engine(Settings(data_dir=served.folder, database_url=None)) as engine:
         newest = served.client.get("/v1/events").json()["newest"]
         assert values["sceneprint_newest_event"] == engine.store.seals.open("event", newest)
@@ -85,8 +85,8 @@ def test_all_figures_are_there(served, make_map):
 def test_models_and_reencoding_over_http(served, make_map, refused):
     path, client = make_map(served, "anew"), served.client
     listed = client.get("/v1/models").json()["items"]
-    compact = next(one for one in listed if one["name"] == "compact")
-    assert "anew" in compact["maps"]
+    depth = next(one for one in listed if one["name"] == "depth")
+    assert "anew" in depth["maps"]
     place = f"{path}/reencoding"
     for body in ({"model": "huge"}, {}, [], {"model": "paper", "x": 1}):
         refused(client.post(place, json=body), 422, "invalid-request")
@@ -94,7 +94,7 @@ def test_models_and_reencoding_over_http(served, make_map, refused):
             "malformed-body")  # fmt: skip
     refused(client.post(place, content=b"model=paper"), 415, "unsupported-type")
     refused(client.post("/v1/maps/nowhere/reencoding", json={"model": "paper"}), 404, "unknown-map")
-    refused(client.post(place, json={"model": compact["model_id"]}), 409, "conflict")
+    refused(client.post(place, json={"model": depth["model_id"]}), 409, "conflict")
     refused(client.delete(place), 409, "conflict")
     begun = client.post(place, json={"model": "paper"})
     assert begun.status_code == 202

@@ -237,7 +237,7 @@ def stored(small_shots, tmp_path_factory) -> Path:
     """A data folder of four indexed frames, closed."""
     folder = tmp_path_factory.mktemp("stored") / "data"
     with Engine(Settings(data_dir=folder, database_url=None)) as engine:
-        engine.create_map(NewMap(name="hall", model="compact"))
+        engine.create_map(NewMap(name="hall", model="depth"))
         for shot in small_shots[:4]:
             meta = FrameMeta.model_validate({"intrinsics": shot.camera})
             engine.add_frame("hall", shot.png, meta)

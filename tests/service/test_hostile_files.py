@@ -35,7 +35,7 @@ def stored(small_shots, tmp_path_factory) -> Path:
     """A folder whose map has two generations, of three and of six frames, and three frames more."""
     folder = tmp_path_factory.mktemp("stored") / "data"
     with opened(folder, tail_frames=2) as engine:
-        engine.create_map(NewMap(name="hall", model="compact"))
+        engine.create_map(NewMap(name="hall", model="depth"))
         for number, shot in enumerate(small_shots[:9]):
             engine.add_frame("hall", shot.png, meta_of(shot))
             work = engine.claim("w")

@@ -95,7 +95,7 @@ OF_A_MAP = {
     "POST /v1/jobs/{job_id}/retry": Case("write"),
     "GET /v1/events": Case(query={"map": "{map}"}),
     "GET /v1/stats": Case(query={"map": "{map}"}),
-    "POST /v1/maps/{map_name}/reencoding": Case("admin", body={"model": "compact"}),
+    "POST /v1/maps/{map_name}/reencoding": Case("admin", body={"model": "depth"}),
     "DELETE /v1/maps/{map_name}/reencoding": Case("admin"),
 }
 #: In the key's own map, an id or session may be named as another map has it: it says nothing.
@@ -151,7 +151,7 @@ def there(walled, small_shots) -> dict[str, There]:
     """Two maps with two frames each, an answer, an association and a reconstruction of each."""
     found = {}
     for name, pair in ((OWN, small_shots[:2]), (THEIRS, small_shots[1:3])):
-        made = walled.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
+        made = walled.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
         assert made.status_code == 201
         session = f"run-of-{name}"
         sent = [
@@ -283,7 +283,7 @@ def test_lists_have_nothing_of_another_map(walled, there, operations):
 
 def test_a_model_that_only_another_map_has_is_not_there(walled, there, small_model):
     with Engine(Settings(data_dir=walled.server.folder, database_url=None)) as engine:
-        engine.create_map(NewMap(name="yard", model="compact"))
+        engine.create_map(NewMap(name="yard", model="depth"))
         engine.reencode("yard", small_model)
     answers = [
         walled.ask("admin", "POST", f"/v1/maps/{OWN}/reencoding", json={"model": name})

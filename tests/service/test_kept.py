@@ -123,7 +123,7 @@ def test_an_answer_is_seen_by_who_may_read_all_of_it(begin):
     }  # fmt: skip
     with Engine(Settings(data_dir=server.folder)) as engine:
         for name in "ab":
-            engine.create_map(NewMap(name=name, model="compact"))
+            engine.create_map(NewMap(name=name, model="depth"))
         with engine.store.database.write() as connection:
             add_frame(connection, find_map(connection, "b").number, known, "f")
         keys = {

@@ -21,7 +21,7 @@ def test_a_map_is_made_once_and_stays_as_it_was_made(served, refused):
     )  # fmt: skip
     assert made["model"] == f"paper-{made['model_id'][:12]}"
     assert datetime.fromisoformat(made["created_at"]).utcoffset() is not None
-    for other in ({"title": "Another"}, {}, {"title": "The hall", "model": "compact"}):
+    for other in ({"title": "Another"}, {}, {"title": "The hall", "model": "depth"}):
         answer = served.client.post("/v1/maps", json={"name": "hall", **other})
         refused(answer, 409, "map-exists", "'hall' with another title or model")
     assert served.client.get("/v1/maps/hall").json()["title"] == "The hall"
@@ -102,7 +102,7 @@ def test_an_upload_is_safe_then_signed_and_the_same_one_is_there_already(
     "prefer", ["wait=0", "wait=-5", "respond-async", "awaited=9", "wait=x", "wait"]
 )
 def test_what_asks_for_no_wait_is_not_waited_for(served, small_shots, prefer):
-    served.client.post("/v1/maps", json={"name": "hurried", "model": "compact"})
+    served.client.post("/v1/maps", json={"name": "hurried", "model": "depth"})
     numbers = {"wait=0": 0, "wait=-5": 1, "respond-async": 2, "awaited=9": 3, "wait=x": 4}
     shot = small_shots[80 + numbers.get(prefer, 5)]
     sent = served.client.post("/v1/maps/hurried/frames", **shot.form(), headers={"Prefer": prefer})
@@ -208,7 +208,7 @@ def test_a_deleted_map_takes_all_with_it(
 
 @pytest.mark.parametrize("when", ["0001-01-01T00:00:00+14:00", "9999-12-31T23:59:59-14:00"])
 def test_a_time_that_is_none_in_utc_spoils_no_page(served, small_shots, refused, when):
-    served.client.post("/v1/maps", json={"name": "times", "model": "compact"})
+    served.client.post("/v1/maps", json={"name": "times", "model": "depth"})
     sent = served.client.post("/v1/maps/times/frames", **small_shots[90].form(captured_at=when))
     problem = refused(sent, 422, "invalid-request", "captured_at")
     assert [one["field"] for one in problem["errors"]] == ["captured_at"]

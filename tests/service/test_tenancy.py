@@ -23,7 +23,7 @@ KEYS: dict[str, dict[str, Scope]] = {
 def house(tmp_path, store_url, open_house) -> Iterator[Any]:
     with open_house(tmp_path, store_url, KEYS) as opened:
         for name in ("alpha", "bravo"):
-            opened.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
+            opened.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
         yield opened
 
 
@@ -37,7 +37,7 @@ def test_a_quota_is_the_operators(house, refused: Callable[..., dict[str, Any]])
     assert house.ask("tenant", "GET", path).json()["title"] is None
     told = house.ask("boss", "PATCH", path, json={"quota_frames": 10, "quota_bytes": 10**9}).json()
     assert (told["quota_frames"], told["quota_bytes"], told["used_frames"]) == (10, 10**9, 0)
-    new = {"name": "later", "model": "compact"}
+    new = {"name": "later", "model": "depth"}
     refused(
         house.ask("tenant", "POST", "/v1/maps", json=new | {"quota_frames": 5}), 403, "forbidden"
     )
@@ -46,7 +46,7 @@ def test_a_quota_is_the_operators(house, refused: Callable[..., dict[str, Any]])
     )
     # and it is not lost by deleting the map and making it anew
     assert house.ask("tenant", "DELETE", path).status_code == 204
-    made = house.ask("tenant", "POST", "/v1/maps", json={"name": "alpha", "model": "compact"})
+    made = house.ask("tenant", "POST", "/v1/maps", json={"name": "alpha", "model": "depth"})
     assert (made.status_code, made.json()["quota_frames"]) == (201, 10)
     audited = house.ask("boss", "GET", "/v1/audit").json()["items"]
     [change] = [one for one in audited if one["action"] == "patch_map"]
@@ -112,7 +112,7 @@ def test_an_answer_goes_with_its_map_and_with_its_frame(house, refused, small_sh
     house.ask("tenant", "DELETE", path)
     for made_anew in (False, True):
         if made_anew:
-            house.ask("tenant", "POST", "/v1/maps", json={"name": "alpha", "model": "compact"})
+            house.ask("tenant", "POST", "/v1/maps", json={"name": "alpha", "model": "depth"})
         for place in ("", "/points", "/question", "/preview.png", "/similarities"):
             answer = house.ask("robot", "GET", f"/v1/queries/{asked[1]}{place}")
             refused(answer, 404, "unknown-query")

@@ -56,7 +56,7 @@ class Twin:
         shot = self.shots[4 + self.sent % 40]
         self.sent += 1
         self.ask("boss", "POST", "/v1/maps/bravo/frames", **shot.form(session="there"))
-        self.ask("boss", "POST", "/v1/maps", json={"name": f"c{self.sent}", "model": "compact"})
+        self.ask("boss", "POST", "/v1/maps", json={"name": f"c{self.sent}", "model": "depth"})
         self.ask("boss", "DELETE", f"/v1/maps/c{self.sent}")
         self.ask("boss", "POST", "/v1/keys", json={"name": f"k{self.sent}"})
         frames = self.ask("boss", "GET", "/v1/maps/bravo/frames?limit=1").json()["items"]
@@ -175,7 +175,7 @@ def both(tmp_path_factory, small_shots, small_model, postgres, open_house) -> li
             house = stack.enter_context(open_house(folder, url, KEYS, events_kept=1000))
             one = Twin(house, small_shots, busy)
             for name in ("bravo", "alpha"):
-                one.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "compact"})
+                one.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
                 one.disturb()
             live(one, small_model)
             found.append(plain(list(everything(one))))

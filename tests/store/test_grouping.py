@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -38,11 +39,17 @@ def together(database: Database, works: list[Callable[[Connection], Any]]) -> tu
     with database.write():  # until this is over nobody else writes
         for one in threads:
             one.start()
-        while len(group._waiting) < len(works):
-            pass
+        until_waiting(group, len(works))
     for one in threads:
         one.join()
     return found, commits[0] - 1
+
+
+def until_waiting(group: Grouping, count: int) -> None:
+    end = time.monotonic() + 60
+    while len(group._waiting) < count:
+        assert time.monotonic() < end
+        time.sleep(0.001)
 
 
 def count(database: Database, kind: str) -> int:
@@ -77,8 +84,7 @@ def test_each_is_of_its_own_request_whoever_writes_it(database: Database) -> Non
     with database.write():
         for one in threads:
             one.start()
-        while len(group._waiting) < len(threads):
-            pass
+        until_waiting(group, len(threads))
     for one in threads:
         one.join()
     assert seen == {i: f"request {i}" for i in range(4)}

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import text
 
+from benchmarks.fleet.postgres import Server
 from sceneprint.schemas import FrameState
 from sceneprint.store import open_database
 from sceneprint.store.deleting import doomed_blobs
@@ -131,3 +132,21 @@ def test_what_a_map_held_before_there_were_quotas_is_counted(
         assert doomed_blobs(connection, 10) == ["blob-2"]
         assert (last_event(connection, "gone"), last_event(connection, "never")) == (3, 0)
     database.close()
+
+
+def test_codes_of_before_there_were_vectors_go(
+    postgres: Server, bring_to: Callable[[str, str], None]
+) -> None:
+    url = postgres.create("coded")
+    bring_to(url, "0007")
+    for statement in (
+        "CREATE TABLE code_fits (number bigint PRIMARY KEY)",
+        "CREATE TABLE code_maps (fit_number bigint REFERENCES code_fits (number))",
+        "CREATE TABLE codes_12 (frame_number bigint PRIMARY KEY)",
+        "CREATE TABLE codes_of_ours (n bigint)",  # nobody's but whose it is
+    ):
+        postgres.execute(statement, "coded")
+    open_database(url).close()
+    left = postgres.execute("SELECT relname FROM pg_class WHERE relname ~ '^code.*'", "coded")
+    assert left == [("codes_of_ours",)]
+    postgres.drop("coded")

@@ -113,7 +113,7 @@ def hire(tmp_path_factory) -> Callable[..., AbstractContextManager[Crew]]:
         given = {"data_dir": folder, "workers": 2, **settings}
         names = {f"SCENEPRINT_{name.upper()}": str(value) for name, value in given.items()}
         with Engine(Settings.model_validate(given)) as engine:
-            engine.create_map(NewMap(name="warm", model="compact"))
+            engine.create_map(NewMap(name="warm", model="depth"))
             with errors.open("wb") as out:
                 process = subprocess.Popen(
                     command, stderr=out, start_new_session=True, env=os.environ | names
@@ -173,7 +173,7 @@ def slow(crew, frames) -> Callable[[str, int], Slow]:
     """Upload a frame whose blob is a pipe before any worker looks."""
 
     def make(name: str, number: int) -> Slow:
-        crew.engine.create_map(NewMap(name=name, model="compact"))
+        crew.engine.create_map(NewMap(name=name, model="depth"))
         crew.send(signal.SIGSTOP)
         added, _ = crew.engine.add_frame(name, *frames[number])
         ((blob,),) = crew.rows(f"SELECT blob FROM frames WHERE id = '{added.frame_id}'")

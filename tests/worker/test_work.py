@@ -11,7 +11,7 @@ from sceneprint.schemas import NewMap
 
 
 def test_two_workers_sign_each_frame_once(crew, frames):
-    crew.engine.create_map(NewMap(name="many", model="compact"))
+    crew.engine.create_map(NewMap(name="many", model="depth"))
     added = [crew.engine.add_frame("many", *one)[0] for one in frames[:32]]
     crew.settled("many", 32)
     jobs = [crew.engine.get_job(one.job_id) for one in added]
@@ -26,7 +26,7 @@ def test_two_workers_sign_each_frame_once(crew, frames):
 
 
 def test_frames_of_a_greater_priority_are_signed_first(crew, frames):
-    crew.engine.create_map(NewMap(name="ranked", model="compact"))
+    crew.engine.create_map(NewMap(name="ranked", model="depth"))
     crew.send(signal.SIGSTOP)
     order = [-10, 0, 3, 0, 10, 3]
     jobs = [crew.engine.add_frame("ranked", *frames[46 + i], order[i])[0].job_id for i in range(6)]
@@ -38,7 +38,7 @@ def test_frames_of_a_greater_priority_are_signed_first(crew, frames):
 
 
 def test_a_database_that_vanishes_for_a_moment_is_waited_for(crew, frames):
-    crew.engine.create_map(NewMap(name="shaken", model="compact"))
+    crew.engine.create_map(NewMap(name="shaken", model="depth"))
     crew.change("ALTER TABLE jobs RENAME TO away")
     crew.until(lambda: len(crew.log("the store does not answer")) >= 2)
     crew.change("ALTER TABLE away RENAME TO jobs")
@@ -104,7 +104,7 @@ def test_a_frame_deleted_while_it_is_signed_stays_deleted(crew, slow):
 
 
 def test_told_to_stop_workers_give_back_what_they_have_not_begun(crew, frames):
-    crew.engine.create_map(NewMap(name="stopped", model="compact"))
+    crew.engine.create_map(NewMap(name="stopped", model="depth"))
     crew.send(signal.SIGSTOP)
     added, _ = crew.engine.add_frame("stopped", *frames[44])
     # who would claim it waits for this to end

@@ -122,18 +122,18 @@ def uploads(
 
 @pytest.fixture(scope="session")
 def master(
-    uploads: list[Upload], small_model: Model, tmp_path_factory: pytest.TempPathFactory
+    uploads: list[Upload], small_whitened: Model, tmp_path_factory: pytest.TempPathFactory
 ) -> House:
     """`hall` with two generations of its index; `attic` with a signed frame, a deleted, one that
     waits. Not to be changed.
     """
     house = House(tmp_path_factory.mktemp("master"))
-    open_table(small_model, house.settings.cache_dir)
+    open_table(small_whitened, house.settings.cache_dir)
     with Engine(house.settings) as engine:
         with engine.store.database.write() as connection:
-            keep_model(connection, small_model.id, "small", write_model(small_model))
+            keep_model(connection, small_whitened.id, "small", write_model(small_whitened))
             for name in ("hall", "attic"):
-                add_map(connection, name, None, small_model.id)
+                add_map(connection, name, None, small_whitened.id)
 
         def add(name: str, some: list[Upload]) -> None:
             for each in some:

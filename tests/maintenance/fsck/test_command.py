@@ -108,7 +108,7 @@ def test_beside_a_service_nothing_is_lost(house: Any, uploads: Any) -> None:
 
     kept, deleted = {}, 0
     with serving(house.data, 1) as url, Client(url) as client:
-        client.create_map("busy", model="compact")
+        client.create_map("busy", model="depth")
         thread = threading.Thread(target=check)
         thread.start()
         n = 0

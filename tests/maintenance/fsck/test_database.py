@@ -102,15 +102,15 @@ def test_a_row_that_refers_to_none_keeps_all_hands_off(house: Any) -> None:
 
 def test_a_damaged_model_that_ships_is_put_back(house: Any) -> None:
     with Engine(house.settings) as engine:
-        engine.create_map(NewMap(name="other", model="compact"))
-    ((sound,),) = house.sql("SELECT content FROM models WHERE name = 'compact'")
+        engine.create_map(NewMap(name="other", model="depth"))
+    ((sound,),) = house.sql("SELECT content FROM models WHERE name = 'depth'")
     damaged = bytearray(sound)
     damaged[-3] ^= 4
-    house.sql("UPDATE models SET content = ? WHERE name = 'compact'", bytes(damaged))
+    house.sql("UPDATE models SET content = ? WHERE name = 'depth'", bytes(damaged))
     (found,) = house.look()
     assert (found.finding.kind, found.left) == ("damaged-model", True)
     assert [one.left for one in house.look(repair=True)] == [False]
-    assert house.sql("SELECT content FROM models WHERE name = 'compact'") == [(sound,)]
+    assert house.sql("SELECT content FROM models WHERE name = 'depth'") == [(sound,)]
     assert house.look() == []
 
 
@@ -153,7 +153,7 @@ def test_a_quick_look_sees_what_is_missing(house: Any) -> None:
     )
     house.blob(blob).unlink()
     house.blob(other).write_bytes(b"other bytes")
-    next((house.data / "index").glob("hall*/*.segment")).unlink()
+    next((house.data / "index").glob("hall*/*.faiss")).unlink()
     found = [one.finding.kind for one in house.look(quick=True)]
     assert found == ["missing-upload", "damaged-index"]
 

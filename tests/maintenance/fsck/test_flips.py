@@ -14,7 +14,7 @@ from sceneprint.maintenance.findings import Finding
 HALL = 12
 #: Flips of each kind.
 TIMES = 12
-INDEX = ("segment", "faiss", "rows", "code", "json")
+INDEX = ("keys", "faiss", "json")
 
 
 def flip(path: Path, at: int, bit: int = 0) -> None:
@@ -32,14 +32,14 @@ def place_of(house: Any, kind: str, rng: np.random.Generator) -> tuple[Path, int
         " ON s.frame_number = f.number JOIN maps m ON m.number = f.map_number"
         " WHERE m.name = 'hall' ORDER BY f.number"
     )
-    frame_id, upload, artifact, vector = frames[rng.integers(len(frames))]
+    frame_id, upload, artifact, _ = frames[rng.integers(len(frames))]
     if kind == "signature":
         path = house.data / "sceneprint.db"
         data = path.read_bytes()
-        while True:  # where it is the only one with these bytes, and on one page
-            at = int(rng.integers(len(vector) - 32))
-            if data.count(vector[at : at + 32]) == 1:
-                return path, data.index(vector[at : at + 32]) + int(rng.integers(32)), frame_id
+        # whichever lies there alone, and on one page: some are split, or like another's
+        alone = [(one[0], one[3]) for one in frames if data.count(one[3]) == 1]
+        frame_id, vector = alone[rng.integers(len(alone))]
+        return path, data.index(vector) + int(rng.integers(len(vector))), frame_id
     if kind in ("upload", "artifact"):
         path = house.blob(upload if kind == "upload" else artifact)
         return path, int(rng.integers(path.stat().st_size)), frame_id

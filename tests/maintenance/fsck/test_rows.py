@@ -166,7 +166,7 @@ def test_a_row_that_cannot_be_read_does_not_hide_the_others(house: Any) -> None:
 def test_a_signature_whose_counts_cannot_be_read_is_made_again(house: Any) -> None:
     sound = house.sql("SELECT * FROM signatures ORDER BY frame_number")
     house.sql("UPDATE signatures SET n_pairs = CAST(x'5b31ff5d' AS TEXT) WHERE frame_number = 3")
-    house.sql("UPDATE signatures SET n_patches = '[1]' WHERE frame_number = 5")
+    house.sql("UPDATE signatures SET n_patches = '[1, 2, 3]' WHERE frame_number = 5")
     checksum = zlib.crc32(b"\0")  # which fits: the length alone does not
     house.sql("UPDATE signatures SET vector = x'00', checksum = ? WHERE frame_number = 7", checksum)
     found = house.look(repair=True)

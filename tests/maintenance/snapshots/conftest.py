@@ -80,7 +80,7 @@ def master(uploads: list[Upload], tmp_path_factory: pytest.TempPathFactory) -> P
     """
     folder = tmp_path_factory.mktemp("master") / "data"
     with Engine(settings_of(folder)) as engine:
-        engine.create_map(NewMap(name="hall", model="compact"))
+        engine.create_map(NewMap(name="hall", model="depth"))
         for each in uploads[: SIGNED + 1]:
             engine.add_frame("hall", each.data, each.meta)
         while (work := engine.claim("w")) is not None:

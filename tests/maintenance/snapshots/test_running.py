@@ -77,7 +77,7 @@ def test_it_holds_one_state_and_all_of_it(data, tmp_path, uploads, rows, answers
     archives = [tmp_path / f"{i}.tar" for i in range(3)]
     with serving(data, 1) as url:
         with Client(url) as client:
-            client.create_map("busy", model="compact")
+            client.create_map("busy", model="depth")
             client.wait([row[0] for row in rows(data, "SELECT id FROM jobs")], timeout_s=60)
         with at_work(url, uploads[6:]) as robots:
             began, ended = [], []

@@ -122,10 +122,10 @@ function progress({ model, done, left, failed, dead }) {
     h("progress", { max: Math.max(all, 1), value: done, "aria-label": `Signing again ${text}` }));
 }
 
-/** How far the index is behind; a small map is searched without one. */
+/** How far the index is behind; a map may do without one. */
 function lag(index, indexed) {
   if (!index || index.generation === null) {
-    return indexed ? h("span", { title: "Small maps are searched frame by frame, which is exact." }, "not needed yet") : "–";
+    return indexed ? h("span", { title: "A query compares every frame of this map." }, "none needed") : "–";
   }
   return `generation ${count(index.generation)}, ${index.tail ? `${count(index.tail)} behind` : "up to date"}`;
 }

@@ -7,9 +7,9 @@ import { confirm, sheet, toast } from "../lib/states.js";
 
 // what the models that ship are for; their size comes from the API
 const FOR = {
-  paper: ["Rooms", "For depth cameras indoors. The paper's size: finds the most."],
-  compact: ["Rooms, compact", "A tenth as large and a third faster to sign, for many frames."],
+  depth: ["Rooms", "For depth cameras indoors."],
   lidar: ["LiDAR", "For scans that reach far: halls, storeys, city blocks."],
+  paper: ["Paper", "For research: the long signatures of the paper, all of them compared."],
 };
 
 // what the API's regular expression means

@@ -5,7 +5,7 @@ import { link } from "../lib/router.js";
 import { rows } from "./poll.js";
 
 /**
- * Search indexes: generation, tail, and what share of the nearest they find.
+ * Search indexes: generation, tail, and the share of the nearest frames that a query finds.
  * @returns {{element: HTMLElement, update: (stats: Object<string, any>) => void}}
  */
 export function indexes() {
@@ -19,11 +19,11 @@ export function indexes() {
   const table = h("table", { class: "table" }, h("thead", {}, h("tr", {},
     h("th", { scope: "col" }, "Map"), h("th", { scope: "col", class: "number" }, "Generation"),
     h("th", { scope: "col", class: "number", title: "Indexed frames that the generation lacks; queries compare them one by one" }, "Tail"),
-    h("th", { scope: "col", class: "number", title: "Share of the 10 nearest by the exact scan that the shortlist finds" }, "Recall@10"))), body);
+    h("th", { scope: "col", class: "number", title: "Share of the 10 nearest frames that a query finds" }, "Recall@10"))), body);
   return {
     element: h("section", { class: "card", "aria-labelledby": "indexes" }, h("h2", { id: "indexes" }, "Search indexes"), none,
       h("div", { class: "scroll" }, table),
-      h("p", { class: "note muted" }, "Recall is measured when a generation is published, on a sample of its own frames, against the exact scan.")),
+      h("p", { class: "note muted" }, "A query compares every frame, except in very large maps. For these, recall is measured when a generation is published, on a sample of its frames.")),
     update({ indexes: found }) {
       none.hidden = found.length > 0;
       table.hidden = found.length === 0;
@@ -32,12 +32,10 @@ export function indexes() {
   };
 }
 
-/** What is known of the share that an index finds, in words where there is no number. */
-function recall({ generation, recall: found }) {
-  if (generation === null) return h("span", { class: "muted", title: "Every frame is compared" }, "compared whole");
-  if (found === null) return h("span", { class: "muted", title: "An earlier version published it" }, "not measured");
-  if (found.sample === 0) return h("span", { class: "muted", title: `Up to ${count(found.shortlist + 1)} frames the shortlist leaves nothing out` }, "compared whole");
-  return h("span", { title: `${count(found.sample)} frames looked up, a shortlist of ${count(found.shortlist)}` }, percent(found.share));
+/** The share of the nearest frames that a query finds, in words where it compares every frame. */
+function recall({ recall: found }) {
+  if (found === null || found.sample === 0) return h("span", { class: "muted", title: "A query compares every frame of this map" }, "compared whole");
+  return h("span", { title: `Measured with ${count(found.sample)} frames; a query compares ${count(found.probes)} inverted lists` }, percent(found.share));
 }
 
 /**

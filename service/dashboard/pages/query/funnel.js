@@ -6,7 +6,7 @@ import { count, ms } from "../lib/format.js";
 const STEPS = [
   ["map", "in the map", ""],
   ["passed", "pass the filter", "do not pass the filter"],
-  ["compared", "compared", "were not proposed by the index"],
+  ["compared", "compared", "were not compared"],
   ["ranked", "ranked", "are farther away"],
   ["selected", "selected", "are like selected ones, or others were taken first"],
   ["validated", "validated", "were not tried"],

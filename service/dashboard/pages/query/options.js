@@ -26,7 +26,7 @@ export const FIELDS = [
       ["retrieve,diversify", "DR: rank, diversify"], ["retrieve", "R: rank"]],
     hint: "The paper’s names for them." },
   { name: "exact", group: "search", label: "Compare every frame", kind: "flag", default: false,
-    hint: "Also in a large map, where an index proposes a shortlist." },
+    hint: "Only very large maps, and those that PostgreSQL searches, leave some out otherwise." },
   { name: "seed", group: "search", label: "Seed", kind: "number", min: 0, max: 4294967295, step: 1, default: 0,
     hint: "Of the random choices of validation." },
   { name: "deadline_ms", group: "search", label: "Deadline", kind: "number", min: 1, max: 600000, step: 1, unit: "ms", default: null,

@@ -10,7 +10,7 @@ const LOST = {
   state: ["It is not searched at all", "Only indexed frames can be found.", null],
   query: ["It is the query itself", "A frame does not find itself.", null],
   filter: ["Lost at the filter", "Only frames that pass it are searched.", () => [{ session: null, not_within_s: null }, "Ask without the filter"]],
-  shortlist: ["Lost at the index", "Its shortlist did not propose the frame.", () => [{ exact: true }, "Compare every frame"]],
+  shortlist: ["Lost at the index", "The search did not compare the frame.", () => [{ exact: true }, "Compare every frame"]],
   ranking: ["Lost in the ranking", "Others are nearer by their signatures.", null],
   selection: ["Lost in the selection", "Others of the ranking were taken as candidates.",
     (answer) => [{ candidates: Math.min(200, Math.max(2 * answer.counts.selected, answer.counts.ranked)) }, "Ask with all of the ranking as candidates"]],
@@ -89,7 +89,7 @@ function explained(told, answer, change) {
     ["State", told.state], ["Passes the filter", yes(told.passes_filter)],
     ["Exact rank", told.rank === null ? "–" : `${count(told.rank)} of ${count(told.of)}`],
     ["Distance", count(told.distance)], ["Similarity", percent(told.similarity)],
-    ["Proposed by the index", yes(told.shortlisted)], ["Ranked", yes(told.ranked)], ["A candidate", yes(told.selected)],
+    ["Compared by the search", yes(told.shortlisted)], ["Ranked", yes(told.ranked)], ["A candidate", yes(told.selected)],
     ...(told.validation ? [["Laid on the query", told.validation.status], ...figures(told.validation)] : []),
   ];
   return [

@@ -1,0 +1,133 @@
+"""The whitened signature: against numpy's own arithmetic, and what whitening promises."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.retrieval import distances
+from sceneprint.geometry.whitening import (
+    UNITS,
+    Whitening,
+    WhiteningParameters,
+    _products,
+    fit_whitening,
+    psi_units,
+    whiten,
+)
+from sceneprint.types import Floats
+
+
+def frames(n: int, length: int = 300, seed: int = 0) -> Floats:
+    """(n, length) unit vectors about a mean, with axes of very different spread."""
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(np.random.default_rng(99).normal(size=(length, length)))[0]
+    spread = 1.0 / np.arange(1, length + 1)
+    psi = 0.5 * turn[0] + (rng.normal(size=(n, length)) * spread) @ turn
+    unit: Floats = psi / np.linalg.norm(psi, axis=1, keepdims=True)
+    return unit
+
+
+@pytest.fixture(scope="module")
+def psi() -> Floats:
+    return frames(200)
+
+
+@pytest.fixture(scope="module")
+def fit(psi: Floats) -> Whitening:
+    return fit_whitening(psi_units(psi), (1,), WhiteningParameters(32))
+
+
+def projected(psi: Floats, fit: Whitening) -> Floats:
+    """What `whiten` rounds, in plain numpy."""
+    z = fit.scales * (np.rint(psi * UNITS) @ fit.basis.T.astype(float) - fit.offsets)
+    unit: Floats = z / np.linalg.norm(z, axis=-1, keepdims=True)
+    return unit
+
+
+def test_products_are_exact_at_the_ends_of_their_range() -> None:
+    basis = np.array([[127] * 25_000, [-127] * 25_000], np.int8)
+    psi = np.full(25_000, round(UNITS / np.sqrt(25_000)), np.int16)  # of length 1
+    found = np.empty(2, np.int32)
+    _products(basis, psi, found)
+    assert found.tolist() == (basis.astype(np.int64) @ psi.astype(np.int64)).tolist()
+
+
+def test_the_same_as_numpy(psi: Floats, fit: Whitening) -> None:
+    wanted = np.clip(np.rint(fit.gain * projected(psi, fit)), -127, 127) + 128
+    stored = np.stack([whiten(one, fit) for one in psi])
+    assert stored.dtype == np.uint8
+    assert np.abs(stored.astype(int) - wanted).max() == 0
+
+
+def test_axes_are_principal_and_whitened(psi: Floats, fit: Whitening) -> None:
+    """The training frames spread alike along each axis, and no two axes say the same."""
+    units = psi_units(psi).astype(float)
+    z = fit.scales * (units @ fit.basis.T.astype(float) - fit.offsets)
+    np.testing.assert_allclose(z.mean(axis=0), 0, atol=1e-9)
+    covariance = z.T @ z / len(z)
+    np.testing.assert_allclose(covariance, np.eye(32), atol=0.03)  # int8 axes: .7 % each
+    _, _, axes = np.linalg.svd(units - units.mean(axis=0), full_matrices=False)
+    own = fit.basis / np.linalg.norm(fit.basis, axis=1, keepdims=True)
+    np.testing.assert_allclose(np.abs((own * axes[:32]).sum(axis=1)), 1.0, atol=1e-3)
+
+
+@pytest.mark.parametrize(("exponent", "spread"), [(1.0, 0.0), (0.5, 0.5), (0.0, 1.0)])
+def test_partial_whitening_keeps_some_spread(psi: Floats, exponent: float, spread: float) -> None:
+    p = WhiteningParameters(32, exponent)
+    fit = fit_whitening(psi_units(psi), (1,), p)
+    full = fit_whitening(psi_units(psi), (1,), WhiteningParameters(32))
+    left = fit.scales / full.scales  # of each axis, its standard deviation to this power
+    deviation = np.linalg.norm(
+        (psi_units(psi) - psi_units(psi).mean(axis=0)) @ (full.basis.T * full.scales), axis=0
+    )
+    np.testing.assert_allclose(deviation, np.sqrt(len(psi)), rtol=0.02)
+    slope = np.polyfit(np.log(1 / full.scales), np.log(left), 1)[0]
+    assert slope == pytest.approx(spread, abs=0.05)
+
+
+def test_shrinkage_raises_what_is_narrow(psi: Floats) -> None:
+    plain, shrunk = (
+        fit_whitening(psi_units(psi), (1,), WhiteningParameters(32, shrinkage=share))
+        for share in (0.0, 0.5)
+    )
+    ratio = shrunk.scales / plain.scales
+    assert ratio[0] > 1 > ratio[-1]  # the widest axis counts more, the narrowest less
+    assert (np.diff(ratio) <= 1e-12).all()
+
+
+def test_squared_distance_is_that_of_unit_vectors(psi: Floats, fit: Whitening) -> None:
+    """Rounding to bytes costs a few units in the hundredth."""
+    stored = np.stack([whiten(one, fit) for one in psi])
+    cosine = projected(psi[:1], fit)[0] @ projected(psi[1:], fit).T
+    found = distances(stored[0], stored[1:], "l2") / fit.gain**2
+    unclipped = (np.abs(fit.gain * projected(psi, fit)) <= 127).all(axis=1)
+    kept = unclipped[1:]
+    assert kept.sum() >= 20
+    # of 32 numbers some reach past 127, which cuts off up to a twentieth
+    np.testing.assert_allclose(found[kept], 2 - 2 * cosine[kept], atol=0.06)
+
+
+def test_a_new_frame_of_a_place_is_nearest_to_it(fit: Whitening) -> None:
+    places = frames(40, seed=7)
+    again = places + 0.02 * frames(40, seed=8)
+    stored = np.stack([whiten(one, fit) for one in places])
+    found = [int(np.argmin(distances(whiten(one, fit), stored, "l2"))) for one in again]
+    assert found == list(range(40))
+
+
+def test_the_mean_itself_and_a_zero(psi: Floats, fit: Whitening) -> None:
+    nothing = replace(fit, offsets=np.zeros(32))
+    assert whiten(np.zeros(300), nothing).tolist() == [128] * 32
+
+
+def test_what_is_refused(psi: Floats, fit: Whitening) -> None:
+    with pytest.raises(ValueError, match=r"psi \(299,\), where the basis is \(32, 300\)"):
+        whiten(psi[0, :299], fit)
+    units = psi_units(psi)
+    with pytest.raises(ValueError, match="200 axes of 200 frames"):
+        fit_whitening(units, (0,), WhiteningParameters(200))
+    with pytest.raises(ValueError, match="span fewer than 32 axes"):
+        fit_whitening(np.repeat(units[:5], 40, axis=0), (0,), WhiteningParameters(32))

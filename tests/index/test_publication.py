@@ -1,0 +1,351 @@
+"""Generations: appended, merged, cleaned, and opened again as they were."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import faiss
+import numpy as np
+import pytest
+
+from sceneprint.index import Generation, clear, newest, newest_number, publication, publish
+from sceneprint.index.files import building
+from sceneprint.index.keys import Block
+from sceneprint.types import Bytes
+
+Walk = Callable[..., Bytes]
+Publish = Callable[..., Generation]
+LENGTH = 256
+
+
+def holds(generation: Generation | None, frames: dict[int, Bytes]) -> bool:
+    """Whether a generation holds these frames with these signatures, in the order of their keys."""
+    assert generation is not None
+    keys = np.array(sorted(frames), np.int64)
+    assert generation.keys.tolist() == keys.tolist()
+    assert len(generation) == len(generation.vectors) == generation.index.ntotal
+    expected = np.array([frames[int(key)] for key in keys], np.uint8).reshape(-1, LENGTH)
+    np.testing.assert_array_equal(generation.vectors, expected)
+    np.testing.assert_array_equal(generation.vectors_of(keys[::-1]), expected[::-1])
+    return True
+
+
+def frames_of(keys: np.ndarray, signatures: Bytes) -> dict[int, Bytes]:
+    return dict(zip(keys.tolist(), signatures, strict=True))
+
+
+def files(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_what_is_published_is_what_is_opened(
+    walk: Walk, published: Publish, tmp_path: Path
+) -> None:
+    keys, signatures = np.arange(300)[::-1] * 7 - 50, walk(300)
+    made = published(keys, signatures, revision=41, anchor="an event")
+    opened = newest(tmp_path / "map", "model", LENGTH)
+    for generation in (made, opened):
+        assert holds(generation, frames_of(keys, signatures))
+        assert generation is not None
+        assert (generation.number, generation.revision, generation.model_id) == (1, 41, "model")
+        assert (generation.dimension, len(generation)) == (LENGTH, 300)
+        assert generation.anchor == "an event"
+        assert not generation.vectors.flags.writeable
+        with pytest.raises(ValueError, match="no frames"):
+            generation.vectors_of(np.array([keys[0], 3]))
+
+
+def test_files_are_keys_and_what_faiss_writes(
+    walk: Walk, published: Publish, tmp_path: Path
+) -> None:
+    """Byte for byte as FAISS serialises an index to which the signatures were added as floats."""
+    signatures = walk(100)
+    published(np.arange(100) + 5, signatures)
+    index = faiss.IndexScalarQuantizer(
+        LENGTH, faiss.ScalarQuantizer.QT_8bit_direct, faiss.METRIC_L2
+    )
+    index.add(signatures.astype(np.float32))
+    (path,) = (tmp_path / "map").glob("*.faiss")
+    assert path.read_bytes() == faiss.serialize_index(index).tobytes()
+    (keys,) = (tmp_path / "map").glob("*.keys")
+    assert keys.read_bytes() == (np.arange(100) + 5).astype("<i8").tobytes()
+    for each in (path, keys):
+        assert each.stem == hashlib.sha256(each.read_bytes()).hexdigest()
+
+
+def test_nothing_is_found_where_nothing_is(walk: Walk, published: Publish, tmp_path: Path) -> None:
+    assert newest(tmp_path / "map", "model", LENGTH) is None
+    assert newest_number(tmp_path / "map") is None
+    published(np.arange(5), walk(5))
+    assert newest_number(tmp_path / "map") == 1
+    assert newest(tmp_path / "map", "another", LENGTH) is None
+    assert newest(tmp_path / "map", "model", LENGTH + 1) is None
+
+
+@pytest.mark.parametrize("step", [1, 37, 1000])
+def test_appending_gives_the_bytes_of_publishing_at_once(
+    walk: Walk, published: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    """Whatever came when, in blocks of whatever size."""
+    monkeypatch.setattr(publication, "BLOCK_BYTES", step * LENGTH)
+    signatures, again = walk(120), walk(30, seed=5)
+    first = published(np.arange(99, -1, -1), signatures[99::-1])
+    keys = np.concatenate([np.arange(10, 40), np.arange(100, 120)])
+    second = published(
+        keys, np.concatenate([again, signatures[100:]]), first,
+        drop=frozenset({0, 1, 2, 50, 110, 999}),
+    )  # fmt: skip
+    expected = frames_of(np.arange(120), signatures) | frames_of(np.arange(10, 40), again)
+    for gone in (0, 1, 2, 50, 110):
+        del expected[gone]
+    assert holds(second, expected)
+    assert holds(newest(tmp_path / "map", "model", LENGTH), expected)
+    assert holds(first, frames_of(np.arange(100), signatures[:100]))  # a live one never changes
+    third = published(np.arange(0), signatures[:0], second, revision=9)  # nothing but a revision
+    assert holds(third, expected)
+    assert (third.number, third.revision, third.manifest.files) == (3, 9, second.manifest.files)
+    once = published(
+        np.array(sorted(expected)), np.stack([expected[key] for key in sorted(expected)]),
+        folder=tmp_path / "once",
+    )  # fmt: skip
+    assert once.manifest.files == second.manifest.files  # names are checksums
+
+
+def test_all_frames_may_go(walk: Walk, published: Publish, tmp_path: Path) -> None:
+    signatures = walk(30)
+    first = published(np.arange(30), signatures)
+    last = published(np.arange(0), signatures[:0], first, drop=frozenset(range(30)))
+    opened = newest(tmp_path / "map", "model", LENGTH)
+    for generation in (last, opened):
+        assert generation is not None
+        assert (len(generation), generation.vectors.shape) == (0, (0, LENGTH))
+    anew = published(np.arange(3), signatures[:3], opened)
+    assert holds(anew, frames_of(np.arange(3), signatures[:3]))
+
+
+def test_two_generations_are_kept_and_only_our_files_removed(
+    walk: Walk, published: Publish, tmp_path: Path
+) -> None:
+    folder, signatures = tmp_path / "map", walk(160)
+    generation = published(np.arange(100), signatures[:100])
+    left = [".0123456789ab.part", f"{'0' * 64}.faiss", f"0000000007-{'0' * 32}.json"]
+    left += [f"{'0' * 64}.{kind}" for kind in ("segment", "rows", "code")]
+    for name in left:  # of a killed builder, of no manifest, and of version 0.1
+        (folder / name).write_bytes(b"left")
+    (folder / "notes.txt").write_text("of somebody else")
+    for key in range(100, 105):
+        generation = published(np.array([key]), signatures[key : key + 1], generation)
+    names = files(folder)
+    assert {".lock", "notes.txt"} <= names
+    kinds = sorted(name.rpartition(".")[2] for name in names - {".lock", "notes.txt"})
+    assert kinds == ["faiss", "faiss", "json", "json", "keys", "keys"]
+    assert newest_number(folder) == 6
+    (folder / left[2]).write_bytes(b"left")
+    assert clear(folder, but=5)
+    assert newest_number(folder) == 5
+    assert clear(folder)
+    assert files(folder) == {".lock", "notes.txt"}
+
+
+def test_clean_leaves_no_byte_of_what_is_gone(
+    walk: Walk, published: Publish, tmp_path: Path
+) -> None:
+    signatures = walk(50)
+    first = published(np.arange(50), signatures)
+    second = published(np.arange(0), signatures[:0], first, drop=frozenset([7]), clean=True)
+    assert holds(second, frames_of(np.delete(np.arange(50), 7), np.delete(signatures, 7, axis=0)))
+    content = b"".join(path.read_bytes() for path in (tmp_path / "map").iterdir())
+    assert signatures[8].tobytes() in content
+    assert signatures[7].tobytes() not in content
+
+
+def test_what_is_open_is_taken_from_there(
+    walk: Walk, published: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, signatures = tmp_path / "map", walk(150)
+    first = published(np.arange(100), signatures[:100])
+    assert newest(folder, "model", LENGTH, known=first) is first
+    assert newest(folder, "model", LENGTH) is not first
+    second = published(np.arange(100, 150), signatures[100:], first)
+    read: list[str] = []
+    monkeypatch.setattr(
+        "sceneprint.index.generations.check", lambda _, name, __: read.append(name) or iter(())
+    )
+    found = newest(folder, "model", LENGTH, known=first)
+    assert found is not None
+    assert holds(found, frames_of(np.arange(150), signatures))
+    assert read == [name for name, _ in second.manifest.files]
+    read.clear()
+    published(np.arange(0), signatures[:0], second, revision=3)  # the same files
+    again = newest(folder, "model", LENGTH, known=newest(folder, "model", LENGTH, known=second))
+    assert again is not None
+    assert again.revision == 3
+
+
+def test_what_was_mapped_survives_its_file(walk: Walk, tmp_path: Path) -> None:
+    """In a process of its own, which a lost mapping would kill."""
+    code = """
+import sys
+from pathlib import Path
+import numpy as np
+from sceneprint.index import Tail, newest, publish, search
+
+folder, n = Path(sys.argv[1]), 4000
+rows = np.random.default_rng(0).integers(0, 256, (n, 256), np.uint8)
+publish(folder, model_id="m", revision=1, blocks=[(np.arange(n), rows)], previous=None,
+        flat_bytes=int(sys.argv[2]))
+found = newest(folder, "m", 256)
+for path in folder.iterdir():
+    path.unlink()
+vectors = found.vectors
+hits = search(rows[777], found, Tail.empty(256), 3, metric="l2")
+assert hits.keys[0] == 777 and hits.distances[0] == 0
+assert (found.vectors == rows).all()
+assert found.distances(rows[5])[5] == 0
+where = next(line for line in open("/proc/self/smaps") if ".faiss" in line)
+del found, hits
+assert (vectors == rows).all()  # keeps the mapping alive by itself
+print(where.split()[1])
+"""
+    for number, flat in enumerate((1 << 30, 0)):
+        place = tmp_path / str(number)
+        place.mkdir()
+        found = subprocess.run(
+            [sys.executable, "-c", code, str(place), str(flat)],
+            capture_output=True, text=True, timeout=120, check=False,
+        )  # fmt: skip
+        assert found.returncode == 0, found.stderr
+        assert found.stdout.startswith("r--")  # a file is mapped, and nobody may write there
+
+
+def test_one_builds_at_a_time(walk: Walk, published: Publish, tmp_path: Path) -> None:
+    folder, signatures = tmp_path / "map", walk(20)
+    first = published(np.arange(10), signatures[:10])
+    new: Block = (np.arange(10, 20), signatures[10:])
+    with building(folder) as mine:
+        assert mine
+        with building(folder) as another:  # of the same process as well
+            assert not another
+        assert publish(folder, model_id="model", revision=1, blocks=[new], previous=first) is None
+        assert not clear(folder)
+    assert newest_number(folder) == 1
+    second = published(*new, first)
+    # the loser of a race has built on what is no longer the newest
+    assert publish(folder, model_id="model", revision=1, blocks=[new], previous=first) is None
+    assert newest_number(folder) == second.number == 2
+    # from nothing is always allowed, and follows in number
+    third = published(np.arange(4), signatures[:4])
+    assert third.number == 3
+    assert holds(newest(folder, "model", LENGTH), frames_of(np.arange(4), signatures[:4]))
+
+
+def test_an_emptied_folder_is_noticed(walk: Walk, published: Publish, tmp_path: Path) -> None:
+    folder, signatures = tmp_path / "map", walk(20)
+    first = published(np.arange(10), signatures[:10])
+    for path in folder.iterdir():
+        path.unlink()
+    folder.rmdir()
+    new: Block = (np.arange(10, 20), signatures[10:])
+    assert publish(folder, model_id="model", revision=1, blocks=[new], previous=first) is None
+    assert newest(folder, "model", LENGTH) is None
+    assert holds(first, frames_of(np.arange(10), signatures[:10]))
+
+
+def test_mistakes_leave_the_generation_before(
+    walk: Walk, published: Publish, tmp_path: Path
+) -> None:
+    folder, signatures = tmp_path / "map", walk(20)
+    first = published(np.arange(10), signatures[:10])
+    before = files(folder)
+
+    def broken() -> Iterator[Block]:
+        yield np.arange(10, 12), signatures[10:12]
+        raise ConnectionError("the database went away")
+
+    def attempt(blocks: object, model: str = "model") -> None:
+        publish(folder, model_id=model, revision=1, blocks=blocks, previous=first)  # type: ignore[arg-type]
+
+    with pytest.raises(ConnectionError):
+        attempt(broken())
+    with pytest.raises(ValueError, match=r"\[10\] are there twice"):
+        attempt([(np.array([10, 11, 10]), signatures[10:13])])
+    with pytest.raises(ValueError, match=r"\[255, 256\] bytes in one map"):
+        attempt([(np.arange(10, 12), signatures[10:12, 1:])])
+    with pytest.raises(ValueError, match="keys of int32"):
+        attempt([(np.arange(10, 12, dtype=np.int32), signatures[10:12])])
+    with pytest.raises(ValueError, match=r"keys \(3,\)"):
+        attempt([(np.arange(10, 13), signatures[10:12])])
+    with pytest.raises(ValueError, match="model other appended to those of model"):
+        attempt([], "other")
+    with pytest.raises(ValueError, match="of no frames"):
+        publish(folder, model_id="model", revision=1, blocks=[], previous=None)
+    assert files(folder) == before
+    assert holds(newest(folder, "model", LENGTH), frames_of(np.arange(10), signatures[:10]))
+    published(np.arange(10, 20), signatures[10:], first)
+    assert holds(newest(folder, "model", LENGTH), frames_of(np.arange(20), signatures))
+
+
+def test_a_failure_at_any_step_leaves_the_old_or_the_new(
+    walk: Walk, published: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that fills, at each of the calls that give a file its name or make it durable."""
+    signatures, real = walk(60), {"replace": os.replace, "fsync": os.fsync}
+    seen = set()
+    for call in ("replace", "fsync"):
+        for step in range(100):
+            folder = tmp_path / f"{call}-{step}"
+            first = published(np.arange(40), signatures[:40], folder=folder)
+            left = step
+
+            def failing(*arguments: object, call: str = call) -> None:
+                nonlocal left
+                left -= 1
+                if left < 0:
+                    raise OSError(28, "No space left on device")
+                real[call](*arguments)  # type: ignore[operator]
+
+            with monkeypatch.context() as patch:
+                patch.setattr(os, call, failing)
+                with contextlib.suppress(OSError):
+                    published(
+                        np.arange(40, 60), signatures[40:], first, folder=folder, flat_bytes=0
+                    )
+            found = newest(folder, "model", LENGTH)
+            assert found is not None
+            n = {1: 40, 2: 60}[found.number]
+            assert holds(found, frames_of(np.arange(n), signatures[:n]))
+            assert not list(folder.glob(".*.part"))
+            seen.add((call, found.number))
+            if left >= 0:
+                break
+        assert step >= 3
+    assert {("replace", 1), ("replace", 2), ("fsync", 1), ("fsync", 2)} <= seen
+
+
+def test_a_disk_that_is_full_is_said_as_it_was(
+    walk: Walk, published: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While FAISS writes, which has errors of its own."""
+    first = published(np.arange(10), walk(20)[:10])
+    before = files(tmp_path / "map")
+
+    def full(_index: object, take: Callable[[bytes], None]) -> None:
+        def refuse(data: bytes) -> None:
+            raise OSError(28, "No space left on device")
+
+        write(first.index, refuse)
+
+    write = publication.write_index
+    monkeypatch.setattr(publication, "write_index", full)
+    with pytest.raises(OSError, match="No space left"):
+        published(np.arange(10, 20), walk(20)[10:], first)
+    assert {name for name in files(tmp_path / "map") if not name.endswith(".keys")} == {
+        name for name in before if not name.endswith(".keys")
+    }
+    assert newest_number(tmp_path / "map") == 1
