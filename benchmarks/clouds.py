@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from sceneprint.datasets import find_sequences
 from sceneprint.geometry.depth import DepthParameters
-from sceneprint.geometry.retrieval import distances
+from sceneprint.geometry.retrieval import Metric, distances
 from sceneprint.geometry.rigid import rotation_angle
 from sceneprint.pipeline import Signer, open_signer, sign
 from sceneprint.types import AnyFrame, Bytes, Cloud, Floats, Frame
@@ -92,7 +92,7 @@ def are_far(frames: Sequence[Frame]) -> NDArray[np.bool_]:
 
 
 def own_is_nearest(
-    queries: Bytes, database: Bytes, own: NDArray[np.intp], far: NDArray[np.bool_]
+    queries: Bytes, database: Bytes, own: NDArray[np.intp], far: NDArray[np.bool_], metric: Metric
 ) -> tuple[float, float]:
     """Share of queries whose own row of the database is nearer than any far one, and the margin.
 
@@ -101,10 +101,11 @@ def own_is_nearest(
     queries, database : (Q, L), (D, L) signatures
     own : (Q,) index of each query's own in the database
     far : (Q, D) who it is to be told from
+    metric : of the signatures
     """
     ratios = []
     for query, mine, others in zip(queries, own, far, strict=True):
-        d = distances(query, database).astype(float)
+        d = distances(query, database, metric).astype(float)
         ratios.append(d[mine] / d[others].min())
     return float(np.mean(np.array(ratios) < 1)), float(np.mean(ratios))
 
@@ -128,9 +129,13 @@ def same_points(
     clouds, seconds = signed(
         [cloud_of(frames[i], int(i), has_viewpoint=has_viewpoint) for i in chosen], signer, "clouds"
     )
-    there, margin = own_is_nearest(clouds, depth, chosen, far[chosen])
+    there, margin = own_is_nearest(clouds, depth, chosen, far[chosen], signer.model.metric)
     back, _ = own_is_nearest(
-        depth[chosen], clouds, np.arange(len(chosen)), far[np.ix_(chosen, chosen)]
+        depth[chosen],
+        clouds,
+        np.arange(len(chosen)),
+        far[np.ix_(chosen, chosen)],
+        signer.model.metric,
     )
     return there, back, margin, float(np.median(seconds) * 1e3)
 
@@ -145,14 +150,14 @@ def turned(
         signer,
         "database",
     )
-    same, margins = [], []
+    same, margins, metric = [], [], signer.model.metric
     for seed, frame in enumerate(tqdm(queries, desc="turned", unit="frame", disable=None)):
         plain = sign(cloud_of(frame, seed, has_viewpoint=has_viewpoint), signer).vector
         R = any_rotation(seed)
         other = sign(cloud_of(frame, seed + 1, R, has_viewpoint=has_viewpoint), signer).vector
-        first, then = distances(plain, d), distances(other, d)
+        first, then = distances(plain, d, metric), distances(other, d, metric)
         same.append(first.argmin() == then.argmin())
-        margins.append(distances(plain, other[None])[0] / first.min())
+        margins.append(distances(plain, other[None], metric)[0] / first.min())
     return float(np.mean(same)), float(np.mean(margins))
 
 

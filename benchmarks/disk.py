@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -48,9 +50,8 @@ def measure(frames: Sequence[FrameReference], model: str, folder: Path) -> DiskF
             client.create_map("disk", model=model)
             added = [client.upload("disk", frame) for frame in some]
             client.wait([one.job_id for one in added])
-        parts = (database, database.with_name(database.name + "-wal"))
         blobs = [path.stat().st_size for path in (folder / "blobs").rglob("*") if path.is_file()]
-        sizes.append((sum(p.stat().st_size for p in parts if p.exists()), sum(blobs)))
+        sizes.append((_used(database), sum(blobs)))
     n = len(frames) - first
     uploads = sum(frame.path.stat().st_size for frame in frames[first:])
     (rows_before, blobs_before), (rows_after, blobs_after) = sizes
@@ -61,6 +62,14 @@ def measure(frames: Sequence[FrameReference], model: str, folder: Path) -> DiskF
         uploads=uploads / n,
         artifacts=(blobs_after - blobs_before - uploads) / n,
     )
+
+
+def _used(database: Path) -> int:
+    """Bytes of the pages that a database uses, whether in its file or in its log."""
+    with closing(sqlite3.connect(database)) as connection:
+        asked = ("page_count", "freelist_count", "page_size")
+        count, free, size = (connection.execute(f"PRAGMA {one}").fetchone()[0] for one in asked)
+    return int((count - free) * size)
 
 
 def measure_new(frames: Sequence[FrameReference], model: str) -> DiskFigures:

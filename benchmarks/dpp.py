@@ -71,14 +71,14 @@ def measure(size: int = 125, k: int = 10, length: int = 448, runs: int = 9) -> D
     runs : of each
     """
     database = views(2 * size, length)
-    ranking = rank(distances(database[size], database), size, 1.0)
+    ranking = rank(distances(database[size], database, "l2"), size, 1.0)
     ranked = database[ranking.indices]
-    among = pairwise_distances(ranked)
+    among = pairwise_distances(ranked, "l2")
     found = diversify(ranking.distances, among, k)
     rows: list[dict[str, float]] = []
     for _ in range(runs):
         clock = Clock()
-        clock.run("pairwise", lambda: pairwise_distances(ranked))
+        clock.run("pairwise", lambda: pairwise_distances(ranked, "l2"))
         clock.run("greedy", lambda: diversify(ranking.distances, among, k))
         clock.run("naive", lambda: naive_selection(ranking, among, k))
         rows.append(clock.stages)

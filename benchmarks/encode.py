@@ -23,6 +23,7 @@ from sceneprint.geometry.hierarchy import hierarchy
 from sceneprint.geometry.normals import surface
 from sceneprint.geometry.segmentation import segment
 from sceneprint.geometry.weights import patch_weights
+from sceneprint.geometry.whitening import whiten
 from sceneprint.libraries import open3d
 from sceneprint.pipeline import Signer, geometry_of, sign
 from sceneprint.signing import float_signature, see
@@ -37,7 +38,8 @@ def signing_stages(frame: Frame, signer: Signer) -> dict[str, float]:
     q, camera = clock.run("inverse depth", lambda: inverse_depth(frame, p.depth))
     seen = clock.run("points and normals", lambda: surface(q, camera, p.normals))
     finest = clock.run("segmentation", lambda: segment(seen, p.segmentation))
-    levels = clock.run("hierarchy", lambda: hierarchy(seen, finest, p.hierarchy)).levels
+    every = clock.run("hierarchy", lambda: hierarchy(seen, finest, p.hierarchy)).levels
+    levels = [every[level] for level in model.levels]
     counted = clock.run(
         "pairs",
         lambda: [
@@ -49,10 +51,11 @@ def signing_stages(frame: Frame, signer: Signer) -> dict[str, float]:
         "statistics",
         lambda: [statistics_of_counts(c, signer.table, len(model.mixture)) for c in counted],
     )
-    clock.run(
-        "Fisher vector",
-        lambda: quantise(float_signature(sums, model), model.quantiser_step),
-    )
+    psi, own = clock.run("Fisher vector", lambda: float_signature(sums, model)), model.whitening
+    if own is None:
+        clock.run("bytes", lambda: quantise(psi, model.quantiser_step))
+    else:
+        clock.run("whitening", lambda: whiten(psi, own))
     return clock.stages
 
 

@@ -86,13 +86,15 @@ def first_right(rows: Floats, at: Floats, allowed: NDArray[np.bool_]) -> tuple[i
 def signature_rows(signatures: Sequence[Signature]) -> Floats:
     """(n, n) distances of signatures."""
     stored = np.stack([one.vector for one in signatures])
-    return np.stack([distances(one, stored) for one in stored]).astype(float)
+    return np.stack([distances(one, stored, signatures[0].metric) for one in stored]).astype(float)
 
 
 def ring_rows(walk: Sequence[Cloud]) -> Floats:
     """(n, n) distances of ring descriptors."""
     stored = np.stack([ring_descriptor(cloud.points) for cloud in walk])
-    return np.stack([ring_distances(one, stored) for one in stored]).astype(float)
+    return np.stack([ring_distances(one, stored, signatures[0].metric) for one in stored]).astype(
+        float
+    )
 
 
 def timed(run: Callable[[], object], times: int = 5) -> float:
@@ -156,7 +158,7 @@ def milliseconds(walk: Sequence[Cloud], signer: Signer) -> dict[str, float]:
     return {
         "points": float(len(cloud.points)),
         "prepare": timed(lambda: prepare(cloud, signer)),
-        "search": timed(lambda: distances(signature.vector, vectors)),
+        "search": timed(lambda: distances(signature.vector, vectors, signature.metric)),
         "validate": timed(lambda: validate(geometry, stored[0][1], p=p)),
     }
 

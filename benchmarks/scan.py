@@ -47,8 +47,11 @@ def measure(signatures: int = 500, length: int = 125_000, runs: int = 15) -> Sca
     queries = rng.integers(0, 256, (TOGETHER, length), np.uint8)
     words = database.reshape(-1).view(np.uint64)
     scans: dict[str, tuple[int, Callable[[], object]]] = {
-        "L1, one query": (1, lambda: distances(queries[0], database)),
-        f"L1, {TOGETHER} queries at once": (TOGETHER, lambda: cross_distances(queries, database)),
+        "L1, one query": (1, lambda: distances(queries[0], database, "l1")),
+        f"L1, {TOGETHER} queries at once": (
+            TOGETHER,
+            lambda: cross_distances(queries, database, "l1"),
+        ),
         "L2, one query": (1, lambda: distances(queries[0], database, "l2")),
         f"L2, {TOGETHER} queries at once": (
             TOGETHER,

@@ -189,8 +189,8 @@ def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
     assert "room-000/seq-01" in printed["frames"]
     assert "frame.indexed" in printed["events"]
     assert "building" in printed["maps"]
-    assert (tmp_path / "restored/sceneprint.db").stat().st_size > 6 * 125_000
-    assert printed["index"].startswith("map building, paper-")
+    assert (tmp_path / "restored/sceneprint.db").stat().st_size > 3_000_000  # the model is in it
+    assert printed["index"].startswith("map building, depth-")
     assert "6" in printed["thin"]
     assert "building" in printed["reencode"]
     index = json.loads((tmp_path / "signatures/signatures.json").read_text())

@@ -75,16 +75,22 @@ def note(*matches: tuple[str, int], begun: float = 5.0) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("answer", "wrong"),
     [
-        (note(("s1", 4), ("w", 8)), []),
-        (note(("s1", 4), ("stranger", 6), ("w", 8)), []),  # not acknowledged before the end
-        (note(("s1", 4), ("w", 9)), ["w at 9, which is not its distance"]),
-        (note(("w", 8), ("s1", 4)), ["the matches are not in their order, or one is there twice"]),
-        (note(("s1", 4), ("s1", 4)), ["the matches are not in their order, or one is there twice"]),
-        (note(("w", 8)), ["s1 at 4 is missing"]),
+        (note(("s1", 16), ("w", 32)), []),
+        (note(("s1", 16), ("stranger", 20), ("w", 32)), []),  # not acknowledged before the end
+        (note(("s1", 16), ("w", 33)), ["w at 33, which is not its distance"]),
+        (
+            note(("w", 32), ("s1", 16)),
+            ["the matches are not in their order, or one is there twice"],
+        ),
+        (
+            note(("s1", 16), ("s1", 16)),
+            ["the matches are not in their order, or one is there twice"],
+        ),
+        (note(("w", 32)), ["s1 at 16 is missing"]),
         (note(), ["0 matches, where 0 can have been deleted meanwhile"]),
         (note(begun=6.8), []),  # one was being deleted
-        (note(("s1", 4), ("w", 8), begun=8.0), ["w is found, and was deleted before"]),
-        (note(("s1", 4), ("w", 8), begun=6.5), []),  # it was being deleted
+        (note(("s1", 16), ("w", 32), begun=8.0), ["w is found, and was deleted before"]),
+        (note(("s1", 16), ("w", 32), begun=6.5), []),  # it was being deleted
     ],
 )
 def test_a_wrong_answer_is_seen(answer: dict[str, Any], wrong: list[str]) -> None:
@@ -96,7 +102,7 @@ def test_a_wrong_answer_is_seen(answer: dict[str, Any], wrong: list[str]) -> Non
 def test_a_frame_beyond_the_last_match_is_not_missed() -> None:
     vectors = np.array([0, 40, *range(1, K + 1)], np.uint8)[:, None]
     numbers = {f"w{i}": i + 1 for i in range(1, K + 1)}
-    answer = note(*[(f"w{i}", i) for i in range(1, K + 1)])
+    answer = note(*[(f"w{i}", i * i) for i in range(1, K + 1)])
     assert faults(answer, numbers, {}, {"s0": 0, "s1": 1}, vectors) == []
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.soak.load import MODEL, Shot
 from sceneprint.pipeline import open_signer, sign
@@ -96,7 +97,7 @@ def faults(
     for frame_id, distance in found:
         if frame_id not in numbers:
             continue  # its upload was not acknowledged before the end
-        if distance != int(np.abs(query - vectors[numbers[frame_id]]).sum()):
+        if distance != _apart(query, vectors[numbers[frame_id]]):
             wrong.append(f"{frame_id} at {distance}, which is not its distance")
         if frame_id in deleted and deleted[frame_id][1] < note["begun"]:
             wrong.append(f"{frame_id} is found, and was deleted before")
@@ -112,7 +113,11 @@ def faults(
     farthest = distances[-1] if distances else -1
     names = {name for name, _ in found}
     for frame_id, number in stable.items():
-        near = int(np.abs(query - vectors[number]).sum())
+        near = _apart(query, vectors[number])
         if frame_id != note["asked"] and near < farthest and frame_id not in names:
             wrong.append(f"{frame_id} at {near} is missing")
     return wrong
+
+
+def _apart(query: NDArray[np.int64], vector: Bytes) -> int:
+    return int(((query - vector) ** 2).sum())

@@ -45,9 +45,7 @@ class Ranking:
         return len(self.indices)
 
 
-def distances(
-    query: Bytes, database: Bytes, metric: Metric = "l1", rows: Ints64 | None = None
-) -> Ints64:
+def distances(query: Bytes, database: Bytes, metric: Metric, rows: Ints64 | None = None) -> Ints64:
     """Distances -s(X, Y) of one signature to many: Sec. III-C.
 
     Parameters
@@ -78,7 +76,7 @@ def distances(
     return found
 
 
-def cross_distances(queries: Bytes, database: Bytes, metric: Metric = "l1") -> Ints64:
+def cross_distances(queries: Bytes, database: Bytes, metric: Metric) -> Ints64:
     """Distances -s(X, Y) of many signatures to many: Sec. III-C.
 
     The database streams through the cache once for all queries that fit in it.
@@ -101,7 +99,7 @@ def cross_distances(queries: Bytes, database: Bytes, metric: Metric = "l1") -> I
     return _distances(queries, database, metric)
 
 
-def pairwise_distances(signatures: Bytes, metric: Metric = "l1") -> Ints64:
+def pairwise_distances(signatures: Bytes, metric: Metric) -> Ints64:
     """Distances of signatures among each other, each pair computed once: Sec. III-C.
 
     Parameters

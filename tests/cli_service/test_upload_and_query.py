@@ -34,7 +34,7 @@ def house(service_url: str, rooms: Path) -> str:
     )
     assert done.returncode == 0, done.stderr
     first, second = done.stdout.splitlines()
-    assert re.fullmatch(r"map house is made, with model paper-[0-9a-f]{12}", first)
+    assert re.fullmatch(r"map house is made, with model depth-[0-9a-f]{12}", first)
     assert second.startswith(
         "6 frames: 6 received, 0 already there; 6 indexed, 0 rejected, 0 failed; "
     )
@@ -121,7 +121,7 @@ def test_upload_refuses_what_would_mix(
     sceneprint: Run, house: str, rooms: Path, tmp_path: Path
 ) -> None:
     done = sceneprint("upload", house, rooms, "--model", "depth", expect=2)
-    assert re.search(r"Map house is there, with model paper-\w+\. Leave --model out", done.stderr)
+    assert re.search(r"Map house is there, with model depth-\w+\. Leave --model out", done.stderr)
     done = sceneprint("upload", "absent", rooms, "--no-create", expect=2)
     assert "There is no map 'absent'" in done.stderr
     other = tmp_path / "room-0"

@@ -65,7 +65,7 @@ def test_a_folder_of_scans(client: Client, map_name: str, folder: Path, seen: li
     signer = open_signer("depth")
     own, two = (sign(decode_cloud(one), signer) for one in map(write_ply, seen))
     told = {match.frame_id: match for match in answer.matches}
-    apart = int(distances(own.vector, two.vector[None])[0])
+    apart = int(distances(own.vector, two.vector[None], "l2")[0])
     assert abs(told[second.frame_id].distance - apart) < 0.02 * apart  # centimetres are rounded
     assert told[first.frame_id].validation.status == "accepted"
     assert np.allclose(told[first.frame_id].transform.matrix, np.eye(4), atol=0.02)

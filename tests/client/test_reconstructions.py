@@ -178,6 +178,7 @@ def test_refusals(both: list[tuple[Client, Answer]]) -> None:
             client.reconstruct(unvalidated)
 
 
+@pytest.mark.usefixtures("with_open3d")
 def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
     views: list[FrameReference], tmp_path: Path
 ) -> None:

@@ -152,9 +152,9 @@ def test_what_cannot_be_asked_is_refused_alike(
     references: tuple[FrameReference, ...],
 ) -> None:  # fmt: skip
     client: Client = request.getfixturevalue(which)
-    client.create_map(map_name)
+    client.create_map(map_name, model="paper")
     for name in ("x", "y"):
-        client.create_map(f"{map_name}-{name}", model="depth")
+        client.create_map(f"{map_name}-{name}")
     frame = references[0]
     with pytest.raises(InvalidRequest, match="maps"):
         client.query(maps=[], frame=frame)

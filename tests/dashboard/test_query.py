@@ -62,7 +62,8 @@ def test_the_rows_are_the_answer(station, page, ask, axe):
         assert tile["rank"] == told["rank"]
         assert f"distance {told['distance']:,}" in tile["text"]
         similar = 100 * told["similarity"]
-        assert f"similar {similar:.{1 if similar < 9.95 else 0}f} %" in tile["text"]
+        digits = 2 if 0 < similar < 1 else 1 if similar < 10 else 0
+        assert f"similar {similar:.{digits}f} %" in tile["text"]
     chosen = sorted(answer["matches"], key=lambda one: one["rank"])
     assert [one["key"] for one in selection] == [key(one) for one in chosen]
     for tile, told in zip(selection, chosen, strict=True):

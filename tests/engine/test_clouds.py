@@ -138,6 +138,7 @@ def test_what_is_behind_a_match_without_a_viewpoint_can_be_looked_at(
     assert empty.inspection.cloud(answer.query_id).startswith(b"ply\n")
 
 
+@pytest.mark.usefixtures("with_open3d")
 def test_a_cloud_that_cannot_be_unpacked_here_costs_no_reconstruction(
     empty: Engine, uploads: Any, work_off: WorkOff, monkeypatch: pytest.MonkeyPatch
 ) -> None:

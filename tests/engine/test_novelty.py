@@ -35,7 +35,7 @@ def share(prepared: Prepared, signer: Signer) -> Callable[[int, int], float]:
 
     def of(i: int, j: int) -> float:
         a, b = (prepared[k][0].vector.astype(np.int64) for k in (i, j))
-        return int(((a - b) ** 2).sum()) / signer.model.unrelated_distance
+        return float(np.sqrt(((a - b) ** 2).sum() / signer.model.unrelated_distance))
 
     return of
 

@@ -114,6 +114,7 @@ def test_clouds_are_registered_as_well(building: Path, asked: list[str], tmp_pat
         assert len(np.unique(np.asarray(image.convert("RGB"))[::3, ::3].reshape(-1, 3))) > 20
 
 
+@pytest.mark.usefixtures("with_open3d")
 def test_baselines_find_a_cloud_again() -> None:
     """Three walls and a box, turned and moved."""
     rng = np.random.default_rng(0)

@@ -13,7 +13,7 @@ def test_by_hand() -> None:
     queries = np.array([[10, 10]], np.uint8)
     database = np.array([[10, 16], [10, 11], [12, 12], [14, 13], [10, 11]], np.uint8)
     allowed = np.array([[True, True, True, True, False]])
-    (found,) = rank(queries, database, allowed, candidates=2)
+    (found,) = rank(queries, database, allowed, metric="l1", candidates=2)
     assert found.ranking == [1, 2, 0, 3]
     assert found.distances.tolist() == [1, 4, 6, 7]
     assert found.selection[0] == 1
@@ -26,7 +26,7 @@ def test_by_hand() -> None:
 
 def test_a_query_that_may_find_nothing() -> None:
     one = np.zeros((1, 4), np.uint8)
-    (found,) = rank(one, one, np.zeros((1, 1), bool))
+    (found,) = rank(one, one, np.zeros((1, 1), bool), metric="l1")
     assert (found.ranking, found.selection) == ([], [])
 
 

@@ -44,7 +44,7 @@ def test_by_hand() -> None:
         ],
         np.uint8,
     )
-    found = distances(query, database)
+    found = distances(query, database, "l1")
     assert found.dtype == np.int64
     assert found.tolist() == [0, 510, 5, 255 + 245 + 55]
     squares = distances(query, database, "l2")
@@ -79,7 +79,7 @@ def test_among_each_other(metric: Metric) -> None:
 def test_sums_do_not_overflow(n: int) -> None:
     """The farthest two signatures there are; squares reach 33 billion, beyond 32 bits."""
     black, white = np.zeros(n, np.uint8), np.full((1, n), 255, np.uint8)
-    assert distances(black, white).tolist() == [n * 255]
+    assert distances(black, white, "l1").tolist() == [n * 255]
     assert distances(black, white, "l2").tolist() == [n * 255**2]
     assert distances(white[0], black[None], "l2").tolist() == [n * 255**2]
     assert pairwise_distances(np.vstack([black, white]), "l2")[1, 0] == n * 255**2
@@ -96,7 +96,7 @@ def test_is_a_metric(triple: tuple[bytes, bytes, bytes]) -> None:
     x, y, z = (np.frombuffer(b, np.uint8) for b in triple)
 
     def d(a: Bytes, b: Bytes) -> int:
-        return int(distances(a, b[None])[0])
+        return int(distances(a, b[None], "l1")[0])
 
     assert d(x, y) == oracle(x[None], y[None])[0][0]
     assert d(x, x) == 0
@@ -158,8 +158,8 @@ def test_some_rows_are_compared_where_they_are(metric: Metric) -> None:
 def test_inputs_are_left_alone() -> None:
     queries, database = random_bytes(4, 2, 100), random_bytes(5, 3, 100)
     before = queries.copy(), database.copy()
-    cross_distances(queries, database)
-    pairwise_distances(database)
+    cross_distances(queries, database, "l1")
+    pairwise_distances(database, "l1")
     np.testing.assert_array_equal(queries, before[0])
     np.testing.assert_array_equal(database, before[1])
 
@@ -167,18 +167,18 @@ def test_inputs_are_left_alone() -> None:
 def test_shapes_types_and_metric_must_be_right() -> None:
     for query, database in (((8,), (3, 9)), ((1, 8), (3, 8)), ((8,), (8,)), ((8,), (2, 8, 1))):
         with pytest.raises(ValueError, match="signatures of"):
-            distances(np.zeros(query, np.uint8), np.zeros(database, np.uint8))
+            distances(np.zeros(query, np.uint8), np.zeros(database, np.uint8), "l1")
     for queries, database in (((2, 8), (3, 9)), ((8,), (3, 8)), ((2, 8), (8,)), ((8,), (8,))):
         with pytest.raises(ValueError, match="signatures of"):
-            cross_distances(np.zeros(queries, np.uint8), np.zeros(database, np.uint8))
+            cross_distances(np.zeros(queries, np.uint8), np.zeros(database, np.uint8), "l1")
     with pytest.raises(ValueError, match="signatures of"):
-        pairwise_distances(np.zeros(8, np.uint8))
+        pairwise_distances(np.zeros(8, np.uint8), "l1")
     one, many = np.zeros(8, np.uint8), np.zeros((3, 8), np.uint8)
     for dtype in (np.int8, np.float64, np.int64, np.bool_):
         with pytest.raises(ValueError, match="not of bytes"):
-            distances(one.astype(dtype), many)
+            distances(one.astype(dtype), many, "l1")
         with pytest.raises(ValueError, match="not of bytes"):
-            distances(one, many.astype(dtype))
+            distances(one, many.astype(dtype), "l1")
     with pytest.raises(ValueError, match="cosine"):
         distances(one, many, "cosine")  # type: ignore[arg-type]
 

@@ -19,7 +19,7 @@ def test_a_map_is_made_once_and_stays_as_it_was_made(served, refused):
     assert (made["name"], made["title"], made["frames"], made["revision"]) == (
         "hall", "The hall", {}, 0,
     )  # fmt: skip
-    assert made["model"] == f"paper-{made['model_id'][:12]}"
+    assert made["model"] == f"depth-{made['model_id'][:12]}"
     assert datetime.fromisoformat(made["created_at"]).utcoffset() is not None
     for other in ({"title": "Another"}, {}, {"title": "The hall", "model": "depth"}):
         answer = served.client.post("/v1/maps", json={"name": "hall", **other})

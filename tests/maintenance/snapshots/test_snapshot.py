@@ -360,7 +360,11 @@ def test_where_there_is_no_room(master, archive, tmp_path, sceneprint, longest_f
     restore = ("restore", archive, "--data", tmp_path / "new")
     for size, arguments, text in (
         (database // 2, snapshot, "the database cannot be copied"),
-        (archive.stat().st_size * 3 // 4, snapshot, "a.tar: cannot be written (File too large)"),
+        (
+            (database + archive.stat().st_size) // 2,
+            snapshot,
+            "a.tar: cannot be written (File too large)",
+        ),
         (database // 2, restore, "new: cannot be written (File too large)"),
     ):
         longest_file(size)
