@@ -92,9 +92,7 @@ def signature_rows(signatures: Sequence[Signature]) -> Floats:
 def ring_rows(walk: Sequence[Cloud]) -> Floats:
     """(n, n) distances of ring descriptors."""
     stored = np.stack([ring_descriptor(cloud.points) for cloud in walk])
-    return np.stack([ring_distances(one, stored, signatures[0].metric) for one in stored]).astype(
-        float
-    )
+    return np.stack([ring_distances(one, stored) for one in stored]).astype(float)
 
 
 def timed(run: Callable[[], object], times: int = 5) -> float:

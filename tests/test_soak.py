@@ -72,6 +72,9 @@ def note(*matches: tuple[str, int], begun: float = 5.0) -> dict[str, Any]:
     return {"asked": "s0", "found": found, "begun": begun, "done": begun + 0.5}
 
 
+OUT_OF_ORDER = "the matches are not in their order, or one is there twice"
+
+
 @pytest.mark.parametrize(
     ("answer", "wrong"),
     [
@@ -80,11 +83,11 @@ def note(*matches: tuple[str, int], begun: float = 5.0) -> dict[str, Any]:
         (note(("s1", 16), ("w", 33)), ["w at 33, which is not its distance"]),
         (
             note(("w", 32), ("s1", 16)),
-            ["the matches are not in their order, or one is there twice"],
+            [OUT_OF_ORDER],
         ),
         (
             note(("s1", 16), ("s1", 16)),
-            ["the matches are not in their order, or one is there twice"],
+            [OUT_OF_ORDER],
         ),
         (note(("w", 32)), ["s1 at 16 is missing"]),
         (note(), ["0 matches, where 0 can have been deleted meanwhile"]),

@@ -120,7 +120,7 @@ def test_poses_lead_to_the_frame_that_is_named(
 def test_upload_refuses_what_would_mix(
     sceneprint: Run, house: str, rooms: Path, tmp_path: Path
 ) -> None:
-    done = sceneprint("upload", house, rooms, "--model", "depth", expect=2)
+    done = sceneprint("upload", house, rooms, "--model", "paper", expect=2)
     assert re.search(r"Map house is there, with model depth-\w+\. Leave --model out", done.stderr)
     done = sceneprint("upload", "absent", rooms, "--no-create", expect=2)
     assert "There is no map 'absent'" in done.stderr

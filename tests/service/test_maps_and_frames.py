@@ -21,7 +21,7 @@ def test_a_map_is_made_once_and_stays_as_it_was_made(served, refused):
     )  # fmt: skip
     assert made["model"] == f"depth-{made['model_id'][:12]}"
     assert datetime.fromisoformat(made["created_at"]).utcoffset() is not None
-    for other in ({"title": "Another"}, {}, {"title": "The hall", "model": "depth"}):
+    for other in ({"title": "Another"}, {}, {"title": "The hall", "model": "paper"}):
         answer = served.client.post("/v1/maps", json={"name": "hall", **other})
         refused(answer, 409, "map-exists", "'hall' with another title or model")
     assert served.client.get("/v1/maps/hall").json()["title"] == "The hall"

@@ -356,12 +356,13 @@ def longest_file() -> Iterator[Callable[[int], None]]:
 def test_where_there_is_no_room(master, archive, tmp_path, sceneprint, longest_file):
     """In the copy of the database, in the archive, and in a blob that is unpacked."""
     database = (master / "sceneprint.db").stat().st_size
+    between = (database + archive.stat().st_size) // 2
     snapshot = ("snapshot", "--data", master, "--out", tmp_path / "a.tar")
     restore = ("restore", archive, "--data", tmp_path / "new")
     for size, arguments, text in (
         (database // 2, snapshot, "the database cannot be copied"),
         (
-            (database + archive.stat().st_size) // 2,
+            between,
             snapshot,
             "a.tar: cannot be written (File too large)",
         ),
