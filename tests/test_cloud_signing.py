@@ -135,8 +135,8 @@ def test_nearest_by_hand() -> None:
     database = np.array([[0, 0], [10, 0], [200, 0]], np.uint8)
     queries = np.array([[2, 0], [9, 0]], np.uint8)
     far = np.array([[False, True, True], [True, False, True]])
-    assert own_is_nearest(queries, database, np.array([0, 2]), far)[0] == 0.5
-    share, margin = own_is_nearest(queries, database, np.array([0, 1]), far)
+    assert own_is_nearest(queries, database, np.array([0, 2]), far, "l1")[0] == 0.5
+    share, margin = own_is_nearest(queries, database, np.array([0, 1]), far, "l1")
     assert (share, margin) == (1.0, pytest.approx((2 / 8 + 1 / 9) / 2))
 
 

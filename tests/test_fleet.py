@@ -241,4 +241,4 @@ def test_what_is_on_paper_is_multiplied_right() -> None:
     assert told["| blobs"] == "2.5 TB |"
     assert told["| vectors and their graph in the database, to be held in its memory"] == "9 GB |"
     assert told["| linking all of them anew, one processor"] == "1.4 h |"
-    assert told["| of one that asks all maps"] == "1.3 GB, 130 GB |"
+    assert told["| of one that asks all maps"] == "160 MB, 128.1 GB |"
