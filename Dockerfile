@@ -25,10 +25,11 @@ COPY pyproject.toml requirements.txt ./
 # that true): here those fail, and name what is missing. All else works.
 # Without pip in the environment: the final stage installs nothing.
 RUN python -m venv --without-pip /opt/sceneprint && \
-    python -c "import tomllib; print(*(d for d in tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies'] if not d.startswith('open3d')), sep='\n')" > runtime.txt && \
+    python -c "import tomllib; print(*(d for d in tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies'] if not d.startswith(('open3d', 'sceneprint-client'))), sep='\n')" > runtime.txt && \
     python -m pip --python /opt/sceneprint install --quiet --constraint requirements.txt --requirement runtime.txt
 
 COPY README.md LICENSE ./
+COPY client client/
 COPY migrations migrations/
 COPY sceneprint sceneprint/
 COPY service service/
@@ -36,15 +37,15 @@ COPY worker worker/
 
 # --no-deps: our own requirement of open3d is left unmet on purpose.
 RUN python -m pip install --quiet --constraint requirements.txt setuptools && \
-    python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir wheels . && \
-    python -m pip --python /opt/sceneprint install --quiet --no-deps wheels/sceneprint-*.whl
+    python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir wheels ./client . && \
+    python -m pip --python /opt/sceneprint install --quiet --no-deps wheels/*.whl
 
 
 FROM python:3.11-slim-bookworm
 
 LABEL org.opencontainers.image.title="sceneprint" \
       org.opencontainers.image.description="Place recognition from pure geometry: service and workers" \
-      org.opencontainers.image.version="0.1.0" \
+      org.opencontainers.image.version="0.2.0" \
       org.opencontainers.image.licenses="Apache-2.0"
 
 # OMP, OPENBLAS: our kernels want one thread each (see Makefile).
@@ -74,7 +75,7 @@ USER 10001:10001
 # folder only where it may write, so one that root made would be passed over, and every process
 # would compile for itself. On another kind of processor than this one the first use compiles
 # once more, into the same folder.
-RUN python -c "from sceneprint.cli.signer import prepare_presets; \
+RUN python -c "from sceneprint.cli.options import prepare_presets; \
     from sceneprint.settings import Settings; \
     prepare_presets(Settings())"
 

@@ -7,18 +7,20 @@ STAMP := $(VENV)/.installed
 # Our kernels want one thread each; more processes, not more threads, use more processors.
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
+# Bytecode is kept: the tests start hundreds of processes, and each would parse our modules anew.
+unexport PYTHONDONTWRITEBYTECODE
 # Tests wait for real processes half of their time: half as many again as there are processors.
 export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell $(PYTHON) -c \
 	'import os; n = len(os.sched_getaffinity(0)); print(n + (n + 1) // 2)')
 
-.PHONY: help demo test test-thorough test-postgres lint kernels format bench screenshots soak siege models lock clean
+.PHONY: help demo test pytest test-thorough test-postgres lint kernels format bench screenshots soak siege models lock clean
 
 help:
 	@echo "make demo    find frames among others with their pose, and draw some [DATASET=folder]"
-	@echo "make test    lint, types, import contracts and all tests"
-	@echo "make test-thorough  tests that make test leaves out, as they take minutes: the image, whole recordings"
+	@echo "make test    lint, types, import contracts and the tests"
+	@echo "make test-thorough  tests that make test leaves out, as they take minutes or seldom fail"
 	@echo "make test-postgres  the tests of what stands on the database, on PostgreSQL"
-	@echo "make lint    lint, types and import contracts only"
+	@echo "make lint    lint, types and import contracts only, of the dashboard's JavaScript too"
 	@echo "make bench   what each stage costs, beside others; rewrites its part of docs/performance.md"
 	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
 	@echo "make soak    200 kills, and a crowd of writers and readers; rewrites its part of docs/reliability.md"
@@ -27,13 +29,14 @@ help:
 	@echo "make models  train the presets that ship with the package (minutes)"
 	@echo "make lock    resolve the dependencies anew into requirements.txt"
 
-$(STAMP): requirements.txt pyproject.toml
+$(STAMP): requirements.txt pyproject.toml client/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "sceneprint needs Python 3.11 or later; set PYTHON=/path/to/python3"; exit 2; }
 	$(PYTHON) -m venv $(VENV) || \
 		{ echo "python3 cannot make environments; on Debian or Ubuntu: apt install python3-venv"; exit 2; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation \
+		-e client -e .
 	@touch $(STAMP)
 
 demo: $(STAMP)
@@ -43,23 +46,28 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy --python-version 3.10 -p sceneprint_client
 	$(BIN)/lint-imports --no-logo
+	@tools/javascript/check
 
-# Compiled once here, beside the linters, and not by each process of the tests for itself.
+# Compiled once here, and not by each process of the tests for itself.
 kernels: $(STAMP)
-	@$(BIN)/python -c 'from sceneprint.cli.signer import prepare_presets; \
+	@$(BIN)/python -c 'from sceneprint.cli.options import prepare_presets; \
 		from sceneprint.settings import Settings; prepare_presets(Settings())'
 
-# Files stay whole, as their fixtures are dear, and in the order of tests/conftest.py.
+# The linters run beside the kernels and the first tests; where one fails, the target fails too.
 test: $(STAMP)
-	@$(MAKE) --no-print-directory -j2 lint kernels
+	@$(MAKE) --no-print-directory -j2 lint pytest
+
+# Files stay whole, as their fixtures are dear, and in the order of tests/conftest.py.
+pytest: kernels
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-# What PostgreSQL does as well, on it: tests/on_postgres leads each process there.
 # What takes long and seldom breaks: the image built step by step, whole recordings, benchmarks.
 test-thorough: $(STAMP) kernels
 	$(BIN)/python -m pytest -n auto --dist loadfile -m thorough
 
+# What PostgreSQL does as well, on it: tests/on_postgres leads each process there.
 test-postgres: $(STAMP) kernels
 	SCENEPRINT_TEST_DATABASE=postgresql PYTHONPATH=$(CURDIR)/tests/on_postgres \
 		$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder \
@@ -93,7 +101,8 @@ models: $(STAMP)
 lock: $(STAMP)
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --no-header \
-		--no-annotate --no-emit-index-url --output-file requirements.txt pyproject.toml
+		--no-annotate --no-emit-index-url --no-emit-package sceneprint-client \
+		--output-file requirements.txt pyproject.toml
 
 clean:
-	rm -rf $(VENV) build out demo *.egg-info
+	rm -rf $(VENV) build client/build out demo *.egg-info client/*.egg-info tools/javascript/node_modules

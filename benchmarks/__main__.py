@@ -23,11 +23,11 @@ from benchmarks.machine import (
     seconds_to_import,
 )
 from benchmarks.pairs import real_pairs, synthetic_pairs
-from sceneprint.datasets import Camera, find_sequences, write_depth_png, write_intrinsics
+from sceneprint.formats.dataset import Camera, find_sequences, write_depth_png, write_intrinsics
+from sceneprint.lab.synth import synthesise_room
 from sceneprint.models import PRESETS
 from sceneprint.pipeline import open_signer
-from sceneprint.synth import synthesise_room
-from sceneprint.types import Frame
+from sceneprint.types import DepthFrame
 
 ROOT = Path(__file__).resolve().parent.parent
 #: Frames of the maps that are searched, and whether by inverted lists.
@@ -43,7 +43,7 @@ def recordings() -> Path:
     return Path(os.environ.get("SCENEPRINT_DATA", ROOT.parent / "shared" / "data"))
 
 
-def real_frames(n: int) -> list[Frame]:
+def real_frames(n: int) -> list[DepthFrame]:
     """`n` frames spread over the recordings at SCENEPRINT_DATA; none where there are none."""
     root = recordings()
     scenes = [root / "7scenes", root / "tum", root / "sun3d"]
@@ -58,13 +58,13 @@ def real_frames(n: int) -> list[Frame]:
     return [reference.read_depth() for reference in found[::step][:n]]
 
 
-def synthetic_frames(n: int) -> list[Frame]:
+def synthetic_frames(n: int) -> list[DepthFrame]:
     """`n` frames of synthetic rooms, five of each."""
     rooms = tqdm(range((n + 4) // 5), desc="synthetic rooms", disable=None)
     return [frame for i in rooms for frame in synthesise_room(3, i, 5).frames][:n]
 
 
-def peak_memory(frames: list[Frame], preset: str) -> float:
+def peak_memory(frames: list[DepthFrame], preset: str) -> float:
     """Peak memory of `sceneprint sign` over ten of the frames, MB."""
     with tempfile.TemporaryDirectory() as folder:
         for i, frame in enumerate(frames[:10]):

@@ -20,7 +20,7 @@ import httpx
 
 from benchmarks.chromium import chromium, installed, settled, until, watched
 from benchmarks.rooms import Shot, multiply, send, shots, wait
-from sceneprint.cli.served import serving
+from sceneprint.cli.demo import serving
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from sceneprint.client import Client
-from sceneprint.datasets import FrameReference
+from sceneprint.formats.dataset import FrameReference
 from sceneprint.models import read_model
+from sceneprint_client import Client
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.encode import Clock
-from sceneprint.geometry.diversity import (
-    DiversityParameters,
-    diversify,
-    kernel_matrix,
+from sceneprint.geometry.retrieval.distance import (
+    Ints64,
+    Ranking,
+    distances,
+    pairwise_distances,
+    rank,
 )
-from sceneprint.geometry.retrieval import Ints64, Ranking, distances, pairwise_distances, rank
+from sceneprint.geometry.retrieval.dpp import DiversityParameters, diversify, kernel_matrix
 from sceneprint.types import Bytes
 
 

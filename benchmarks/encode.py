@@ -7,32 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.errors import MissingDependency
-from sceneprint.evaluation.registration_baselines import (
-    FEATURES,
-    NORMALS,
-    VOXEL,
-    Clock,
-    points_of,
-)
-from sceneprint.geometry.counting import count_pairs
-from sceneprint.geometry.depth import inverse_depth
-from sceneprint.geometry.encoding import quantise, statistics_of_counts
-from sceneprint.geometry.hierarchy import hierarchy
-from sceneprint.geometry.normals import surface
-from sceneprint.geometry.segmentation import segment
-from sceneprint.geometry.weights import patch_weights
-from sceneprint.geometry.whitening import whiten
+from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.geometry.signature.fisher_vector import quantise, statistics_of_counts
+from sceneprint.geometry.signature.pair_table import count_pairs
+from sceneprint.geometry.signature.segmentation import hierarchy, patch_weights, segment
+from sceneprint.geometry.signature.whitening import whiten
+from sceneprint.geometry.surface.depth_image import inverse_depth, surface
+from sceneprint.lab.evaluation.pairs.pair_run import FEATURES, NORMALS, VOXEL, Clock, points_of
 from sceneprint.libraries import open3d
 from sceneprint.pipeline import Signer, geometry_of, sign
 from sceneprint.signing import float_signature, see
-from sceneprint.types import Floats, Frame
+from sceneprint.types import DepthFrame, Floats
 
 __all__ = ["Clock", "measure", "open3d", "points_of", "signing_stages"]
 
 
-def signing_stages(frame: Frame, signer: Signer) -> dict[str, float]:
+def signing_stages(frame: DepthFrame, signer: Signer) -> dict[str, float]:
     """Milliseconds of each stage of `sign`; their sum is the time of `sign` itself."""
     model, p, clock = signer.model, signer.model.parameters, Clock()
     q, camera = clock.run("inverse depth", lambda: inverse_depth(frame, p.depth))
@@ -59,7 +50,7 @@ def signing_stages(frame: Frame, signer: Signer) -> dict[str, float]:
     return clock.stages
 
 
-def artifact_stages(frame: Frame, signer: Signer) -> tuple[dict[str, float], int]:
+def artifact_stages(frame: DepthFrame, signer: Signer) -> tuple[dict[str, float], int]:
     """Milliseconds of each stage of the geometry artifact beside `sign`, and its bytes."""
     clock, model = Clock(), signer.model
     seen = see(frame, model.parameters)
@@ -101,7 +92,7 @@ class EncodeFigures:
     note: str
 
 
-def measure(frames: list[Frame], signer: Signer, warm_up: int = 3) -> EncodeFigures:
+def measure(frames: list[DepthFrame], signer: Signer, warm_up: int = 3) -> EncodeFigures:
     """Sign every frame and, in turn, compute its FPFH, on the processor we are pinned to."""
     p, note, o3d = signer.model.parameters.depth, "", None
     try:

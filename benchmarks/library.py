@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from benchmarks.encode import Clock
-from sceneprint.artifacts import read_geometry, write_geometry
-from sceneprint.datasets import FrameReference
+from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.formats.dataset import FrameReference
 from sceneprint.matches import associate
 from sceneprint.pipeline import Signature, diversify, open_signer, prepare, retrieve
-from sceneprint.schemas import Answer
+from sceneprint_client.api import Answer
 
 #: What a match is compared by: place in the database, and its transform row by row.
 Matches = list[tuple[int, list[list[float]]]]

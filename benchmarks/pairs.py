@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprint.datasets import find_sequences
-from sceneprint.evaluation.overlap import overlap, view_of
-from sceneprint.geometry.rigid import inverse
-from sceneprint.synth import synthesise_room
-from sceneprint.types import Floats, Frame
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.lab.evaluation.protocol import overlap, view_of
+from sceneprint.lab.synth import synthesise_room
+from sceneprint.types import DepthFrame, Floats
 
 #: A pair counts where the smaller share of either frame seen by the other is at least this.
 LEAST_OVERLAP = 0.3
@@ -32,13 +32,13 @@ class FramePair:
     T_match_query : (4, 4), from the poses
     """
 
-    query: Frame
-    match: Frame
+    query: DepthFrame
+    match: DepthFrame
     overlap: float
     T_match_query: Floats
 
 
-def pairs_among(frames: Sequence[Frame], apart: int = 1) -> list[FramePair]:
+def pairs_among(frames: Sequence[DepthFrame], apart: int = 1) -> list[FramePair]:
     """All pairs of a list of frames that overlap enough, `apart` places or more in the list."""
     views, found = [view_of(frame) for frame in frames], []
     for i, query in enumerate(frames):

@@ -20,16 +20,16 @@ import numpy as np
 from sqlalchemy import insert, update
 
 from benchmarks.machine import own_bytes
-from sceneprint.cli.served import serving
-from sceneprint.client import Client
-from sceneprint.datasets import FrameReference, find_sequences
+from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
-from sceneprint.schemas import NewMap
-from sceneprint.schemas.maps import Preset
+from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.settings import Settings
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames as frame_table
 from sceneprint.store.tables import maps, signatures
+from sceneprint_client import Client
+from sceneprint_client.api import NewMap
+from sceneprint_client.api.maps import Preset
 
 MAP = "bench"
 #: Frames that are written in one commit.

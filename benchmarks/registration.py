@@ -17,13 +17,13 @@ from tqdm import tqdm
 from benchmarks.encode import Clock, points_of
 from benchmarks.pairs import FramePair
 from sceneprint.errors import MissingDependency
-from sceneprint.evaluation.registration_baselines import METHODS, register
-from sceneprint.geometry.rigid import difference
+from sceneprint.geometry.pose.rigid import difference
+from sceneprint.lab.evaluation.pairs.pair_run import METHODS, register
 from sceneprint.libraries import open3d
 from sceneprint.models import Model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
-from sceneprint.types import Floats, Frame
+from sceneprint.types import DepthFrame, Floats
 
 #: The one of Open3D's methods that is timed here; `sceneprint evaluate-pairs` has the others.
 METHOD = METHODS[0]
@@ -53,7 +53,9 @@ class RegistrationFigures:
     note: str
 
 
-def register_by_us(query: Frame, match: Frame, model: Model, clock: Clock) -> Floats | None:
+def register_by_us(
+    query: DepthFrame, match: DepthFrame, model: Model, clock: Clock
+) -> Floats | None:
     """Validation of two frames: T_match_query (4, 4) where it is accepted, else None."""
     of_query, of_match = clock.run(
         "geometry of both frames",

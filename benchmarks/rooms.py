@@ -16,15 +16,15 @@ import numpy as np
 from PIL import Image
 from sqlalchemy import insert, select
 
-from sceneprint.clouds import write_ply
-from sceneprint.datasets import write_depth_png
 from sceneprint.engine import Engine
-from sceneprint.schemas import NewMap
+from sceneprint.formats.dataset import write_depth_png
+from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.lab.synth import synthesise_room, synthesise_survey
 from sceneprint.settings import Settings
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames as frame_table
 from sceneprint.store.tables import jobs, signatures
-from sceneprint.synth import synthesise_room, synthesise_survey
+from sceneprint_client.api import NewMap
 
 SEED = 21
 #: Frames that are written in one commit.

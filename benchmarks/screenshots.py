@@ -1,6 +1,7 @@
 """`make screenshots`: every page of the dashboard, light and dark, over a real service.
 
-All that is to be seen is synthetic: rooms and a hall of `sceneprint.synth`, signed by two workers.
+All that is to be seen is synthetic: rooms and a hall of `sceneprint.lab.synth`, signed by two
+workers.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from tqdm import tqdm
 
 from benchmarks.chromium import PATIENCE_S, chromium, installed, settled, watched
 from benchmarks.rooms import Shot, box, scans, send, shots, wait
-from sceneprint.cli.served import serving
+from sceneprint.cli.demo import serving
 
 if TYPE_CHECKING:
     from playwright.sync_api import FilePayload

@@ -24,10 +24,9 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.library import Library, accepted
-from sceneprint.cli.demo_building import write_building
-from sceneprint.cli.served import serving
-from sceneprint.client import Client
-from sceneprint.datasets import FrameReference, find_sequences
+from sceneprint.cli.demo import serving, write_building
+from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint_client import Client
 
 #: Processes that query at once while a worker signs, and for how long.
 CLIENTS, SECONDS = 4, 20.0

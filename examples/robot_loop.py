@@ -16,11 +16,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from sceneprint.client import Client
 from sceneprint.errors import MapExists, UselessFrame
-from sceneprint.schemas import CameraIntrinsics, FrameMeta, GivenPose
-from sceneprint.synth import synthesise_room
-from sceneprint.types import Floats, Frame
+from sceneprint.lab.synth import synthesise_room
+from sceneprint.types import DepthFrame, Floats
+from sceneprint_client import Client
+from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose
 
 MAP, ROBOT = "robot-loop", "r2"
 
@@ -32,12 +32,12 @@ class Robot:
         self.client = client
         self.waiting: list[str] = []  # jobs of what was uploaded: none has to be waited for
 
-    def remember(self, seen: Frame, session: str) -> None:
+    def remember(self, seen: DepthFrame, session: str) -> None:
         """Once a metre, say: the frame is safe when this returns, and can be found soon after."""
         added = self.client.upload(MAP, depth_of(seen), meta_of(seen, session))
         self.waiting.append(added.job_id)
 
-    def find_itself(self, views: Iterable[Frame]) -> tuple[Frame, Floats] | None:
+    def find_itself(self, views: Iterable[DepthFrame]) -> tuple[DepthFrame, Floats] | None:
         """Look until the place is known: the frame it was known by, and the camera's pose (4, 4)
         in the map. None where the map has not been here.
         """
@@ -61,14 +61,14 @@ class Robot:
         return None
 
 
-def depth_of(seen: Frame) -> bytes:
+def depth_of(seen: DepthFrame) -> bytes:
     """Depth as it is sent: metres, NPY. A 16-bit PNG in millimetres is smaller."""
     file = io.BytesIO()
     np.save(file, seen.depth)
     return file.getvalue()
 
 
-def meta_of(seen: Frame, session: str | None = None) -> FrameMeta:
+def meta_of(seen: DepthFrame, session: str | None = None) -> FrameMeta:
     """What is known of a frame: its camera, and with a session also the pose by odometry."""
     k = seen.intrinsics
     camera = CameraIntrinsics(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
@@ -79,7 +79,7 @@ def meta_of(seen: Frame, session: str | None = None) -> FrameMeta:
     return FrameMeta(intrinsics=camera, robot=ROBOT, session=session, pose=pose)
 
 
-def truth_of(seen: Frame) -> Floats:
+def truth_of(seen: DepthFrame) -> Floats:
     """Where a synthetic frame was taken: a real robot does not know."""
     if seen.pose is None:
         raise ValueError(f"{seen.name} has no pose")

@@ -19,11 +19,11 @@ from importlib.metadata import version as _version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sceneprint.artifacts import read_geometry, write_geometry
-    from sceneprint.client import Client
-    from sceneprint.datasets import find_sequences, make_frame, read_frame
-    from sceneprint.geometry.validation import Validation
-    from sceneprint.matches import Location, Match, associate, locate
+    from sceneprint.formats.artifact import read_geometry, write_geometry
+    from sceneprint.formats.dataset import find_sequences, make_frame, read_frame
+    from sceneprint.formats.points import decode_cloud
+    from sceneprint.geometry.validation.validation import PairValidation
+    from sceneprint.matches import PairMatch, PoseEstimate, associate, locate
     from sceneprint.models import Model, read_model
     from sceneprint.pipeline import (
         Signature,
@@ -36,21 +36,21 @@ if TYPE_CHECKING:
         sign,
         validate,
     )
-    from sceneprint.scans import decode_cloud
-    from sceneprint.types import Cloud, Frame, Geometry, Intrinsics
+    from sceneprint.types import Cloud, DepthFrame, Geometry, Intrinsics
+    from sceneprint_client import Client
 
 __all__ = [
     "Client",
     "Cloud",
-    "Frame",
+    "DepthFrame",
     "Geometry",
     "Intrinsics",
-    "Location",
-    "Match",
     "Model",
+    "PairMatch",
+    "PairValidation",
+    "PoseEstimate",
     "Signature",
     "Signer",
-    "Validation",
     "associate",
     "decode_cloud",
     "distance",
@@ -72,37 +72,38 @@ __all__ = [
 __version__ = _version("sceneprint")
 
 _HOME = {
-    "Client": "client",
     "Cloud": "types",
-    "Frame": "types",
+    "DepthFrame": "types",
     "Geometry": "types",
     "Intrinsics": "types",
-    "Location": "matches",
-    "Match": "matches",
+    "PoseEstimate": "matches",
+    "PairMatch": "matches",
     "Model": "models",
     "Signature": "pipeline",
     "Signer": "pipeline",
-    "Validation": "geometry.validation",
+    "PairValidation": "geometry.validation.validation",
     "associate": "matches",
-    "decode_cloud": "scans",
+    "decode_cloud": "formats.points",
     "distance": "pipeline",
     "diversify": "pipeline",
-    "find_sequences": "datasets",
+    "find_sequences": "formats.dataset",
     "locate": "matches",
-    "make_frame": "datasets",
+    "make_frame": "formats.dataset",
     "open_signer": "pipeline",
     "prepare": "pipeline",
-    "read_frame": "datasets",
-    "read_geometry": "artifacts",
+    "read_frame": "formats.dataset",
+    "read_geometry": "formats.artifact",
     "read_model": "models",
     "retrieve": "pipeline",
     "sign": "pipeline",
     "validate": "pipeline",
-    "write_geometry": "artifacts",
+    "write_geometry": "formats.artifact",
 }
 
 
 def __getattr__(name: str) -> Any:
+    if name == "Client":
+        return import_module("sceneprint_client").Client
     if name not in _HOME:
         raise AttributeError(f"module 'sceneprint' has no attribute {name!r}")
     return getattr(import_module(f"sceneprint.{_HOME[name]}"), name)

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidRequest, UselessFrame
-from sceneprint.geometry.coverage import Mesh
-from sceneprint.geometry.depth import halved
-from sceneprint.geometry.rigid import inverse, moved
+from sceneprint.geometry.pose.rigid import inverse, moved
+from sceneprint.geometry.surface.coverage import TriangleMesh
+from sceneprint.geometry.surface.depth_image import halved
 from sceneprint.libraries import open3d
-from sceneprint.types import Floats, Floats32, Frame
+from sceneprint.types import DepthFrame, Floats, Floats32
 
 #: Voxels along the edge of a block: space is kept in blocks, where a surface is.
 _SIDE = 8
@@ -41,7 +41,9 @@ class FusionParameters:
     most_samples: int = 640 * 480  #: of a view; a larger image is thinned
 
 
-def fuse(views: Sequence[Frame], p: FusionParameters | None = None) -> tuple[Mesh, float]:
+def fuse(
+    views: Sequence[DepthFrame], p: FusionParameters | None = None
+) -> tuple[TriangleMesh, float]:
     """One surface of several views; the same one for the same views.
 
     Parameters
@@ -73,7 +75,7 @@ def fuse(views: Sequence[Frame], p: FusionParameters | None = None) -> tuple[Mes
     return _meshed(o3d, kept, points, voxel, p), voxel
 
 
-def within(view: Frame, p: FusionParameters) -> Frame:
+def within(view: DepthFrame, p: FusionParameters) -> DepthFrame:
     """A view as it is fused: thinned to `most_samples`, and without what lies out of range.
 
     Thinned by leaving samples out: a mean over an edge would be a surface that is not there.
@@ -90,7 +92,7 @@ def within(view: Frame, p: FusionParameters) -> Frame:
     return replace(view, depth=kept, intrinsics=camera)
 
 
-def _points(view: Frame) -> Floats:
+def _points(view: DepthFrame) -> Floats:
     """(N, 3) samples of a view in its own frame."""
     k = view.intrinsics
     y, x = np.nonzero(view.depth)
@@ -98,7 +100,9 @@ def _points(view: Frame) -> Floats:
     return np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=1)
 
 
-def _chosen_voxel(views: Sequence[Frame], points: Sequence[Floats], p: FusionParameters) -> float:
+def _chosen_voxel(
+    views: Sequence[DepthFrame], points: Sequence[Floats], p: FusionParameters
+) -> float:
     """The wanted edge, or the least at which pixels leave no gaps and blocks suffice."""
     if p.voxel_m is not None:
         count = _count(views, points, p.voxel_m)
@@ -122,7 +126,7 @@ def _chosen_voxel(views: Sequence[Frame], points: Sequence[Floats], p: FusionPar
     return voxel
 
 
-def _count(views: Sequence[Frame], points: Sequence[Floats], voxel: float) -> int:
+def _count(views: Sequence[DepthFrame], points: Sequence[Floats], voxel: float) -> int:
     """How many blocks the surfaces of all views touch."""
     blocks = [_blocks(_pose(v), own, voxel) for v, own in zip(views, points, strict=True)]
     return len(np.unique(np.concatenate(blocks), axis=0))
@@ -145,8 +149,12 @@ def _blocks(T: Floats, points: Floats, voxel: float) -> NDArray[np.int32]:
 
 
 def _meshed(
-    o3d: Any, views: Sequence[Frame], points: Sequence[Floats], voxel: float, p: FusionParameters
-) -> Mesh:
+    o3d: Any,
+    views: Sequence[DepthFrame],
+    points: Sequence[Floats],
+    voxel: float,
+    p: FusionParameters,
+) -> TriangleMesh:
     core, geometry = o3d.core, o3d.t.geometry
     grid = geometry.VoxelBlockGrid(
         ("tsdf", "weight"), (core.float32, core.float32), ((1,), (1,)), voxel_size=voxel,
@@ -176,7 +184,7 @@ def _meshed(
     )
 
 
-def _in_order(points: Floats, normals: Floats, triangles: NDArray[np.int32]) -> Mesh:
+def _in_order(points: Floats, normals: Floats, triangles: NDArray[np.int32]) -> TriangleMesh:
     """A mesh whose order does not depend on that of a hash table."""
     order = np.lexsort(points.T[::-1])
     place = np.empty(len(order), np.int32)
@@ -187,10 +195,10 @@ def _in_order(points: Floats, normals: Floats, triangles: NDArray[np.int32]) -> 
     triangles = np.take_along_axis(triangles, turned, axis=1)
     triangles = triangles[np.lexsort(triangles.T[::-1])]
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return Mesh(points[order], (normals / np.maximum(length, 1e-12))[order], triangles)
+    return TriangleMesh(points[order], (normals / np.maximum(length, 1e-12))[order], triangles)
 
 
-def _pose(view: Frame) -> Floats:
+def _pose(view: DepthFrame) -> Floats:
     if view.pose is None:
         raise ValueError(f"view {view.name!r} has no pose")
     return view.pose

@@ -10,19 +10,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sceneprint.geometry.acceptance import Mode
-from sceneprint.geometry.association import preferred, voters
-from sceneprint.geometry.averaging import PoseAverage, average_poses
-from sceneprint.geometry.covariance import place_covariance, transported
-from sceneprint.geometry.retrieval import Ranking
-from sceneprint.geometry.sequences import Matching
-from sceneprint.geometry.validation import Validation, ValidationParameters
+from sceneprint.geometry.pose.average import PoseAverage, average_poses
+from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.validation.acceptance import Mode
+from sceneprint.geometry.validation.association import preferred, voters
+from sceneprint.geometry.validation.icp import place_covariance, transported
+from sceneprint.geometry.validation.sequence_alignment import Matching
+from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.pipeline import validate
 from sceneprint.types import Floats, Geometry
 
 
 @dataclass(frozen=True, eq=False)
-class Match:
+class PairMatch:
     """A database frame validated against a query.
 
     Parameters
@@ -35,11 +35,11 @@ class Match:
     index: int
     distance: int
     similarity: float
-    validation: Validation
+    validation: PairValidation
 
 
 @dataclass(frozen=True, eq=False)
-class Location:
+class PoseEstimate:
     """Where a query was taken.
 
     Parameters
@@ -65,7 +65,7 @@ def associate(
     mode: Mode = "full",
     go_on: Callable[[], bool] = lambda: True,
     matching: Matching = "histograms",
-) -> list[Match]:
+) -> list[PairMatch]:
     """Candidates validated in the order of R until `k` are accepted: Sec. III-E.
 
     Parameters
@@ -80,8 +80,8 @@ def associate(
 
     Returns
     -------
-    matches : all that were tried: C_vld first, strong before weak, each in the order of R (of
-        scans all around, the nearest first); then those that were not accepted
+    matches : all that were tried: C_vld first, strong before weak, then by overlap (of scans
+        all around, the nearest first); then those that were not accepted
 
     Raises
     ------
@@ -90,7 +90,7 @@ def associate(
     """
     if k < 1:
         raise ValueError(f"k = {k}: ask for 1 match or more")
-    tried: list[Match] = []
+    tried: list[PairMatch] = []
     accepted = 0
     for position in among:
         if not go_on():
@@ -101,7 +101,7 @@ def associate(
             continue
         validation = validate(query, geometry, seed, p, mode, matching)
         tried.append(
-            Match(
+            PairMatch(
                 index,
                 int(ranking.distances[position]),
                 float(ranking.similarities[position]),
@@ -117,11 +117,11 @@ def associate(
 
 
 def locate(
-    matches: Sequence[Match],
+    matches: Sequence[PairMatch],
     poses: Sequence[Floats] | Mapping[int, Floats],
     parents: Sequence[str] | Mapping[int, str] | None = None,
     views: int = 5,
-) -> Location | None:
+) -> PoseEstimate | None:
     """Pose of the query: robust average over up to five validated views.
 
     Parameters
@@ -157,4 +157,4 @@ def locate(
     average, sure = average_poses(np.stack(votes)), None
     if len(told) == len(votes):
         sure = place_covariance(average, np.stack(votes), np.stack(told))
-    return Location(names[chosen[0]], average, sure)
+    return PoseEstimate(names[chosen[0]], average, sure)

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.depth import inverse_depth
-from sceneprint.geometry.normals import surface
-from sceneprint.geometry.rigid import moved
+from sceneprint.atomic_files import write_whole
+from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.surface.depth_image import inverse_depth, surface
 from sceneprint.models import Model
 from sceneprint.signing import describe
-from sceneprint.types import Bytes, Floats, Floats32, Frame, Ints32, Surface
-from sceneprint.writing import write_whole
+from sceneprint.types import Bytes, DepthFrame, Floats, Floats32, Ints32, Surface
 
 #: Colour where nothing is known: dark grey, which no normal and no depth has.
 UNKNOWN = 40
@@ -75,7 +74,7 @@ def patch_colours(base: Bytes, labels: Ints32, zoom: int = 4) -> Bytes:
     return np.where(edge[..., None], np.uint8(0), large)
 
 
-def save_picture(frame: Frame, model: Model, path: Path) -> None:
+def save_picture(frame: DepthFrame, model: Model, path: Path) -> None:
     """Depth, normals as colour, and the patches of each level, side by side in a PNG.
 
     Parameters
@@ -114,7 +113,7 @@ def save_picture(frame: Frame, model: Model, path: Path) -> None:
     write_whole(path, buffer.getvalue())
 
 
-def _draw_depth(figure: Any, axis: Any, frame: Frame, model: Model) -> None:
+def _draw_depth(figure: Any, axis: Any, frame: DepthFrame, model: Model) -> None:
     from matplotlib import colormaps
 
     p = model.parameters.depth

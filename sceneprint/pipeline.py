@@ -11,10 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sceneprint.errors import ModelMismatch
-from sceneprint.geometry.acceptance import Mode
-from sceneprint.geometry.diversity import DiversityParameters, Selection
-from sceneprint.geometry.diversity import diversify as select
-from sceneprint.geometry.retrieval import (
+from sceneprint.geometry.retrieval.distance import (
     Metric,
     Ranking,
     distances,
@@ -22,12 +19,15 @@ from sceneprint.geometry.retrieval import (
     rank,
     ranking_size,
 )
-from sceneprint.geometry.sequences import Matching
-from sceneprint.geometry.spheres import range_image
-from sceneprint.geometry.surroundings import compress, surroundings
-from sceneprint.geometry.validation import Validation, ValidationParameters
-from sceneprint.geometry.validation import validate as validate_geometry
-from sceneprint.geometry.voxels import Voxels
+from sceneprint.geometry.retrieval.dpp import DiversityParameters, Selection
+from sceneprint.geometry.retrieval.dpp import diversify as select
+from sceneprint.geometry.surface.range_image import range_image
+from sceneprint.geometry.surface.voxels import Voxels
+from sceneprint.geometry.validation.acceptance import Mode
+from sceneprint.geometry.validation.patch_descriptors import compress, patch_descriptors
+from sceneprint.geometry.validation.sequence_alignment import Matching
+from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
+from sceneprint.geometry.validation.validation import validate as validate_geometry
 from sceneprint.models import PRESETS, Model, read_model
 from sceneprint.signing import (
     Signature,
@@ -97,7 +97,7 @@ def geometry_of(seen: Surface, model: Model) -> Geometry:
     if isinstance(seen, Voxels):
         shown = range_image(seen.cloud, p.cloud) if seen.cloud.has_viewpoint else seen.plain
     patches = patches_for_validation(seen, p)
-    histograms = surroundings(patches, p.surroundings)
+    histograms = patch_descriptors(patches, p.surroundings)
     return Geometry(shown, patches, compress(histograms, model.compression), model.id)
 
 
@@ -169,7 +169,7 @@ def validate(
     p: ValidationParameters | None = None,
     mode: Mode = "full",
     matching: Matching = "histograms",
-) -> Validation:
+) -> PairValidation:
     """Whether two frames see one place, and the transform between them: Sec. III-E.
 
     Parameters

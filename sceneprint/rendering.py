@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from sceneprint.geometry.coverage import Mesh
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.levelling import levelling
-from sceneprint.geometry.rigid import moved
-from sceneprint.types import Bytes, Floats, Floats32, Frame, Ints32
+from sceneprint.geometry.pose.average import levelling
+from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.surface.coverage import TriangleMesh
+from sceneprint.types import Bytes, DepthFrame, Floats, Floats32, Ints32
 
 #: One for each view in order, then again; the query's grey first.
 PALETTE = np.array(
@@ -61,7 +61,7 @@ class Viewpoint:
         return np.column_stack([self.focal * seen[:, :2] / z[:, None] + middle, seen[:, 2]])
 
 
-def viewpoint(mesh: Mesh, cameras: Floats, width: int, height: int) -> Viewpoint:
+def viewpoint(mesh: TriangleMesh, cameras: Floats, width: int, height: int) -> Viewpoint:
     """From behind and above the query, so that all is in view: floors level, and nothing between.
 
     Parameters
@@ -122,7 +122,9 @@ def _fill(
                         picture[y, x, i] = u * colours[a, i] + v * colours[b, i] + w * colours[c, i]
 
 
-def rendered(mesh: Mesh, first: Ints32, cameras: Sequence[Frame], view: Viewpoint) -> Bytes:
+def rendered(
+    mesh: TriangleMesh, first: Ints32, cameras: Sequence[DepthFrame], view: Viewpoint
+) -> Bytes:
     """A mesh as a picture, without what faces away: a room is looked into from above.
 
     Parameters
@@ -167,7 +169,7 @@ def _crevices(depth: Floats32) -> Floats32:
     return factor
 
 
-def _with_cameras(picture: Bytes, cameras: Sequence[Frame], view: Viewpoint) -> Bytes:
+def _with_cameras(picture: Bytes, cameras: Sequence[DepthFrame], view: Viewpoint) -> Bytes:
     """View cones drawn over a picture; the query's comes last."""
     from PIL import Image, ImageDraw
 
@@ -194,7 +196,11 @@ def _with_cameras(picture: Bytes, cameras: Sequence[Frame], view: Viewpoint) -> 
 
 
 def reconstruction_picture(
-    mesh: Mesh, first: Ints32, views: Sequence[Frame], added: Sequence[float], title: str
+    mesh: TriangleMesh,
+    first: Ints32,
+    views: Sequence[DepthFrame],
+    added: Sequence[float],
+    title: str,
 ) -> bytes:
     """The picture of a reconstruction as PNG: the surface, and what each view adds to it.
 
@@ -222,7 +228,7 @@ def reconstruction_picture(
     return buffer.getvalue()
 
 
-def _added(axes: Any, views: Sequence[Frame], added: Sequence[float]) -> None:
+def _added(axes: Any, views: Sequence[DepthFrame], added: Sequence[float]) -> None:
     """Bars from above in the order of the views, each beginning where the last one ended."""
     total, place = np.cumsum([0.0, *added]), np.arange(len(views))
     colours = PALETTE[place % len(PALETTE)] / 255

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import re
 from pathlib import Path
@@ -14,6 +13,7 @@ from pydantic import Field, SecretStr, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from sceneprint.models import default_cache_dir
+from sceneprint_client.addresses import is_loopback
 
 
 def default_data_dir() -> Path:
@@ -23,16 +23,6 @@ def default_data_dir() -> Path:
 
 #: Where blobs and snapshots may be, by what their URL begins with.
 OBJECT_SCHEMES = ("s3", "gs", "az", "file", "memory")
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a name or address, without port or brackets, is only ever this machine."""
-    if host.lower() == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 class Settings(BaseSettings):
@@ -119,7 +109,7 @@ class Settings(BaseSettings):
     @classmethod
     def _has_primary(cls, given: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
         if given is not None and info.data.get("database_url") is None:
-            raise ValueError("a replica is of the database that SCENEPRINT_DATABASE_URL names")
+            raise ValueError("a replica needs its primary in SCENEPRINT_DATABASE_URL")
         return given
 
     @field_validator("blob_url", "snapshot_url")
@@ -141,7 +131,7 @@ class Settings(BaseSettings):
     def _are_origins(cls, given: tuple[str, ...]) -> tuple[str, ...]:
         for one in given:
             if one != "*" and not re.fullmatch(r"https?://[^/?#@\s*]+", one):
-                raise ValueError(f"{one!r:.80} is no origin such as https://fleet.example")
+                raise ValueError(f"{one!r:.80} is not an origin such as https://fleet.example")
         return given
 
     @property
@@ -204,14 +194,14 @@ def _require_objects(url: str) -> None:
     scheme, _, rest = url.partition("://")
     if scheme not in OBJECT_SCHEMES or "://" not in url:
         known = ", ".join(f"{one}://" for one in OBJECT_SCHEMES)
-        raise ValueError(f"it begins with none of {known}")
+        raise ValueError(f"it does not start with any of {known}")
     try:
         holds = "@" in urlsplit(url).netloc or "?" in rest or "#" in rest
     except ValueError:
         holds = True
     if holds:
         raise ValueError(
-            "it holds more than a bucket and a prefix: credentials come from the environment "
+            "it contains more than a bucket and a prefix; credentials come from the environment "
             "(AWS_..., GOOGLE_..., AZURE_...), never from a URL"
         )
     if scheme in ("s3", "gs", "az") and not urlsplit(url).netloc:

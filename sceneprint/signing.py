@@ -12,27 +12,22 @@ from pathlib import Path
 import numpy as np
 
 from sceneprint.errors import UselessFrame
-from sceneprint.geometry.counting import count_pairs
-from sceneprint.geometry.depth import inverse_depth
-from sceneprint.geometry.encoding import (
-    Statistics,
+from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.geometry.signature.fisher_vector import (
+    LevelStatistics,
     fisher_vector,
     quantise,
     signature,
     statistics_of_counts,
     statistics_of_features,
 )
-from sceneprint.geometry.hierarchy import hierarchy
-from sceneprint.geometry.normals import surface
-from sceneprint.geometry.projection import project
-from sceneprint.geometry.properties import neighbour_pairs, pair_properties
-from sceneprint.geometry.retrieval import Metric
-from sceneprint.geometry.segmentation import patches_of, segment
-from sceneprint.geometry.supervoxels import supervoxels
-from sceneprint.geometry.table import PairTable
-from sceneprint.geometry.voxels import Voxels, voxels
-from sceneprint.geometry.weights import patch_weights
-from sceneprint.geometry.whitening import whiten
+from sceneprint.geometry.signature.pair_features import neighbour_pairs, pair_properties, project
+from sceneprint.geometry.signature.pair_table import PairTable, count_pairs
+from sceneprint.geometry.signature.segmentation import hierarchy, patch_weights, patches_of, segment
+from sceneprint.geometry.signature.supervoxels import supervoxels
+from sceneprint.geometry.signature.whitening import whiten
+from sceneprint.geometry.surface.depth_image import inverse_depth, surface
+from sceneprint.geometry.surface.voxels import Voxels, voxels
 from sceneprint.models import (
     PRESETS,
     Model,
@@ -200,7 +195,7 @@ def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
     )
 
 
-def table_statistics(level: Patches, signer: Signer) -> Statistics:
+def table_statistics(level: Patches, signer: Signer) -> LevelStatistics:
     """Pair statistics of one level through the 4-D table."""
     p = signer.model.parameters
     weights = patch_weights(level, p.weights)
@@ -208,7 +203,7 @@ def table_statistics(level: Patches, signer: Signer) -> Statistics:
     return statistics_of_counts(counts, signer.table, len(signer.model.mixture))
 
 
-def exact_statistics(level: Patches, model: Model) -> Statistics:
+def exact_statistics(level: Patches, model: Model) -> LevelStatistics:
     """Pair statistics of one level, pair by pair: slow, the oracle of the table."""
     p = model.parameters.properties
     pairs = neighbour_pairs(level, p)
@@ -217,7 +212,7 @@ def exact_statistics(level: Patches, model: Model) -> Statistics:
     return statistics_of_features(features, weights, model.mixture)
 
 
-def float_signature(levels: list[Statistics], model: Model, name: str = "") -> Floats:
+def float_signature(levels: list[LevelStatistics], model: Model, name: str = "") -> Floats:
     """psi before quantisation: Eq. (2) of each level, rooted, normalised, end to end.
 
     A coarse level without pairs says nothing, and its part of psi is zero.

@@ -6,12 +6,77 @@ in the name. Camera frames are optical: x right, y down, z forward.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.cameras import MAXIMUM_PIXELS, MAXIMUM_SAMPLES, Camera, Intrinsics, Sphere
+from sceneprint.errors import InvalidIntrinsics
+from sceneprint_client.sidecars import MAXIMUM_PIXELS, MAXIMUM_SAMPLES, Intrinsics
+
+# How a sensor looks: pixels to directions.
+#
+# Camera frames are optical: x right, y down, z forward. Clouds keep their sensor's axes.
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """The "camera" of a range image about a viewpoint: azimuth by elevation, in equal steps.
+
+    With (a, b, c) the sensor's axes in cyclic order such that c is the pole, a direction has
+    azimuth = atan2(b, a) and elevation = asin(c); column = (azimuth - left) / step, where azimuth
+    counts on from that of column 0, and row = (top - elevation) / step. Centres at integers.
+
+    Parameters
+    ----------
+    width, height : size of the image, pixels
+    step : from pixel to pixel either way, radians
+    left : azimuth of column 0, radians
+    top : elevation of row 0, radians
+    pole : 0, 1 or 2: the axis that elevation is measured towards
+
+    Raises
+    ------
+    InvalidIntrinsics : no image, one of too many pixels, or one that covers more than a sphere.
+    """
+
+    width: int
+    height: int
+    step: float
+    left: float
+    top: float
+    pole: int = 2
+
+    def __post_init__(self) -> None:
+        within = self.width >= 1 and self.height >= 1 and self.pole in (0, 1, 2)
+        if not (within and math.isfinite(self.left) and math.isfinite(self.top)):
+            raise InvalidIntrinsics(f"{self} is no range image. Sign the cloud again.")
+        if self.width * self.height > MAXIMUM_SAMPLES:
+            raise InvalidIntrinsics(
+                f"A range image of {self.width} x {self.height} exceeds the limit of "
+                f"{MAXIMUM_SAMPLES} samples. Sign the cloud with a coarser model."
+            )
+        # half a pixel more than a turn, or than half of one, is rounding
+        if not (0 < (self.width - 1) * self.step < 2 * math.pi) or not (
+            0 <= (self.height - 1) * self.step <= math.pi + self.step
+        ):
+            raise InvalidIntrinsics(f"{self} covers more than a sphere. Sign the cloud again.")
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the last column is a neighbour of the first."""
+        return self.width * self.step > 2 * math.pi - self.step / 2
+
+    @property
+    def sees_around(self) -> bool:
+        """Whether three quarters of a turn or more are seen, whichever way the sensor is turned."""
+        return self.width * self.step > 1.5 * math.pi
+
+
+#: Either kind of looking.
+Camera = Intrinsics | Sphere
+
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -25,9 +90,9 @@ __all__ = [
     "Bytes",
     "Camera",
     "Cloud",
+    "DepthFrame",
     "Floats",
     "Floats32",
-    "Frame",
     "Geometry",
     "Hierarchy",
     "Intrinsics",
@@ -39,7 +104,7 @@ __all__ = [
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class DepthFrame:
     """One depth image, undistorted, as the geometry reads it.
 
     Parameters
@@ -78,7 +143,7 @@ class Cloud:
 
 
 #: A frame of either kind.
-AnyFrame = Frame | Cloud
+AnyFrame = DepthFrame | Cloud
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,52 +2,101 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, nullcontext
+from typing import Any
 
 from anyio import to_thread
-from fastapi import APIRouter, Depends, FastAPI
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from pydantic.json_schema import models_json_schema
 
 from sceneprint import __version__
 from sceneprint.engine import Engine
+from sceneprint.errors import SceneprintError
 from sceneprint.settings import Settings
+from sceneprint_client.api import (
+    Diversity,
+    Filter,
+    FrameMeta,
+    NamedFrame,
+    NewMap,
+    Problem,
+    ValidationOptions,
+)
+from sceneprint_client.api.admin import NewKey, NewModel
+from sceneprint_client.api.listing import FrameEdit, MapEdit
+from sceneprint_client.api.reconstructions import NewReconstruction
+from sceneprint_client.api.sessions import NewAssociation
 from service import dashboard, problems
-from service.access import caller
 from service.context import Context, Gate
-from service.cors import origins_of
-from service.document import openapi_of
-from service.feed import Feed
+from service.events import Feed
+from service.guards import origins_of
 from service.limits import Limits
-from service.metrics import Metrics
-from service.middleware import Around
+from service.metrics import Metrics, housekeeping
+from service.middleware import RequestMiddleware
 from service.routes import (
-    again,
-    associations,
-    edits,
-    events,
+    admin,
+    frame_data,
     frames,
-    health,
-    imports,
     jobs,
-    kept,
-    keys,
     maps,
-    operations,
-    outputs,
-    points,
     queries,
     reconstructions,
+    results,
     sessions,
-    similarity,
-    snapshots,
-    uploads,
 )
-from service.sampling import housekeeping
+
+# The OpenAPI document: FastAPI's, and the records that only bodies of our own reading use.
+
+
+def openapi_of(app: FastAPI) -> dict[str, Any]:
+    """The document of an application, made once."""
+    if app.openapi_schema is None:
+        document = get_openapi(
+            title=app.title, version=app.version, description=app.description, routes=app.routes
+        )
+        template = "#/components/schemas/{model}"
+        _, own = models_json_schema(
+            [
+                (FrameMeta, "validation"),
+                (FrameEdit, "validation"),
+                (MapEdit, "validation"),
+                (Filter, "validation"),
+                (NamedFrame, "validation"),
+                (Diversity, "validation"),
+                (ValidationOptions, "validation"),
+                (NewMap, "validation"),
+                (NewKey, "validation"),
+                (NewAssociation, "validation"),
+                (NewModel, "validation"),
+                (NewReconstruction, "validation"),
+                (Problem, "serialization"),
+            ],
+            ref_template=template,
+        )
+        schemas = document.setdefault("components", {}).setdefault("schemas", {})
+        for name, schema in own["$defs"].items():
+            schemas.setdefault(name, schema)
+        for operation in (one for path in document["paths"].values() for one in path.values()):
+            if "application/json" in operation["responses"].get("422", {}).get("content", {}):
+                del operation["responses"]["422"]  # FastAPI's guess: a name in a path is never so
+        for name in ("HTTPValidationError", "ValidationError"):
+            schemas.pop(name, None)
+        app.openapi_schema = document
+    return app.openapi_schema
+
+
+log = logging.getLogger(__name__)
 
 #: In the order in which the document lists them.
-ROUTES = (
-    maps, frames, uploads, outputs, points, edits, sessions, imports, queries, kept, again,
-    similarity, associations, reconstructions, jobs, events, operations, snapshots, keys,
+ROUTERS = (
+    maps.router, frames.router, frame_data.router, frame_data.points_router, maps.edits_router,
+    sessions.router, frames.imports_router, queries.router, results.router,
+    queries.similarity_router, sessions.associations_router, reconstructions.router, jobs.router,
+    jobs.events_router, admin.operations_router, admin.snapshots_router, admin.keys_router,
 )  # fmt: skip
 #: Uploads that are in hand at once, so that one wait for the disk is enough for all of them.
 UPLOADS = 12
@@ -61,12 +110,30 @@ their sensor. Refusals are problem documents (RFC 9457) that say what happened, 
 """
 
 
-def create_app(settings: Settings) -> FastAPI:
+@asynccontextmanager
+async def warming(engine: Engine) -> AsyncIterator[None]:
+    """Load kernels and tables in the background, so that the service answers at once."""
+    task = asyncio.create_task(to_thread.run_sync(_warm, engine))
+    try:
+        yield
+    finally:
+        await task  # the engine must outlast it
+
+
+def _warm(engine: Engine) -> None:
+    try:
+        engine.warm()
+    except SceneprintError as error:  # the first requests load what they need, or say the same
+        log.info("store unreachable", extra={"error": str(error)})
+
+
+def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
     """The service as an ASGI application.
 
     Parameters
     ----------
     settings : see Settings; callers must show a key where it `asks_for_keys`
+    warm : load models and kernels before the first request
     """
     figures = Metrics()
 
@@ -74,7 +141,6 @@ def create_app(settings: Settings) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         engine = await to_thread.run_sync(Engine, settings)
         try:
-            await to_thread.run_sync(engine.warm)
             gate = Gate(settings.concurrency, settings.waiting, settings.wait_s)
             # they mostly wait for the disk: the engine sees to how many are decoded at once
             uploads = Gate(max(UPLOADS, settings.concurrency), settings.waiting, settings.wait_s)
@@ -83,7 +149,8 @@ def create_app(settings: Settings) -> FastAPI:
             app.state.context = Context(
                 engine, gate, uploads, figures, settings.asks_for_keys, feed=feed, limits=limits
             )
-            async with housekeeping(engine, figures.sampler):
+            loading = warming(engine) if warm else nullcontext()
+            async with housekeeping(engine, figures.sampler), loading:
                 yield
             feed.close()
         finally:
@@ -95,13 +162,12 @@ def create_app(settings: Settings) -> FastAPI:
         title="sceneprint", version=__version__, description=DESCRIPTION, lifespan=lifespan,
         redirect_slashes=False,
     )  # fmt: skip
-    v1 = APIRouter(prefix="/v1", dependencies=[Depends(caller)])
-    for part in ROUTES:
-        v1.include_router(part.router)
-    app.include_router(v1)
-    app.include_router(health.router)
+    for router in (*ROUTERS, admin.router):  # as they are: `include_router` would make each anew
+        app.router.routes.extend(router.routes)
     app.include_router(dashboard.routes(dashboard.files_in(dashboard.PAGES)))
     problems.install(app)
-    app.add_middleware(Around, settings=settings, origins=origins_of(settings), metrics=figures)
+    app.add_middleware(
+        RequestMiddleware, settings=settings, origins=origins_of(settings), metrics=figures
+    )
     app.openapi = lambda: openapi_of(app)  # type: ignore[method-assign]
     return app

@@ -7,10 +7,10 @@ from typing import Any
 from urllib.parse import unquote
 
 from anyio import to_thread
-from starlette.types import Scope
+from starlette.types import Scope as AsgiScope
 
 from sceneprint.errors import SceneprintError
-from sceneprint.store.audit import Change
+from sceneprint.store.keys import KeyChange
 
 log = logging.getLogger(__name__)
 
@@ -23,7 +23,7 @@ UNNOTED = frozenset(
 )  # fmt: skip
 
 
-async def note(scope: Scope, status: int, headers: list[tuple[bytes, bytes]]) -> None:
+async def note(scope: AsgiScope, status: int, headers: list[tuple[bytes, bytes]]) -> None:
     """Note an answer where it tells of a change, before it is sent: who has it finds the line.
 
     An answer is not held back by a log that cannot be written.
@@ -36,10 +36,10 @@ async def note(scope: Scope, status: int, headers: list[tuple[bytes, bytes]]) ->
     try:
         await to_thread.run_sync(scope["app"].state.context.engine.audit.note, change)
     except SceneprintError as error:
-        log.error("a change was not noted", extra={"action": change.action, "error": str(error)})
+        log.error("audit entry not written", extra={"action": change.action, "error": str(error)})
 
 
-def _change(scope: Scope, status: int, headers: list[tuple[bytes, bytes]]) -> Change | None:
+def _change(scope: AsgiScope, status: int, headers: list[tuple[bytes, bytes]]) -> KeyChange | None:
     action = getattr(scope.get("route"), "name", None)
     if action is None or action in UNNOTED:
         return None
@@ -57,7 +57,7 @@ def _change(scope: Scope, status: int, headers: list[tuple[bytes, bytes]]) -> Ch
     if map_name is None and len(changed) == 1:
         (map_name,) = changed
     client = scope.get("client")
-    return Change(
+    return KeyChange(
         action,
         state.get("caller", ""),
         None if client is None else client[0],

@@ -2,37 +2,307 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
+import json
 import re
-from collections.abc import AsyncIterator, Collection, Mapping
+import tempfile
+from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, cast, get_args
 
-from fastapi import Request
-from pydantic import ValidationError
+from fastapi import Header, Request, Response
+from pydantic import BaseModel, ValidationError
 from pydantic_core import from_json
 from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException
 
+from sceneprint.engine.ingest.uploads import Upload, UploadResult, item_of
 from sceneprint.errors import (
     InvalidRequest,
     MalformedBody,
+    StoreFull,
     TooLarge,
     UnsupportedType,
+    UnusableStore,
 )
-from sceneprint.schemas import FrameMeta
-from sceneprint.schemas.frames import MOST_PRIORITY
-from service import raw
+from sceneprint.formats.image.depth_file import size_of
+from sceneprint.store.idempotency import IdempotentRequest
+from sceneprint_client.api import FrameMeta
+from sceneprint_client.api.frames import (
+    MOST_OF_BATCH,
+    MOST_PRIORITY,
+    Batch,
+    CloudFormat,
+    novelty_of,
+)
+from sceneprint_client.file_formats import HEAD, format_of
+from service.auth import Caller
 from service.problems import invalid
+
+# A frame as the whole body of a request, and what is known of it in the query string.
+#
+# curl --data-binary @frame.png -H 'Content-Type: image/png' '...?fx=585&fy=585&cx=320&cy=240'
+# curl --data-binary @scan.ply -H 'Content-Type: application/ply' '...?robot=spot'
+
+#: Types of a body that is a frame; its first bytes decide which of them it is.
+TYPES = ("image/png", "application/x-npy", "application/ply", "application/octet-stream")
+#: Bytes of a body that are kept in memory until they are read; the rest waits on disk.
+_IN_MEMORY = 1 << 20
+
+_CAMERA = ("fx", "fy", "cx", "cy", "width", "height", "distortion")
+_PLAIN = (
+    "depth_scale", "depth_along_ray", "units_per_metre", "format", "robot", "session",
+    "captured_at",
+)  # fmt: skip
+_OTHERS = ("viewpoint", "tags", "pose", "parent_frame", "base", "base_frame")
+_SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
+
+
+def content(types: Sequence[str] = TYPES) -> dict[str, Any]:
+    """Bodies of this kind, for `requestBody.content` of the OpenAPI document."""
+    return {one: {"schema": {"type": "string", "format": "binary"}} for one in types}
+
+
+def parameters() -> list[dict[str, Any]]:
+    """What the query string may say of a frame that is the body, for the OpenAPI document."""
+    number, text = {"type": "number"}, {"type": "string"}
+    whole = {"type": "integer", "minimum": 1, "maximum": 65535}
+    own = "Where the frame is the body: "
+    told: dict[str, tuple[dict[str, Any], str]] = {
+        "meta": (text, "FrameMeta as JSON, in place of what follows."),
+        **dict.fromkeys(("fx", "fy", "cx", "cy"), (number, "of the camera, pixels.")),
+        "width": (whole, "of the camera's image, pixels; default: that of the image."),
+        "height": (whole, "as `width`."),
+        "distortion": (text, "k1,k2,p1,p2[,k3] of OpenCV."),
+        "depth_scale": (number, "stored units per metre; default: 1000."),
+        "depth_along_ray": ({"type": "boolean"}, "samples are ranges along the pixel's ray."),
+        "viewpoint": (text, "of a point cloud: x,y,z in metres; `none` where there is none."),
+        "units_per_metre": (number, "of a point cloud; default: 1."),
+        "format": (
+            {"type": "string", "enum": list(get_args(CloudFormat))},
+            "of a point cloud: needed for `kitti` alone.",
+        ),
+        "robot": (text, "who took it."),
+        "session": (text, "in which run."),
+        "captured_at": ({"type": "string", "format": "date-time"}, "when, with its time zone."),
+        "tags": (text, "with commas between."),
+        "pose": (text, f"T_parent_sensor as {','.join(_SEVEN)}: metres, unit quaternion."),
+        "parent_frame": (text, "what `pose` leads to; default: ROBOT/SESSION."),
+        "base": (text, "T_base_sensor, written as `pose`: where the sensor sits on the robot."),
+        "base_frame": (text, "what the robot calls its base; default: base_link."),
+    }
+    return [
+        {
+            "name": name,
+            "in": "query",
+            "required": False,
+            "schema": schema,
+            "description": own + what,
+        }
+        for name, (schema, what) in told.items()
+    ]
+
+
+async def received(
+    request: Request, fields: Sequence[str]
+) -> tuple[UploadFile, FrameMeta, dict[str, str]]:
+    """Read a body that is a frame.
+
+    Parameters
+    ----------
+    request : of one of `TYPES`
+    fields : that the query string may have beside what is known of the frame
+
+    Returns
+    -------
+    file : to be closed
+    meta : what is known of it
+    others : those of `fields` that were given
+
+    Raises
+    ------
+    InvalidRequest : a parameter is missing, unknown, given twice or not as it should be.
+    MalformedBody : `meta` is no JSON.
+    StoreFull, UnusableStore : the machine cannot keep the body until it is read.
+    """
+    given = query_parameters(request, ("meta", *_CAMERA, *_PLAIN, *_OTHERS, *fields))
+    spooled = tempfile.SpooledTemporaryFile(max_size=_IN_MEMORY)  # noqa: SIM115  (the caller's)
+    file = UploadFile(cast(BinaryIO, spooled), size=0)
+    try:
+        try:
+            async for chunk in request.stream():
+                await file.write(chunk)
+            await file.seek(0)
+            head = await file.read(HEAD)
+            await file.seek(0)
+        except OSError as error:
+            raise unspoolable(error) from error
+        others = {name: given.pop(name) for name in fields if name in given}
+        meta = _query_meta(given, head)  # a query string is short
+    except BaseException:
+        await file.close()
+        raise
+    return file, meta, others
+
+
+def unspoolable(error: OSError) -> UnusableStore:
+    """That the machine cannot keep a body until it is read."""
+    kind = StoreFull if error.errno in (errno.ENOSPC, errno.EDQUOT) else UnusableStore
+    return kind(
+        f"The upload cannot be written to the temporary folder ({error}). Free some space there, "
+        "or set TMPDIR to another folder."
+    )
+
+
+def query_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
+    """The query string of a request that is not a form.
+
+    Raises
+    ------
+    InvalidRequest : it has something twice, or that is not known.
+    """
+    given: dict[str, str] = {}
+    for name, value in request.query_params.multi_items():
+        if name not in known:
+            raise InvalidRequest(
+                f"The query string has an unknown parameter {name!r:.80}. Known parameters are "
+                f"{', '.join(sorted(known))}.",
+                ((name[:80], "unknown"),),
+            )
+        if name in given:
+            raise InvalidRequest(
+                f"The query string has {name!r} twice. Send it once.", ((name, "given twice"),)
+            )
+        given[name] = value
+    return given
+
+
+def _query_meta(given: dict[str, str], head: bytes) -> FrameMeta:
+    text = given.pop("meta", None)
+    if text is not None and given:
+        raise InvalidRequest(
+            f"The query string has `meta` and {', '.join(sorted(given))}. Put everything into "
+            "`meta`, or leave it out.",
+            tuple((name, "beside meta") for name in sorted(given)),
+        )
+    try:
+        if text is not None:
+            return FrameMeta.model_validate_json(text)
+        return FrameMeta.model_validate(_fields(given, head))
+    except ValidationError as error:
+        if error.errors(include_url=False)[0]["type"] == "json_invalid":
+            raise MalformedBody("The parameter `meta` is not JSON. Send a JSON object.") from error
+        raise invalid(error, "The frame metadata in the query string") from error
+
+
+def _fields(given: Mapping[str, str], head: bytes) -> dict[str, Any]:
+    """Fields of FrameMeta from single parameters."""
+    camera: dict[str, Any] = {name: given[name] for name in _CAMERA if name in given}
+    if "distortion" in camera:
+        camera["distortion"] = camera["distortion"].split(",")
+    size = size_of(head)
+    # an array of three or four columns is a cloud, unless somebody speaks of a camera
+    is_image = bool(camera) or ("format" not in given and format_of(head) is None)
+    if size is not None and is_image:
+        camera = {"width": size[0], "height": size[1], **camera}
+    found: dict[str, Any] = {"intrinsics": camera} if camera else {}
+    if "viewpoint" in given:
+        found["viewpoint"] = _viewpoint(given["viewpoint"])
+    found |= {name: given[name] for name in _PLAIN if name in given}
+    if given.get("tags"):
+        found["tags"] = given["tags"].split(",")
+    add_transform(found, given, "pose", "pose", "parent_frame")
+    add_transform(found, given, "base", "T_base_sensor", "base_frame")
+    return found
+
+
+def add_transform(
+    found: dict[str, Any], given: Mapping[str, str], name: str, field: str, frame: str
+) -> None:
+    """Add a transform that the query string has, and the frame that it leads to.
+
+    Parameters
+    ----------
+    found : fields of a record
+    given : the query string
+    name, frame : of the two parameters
+    field : of the record
+
+    Raises
+    ------
+    InvalidRequest : it has not seven numbers, or the frame is given alone.
+    """
+    if name in given:
+        found[field] = _transform(name, given[name])
+        if frame in given:
+            found[field][frame] = given[frame]
+    elif frame in given:
+        raise InvalidRequest(
+            f"The query string has `{frame}` but no `{name}`. Send both.",
+            ((frame, f"without {name}"),),
+        )
+
+
+def _viewpoint(text: str) -> dict[str, Any] | str | None:
+    if text in ("none", "file"):
+        return None if text == "none" else text
+    parts = text.split(",")
+    if len(parts) != 3:
+        raise InvalidRequest(
+            f"`viewpoint` has {len(parts)} numbers. Send x,y,z in metres, comma-separated, or "
+            "`none` if the cloud has no single viewpoint.",
+            (("viewpoint", "not three numbers"),),
+        )
+    return dict(zip("xyz", parts, strict=True))
+
+
+def _transform(name: str, text: str) -> dict[str, Any]:
+    parts = text.split(",")
+    if len(parts) != len(_SEVEN):
+        raise InvalidRequest(
+            f"`{name}` has {len(parts)} numbers. Send {','.join(_SEVEN)}: metres and a unit "
+            "quaternion, comma-separated.",
+            ((name, "not seven numbers"),),
+        )
+    return {
+        "translation": dict(zip("xyz", parts[:3], strict=True)),
+        "rotation": dict(zip("xyzw", parts[3:], strict=True)),
+    }
+
 
 #: Most bytes of a form field that is no file, and of a JSON body.
 FIELD_BYTES = 1 << 18
 FORM = "multipart/form-data"
 
+FRAME_BODY: dict[str, Any] = {
+    "required": True,
+    "content": {
+        FORM: {
+            "schema": {
+                "type": "object",
+                "required": ["frame", "meta"],
+                "properties": {
+                    "frame": {
+                        "type": "string",
+                        "format": "binary",
+                        "description": "A depth image: 16-bit greyscale PNG in stored units (0 and "
+                        "65535 where missing), or a two-dimensional float NPY in metres. Or a "
+                        "point cloud: PLY, PCD, LAS, LAZ, NPY of shape (N, 3), or KITTI's .bin.",
+                    },
+                    "meta": {"$ref": "#/components/schemas/FrameMeta"},
+                },
+            },
+            "encoding": {"meta": {"contentType": "application/json"}},
+        }
+    },
+}
+
 
 @dataclass(frozen=True, eq=False)
-class Upload:
+class FormUpload:
     """A frame that came in a form, or as the body.
 
     Parameters
@@ -53,7 +323,7 @@ def media_type(request: Request) -> str:
 
 
 @asynccontextmanager
-async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
+async def uploaded(request: Request, *fields: str) -> AsyncIterator[FormUpload]:
     """Read a frame: a form with a file part `frame`, a field `meta`, and others that are named; or
     the frame alone, with the same in the query string.
 
@@ -64,10 +334,10 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
     InvalidRequest : a part is missing or unknown, or `meta` is not as it should be.
     StoreFull, UnusableStore : the machine cannot keep it until it is read.
     """
-    if media_type(request) in raw.TYPES:
-        file, meta, others = await raw.received(request, fields)
+    if media_type(request) in TYPES:
+        file, meta, others = await received(request, fields)
         try:
-            yield Upload(file.file, meta, others)
+            yield FormUpload(file.file, meta, others)
         finally:
             await file.close()
         return
@@ -82,7 +352,7 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[Upload]:
                 (("frame", "not one file"),),
             )
         texts = texts_of(form)
-        yield Upload(frame.file, _meta(texts.pop("meta", None)), texts)
+        yield FormUpload(frame.file, _meta(texts.pop("meta", None)), texts)
 
 
 @asynccontextmanager
@@ -95,9 +365,9 @@ async def form_of(request: Request, most_files: int) -> AsyncIterator[FormData]:
     """
     if media_type(request) != FORM:
         raise UnsupportedType(
-            f"The body is {media_type(request) or 'of no type'!r:.80}, and a frame comes as "
-            f"{FORM}: a file part `frame` and a field `meta` with JSON. One frame may also be the "
-            f"whole body, as {', '.join(raw.TYPES)}."
+            f"The body is {media_type(request) or 'of no type'!r:.80}. Send a frame as {FORM}: a "
+            "file part `frame` and a field `meta` with JSON. You can also send a single frame "
+            f"as the whole body, as {', '.join(TYPES)}."
         )
     try:
         form = await request.form(max_files=most_files, max_fields=16, max_part_size=FIELD_BYTES)
@@ -109,7 +379,7 @@ async def form_of(request: Request, most_files: int) -> AsyncIterator[FormData]:
             "`frame` and a field `meta`, with a boundary as in RFC 7578."
         ) from error
     except OSError as error:  # what is too large for memory is spooled to a file meanwhile
-        raise raw.unspoolable(error) from error
+        raise unspoolable(error) from error
     try:
         yield form
     finally:
@@ -121,9 +391,9 @@ def check_parts(form: FormData, known: Collection[str]) -> None:
     for name in form:
         if name not in known:
             raise InvalidRequest(
-                f"The form has a part {name!r:.80} that is not known. Its parts are "
+                f"The form has an unknown part {name!r:.80}. Known parts are "
                 f"{', '.join(sorted(known))}.",
-                ((name[:80], "not known"),),
+                ((name[:80], "unknown"),),
             )
 
 
@@ -145,7 +415,7 @@ def priority_of(fields: Mapping[str, str]) -> int:
         raise InvalidRequest(
             f"The priority is {text!r:.40}. Send a whole number from {-MOST_PRIORITY} to "
             f"{MOST_PRIORITY}, or leave it out for 0.",
-            (("priority", "no whole number in its range"),),
+            (("priority", "not a whole number in the allowed range"),),
         )
     return number
 
@@ -163,8 +433,7 @@ async def read_json(request: Request) -> Any:
         body += chunk
         if len(body) > FIELD_BYTES:
             raise TooLarge(
-                f"The JSON has more than {FIELD_BYTES} bytes, the most that is taken. Send only "
-                "the fields in /docs."
+                f"The JSON exceeds the limit of {FIELD_BYTES} bytes. Send only the fields in /docs."
             )
     try:
         return from_json(bytes(body))  # unlike `json`, no text that is not Unicode
@@ -175,8 +444,8 @@ async def read_json(request: Request) -> Any:
 def _meta(text: str | None) -> FrameMeta:
     if text is None:
         raise InvalidRequest(
-            "The form has no field `meta`. Send JSON in it: of a depth image at least the camera's "
-            "intrinsics, of a point cloud {}.",
+            "The form has no field `meta`. Send JSON in it: for a depth image at least the "
+            "camera intrinsics, for a point cloud {}.",
             (("meta", "missing"),),
         )
     try:
@@ -194,3 +463,158 @@ def _text(values: list[UploadFile | str], name: str) -> str:
             ((name, "not one text"),),
         )
     return values[0]
+
+
+# Many frames in one form, each with its own metadata and its own answer.
+#
+# form  --frames_of-->  Incoming  --read-->  Upload, ...  --told-->  Batch
+
+
+@dataclass(frozen=True, eq=False)
+class FormFrames:
+    """Frames that came in one form.
+
+    Parameters
+    ----------
+    files : their bytes, not yet read
+    metas : what is known of each, or why that cannot be
+    priority, if_novel : of all
+    """
+
+    files: Sequence[BinaryIO]
+    metas: Sequence[FrameMeta | InvalidRequest]
+    priority: int
+    if_novel: float | None
+
+    def read(self) -> list[Upload]:
+        """Those whose metadata are sound."""
+        return [
+            Upload(file.read(), meta, self.priority, self.if_novel)
+            for file, meta in zip(self.files, self.metas, strict=True)
+            if isinstance(meta, FrameMeta)
+        ]
+
+    def faults(self) -> list[str]:
+        """What is wrong with the others."""
+        return [f"{i} {one}" for i, one in enumerate(self.metas) if not isinstance(one, FrameMeta)]
+
+
+@asynccontextmanager
+async def frames_of(request: Request) -> AsyncIterator[FormFrames]:
+    """Read a form with parts `frame` and a field `metas`.
+
+    Raises
+    ------
+    UnsupportedType, MalformedBody, StoreFull, UnusableStore : see `form_of`.
+    InvalidRequest : there is no frame, or there are not as many metadata as frames.
+    """
+    async with form_of(request, most_files=MOST_OF_BATCH) as form:
+        check_parts(form, ("frame", "metas", "priority", "if_novel"))
+        files = [one.file for one in form.getlist("frame") if isinstance(one, UploadFile)]
+        if not files or len(files) != len(form.getlist("frame")):
+            raise InvalidRequest(
+                "The form has no file part `frame`, or one that is not a file. Send 1 to "
+                f"{MOST_OF_BATCH} depth images or point clouds in parts of that name, each with "
+                "a file name.",
+                (("frame", "not all files"),),
+            )
+        texts = texts_of(form)
+        metas = _metas(texts.get("metas"), len(files))
+        yield FormFrames(files, metas, priority_of(texts), novelty_of(texts.get("if_novel")))
+
+
+def upload_responses(batch: FormFrames, outcomes: Sequence[UploadResult]) -> Batch:
+    """What came of each frame, in their order."""
+    rest = iter(outcomes)
+    return Batch(
+        items=[
+            item_of(next(rest) if isinstance(one, FrameMeta) else UploadResult(None, error=one))
+            for one in batch.metas
+        ]
+    )
+
+
+def _metas(text: str | None, count: int) -> list[FrameMeta | InvalidRequest]:
+    if text is None:
+        raise InvalidRequest(
+            "The form has no field `metas`. Send JSON in it: one object for all frames, or a "
+            "list with one for each.",
+            (("metas", "missing"),),
+        )
+    try:
+        given = from_json(text)
+    except ValueError as error:
+        raise MalformedBody("The field `metas` is not JSON. Send an object or a list.") from error
+    if isinstance(given, dict):
+        return [_batch_meta(given)] * count
+    if not isinstance(given, list) or len(given) != count:
+        told = f"a list of {len(given)}" if isinstance(given, list) else "neither object nor list"
+        raise InvalidRequest(
+            f"`metas` is {told}, but there are {count} frames. Send one object for all, or a "
+            "list with one for each.",
+            (("metas", "not one for each frame"),),
+        )
+    return [_batch_meta(one) for one in given]
+
+
+def _batch_meta(given: Any) -> FrameMeta | InvalidRequest:
+    try:
+        return FrameMeta.model_validate(given)
+    except ValidationError as error:
+        return invalid(error, "The frame metadata")
+
+
+# The header Idempotency-Key: a request that is sent again takes effect once.
+#
+# guarded(asking, key, route, payload...)  -->  Once, which the engine stores with what it made
+
+#: As a parameter of a route: `key: IdempotencyKey = None`.
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        min_length=1,
+        max_length=255,
+        pattern=r"^[\x20-\x7e]+$",
+        description="Made up by the caller for this request, printable ASCII. The same request "
+        "sent again with it within a day takes effect once, and is answered as things are now, "
+        "with `Idempotent-Replayed: true`; another request with it is refused.",
+    ),
+]
+
+
+def guarded(asking: Caller, key: str | None, *parts: object) -> IdempotentRequest | None:
+    """What makes a request take effect once; None where the caller asks for no such thing.
+
+    Parameters
+    ----------
+    asking : who asks: keys of two callers have nothing to do with each other
+    key : of the header
+    parts : of the request, all that makes it another one: route, map, content, metadata; bytes,
+        records, or what JSON can say
+    """
+    if key is None:
+        return None
+    return IdempotentRequest(asking.name, key, _fingerprint(parts))
+
+
+def mark_replayed(response: Response, *, replayed: bool) -> None:
+    """Say that an answer is that of an earlier request."""
+    if replayed:
+        response.headers["Idempotent-Replayed"] = "true"
+
+
+def _fingerprint(parts: tuple[object, ...]) -> str:
+    plain = [_plain(part) for part in parts]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def _plain(part: object) -> object:
+    if isinstance(part, bytes):
+        return hashlib.sha256(part).hexdigest()
+    if isinstance(part, BaseModel):
+        # a field that a later version adds must not make a request of before another one
+        return part.model_dump(mode="json", exclude_defaults=True)
+    if isinstance(part, list | tuple):
+        return [_plain(one) for one in part]
+    return part

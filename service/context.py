@@ -13,7 +13,7 @@ from fastapi import Depends, Request
 
 from sceneprint.engine import Engine
 from sceneprint.errors import Busy
-from service.feed import Feed
+from service.events import Feed
 from service.limits import Limits
 from service.metrics import Metrics
 
@@ -45,10 +45,7 @@ class Gate:
         Busy : as many are inside as may.
         """
         if self._taken >= self._places:
-            raise Busy(
-                "The service is working on as many uploads and queries as it lets wait. "
-                "Come back in a second."
-            )
+            raise Busy("The queue of uploads and queries is full. Retry in a second.")
         self._taken += 1
         try:
             yield
@@ -73,8 +70,8 @@ class Gate:
                 await self._turns.acquire_on_behalf_of(turn)
         except TimeoutError:
             raise Busy(
-                f"More uploads and queries came than can be done in {self._longest_s:g} s. "
-                "Nothing was begun: come back in a second."
+                f"The service cannot start this request within {self._longest_s:g} s. Nothing "
+                "was stored. Retry in a second."
             ) from None
         try:
             return await to_thread.run_sync(do, limiter=self._threads)

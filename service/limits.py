@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Standing:
+class RateState:
     """How a caller stands after a request, as the RateLimit headers of the IETF draft tell it.
 
     Parameters
@@ -65,7 +65,7 @@ class Limit:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def take(self, caller: str) -> Standing | None:
+    def take(self, caller: str) -> RateState | None:
         """Take a token, if there is one; None where nothing is limited."""
         if self._per_s <= 0:
             return None
@@ -78,7 +78,7 @@ class Limit:
             self._buckets[caller] = (tokens, now)
             if len(self._buckets) > self._most:
                 self._buckets.popitem(last=False)
-        return Standing(
+        return RateState(
             self._name,
             int(self._burst),
             math.ceil(self._burst / self._per_s),

@@ -16,13 +16,21 @@ from sceneprint.errors import Busy, RateLimited, SceneprintError
 from sceneprint.logs import name_request
 from sceneprint.settings import Settings
 from service.audit import note
-from service.cors import Headers, Origins, is_preflight, preflight_headers
-from service.headers import guards
-from service.hosts import forwarded, stranger
-from service.limits import Standing
+from service.guards import (
+    Broken,
+    Headers,
+    Origins,
+    RequestBody,
+    forwarded,
+    guards,
+    is_preflight,
+    preflight_headers,
+    stranger,
+    too_large,
+)
+from service.limits import RateState
 from service.metrics import Metrics
 from service.problems import problem, status_of
-from service.slowness import Broken, Incoming, too_large
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +45,7 @@ _HUNG_UP = 499
 _MOST_AT_ONCE = 900
 
 
-class Around:
+class RequestMiddleware:
     """Gives each request an id, sends strangers away, stops bodies, guards answers, and notes it.
 
     Parameters
@@ -73,7 +81,7 @@ class Around:
         own += self._origins.headers(headers.get(b"origin"))
         state = scope.setdefault("state", {})
         state.update(request_id=request_id, headers=own, forwarded=forwarded(headers))
-        body = Incoming(receive, self._limit(scope), self._body_s)
+        body = RequestBody(receive, self._limit(scope), self._body_s)
         status, start = 0, time.perf_counter()
 
         async def answered(message: Message) -> None:
@@ -82,7 +90,7 @@ class Around:
                 return  # whatever the application makes of the broken body; ours follows
             if message["type"] == "http.response.start":
                 status = message["status"]
-                standing: Standing | None = state.get("standing")
+                standing: RateState | None = state.get("standing")
                 said = [
                     *message["headers"],
                     *own,
@@ -134,13 +142,13 @@ class Around:
             return Response(status_code=204, headers=preflight_headers())
         if self._at_once > _MOST_AT_ONCE:
             return Busy(
-                "The service is answering as many requests as it can hold. Come back in a second."
+                "The service has reached its limit of concurrent requests. Retry in a second."
             )
         key = b"" if self._alone else _key_of(headers)
         if key and self._of_key[key] > self._most_of_key:
             return RateLimited(
-                f"{self._most_of_key} requests with this key are in hand, the most at once. Wait "
-                "for their answers."
+                f"{self._most_of_key} requests with this key are in progress, which is the "
+                "limit. Wait for their answers."
             )
         most = self._limit(scope)
         if length.isdigit() and (len(length) > 18 or int(length) > most):

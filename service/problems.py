@@ -15,8 +15,8 @@ from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 
 from sceneprint import errors
-from sceneprint.schemas import Problem
-from service.headers import guards
+from sceneprint_client.api import Problem
+from service.guards import guards
 
 log = logging.getLogger(__name__)
 
@@ -47,18 +47,18 @@ STATUSES: dict[type[errors.SceneprintError], int] = {
 RETRY_AFTER_S = {429: "1", 503: "1", 507: "30"}
 LATER_S: dict[type[errors.SceneprintError], str] = {errors.ReadOnlyStore: "60"}
 #: What is told of a store that cannot be used: its errors name folders, which are the operator's.
-_LOG = "Its log says more under the request's id."
+_LOG = "See its log under the request's id."
 UNUSABLE: dict[type[errors.SceneprintError], str] = {
-    errors.StoreFull: "The service's disk is full, and nothing was taken; queries of what is "
-    f"stored go on. {_LOG} Free some space there, and send it again.",
-    errors.ReadOnlyStore: "The service's store is read-only, and nothing was taken; queries of "
-    f"what is stored go on. {_LOG} Make the data folder writable there, and start it again.",
-    errors.StoreLocked: "Another process has been writing to the service's store for long, and "
-    f"nothing was taken; queries go on. {_LOG} Come back later.",
-    errors.StoreAway: "The service's database or object store does not answer. What was sent may "
-    f"have been stored just before: send it again, and it is stored once. {_LOG} Come back later.",
-    errors.UnusableStore: "The service cannot use its store at the moment, and nothing was taken. "
-    "Its log says why under the request's id. Come back later.",
+    errors.StoreFull: "The service's disk is full, so nothing was stored. Queries still work. "
+    f"{_LOG} Free some space there, and send the request again.",
+    errors.ReadOnlyStore: "The service's store is read-only, so nothing was stored. Queries "
+    f"still work. {_LOG} Make the data folder writable there, and restart the service.",
+    errors.StoreLocked: "Another process has locked the service's store for too long, so "
+    f"nothing was stored. Queries still work. {_LOG} Retry later.",
+    errors.StoreAway: "The service's database or object store does not answer. The request may "
+    f"or may not have been stored; it is safe to send it again. {_LOG} Retry later.",
+    errors.UnusableStore: "The service cannot use its store at the moment, so nothing was "
+    "stored. See its log under the request's id. Retry later.",
 }
 MEDIA_TYPE = "application/problem+json"
 #: Most fields at fault that a problem lists, and most characters of the place of one.
@@ -148,11 +148,12 @@ def install(app: FastAPI) -> None:
     async def _unexpected(request: Request, error: Exception) -> JSONResponse:
         log.error("request broke down", exc_info=error, extra={"request_id": _id(request)})
         detail = (
-            "The service broke down over this request; nothing was half-written. Its log has the "
-            "traceback under the request's id. Please report it."
+            "The service failed to handle this request; nothing was partially written. Its log "
+            "has the traceback under the request's id. Please report it."
         )
         answer = problem(_id(request), "InternalError", 500, detail)
-        for name, value in getattr(request.state, "headers", ()):  # `Around` does not see this one
+        # `RequestMiddleware` does not see this one
+        for name, value in getattr(request.state, "headers", ()):
             answer.headers[name.decode()] = value.decode()
         for name, value in guards(request.url.path, answer.raw_headers):
             answer.headers[name.decode()] = value.decode()
@@ -173,7 +174,7 @@ def _invalid(found: Sequence[dict[str, Any]], what: str) -> errors.InvalidReques
     if len(found) > MOST_FIELDS:
         more = f" (and {len(found) - 3} more; {MOST_FIELDS} of {len(found)} are listed)"
     return errors.InvalidRequest(
-        f"{what} is not as it should be: {first}{more}. See /docs for its fields.", fields
+        f"{what} is not valid: {first}{more}. See /docs for its fields.", fields
     )
 
 

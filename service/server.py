@@ -2,19 +2,182 @@
 
 from __future__ import annotations
 
+import asyncio
+import fcntl
 import logging
+import resource
 import socket
+import struct
 import sys
+import termios
+import time
+import uuid
 from collections.abc import Callable
 
+import h11
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from sceneprint.descriptors import raise_descriptors
-from sceneprint.engine.opening import open_engine
+from sceneprint.engine.engine import open_engine
 from sceneprint.errors import UnusableStore
+from sceneprint.process_limits import raise_descriptors
 from sceneprint.settings import Settings
 from service.app import create_app
-from service.connections import Connection, make_room
+from service.problems import problem
+
+# Connections: none is kept by who neither speaks nor listens.
+#
+# uvicorn lets the head of a request take any time, waits for ever for an answer to be read, and
+# counts silent connections like busy ones: a few callers could shut all others out.
+
+#: Seconds in which the head of a request must be whole, counted from its first byte, or from when
+#: the connection was made.
+HEAD_S = 10.0
+#: Seconds between two looks at whether an answer is being read, and the fewest bytes between them.
+READING_S, READING_BYTES = 30.0, 30 << 10
+#: Connections of all callers; beyond, the one that has been silent for longest is closed.
+MOST_CONNECTIONS = 1000
+#: Files that are open beside them: the database, uploads, blobs, indexes.
+OTHER_FILES = 256
+
+
+class Connection(H11Protocol):
+    """A connection that is closed where the caller keeps us waiting.
+
+    How long an answer takes to be made is not its concern.
+    """
+
+    _head: asyncio.TimerHandle | None = None
+    _reading: asyncio.TimerHandle | None = None
+    _unread_before = 0
+    silent_since = 0.0
+
+    @property
+    def silent(self) -> bool:
+        """Whether no request is being answered."""
+        return self.cycle is None or self.cycle.response_complete
+
+    @property
+    def idle(self) -> bool:
+        """Whether it is silent, and not being closed already."""
+        return self.silent and not self.transport.is_closing()
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin; where there is no room, the connection that was silent for longest makes some."""
+        super().connection_made(transport)
+        self.silent_since = time.monotonic()
+        if len(self.connections) > room():
+            others = [one for one in self.connections if isinstance(one, Connection)]
+            waiting = [one for one in others if one is not self and one.idle]
+            if waiting:
+                min(waiting, key=lambda one: one.silent_since).transport.abort()
+        self._time_head()
+
+    def data_received(self, data: bytes) -> None:
+        """Read on."""
+        super().data_received(data)
+        self._time_head()
+
+    def on_response_complete(self) -> None:
+        """Wait for the next request."""
+        self.silent_since = time.monotonic()
+        super().on_response_complete()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """End."""
+        for timer in (self._head, self._reading):
+            if timer is not None:
+                timer.cancel()
+        super().connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        """So much of an answer waits to be read that no more is written until some is."""
+        super().pause_writing()
+        self._time_reading()
+
+    def resume_writing(self) -> None:
+        """Enough was read."""
+        if self._reading is not None:
+            self._reading.cancel()
+            self._reading = None
+        super().resume_writing()
+
+    def timeout_keep_alive_handler(self) -> None:
+        """Close what was not used again; an answer that is still being read has its time."""
+        if self.transport.get_write_buffer_size() == 0:
+            self.transport.abort()
+        elif self._reading is None:
+            self._time_reading()
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse what is no HTTP in the form of all refusals."""
+        if self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE):
+            self.transport.abort()  # in the middle of an answer
+            return
+        request_id = uuid.uuid4().hex
+        detail = f"{msg} Its head is not HTTP/1.1, or longer than 16 KiB. Check the sender."
+        told = problem(request_id, "BadRequest", 400, detail)
+        headers = [*told.raw_headers, (b"x-request-id", request_id.encode())]
+        headers += [(b"connection", b"close"), (b"cache-control", b"no-store")]
+        for event in (
+            h11.Response(status_code=400, headers=headers, reason=b"Bad Request"),
+            h11.Data(data=bytes(told.body)),
+            h11.EndOfMessage(),
+        ):
+            self.transport.write(self.conn.send(event) or b"")
+        self.transport.close()
+
+    def _time_head(self) -> None:
+        """Have the next head timed while none is being answered; each byte is not a new start."""
+        if not self.silent:
+            if self._head is not None:
+                self._head.cancel()
+                self._head = None
+        elif self._head is None:
+            self._head = self.loop.call_later(HEAD_S, self.transport.abort)
+
+    def _time_reading(self) -> None:
+        if self._reading is not None:
+            self._reading.cancel()
+        self._unread_before = self._unread()
+        self._reading = self.loop.call_later(READING_S, self._look)
+
+    def _look(self) -> None:
+        """Whether some of the answer was read since the last look."""
+        self._reading = None
+        if not (self.silent or self.flow.write_paused):
+            return  # it was read, and the next request came
+        if self._unread() > self._unread_before - READING_BYTES:
+            self.transport.abort()
+        else:
+            self._time_reading()
+
+    def _unread(self) -> int:
+        """Bytes of answers that the other side has not taken yet: ours, and the kernel's."""
+        known = self.transport.get_extra_info("socket")
+        try:
+            (kernel,) = struct.unpack("i", fcntl.ioctl(known, termios.TIOCOUTQ, bytes(4)))
+        except (OSError, TypeError):  # closed meanwhile
+            kernel = 0
+        return self.transport.get_write_buffer_size() + int(kernel)
+
+
+def room() -> int:
+    """Connections that may be open at once."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY:
+        return MOST_CONNECTIONS
+    return min(MOST_CONNECTIONS, max(soft - OTHER_FILES, 16))
+
+
+def make_room() -> None:
+    """Let this process have as many files open as all connections need, if it may."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MOST_CONNECTIONS + OTHER_FILES
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        most = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, most), hard))
+
 
 log = logging.getLogger(__name__)
 
@@ -41,8 +204,8 @@ def listen(settings: Settings) -> socket.socket:
     except OSError as error:
         listening.close()
         raise UnusableStore(
-            f"{settings.host}:{settings.port} cannot be listened on ({error.strerror}). "
-            "Choose another --port, 0 for a free one, or stop what holds it."
+            f"{settings.host}:{settings.port} is not available ({error.strerror}). Choose "
+            "another --port, 0 for a free one, or stop the process that uses it."
         ) from error
     return listening
 
@@ -64,7 +227,7 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
         read_only = engine.store.database.read_only
     if read_only:
         log.warning(
-            "the store is read-only: queries are answered, and nothing is taken or signed",
+            "the store is read-only: queries work, but nothing is stored or signed",
             extra={"data": str(settings.data_dir)},
         )
     # a thread that computes gives way to the event loop after this long, not after 5 ms
@@ -76,7 +239,7 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     config = uvicorn.Config(
         app,
         log_config=None,  # ours is JSON
-        access_log=False,  # `Around` writes one line a request
+        access_log=False,  # `RequestMiddleware` writes one line a request
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
         timeout_keep_alive=30,

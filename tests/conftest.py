@@ -22,21 +22,20 @@ from sqlalchemy import Connection, NullPool, create_engine
 
 from benchmarks.fleet.postgres import NoServer, Server
 from benchmarks.fleet.s3 import ObjectServer
-from sceneprint.cli.demo_building import write_building
-from sceneprint.geometry.bins import TableLayout
-from sceneprint.geometry.hierarchy import HierarchyParameters
-from sceneprint.geometry.mixture import Mixture
-from sceneprint.geometry.projection import Projection
-from sceneprint.geometry.segmentation import SegmentationParameters
-from sceneprint.geometry.surroundings import Compression, SurroundingsParameters
-from sceneprint.geometry.whitening import Whitening
+from sceneprint.cli.demo import write_building
+from sceneprint.geometry.signature.mixture import Mixture
+from sceneprint.geometry.signature.pair_features import Projection
+from sceneprint.geometry.signature.pair_table import TableLayout
+from sceneprint.geometry.signature.segmentation import HierarchyParameters, SegmentationParameters
+from sceneprint.geometry.signature.whitening import Whitening
+from sceneprint.geometry.validation.patch_descriptors import Compression, PatchDescriptorParameters
+from sceneprint.lab.synth import synthesise_room
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
 from sceneprint.store.tables import metadata
-from sceneprint.synth import synthesise_room
-from sceneprint.types import Frame
+from sceneprint.types import DepthFrame
 
 #: Files that are begun first: no process is left alone with one of them in the end.
 LONG = (
@@ -282,7 +281,7 @@ def with_open3d() -> None:
 def small_model() -> Model:
     """Eight components, two levels: quick to open, and signs like a real one."""
     rng = np.random.default_rng(5)
-    bins = SurroundingsParameters().dimension
+    bins = PatchDescriptorParameters().dimension
     axes = np.linalg.qr(rng.normal(size=(bins, 16)))[0].T.astype(np.float32)
     matrix = np.asfortranarray(rng.normal(size=(12, 13)) / 3)  # as scikit-learn returns them
     return Model(
@@ -316,7 +315,7 @@ def small_signer(small_model: Model) -> Signer:
 
 
 @pytest.fixture(scope="session")
-def room_frames() -> tuple[Frame, ...]:
+def room_frames() -> tuple[DepthFrame, ...]:
     """Three views of each of two synthetic rooms."""
     rooms = [synthesise_room(21, i, 3) for i in range(2)]
     return tuple(
@@ -334,7 +333,7 @@ def bring_to() -> Callable[[str, str], None]:
         from alembic import command
         from sqlalchemy import create_engine
 
-        from sceneprint.store.revisions import migration_config
+        from sceneprint.store.schema import migration_config
 
         config, engine = migration_config(), create_engine(url)
         with engine.begin() as connection:

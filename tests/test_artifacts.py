@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.artifacts import MAGIC, SCHEMA_VERSION, read_geometry, write_geometry
 from sceneprint.errors import SceneprintError, UnreadableGeometry
+from sceneprint.formats.artifact import MAGIC, SCHEMA_VERSION, read_geometry, write_geometry
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
-from sceneprint.types import Frame, Geometry, Intrinsics, Patches, Surface
+from sceneprint.types import DepthFrame, Geometry, Intrinsics, Patches, Surface
 
 #: Bytes of magic, schema and checksum; and of sizes, camera, scale and model id.
 HEAD, BODY = 11, 8 + 5 * 8 + 32
@@ -28,7 +28,7 @@ def paper() -> Model:
 
 
 @pytest.fixture(scope="module")
-def geometries(paper: Model, room_frames: tuple[Frame, ...]) -> list[Geometry]:
+def geometries(paper: Model, room_frames: tuple[DepthFrame, ...]) -> list[Geometry]:
     return [geometry_of(see(frame, paper.parameters), paper) for frame in room_frames]
 
 

@@ -10,9 +10,9 @@ import zlib
 import numpy as np
 import pytest
 
-from sceneprint.artifacts import MAXIMUM_POINTS, read_geometry, write_geometry
 from sceneprint.errors import UnreadableGeometry
-from sceneprint.geometry.framing import directions
+from sceneprint.formats.artifact import MAXIMUM_POINTS, read_geometry, write_geometry
+from sceneprint.geometry.surface.range_image import directions
 from sceneprint.types import (
     Camera,
     Floats,

@@ -21,28 +21,28 @@ from benchmarks.__main__ import BEGIN, END, Rows, page
 from benchmarks.encode import EncodeFigures, points_of
 from benchmarks.machine import Machine
 from benchmarks.pairs import FramePair, pairs_among, real_pairs, synthetic_pairs
-from sceneprint.artifacts import write_geometry
-from sceneprint.datasets import Camera, find_sequences, write_depth_png, write_intrinsics
 from sceneprint.errors import MissingDependency
-from sceneprint.evaluation.registration_baselines import register
-from sceneprint.geometry.diversity import diversify
-from sceneprint.geometry.retrieval import distances, pairwise_distances, rank
+from sceneprint.formats.artifact import write_geometry
+from sceneprint.formats.dataset import Camera, find_sequences, write_depth_png, write_intrinsics
+from sceneprint.geometry.retrieval.distance import distances, pairwise_distances, rank
+from sceneprint.geometry.retrieval.dpp import diversify
+from sceneprint.lab.evaluation.pairs.pair_run import register
 from sceneprint.libraries import open3d
 from sceneprint.models import Model
 from sceneprint.pipeline import open_signer, prepare
-from sceneprint.types import Floats, Frame, Intrinsics
+from sceneprint.types import DepthFrame, Floats, Intrinsics
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
 
 
-def wall(shift: float = 0.0) -> Frame:
+def wall(shift: float = 0.0) -> DepthFrame:
     """A wall 2 m away, seen by a camera `shift` metres to the right, and turned upside down."""
     pose: Floats = np.diag([-1.0, -1.0, 1.0, 1.0])
     pose[0, 3] = shift
-    return Frame(np.full((60, 80), 2.0, np.float32), CAMERA, f"{shift:g} m", pose)
+    return DepthFrame(np.full((60, 80), 2.0, np.float32), CAMERA, f"{shift:g} m", pose)
 
 
-def pair_of(frames: tuple[Frame, ...]) -> FramePair:
+def pair_of(frames: tuple[DepthFrame, ...]) -> FramePair:
     """A frame with itself."""
     return FramePair(frames[0], frames[0], 1.0, np.eye(4))
 
@@ -113,6 +113,7 @@ def test_pairs_of_rooms_and_of_no_recordings(tmp_path: Path) -> None:
     assert pair.overlap >= 0.3
 
 
+@pytest.mark.thorough
 def test_pairs_of_recordings(data_root: Path) -> None:
     pairs = real_pairs(data_root, 4, step=100)
     assert len(pairs) == 4
@@ -136,7 +137,7 @@ def test_right_within_ten_centimetres_and_degrees(
 
 
 def test_without_open3d_the_row_says_so(
-    small_model: Model, room_frames: tuple[Frame, ...], monkeypatch: pytest.MonkeyPatch
+    small_model: Model, room_frames: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
     figures = registration.measure([pair_of(room_frames)], small_model, warm_up=0)
@@ -147,7 +148,8 @@ def test_without_open3d_the_row_says_so(
     assert "Open3D | not measured: FPFH needs Open3D, which cannot be imported" in text
 
 
-def test_open3d_finds_a_frame_in_itself(room_frames: tuple[Frame, ...]) -> None:
+@pytest.mark.thorough
+def test_open3d_finds_a_frame_in_itself(room_frames: tuple[DepthFrame, ...]) -> None:
     try:
         o3d = open3d("FPFH")
     except MissingDependency as error:
@@ -222,6 +224,7 @@ def few_clients(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "CLIENTS", 2)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("few_clients")
 def test_service_and_library_do_the_same_work(building: Path) -> None:
     """`measure` compares every answer with the library's."""
@@ -236,6 +239,7 @@ def test_service_and_library_do_the_same_work(building: Path) -> None:
     assert 0 < found.loaded[0] <= found.loaded[1]
 
 
+@pytest.mark.thorough
 def test_a_building_of_its_own_is_gone_afterwards(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -254,6 +258,7 @@ def test_a_building_of_its_own_is_gone_afterwards(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("few_clients")
 def test_a_load_that_dies_ends_the_measurement() -> None:
     with pytest.raises(RuntimeError, match=r"of 3 processes of the load died: \[1"):
@@ -271,6 +276,7 @@ def test_a_load_that_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> N
     assert (stop.is_set(), stuck.exitcode) == (True, -signal.SIGTERM)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("flat_bytes", [search.FLAT, search.LISTS])
 def test_a_search_is_compared_with_the_scan_of_all(flat_bytes: int) -> None:
     found = search.measure(frames=1000, length=64, flat_bytes=flat_bytes, runs=2)
@@ -291,7 +297,8 @@ def test_signatures_of_a_place_are_near_each_other() -> None:
     assert np.nanmax(among[same]) < np.nanmin(among[~same])
 
 
-def test_disk_of_a_frame(room_frames: tuple[Frame, ...], tmp_path: Path) -> None:
+@pytest.mark.thorough
+def test_disk_of_a_frame(room_frames: tuple[DepthFrame, ...], tmp_path: Path) -> None:
     folder = tmp_path / "frames"
     folder.mkdir()
     write_intrinsics(folder, Camera(room_frames[0].intrinsics, 1000.0, along_ray=False))

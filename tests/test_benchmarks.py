@@ -1,32 +1,22 @@
-"""The measurements themselves: recall by hand, and a missing open3d that stops nothing."""
+"""The measurements themselves: a missing open3d stops nothing, and memory stays bounded."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from benchmarks.__main__ import table
 from benchmarks.encode import measure
 from benchmarks.machine import peak_megabytes_of_signing
-from benchmarks.retrieval import recall_at_10
-from sceneprint.datasets import Camera, write_depth_png, write_intrinsics
+from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics
 from sceneprint.pipeline import Signer
-from sceneprint.types import Frame
-
-
-def test_recall_by_hand() -> None:
-    exact = np.arange(20.0)[None]
-    assert recall_at_10(exact, exact) == 1.0
-    # the nearest four move behind all others: six of the first ten remain
-    moved = np.where(exact < 4, exact + 100, exact)
-    assert recall_at_10(moved, exact) == pytest.approx(0.6)
+from sceneprint.types import DepthFrame
 
 
 def test_without_open3d_the_row_says_so_and_the_rest_runs(
-    small_signer: Signer, room_frames: tuple[Frame, ...], monkeypatch: pytest.MonkeyPatch
+    small_signer: Signer, room_frames: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
     figures = measure(list(room_frames[:3]), small_signer, warm_up=1)
@@ -41,7 +31,7 @@ def test_without_open3d_the_row_says_so_and_the_rest_runs(
 
 @pytest.mark.parametrize("preset", ["paper", "depth"])
 def test_signing_stays_under_its_memory(
-    preset: str, room_frames: tuple[Frame, ...], tmp_path: Path
+    preset: str, room_frames: tuple[DepthFrame, ...], tmp_path: Path
 ) -> None:
     """The budget is 700 MB; a process that has done its imports alone needs over 50."""
     write_intrinsics(tmp_path, Camera(room_frames[0].intrinsics))

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from sceneprint.cli import main
-from sceneprint.datasets import find_sequences
-from sceneprint.synth import synthesise_survey
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.lab.synth import synthesise_survey
 from sceneprint.types import Cloud
 
 

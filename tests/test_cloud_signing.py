@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,14 +11,128 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
+from tqdm import tqdm
 
-from benchmarks.clouds import any_rotation, are_far, cloud_of, own_is_nearest, same_points, turned
-from sceneprint.datasets import find_sequences
 from sceneprint.errors import UselessFrame
-from sceneprint.geometry.clouds import CloudParameters
-from sceneprint.geometry.voxels import Voxels
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.geometry.pose.rigid import rotation_angle
+from sceneprint.geometry.retrieval.distance import Metric, distances
+from sceneprint.geometry.surface.cloud import CloudParameters
+from sceneprint.geometry.surface.depth_image import DepthParameters
+from sceneprint.geometry.surface.voxels import Voxels
 from sceneprint.pipeline import Signer, distance, geometry_of, open_signer, prepare, see, sign
-from sceneprint.types import Cloud, Floats, Frame
+from sceneprint.types import AnyFrame, Bytes, Cloud, DepthFrame, Floats
+
+FAR_M = 0.5
+
+FAR_RAD = np.radians(30.0)
+
+
+def cloud_of(
+    frame: DepthFrame, seed: int, R: Floats | None = None, *, has_viewpoint: bool = True
+) -> Cloud:
+    """All samples of a depth frame that are in range, in no order, turned by R."""
+    k, p = frame.intrinsics, DepthParameters()
+    y, x = np.nonzero((frame.depth >= p.minimum_depth) & (frame.depth <= p.maximum_depth))
+    z = frame.depth[y, x].astype(float)
+    points = np.column_stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z])
+    if R is not None:
+        points = points @ R.T
+    shuffled = points[np.random.default_rng(seed).permutation(len(points))]
+    return Cloud(shuffled.astype(np.float32), has_viewpoint, frame.name, frame.pose)
+
+
+def any_rotation(seed: int) -> Floats:
+    """A rotation drawn uniformly: (3, 3)."""
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    if np.linalg.det(q) < 0:
+        q[:, 0] *= -1
+    return np.asarray(q, float)
+
+
+def are_far(frames: Sequence[DepthFrame]) -> NDArray[np.bool_]:
+    """(N, N), by pose."""
+    poses = np.stack([frame.pose for frame in frames if frame.pose is not None])
+    apart = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2) > FAR_M
+    turned = [[rotation_angle(a[:3, :3].T @ b[:3, :3]) > FAR_RAD for b in poses] for a in poses]
+    result: NDArray[np.bool_] = apart | np.array(turned)
+    return result
+
+
+def own_is_nearest(
+    queries: Bytes, database: Bytes, own: NDArray[np.intp], far: NDArray[np.bool_], metric: Metric
+) -> tuple[float, float]:
+    """Share of queries whose own row of the database is nearer than any far one, and the margin.
+
+    Parameters
+    ----------
+    queries, database : (Q, L), (D, L) signatures
+    own : (Q,) index of each query's own in the database
+    far : (Q, D) who it is to be told from
+    metric : of the signatures
+    """
+    ratios = []
+    for query, mine, others in zip(queries, own, far, strict=True):
+        d = distances(query, database, metric).astype(float)
+        ratios.append(d[mine] / d[others].min())
+    return float(np.mean(np.array(ratios) < 1)), float(np.mean(ratios))
+
+
+def signed(frames: Sequence[AnyFrame], signer: Signer, what: str) -> tuple[Bytes, list[float]]:
+    """Signatures (N, L), and the seconds that each took."""
+    rows, seconds = [], []
+    for frame in tqdm(frames, desc=what, unit="frame", disable=None):
+        begun = time.perf_counter()
+        rows.append(sign(frame, signer).vector)
+        seconds.append(time.perf_counter() - begun)
+    return np.stack(rows), seconds
+
+
+def same_points(
+    frames: Sequence[DepthFrame],
+    chosen: NDArray[np.intp],
+    signer: Signer,
+    *,
+    has_viewpoint: bool = True,
+) -> tuple[float, float, float, float]:
+    """Of the chosen frames as clouds: see own_depth, own_cloud, margin, milliseconds."""
+    far = are_far(frames)
+    depth, _ = signed(frames, signer, "depth")
+    clouds, seconds = signed(
+        [cloud_of(frames[i], int(i), has_viewpoint=has_viewpoint) for i in chosen], signer, "clouds"
+    )
+    there, margin = own_is_nearest(clouds, depth, chosen, far[chosen], signer.model.metric)
+    back, _ = own_is_nearest(
+        depth[chosen],
+        clouds,
+        np.arange(len(chosen)),
+        far[np.ix_(chosen, chosen)],
+        signer.model.metric,
+    )
+    return there, back, margin, float(np.median(seconds) * 1e3)
+
+
+def turned(
+    database: Sequence[DepthFrame], queries: Sequence[DepthFrame], signer: Signer, *,
+    has_viewpoint: bool = True,
+) -> tuple[float, float]:  # fmt: skip
+    """Share of queries with the same first match when turned, and how far turning takes them."""
+    d, _ = signed(
+        [cloud_of(f, i, has_viewpoint=has_viewpoint) for i, f in enumerate(database)],
+        signer,
+        "database",
+    )
+    same, margins, metric = [], [], signer.model.metric
+    for seed, frame in enumerate(tqdm(queries, desc="turned", unit="frame", disable=None)):
+        plain = sign(cloud_of(frame, seed, has_viewpoint=has_viewpoint), signer).vector
+        R = any_rotation(seed)
+        other = sign(cloud_of(frame, seed + 1, R, has_viewpoint=has_viewpoint), signer).vector
+        first, then = distances(plain, d, metric), distances(other, d, metric)
+        same.append(first.argmin() == then.argmin())
+        margins.append(distances(plain, other[None], metric)[0] / first.min())
+    return float(np.mean(same)), float(np.mean(margins))
 
 
 def grid(n: int, low: float, high: float) -> tuple[Floats, Floats]:
@@ -93,7 +208,7 @@ def test_any_points_are_signed_or_refused(
 
 
 def test_points_in_any_order_are_one_cloud(
-    small_signer: Signer, room_frames: tuple[Frame, ...]
+    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
 ) -> None:
     for has_viewpoint in (True, False):
         made = [
@@ -107,7 +222,7 @@ def test_points_in_any_order_are_one_cloud(
 
 
 def test_a_cloud_is_near_its_own_depth_image(
-    small_signer: Signer, room_frames: tuple[Frame, ...]
+    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
 ) -> None:
     depth = [sign(frame, small_signer) for frame in room_frames]
     for i, frame in enumerate(room_frames[:3]):
@@ -119,7 +234,7 @@ def test_a_cloud_is_near_its_own_depth_image(
 
 
 def test_an_artifact_has_the_range_image(
-    small_signer: Signer, room_frames: tuple[Frame, ...]
+    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
 ) -> None:
     p = small_signer.model.parameters
     seen = see(cloud_of(room_frames[0], 0), p)
@@ -141,7 +256,7 @@ def test_nearest_by_hand() -> None:
 
 
 def test_real_clouds_are_near_their_depth_images_and_may_turn(data_root: Path) -> None:
-    """A few frames of what `benchmarks.clouds` measures."""
+    """A few frames of what docs/evaluation.md tells of clouds."""
     references = find_sequences(data_root / "7scenes" / "redkitchen")[0].frames
     signer = open_signer("paper")
     room = [one.read_depth() for one in references[::200]]

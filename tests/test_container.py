@@ -33,7 +33,7 @@ from ruamel.yaml import YAML
 
 from sceneprint.models import PRESETS
 from sceneprint.settings import Settings
-from sceneprint.types import Frame
+from sceneprint.types import DepthFrame
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
@@ -630,11 +630,11 @@ def test_what_is_installed_is_the_lock_and_no_more(image: Image) -> None:
         check=True, cwd=image.root,
     )  # fmt: skip
     there: dict[str, str] = json.loads(told.stdout)
-    assert there.pop("sceneprint") == PROJECT["version"]
+    assert there.pop("sceneprint") == there.pop("sceneprint-client") == PROJECT["version"]
     lock = set(re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / "requirements.txt").read_text(), re.M))
     assert set(there.items()) <= {(name.lower(), version) for name, version in lock}
     wanted = {re.split(r"[<>=;\[ ]", line)[0] for line in PROJECT["dependencies"]}
-    assert wanted - set(there) == {"open3d"}
+    assert wanted - set(there) == {"open3d", "sceneprint-client"}
     assert {"pip", "setuptools", "pytest", "mypy", "ruff", "dash"} & set(there) == set()
 
 
@@ -690,7 +690,8 @@ def start(image: Image, tmp_path: Path) -> Iterator[Callable[[str, dict[str, str
 
 @pytest.mark.thorough
 def test_service_and_worker_run_as_composed(
-    image: Image, start: Callable[[str, dict[str, str]], Running], room_frames: tuple[Frame, ...],
+    image: Image, start: Callable[[str, dict[str, str]], Running], room_frames: tuple[DepthFrame,
+...],
     tmp_path: Path,
 ) -> None:  # fmt: skip
     steps, parts = steps_of(DOCKERFILE), composed()["services"]

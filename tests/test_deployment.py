@@ -13,8 +13,8 @@ import pytest
 
 from benchmarks.fleet.postgres import Server, binaries, of_nobody
 from sceneprint.engine import Engine
-from sceneprint.schemas import NewMap
 from sceneprint.settings import Settings
+from sceneprint_client.api import NewMap
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "deployment.md").read_text()
 #: Folders that commands of the product run from, and that of PostgreSQL's.
@@ -65,6 +65,7 @@ def database(*ports: int) -> str:
     return f"postgresql+psycopg://sceneprint@/sceneprint?{hosts}target_session_attrs=read-write"
 
 
+@pytest.mark.thorough
 def test_commands_in_their_order(primary: Server, run: Run, tmp_path: Path) -> None:
     (made,) = blocks("The database")
     run(made)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import json
 import os
@@ -16,14 +17,19 @@ from pathlib import Path
 
 import pytest
 
+from sceneprint.cli import parser
 from sceneprint.models import PRESETS, read_model
 
 ROOT = Path(__file__).resolve().parent.parent
 PAPER = (ROOT / "docs/paper.md").read_text()
 README = (ROOT / "README.md").read_text()
+ARCHITECTURE = (ROOT / "docs/architecture.md").read_text()
 MODEL = (ROOT / "docs/model.md").read_text()
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
-GEOMETRY = sorted((ROOT / "sceneprint/geometry").glob("*.py"))
+PAGES = [
+    *map(ROOT.joinpath, ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+GEOMETRY = sorted((ROOT / "sceneprint/geometry").rglob("*.py"))
 ROWS = re.findall(r"^\| ((?:Eq\.|Sec\.)[^|]+) \| `([^`:]+):(\w+)`", PAPER, re.MULTILINE)
 
 
@@ -119,7 +125,8 @@ def test_every_dependency_has_a_reason() -> None:
     names = [re.split(r"[<>=;\[ ]", requirement)[0] for requirement in wanted]
     assert [name for name in names if name not in reasons] == []
     locked = (ROOT / "requirements.txt").read_text()
-    assert [name for name in names if f"\n{name}==" not in f"\n{locked}"] == []
+    ours = {"sceneprint-client"}
+    assert {name for name in names if f"\n{name}==" not in f"\n{locked}"} == ours
     assert "://" not in locked
 
 
@@ -151,6 +158,16 @@ def served(line: str, folder: Path, environment: dict[str, str]) -> Iterator[Non
         assert (process.returncode, out) == (0, f"sceneprint: dashboard {url}/dashboard\n")
 
 
+def test_readme_commands_are_known() -> None:
+    lines = [line for block in blocks(README, "sh") for line in block.strip().splitlines()]
+    commands = [line.split()[1:] for line in lines if line.startswith(".venv/bin/sceneprint ")]
+    assert len(commands) == 21
+    known = parser()
+    for command in commands:
+        assert known.parse_args(command).command == command[0]
+
+
+@pytest.mark.thorough
 def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
     """Every command but `make`, which the tests themselves run under, in the README's order."""
     commands = [line for block in blocks(README, "sh") for line in block.strip().splitlines()]
@@ -218,23 +235,60 @@ def run_example(code: str, folder: Path) -> str:
     return done.stdout
 
 
-def test_every_room_of_the_staircase_is_on_its_page() -> None:
-    import tomllib
+PLACES = re.findall(
+    r"`((?:client|sceneprint|service|worker|migrations|tests)/[\w/.]*)(?::([\w.]+))?`", ARCHITECTURE
+)
 
-    page = (ROOT / "docs/architecture.md").read_text()
-    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
-    layers = contracts["contracts"][0]["layers"]
-    rooms = {
-        one.strip().removeprefix("sceneprint.") for layer in layers for one in layer.split("|")
-    }
-    told = {"cli", "service", "worker", "client", "engine", "settings", "pipeline", "matches",
-            "store", "index", "schemas", "geometry", "errors", "maintenance"}  # fmt: skip
-    assert told <= rooms
-    assert all(re.search(rf"\b{name}\b", page) for name in told)
+
+def test_architecture_has_a_line_for_every_folder() -> None:
+    folders = {
+        f"{one.parent.relative_to(ROOT).as_posix()}/"
+        for top in ("client", "sceneprint", "service", "worker", "migrations")
+        for one in (ROOT / top).rglob("__init__.py")
+    } - {"sceneprint/"}  # fmt: skip
+    house = ARCHITECTURE.split("\n## ")[1]
+    lines = set(re.findall(r"^\| `([\w/]+/)` \| \S", house, re.MULTILINE))
+    assert len(folders) > 30
+    assert folders - lines == set()
+    assert lines - folders == set()
+
+
+@pytest.mark.parametrize(("path", "name"), sorted(set(PLACES)))
+def test_architecture_names_what_exists(path: str, name: str) -> None:
+    assert (ROOT / path).exists()
+    if name:
+        assert name in definitions(ROOT / path)
+
+
+def definitions(path: Path) -> set[str]:
+    """Functions and classes of a module, and methods as `Class.method`."""
+    found = set()
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            found.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            inner = [
+                one for one in node.body if isinstance(one, ast.FunctionDef | ast.AsyncFunctionDef)
+            ]
+            found |= {f"{node.name}.{one.name}" for one in inner}
+    return found
+
+
+def test_an_upload_and_a_query_are_walked_through_step_by_step() -> None:
+    upload, query = re.findall(r"^## One \w+\n(.*?)(?=^## )", ARCHITECTURE, re.M | re.S)
+    for part, first, last, steps in (
+        (upload, "service/middleware.py", "sceneprint/store/signatures.py", 17),
+        (query, "service/routes/queries.py", "sceneprint/engine/results/stored_results.py", 11),
+    ):
+        rows = re.findall(r"^\| (\d+) \|.*$", part, re.MULTILINE)
+        assert [int(one) for one in rows] == list(range(1, steps + 1))
+        files = re.findall(r"`((?:sceneprint|service|worker)/[\w/]+\.py):", part)
+        assert first in files
+        assert last in files
 
 
 def test_readme_camera_is_valid_json() -> None:
-    from sceneprint.datasets import Camera
+    from sceneprint.formats.dataset import Camera
     from sceneprint.types import Intrinsics
 
     (example,) = blocks(README, "json")
@@ -244,9 +298,9 @@ def test_readme_camera_is_valid_json() -> None:
 
 
 def test_make_has_the_verbs_the_docs_name() -> None:
-    targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    pages = README + "".join(page.read_text() for page in (ROOT / "docs").glob("*.md"))
-    named = set(re.findall(r"(?:`|\n)make (\w+)", pages))
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    pages = "".join(page.read_text() for page in PAGES)
+    named = set(re.findall(r"(?:`|\n)make ([\w-]+)", pages))
     assert {"demo", "test", "bench", "soak", "siege", "models"} <= named
     assert named <= targets
     assert "make test" in (ROOT / ".ci/run").read_text()

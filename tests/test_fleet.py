@@ -26,15 +26,32 @@ from benchmarks.fleet.robots import Kept, Listener
 from benchmarks.fleet.saboteur import PRIMARY, Kill, Promotion, schedule
 from benchmarks.pages import put_between
 from benchmarks.soak.load import free_port
-from sceneprint.client import Client
 from sceneprint.errors import DatasetError
+from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
+from sceneprint.types import DepthFrame
+from sceneprint_client import Client
 
 #: At reduced size.
 SMALL = Plan(seconds=6, robots=2, rate=2, kills=2, promotions=1, seed=1, workers=1)
 
 
+@pytest.fixture(scope="module")
+def recording(
+    room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """Six frames of two rooms as one sequence, which is enough for walks of many grids."""
+    folder = tmp_path_factory.mktemp("recording") / "seq-01"
+    folder.mkdir()
+    write_intrinsics(folder, Camera(room_frames[0].intrinsics, 1000.0, along_ray=False))
+    for number, frame in enumerate(room_frames):
+        assert frame.pose is not None
+        write_depth_png(folder / f"frame-{number:06d}.depth.png", frame.depth, 1000.0)
+        write_pose(folder / f"frame-{number:06d}.pose.txt", frame.pose)
+    return folder.parent
+
+
 def test_a_fleet_loses_nothing(
-    tmp_path: Path, building: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     try:
         binaries()
@@ -43,7 +60,7 @@ def test_a_fleet_loses_nothing(
     monkeypatch.setattr(saboteur, "AWAY_S", (0.0, 0.0))
     monkeypatch.setattr(saboteur, "UNNOTICED_S", 0.2)
     monkeypatch.setattr(checking, "COMPARED", 4)
-    plan = Plan(**vars(SMALL) | {"data": building})
+    plan = Plan(**vars(SMALL) | {"data": recording})
     found = drive(tmp_path, plan)
     assert (found.kills["service"], found.kills[PRIMARY], found.kills.total()) == (1, 1, 3)
     assert (found.lost, found.window, found.damaged, found.faults) == (0, 0, 0, [])
@@ -69,13 +86,13 @@ def test_the_schedule_is_that_of_its_seed() -> None:
     assert [at < 50 for at in primaries] == [True, False]
 
 
-def test_walks_have_nothing_in_common(building: Path) -> None:
-    found = walks(building, 3, 24)
+def test_walks_have_nothing_in_common(recording: Path) -> None:
+    found = walks(recording, 3, 24)
     assert [len(one) for one in found] == [24, 24, 24]
     assert len({shot.png for walk in found for shot in walk}) == 72
     assert {shot.meta.intrinsics.width for shot in found[0] if shot.meta.intrinsics} == {160}
     with pytest.raises(DatasetError, match=f"fewer than 850 frames in {GRIDS} grids"):
-        walks(building, 1, 850)
+        walks(recording, 1, 850)
 
 
 @pytest.mark.parametrize(
@@ -142,10 +159,10 @@ def test_a_robot_gives_up_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_is_not_there_is_seen(
-    tmp_path: Path, building: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(checking, "EVENTS_S", 0.0)
-    [walk] = walks(building, 1, 5)
+    [walk] = walks(recording, 1, 5)
     with Client.embedded(tmp_path) as client:
         client.create_map("fleet", model="depth")
         added = [client.upload("fleet", one.png, one.meta, wait_s=60) for one in walk[:4]]

@@ -9,17 +9,23 @@ import pytest
 
 from sceneprint.errors import InvalidRequest, UselessFrame
 from sceneprint.fusion import FusionParameters, fuse, within
-from sceneprint.geometry.coverage import Mesh, added_areas, observed_volume, of_views, share_seen
-from sceneprint.geometry.levelling import levelling
+from sceneprint.geometry.pose.average import levelling
+from sceneprint.geometry.surface.coverage import (
+    TriangleMesh,
+    added_areas,
+    observed_volume,
+    of_views,
+    share_seen,
+)
 from sceneprint.rendering import PALETTE, reconstruction_picture, rendered, viewpoint
-from sceneprint.types import Frame, Intrinsics
+from sceneprint.types import DepthFrame, Intrinsics
 
 #: Half the room's width, height and depth, metres: x right, y down, z ahead; its centre at 0.
 ROOM = np.array([2.0, 1.25, 1.5])
 CAMERA = Intrinsics(160, 120, 80.0, 80.0, 79.5, 59.5)  # sees 90 by 74 degrees
 
 
-def view(yaw: float, at: tuple[float, float, float] = (0, 0, 0), pitch: float = 0.0) -> Frame:
+def view(yaw: float, at: tuple[float, float, float] = (0, 0, 0), pitch: float = 0.0) -> DepthFrame:
     """What a camera in the room sees of its walls, floor and ceiling."""
     c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
     e, f = np.cos(np.radians(pitch)), np.sin(np.radians(pitch))
@@ -31,21 +37,21 @@ def view(yaw: float, at: tuple[float, float, float] = (0, 0, 0), pitch: float = 
     rays = np.moveaxis(rays, 0, -1) @ T[:3, :3].T
     with np.errstate(divide="ignore"):
         depth = ((np.where(rays > 0, ROOM, -ROOM) - T[:3, 3]) / rays).min(axis=-1)
-    return Frame(depth.astype(np.float32), CAMERA, f"yaw {yaw:g}", T)
+    return DepthFrame(depth.astype(np.float32), CAMERA, f"yaw {yaw:g}", T)
 
 
 @pytest.fixture(scope="module")
-def around(with_open3d: None) -> list[Frame]:
+def around(with_open3d: None) -> list[DepthFrame]:
     """All walls of the room, the floor and the ceiling, seen from six sides."""
     return [*(view(yaw) for yaw in (0, 90, 180, 270)), view(0, pitch=90), view(0, pitch=-90)]
 
 
 @pytest.fixture(scope="module")
-def room(around: list[Frame]) -> tuple[Mesh, float]:
+def room(around: list[DepthFrame]) -> tuple[TriangleMesh, float]:
     return fuse(around, FusionParameters(voxel_m=0.026))
 
 
-def test_the_surface_lies_on_the_walls_and_has_their_area(around: list[Frame]) -> None:
+def test_the_surface_lies_on_the_walls_and_has_their_area(around: list[DepthFrame]) -> None:
     """From the middle of the room in 26 directions: no part of a wall is unseen."""
     whole = [view(yaw, pitch=pitch) for pitch in (-50, 0, 50) for yaw in range(0, 360, 45)]
     mesh, voxel = fuse([*whole, *around[4:]], FusionParameters(voxel_m=0.026))
@@ -64,7 +70,9 @@ def test_the_surface_lies_on_the_walls_and_has_their_area(around: list[Frame]) -
     assert (turning > -1e-6).mean() > 0.999
 
 
-def test_the_same_views_give_the_same_bytes(around: list[Frame], room: tuple[Mesh, float]) -> None:
+def test_the_same_views_give_the_same_bytes(
+    around: list[DepthFrame], room: tuple[TriangleMesh, float]
+) -> None:
     mesh, _ = fuse(around, FusionParameters(voxel_m=0.026))
     for name in ("points", "normals", "triangles"):
         assert getattr(mesh, name).tobytes() == getattr(room[0], name).tobytes()
@@ -72,7 +80,7 @@ def test_the_same_views_give_the_same_bytes(around: list[Frame], room: tuple[Mes
     assert (mesh.triangles[:, :1] <= mesh.triangles).all()
 
 
-def test_a_finer_voxel_is_taken_as_wanted_until_blocks_run_out(around: list[Frame]) -> None:
+def test_a_finer_voxel_is_taken_as_wanted_until_blocks_run_out(around: list[DepthFrame]) -> None:
     p = FusionParameters(voxel_m=0.05)
     mesh, voxel = fuse(around[:1], p)
     assert voxel == 0.05
@@ -87,7 +95,7 @@ def test_a_finer_voxel_is_taken_as_wanted_until_blocks_run_out(around: list[Fram
     assert fuse(around[:1])[1] == pytest.approx(2 * 1.5 / 80, abs=0.001)
 
 
-def test_out_of_range_is_not_fused(around: list[Frame]) -> None:
+def test_out_of_range_is_not_fused(around: list[DepthFrame]) -> None:
     with pytest.raises(UselessFrame, match=r"between 0\.3 and 1 m"):
         fuse(around[:1], FusionParameters(farthest_m=1.0))
     holes = replace(around[0], depth=np.where(np.eye(120, 160) > 0, np.nan, around[0].depth))
@@ -95,7 +103,7 @@ def test_out_of_range_is_not_fused(around: list[Frame]) -> None:
     assert (kept.depth[np.eye(120, 160) > 0] == 0).all()
 
 
-def test_a_thinned_view_keeps_its_rays(around: list[Frame]) -> None:
+def test_a_thinned_view_keeps_its_rays(around: list[DepthFrame]) -> None:
     thin = within(around[0], FusionParameters(most_samples=5000))
     assert thin.depth.shape == (60, 80)
     for x, y in ((0, 0), (17, 40), (79, 59)):
@@ -105,7 +113,7 @@ def test_a_thinned_view_keeps_its_rays(around: list[Frame]) -> None:
         assert (y - k.cy) / k.fy == pytest.approx((2 * y - whole.cy) / whole.fy, abs=1e-12)
 
 
-def test_what_each_view_adds(around: list[Frame], room: tuple[Mesh, float]) -> None:
+def test_what_each_view_adds(around: list[DepthFrame], room: tuple[TriangleMesh, float]) -> None:
     mesh, voxel = room
     views = [around[0], around[0], around[2], *around[1:2], *around[3:]]
     first = of_views(mesh, views, 2 * voxel)
@@ -122,13 +130,15 @@ def test_what_each_view_adds(around: list[Frame], room: tuple[Mesh, float]) -> N
 def test_first_seen_by_hand() -> None:
     """One square of two triangles, the first seen by the second view alone."""
     points = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1.0]])
-    mesh = Mesh(points, np.tile([0, 0, -1.0], (4, 1)), np.array([[0, 2, 1], [1, 2, 3]], np.int32))
+    mesh = TriangleMesh(
+        points, np.tile([0, 0, -1.0], (4, 1)), np.array([[0, 2, 1], [1, 2, 3]], np.int32)
+    )
     assert mesh.areas().tolist() == [0.5, 0.5]
     k = Intrinsics(3, 3, 1.0, 1.0, 1.0, 1.0)  # one pixel for each metre at a metre
     near, far = np.full((3, 3), 1.0, np.float32), np.full((3, 3), 1.0, np.float32)
     near[1, 1], near[1, 2], near[2, 1] = 0, 2.0, 2.0  # nothing known, and seen through
     far[2, 2] = 0
-    views = [Frame(near, k, "a", np.eye(4)), Frame(far, k, "b", np.eye(4))]
+    views = [DepthFrame(near, k, "a", np.eye(4)), DepthFrame(far, k, "b", np.eye(4))]
     first = of_views(mesh, views, 0.1)
     assert first.tolist() == [1, 1, 1, 0]
     assert added_areas(mesh, first, 2).tolist() == [0.5, 0.5]
@@ -141,7 +151,7 @@ def test_first_seen_by_hand() -> None:
     assert share_seen(points + np.array([0, 0, 0.0830]), views[1:]) == 0.0
 
 
-def test_the_observed_volume_is_that_of_the_view_cone(around: list[Frame]) -> None:
+def test_the_observed_volume_is_that_of_the_view_cone(around: list[DepthFrame]) -> None:
     # a pyramid to a wall 1.5 m ahead, 160/80 * 1.5 wide and 120/80 * 1.5 high
     ahead = replace(around[0], depth=np.full((120, 160), 1.5, np.float32))
     volume, cell = observed_volume([ahead])
@@ -155,7 +165,7 @@ def test_the_observed_volume_is_that_of_the_view_cone(around: list[Frame]) -> No
 
 
 def test_the_picture_shows_the_room_from_above_without_what_faces_away(
-    around: list[Frame], room: tuple[Mesh, float]
+    around: list[DepthFrame], room: tuple[TriangleMesh, float]
 ) -> None:
     mesh, voxel = room
     first = of_views(mesh, around, 2 * voxel)
@@ -189,7 +199,7 @@ def test_the_picture_shows_the_room_from_above_without_what_faces_away(
     assert (drawn[around_camera] != picture[around_camera]).any()
 
 
-def test_the_picture_is_a_png(around: list[Frame], room: tuple[Mesh, float]) -> None:
+def test_the_picture_is_a_png(around: list[DepthFrame], room: tuple[TriangleMesh, float]) -> None:
     mesh, voxel = room
     first = of_views(mesh, around, 2 * voxel)
     added = added_areas(mesh, first, len(around)).tolist()
@@ -207,7 +217,7 @@ class Without:
         if name == "open3d":
             raise ImportError("libX11.so.6: cannot open shared object file")
 sys.meta_path.insert(0, Without())
-import sceneprint.cli, sceneprint.client, sceneprint.fusion, service.app, worker.loop
+import sceneprint.cli, sceneprint_client.client, sceneprint.fusion, service.app, worker.loop
 from sceneprint.libraries import open3d
 from sceneprint.errors import MissingDependency
 try:

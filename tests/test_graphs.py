@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.rigid import inverse
-from sceneprint.graphs import GraphEdge, g2o, information_of
+from sceneprint.formats.pose_graph import PoseEdge, g2o, information_of
+from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.types import Floats
 
 
@@ -26,11 +26,11 @@ def positive(rng: np.random.Generator) -> Floats:
     return A @ A.T + np.eye(6)
 
 
-def a_graph(n: int = 5) -> tuple[list[Floats], list[GraphEdge]]:
+def a_graph(n: int = 5) -> tuple[list[Floats], list[PoseEdge]]:
     rng = np.random.default_rng(3)
     poses = [rigid(rng) for _ in range(n)]
     edges = [
-        GraphEdge(i, j, inverse(poses[i]) @ poses[j] @ rigid(rng, 0.02, 0.02), positive(rng))
+        PoseEdge(i, j, inverse(poses[i]) @ poses[j] @ rigid(rng, 0.02, 0.02), positive(rng))
         for i, j in [(0, 1), (1, 2), (3, 2), (2, 4), (4, 0)]
     ]
     return poses, edges
@@ -85,7 +85,7 @@ def test_its_error_costs_what_the_information_says() -> None:
         error = rng.normal(0, 1e-4, 6)
         small = np.eye(4)
         small[:3, :3], small[:3, 3] = Rotation.from_rotvec(error[3:]).as_matrix(), error[:3]
-        _, read = read_strictly(g2o([np.eye(4), T @ small], [GraphEdge(0, 1, T, information)]))
+        _, read = read_strictly(g2o([np.eye(4), T @ small], [PoseEdge(0, 1, T, information)]))
         delta = inverse(T) @ T @ small
         vector = Rotation.from_matrix(delta[:3, :3]).as_quat()[:3]
         theirs = np.concatenate([delta[:3, 3], vector])
@@ -113,7 +113,7 @@ def test_information_of_a_covariance_in_other_axes() -> None:
 def test_a_standard_reader_takes_it_and_optimises(tmp_path: Path) -> None:
     graphslam = pytest.importorskip("graphslam.graph")
     poses, edges = a_graph()
-    exact = [GraphEdge(e.first, e.second, inverse(poses[e.first]) @ poses[e.second], e.information)
+    exact = [PoseEdge(e.first, e.second, inverse(poses[e.first]) @ poses[e.second], e.information)
              for e in edges]  # fmt: skip
     path = tmp_path / "graph.g2o"
     path.write_text(g2o(poses, exact))

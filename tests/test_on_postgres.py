@@ -14,7 +14,6 @@ TESTS = Path(__file__).resolve().parent
 GROUPS = {
     "engine": (
         "on_postgres/test_switch.py", "engine/test_uploads.py", "engine/test_jobs.py",
-        "engine/test_upkeep.py",
     ),
     "service": (
         "service/test_maps_and_frames.py", "service/test_events.py", "service/test_once.py",
@@ -24,7 +23,7 @@ GROUPS = {
 
 
 @pytest.mark.usefixtures("postgres")  # skips where there is no server
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("group", ["engine", pytest.param("service", marks=pytest.mark.thorough)])
 def test_what_holds_on_sqlite_holds_on_postgresql(group: str, tmp_path: Path) -> None:
     outside = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     done = subprocess.run(

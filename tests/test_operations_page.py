@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any, get_args
 
 from sceneprint.cli import parser
-from sceneprint.schemas import AnswerStatus, FrameState, JobState
-from sceneprint.schemas.events import KINDS, MISSED
-from sceneprint.schemas.operations import ReplicaSeen
 from sceneprint.settings import Settings
+from sceneprint_client.api import AnswerStatus, FrameState, JobState
+from sceneprint_client.api.admin import KINDS, MISSED, ReplicaSeen
 from service.metrics import Metrics
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

@@ -14,7 +14,7 @@ import pytest
 
 import sceneprint
 from sceneprint.errors import ModelMismatch, UselessFrame
-from sceneprint.geometry.encoding import quantise
+from sceneprint.geometry.signature.fisher_vector import quantise
 from sceneprint.models import Model, save_model
 from sceneprint.pipeline import distance, sign
 from sceneprint.signing import (
@@ -26,17 +26,17 @@ from sceneprint.signing import (
     open_signer,
     table_statistics,
 )
-from sceneprint.types import Frame, Intrinsics
+from sceneprint.types import DepthFrame, Intrinsics
 
 CAMERA = Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)
 
 
-def flat(depth: float, camera: Intrinsics = CAMERA) -> Frame:
-    return Frame(np.full((camera.height, camera.width), depth, np.float32), camera, "wall")
+def flat(depth: float, camera: Intrinsics = CAMERA) -> DepthFrame:
+    return DepthFrame(np.full((camera.height, camera.width), depth, np.float32), camera, "wall")
 
 
 def test_a_signature_has_the_size_of_its_model(
-    small_signer: Signer, room_frames: tuple[Frame, ...]
+    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
 ) -> None:
     signature = sign(room_frames[0], small_signer)
     assert signature.vector.dtype == np.uint8
@@ -50,7 +50,7 @@ def test_a_signature_has_the_size_of_its_model(
 
 
 def test_same_bytes_in_any_thread_and_order(
-    small_signer: Signer, room_frames: tuple[Frame, ...]
+    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
 ) -> None:
     alone = [sign(frame, small_signer).vector.tobytes() for frame in room_frames]
     with ThreadPoolExecutor(4) as pool:
@@ -67,7 +67,9 @@ PLAIN_PROCESSOR = {
 }
 
 
-def signed_elsewhere(frame: Frame, model: Model, folder: Path, **environment: str) -> np.ndarray:
+def signed_elsewhere(
+    frame: DepthFrame, model: Model, folder: Path, **environment: str
+) -> np.ndarray:
     """The stored signature of a frame, made by a fresh process."""
     save_model(model, folder / "model")
     np.save(folder / "depth.npy", frame.depth)
@@ -75,7 +77,7 @@ def signed_elsewhere(frame: Frame, model: Model, folder: Path, **environment: st
         "import sys, numpy as np, sceneprint as s\n"
         "k = s.Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)\n"
         f"signer = s.open_signer({str(folder / 'model')!r}, cached=False)\n"
-        f"frame = s.Frame(np.load({str(folder / 'depth.npy')!r}), k)\n"
+        f"frame = s.DepthFrame(np.load({str(folder / 'depth.npy')!r}), k)\n"
         "sys.stdout.buffer.write(s.sign(frame, signer).vector.tobytes())\n"
     )
     environment = {"PATH": "/usr/bin:/bin", "HOME": str(folder), **environment}
@@ -85,7 +87,7 @@ def signed_elsewhere(frame: Frame, model: Model, folder: Path, **environment: st
 
 
 def test_same_bytes_in_another_process(
-    small_signer: Signer, room_frames: tuple[Frame, ...], tmp_path: Path
+    small_signer: Signer, room_frames: tuple[DepthFrame, ...], tmp_path: Path
 ) -> None:
     assert room_frames[0].intrinsics == CAMERA
     elsewhere = signed_elsewhere(room_frames[0], small_signer.model, tmp_path)
@@ -94,7 +96,7 @@ def test_same_bytes_in_another_process(
 
 @pytest.mark.thorough
 def test_nearly_the_same_on_another_processor(
-    small_signer: Signer, room_frames: tuple[Frame, ...], tmp_path: Path
+    small_signer: Signer, room_frames: tuple[DepthFrame, ...], tmp_path: Path
 ) -> None:
     """Our kernels are exact everywhere; numpy's own powers and sines may round otherwise."""
     elsewhere = signed_elsewhere(room_frames[0], small_signer.model, tmp_path, **PLAIN_PROCESSOR)
@@ -104,13 +106,15 @@ def test_nearly_the_same_on_another_processor(
     assert np.abs(here.astype(int) - elsewhere.astype(int)).sum() < 0.001 * d0
 
 
-def test_the_frame_is_left_as_it_was(small_signer: Signer, room_frames: tuple[Frame, ...]) -> None:
+def test_the_frame_is_left_as_it_was(
+    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
+) -> None:
     before = hashlib.sha256(room_frames[1].depth.tobytes()).hexdigest()
     sign(room_frames[1], small_signer)
     assert hashlib.sha256(room_frames[1].depth.tobytes()).hexdigest() == before
 
 
-def test_stages_add_up_to_sign(small_signer: Signer, room_frames: tuple[Frame, ...]) -> None:
+def test_stages_add_up_to_sign(small_signer: Signer, room_frames: tuple[DepthFrame, ...]) -> None:
     model = small_signer.model
     patches = describe(room_frames[2], model.parameters)
     psi = float_signature([table_statistics(x, small_signer) for x in patches.levels], model)
@@ -123,7 +127,7 @@ def test_stages_add_up_to_sign(small_signer: Signer, room_frames: tuple[Frame, .
 
 
 def test_distance_of_two_models_is_an_error_that_names_both(
-    small_model: Model, small_signer: Signer, room_frames: tuple[Frame, ...]
+    small_model: Model, small_signer: Signer, room_frames: tuple[DepthFrame, ...]
 ) -> None:
     a = sign(room_frames[0], small_signer)
     other = open_signer(replace(small_model, quantiser_step=0.004), cached=False)
@@ -158,7 +162,7 @@ def test_a_lone_flat_wall_signs(small_signer: Signer) -> None:
         (flat(1.0, Intrinsics(2, 1, 500.0, 500.0, 0.5, 0.0)), "2 x 1 samples show no surface"),
     ],
 )
-def test_frames_with_nothing_to_sign(small_signer: Signer, frame: Frame, message: str) -> None:
+def test_frames_with_nothing_to_sign(small_signer: Signer, frame: DepthFrame, message: str) -> None:
     with pytest.raises(UselessFrame, match=message):
         sign(frame, small_signer)
 
@@ -166,7 +170,7 @@ def test_frames_with_nothing_to_sign(small_signer: Signer, frame: Frame, message
 def test_noise_is_no_surface(small_signer: Signer) -> None:
     depth = np.random.default_rng(0).uniform(0.5, 8.0, (480, 640)).astype(np.float32)
     with pytest.raises(UselessFrame):
-        sign(Frame(depth, CAMERA, "noise"), small_signer)
+        sign(DepthFrame(depth, CAMERA, "noise"), small_signer)
 
 
 def test_one_patch_has_no_pair(small_model: Model) -> None:
@@ -192,7 +196,7 @@ def test_any_depth_signs_or_says_why(small_signer: Signer) -> None:
         depth = (3 + plane[0] * x + plane[1] * y).astype(np.float32)
         depth[rng.random(depth.shape) < rng.uniform(0, 0.6)] = rng.choice([0, np.nan, np.inf, -1])
         try:
-            signature = sign(Frame(depth, camera), small_signer)
+            signature = sign(DepthFrame(depth, camera), small_signer)
             assert signature.n_pairs[0] > 0
             outcomes["signed"] += 1
         except UselessFrame:

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import ModelMismatch, UselessFrame
-from sceneprint.geometry.association import preferred, voters
-from sceneprint.geometry.averaging import average_poses
-from sceneprint.geometry.diversity import diversify as select
-from sceneprint.geometry.retrieval import Ranking
-from sceneprint.geometry.segmentation import patches_of, segment
-from sceneprint.geometry.surroundings import compress, surroundings
-from sceneprint.geometry.validation import Validation
-from sceneprint.matches import Match, associate, locate
+from sceneprint.geometry.pose.average import average_poses
+from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.retrieval.dpp import diversify as select
+from sceneprint.geometry.signature.segmentation import patches_of, segment
+from sceneprint.geometry.validation.association import preferred, voters
+from sceneprint.geometry.validation.patch_descriptors import compress, patch_descriptors
+from sceneprint.geometry.validation.validation import PairValidation
+from sceneprint.lab.synth import KINECT, take, trajectory
+from sceneprint.lab.synth.dataset import room_and_rng
+from sceneprint.matches import PairMatch, associate, locate
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import (
     Signature,
@@ -28,9 +30,7 @@ from sceneprint.pipeline import (
     validate,
 )
 from sceneprint.signing import see
-from sceneprint.synth import KINECT, take, trajectory
-from sceneprint.synth.synthesis import room_and_rng
-from sceneprint.types import Floats, Frame, Geometry, Intrinsics
+from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics
 
 
 def signature(*values: int, model_id: str = "a" * 64) -> Signature:
@@ -39,9 +39,9 @@ def signature(*values: int, model_id: str = "a" * 64) -> Signature:
 
 def outcome(
     status: str = "accepted", strength: str | None = "strong", T: Floats | None = None
-) -> Validation:
+) -> PairValidation:
     """What `validate` might have said."""
-    return Validation(
+    return PairValidation(
         status,  # type: ignore[arg-type]
         strength if status == "accepted" else None,  # type: ignore[arg-type]
         "as given", np.eye(4) if T is None else T, 0.01, 0.01, 0.5, 0.4, 0.0, 100, 0.0,
@@ -55,8 +55,8 @@ def shifted(x: float) -> Floats:
     return T
 
 
-def match(index: int, validation: Validation) -> Match:
-    return Match(index, 10, 0.5, validation)
+def match(index: int, validation: PairValidation) -> PairMatch:
+    return PairMatch(index, 10, 0.5, validation)
 
 
 def ranked(model: Model, *indices: int) -> Ranking:
@@ -132,7 +132,7 @@ def test_signatures_of_two_models_are_not_compared(model_a: Model) -> None:
 
 
 def test_a_frame_of_the_database_finds_itself(
-    small_signer: Signer, room_frames: tuple[Frame, ...]
+    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
 ) -> None:
     signed = [sign(frame, small_signer) for frame in room_frames]
     for i, one in enumerate(signed):
@@ -164,7 +164,7 @@ def test_diversify_is_the_selection_from_distances_among_the_ranking(model_a: Mo
 
 
 def test_prepare_is_sign_and_geometry_of_one_look(
-    small_signer: Signer, room_frames: tuple[Frame, ...]
+    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
 ) -> None:
     model = small_signer.model
     made, geometry = prepare(room_frames[0], small_signer)
@@ -179,7 +179,7 @@ def test_prepare_is_sign_and_geometry_of_one_look(
     p = model.parameters
     patches = patches_of(seen, segment(seen, p.validation_segmentation))
     np.testing.assert_array_equal(geometry.patches.means, patches.means)
-    expected = compress(surroundings(patches, p.surroundings), model.compression)
+    expected = compress(patch_descriptors(patches, p.surroundings), model.compression)
     np.testing.assert_array_equal(geometry.descriptors, expected)
     assert (geometry.descriptors.shape, geometry.descriptors.dtype) == (
         (len(patches), 16),
@@ -191,7 +191,7 @@ def test_prepare_is_sign_and_geometry_of_one_look(
 def test_prepare_of_nothing(small_signer: Signer) -> None:
     k = Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)
     with pytest.raises(UselessFrame, match="every depth sample is missing"):
-        prepare(Frame(np.zeros((48, 64), np.float32), k), small_signer)
+        prepare(DepthFrame(np.zeros((48, 64), np.float32), k), small_signer)
 
 
 # validate, associate
@@ -222,7 +222,7 @@ def walk() -> list[Geometry]:
     for number, views in ((3, (24, 36, 48)), (1, (0,))):
         room, rng = room_and_rng(11, number)
         poses = trajectory(room, 61, rng)
-        frames += [Frame(take(room, poses[i], KINECT, rng), KINECT) for i in views]
+        frames += [DepthFrame(take(room, poses[i], KINECT, rng), KINECT) for i in views]
     return [geometry_of(see(frame, model.parameters), model) for frame in frames]
 
 
@@ -240,16 +240,16 @@ def test_candidates_are_tried_in_order_until_enough(
 
     found = associate(query, ranking, [0, 1, 2, 3], row, 2, 7)
     assert opened == [40, 10, 30]  # enough: the last is not looked at
-    # those accepted in the order of the ranking, then what was not
-    assert [m.index for m in found] == [10, 30, 40]
+    # those accepted, what shares most first, then what was not
+    assert [m.index for m in found] == [30, 10, 40]
     assert [m.validation.status for m in found] == ["accepted", "accepted", "rejected"]
-    assert [m.distance for m in found] == [20, 30, 10]
-    assert [m.similarity for m in found] == pytest.approx([0.98, 0.97, 0.99])
+    assert [m.distance for m in found] == [30, 20, 10]
+    assert [m.similarity for m in found] == pytest.approx([0.97, 0.98, 0.99])
     assert [m.validation.seed for m in found] == [7, 7, 7]
     alone = validate(query, far, 7)
     assert alone.T_match_query is not None
-    assert found[0].validation.T_match_query is not None
-    np.testing.assert_array_equal(found[0].validation.T_match_query, alone.T_match_query)
+    assert found[1].validation.T_match_query is not None
+    np.testing.assert_array_equal(found[1].validation.T_match_query, alone.T_match_query)
     opened.clear()
     found = associate(query, ranking, np.array([0, 2]), row, 5, 7)
     assert (opened, [m.index for m in found]) == ([40, 30], [30, 40])
@@ -264,14 +264,20 @@ def test_preferred() -> None:
     assert preferred([]) == []
     assert preferred([no, unsure]) == []
     assert preferred([weak, no, strong, weak, unsure, strong]) == [2, 5, 0, 3]
-    assert preferred([strong, strong]) == [0, 1]
+    assert preferred([strong, strong]) == [0, 1]  # equals: the order of R
+
+
+def test_of_cameras_what_shares_most_goes_first() -> None:
+    little, much = (replace(outcome(), overlap=share) for share in (0.4, 0.8))
+    weak = replace(outcome(strength="weak"), overlap=0.9)
+    assert preferred([little, weak, much, outcome("rejected")]) == [2, 0, 1]
 
 
 def test_of_scans_all_around_the_nearest_goes_first() -> None:
     far, near, nearest = (outcome(T=shifted(x)) for x in (3.0, -2.0, 1.0))
     weak = outcome(strength="weak", T=shifted(0.5))
     said = [far, weak, near, nearest]
-    assert preferred(said) == [0, 2, 3, 1]  # cameras: the order of R
+    assert preferred(said) == [0, 2, 3, 1]  # cameras: they share the same, so the order of R
     around = [replace(one, around=True) for one in said]
     assert preferred(around) == [3, 2, 0, 1]
     assert preferred([*around[:3], nearest]) == [0, 2, 3, 1]  # one of a camera: not comparable
@@ -360,7 +366,7 @@ def test_locate_takes_the_first_few() -> None:
 
 
 def test_frames_are_judged_by_the_numbers_of_their_model(
-    room_frames: tuple[Frame, ...], small_model: Model, small_signer: Signer
+    room_frames: tuple[DepthFrame, ...], small_model: Model, small_signer: Signer
 ) -> None:
     """Of a preset, whoever made the artifacts; of a model of one's own, once it was used."""
     query, match = (prepare(frame, small_signer)[1] for frame in room_frames[:2])

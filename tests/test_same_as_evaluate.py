@@ -11,14 +11,11 @@ from typing import Any
 
 import pytest
 
-from sceneprint.cli.choosing import choose_frames
-from sceneprint.cli.demo_map import Asked, ask, fill
-from sceneprint.cli.demo_report import place_of
-from sceneprint.cli.served import serving
-from sceneprint.client import Client, meta_of
-from sceneprint.datasets import FrameReference, find_sequences
-from sceneprint.evaluation.answers import answer_rows, judge_answers
-from sceneprint.schemas import Answer
+from sceneprint.cli.demo import DemoQuery, choose_frames, fill, place_of, run_queries, serving
+from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint.lab.evaluation.report import answer_rows, judge_answers
+from sceneprint_client import Client, meta_of
+from sceneprint_client.api import Answer
 
 
 def evaluate(folder: Path, *arguments: str) -> dict[str, Any]:
@@ -71,6 +68,7 @@ def check(
             assert [names[match.frame_id] for match in ranked.matches] == one["ranking"]
 
 
+@pytest.mark.thorough
 def test_redkitchen_over_http_is_redkitchen_evaluated(data_root: Path, tmp_path: Path) -> None:
     recording = data_root / "7scenes" / "redkitchen"
     figures = evaluate(
@@ -97,7 +95,7 @@ def test_the_demo_prints_the_figures_of_evaluate(building: Path, tmp_path: Path)
     data.mkdir()
     with serving(data, workers=1) as url, Client(url) as client:
         known = fill(client, "depth", choice)
-        asked: list[Asked] = ask(client, choice)
+        asked: list[DemoQuery] = run_queries(client, choice)
     places = {key: place for key, one in known.items() if (place := place_of(one)) is not None}
     rows = answer_rows(
         [

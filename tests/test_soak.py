@@ -20,16 +20,23 @@ from benchmarks.soak.load import shots
 from benchmarks.soak.writers import Plan
 
 
-def test_kills_lose_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("frames", "n_kills", "queries"),  # of each frame that stays its ranking, of some validated
+    [(10, 3, 9 + 9), pytest.param(60, 14, 54 + 9, marks=pytest.mark.thorough)],
+)
+def test_kills_lose_nothing(
+    frames: int, n_kills: int, queries: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(kills, "PAUSE_S", (0.2, 1.2))
-    found = kill(tmp_path, shots(60), n_kills=14, seed=2)
-    assert sum(found.kills.values()) == 14
-    assert (found.acknowledged, found.deleted) == (60, 6)
+    found = kill(tmp_path, shots(frames), n_kills=n_kills, seed=2)
+    assert sum(found.kills.values()) == n_kills
+    assert (found.acknowledged, found.deleted) == (frames, frames // 10)
     assert (found.lost, found.doubled, found.half_written) == (0, 0, 0)
-    assert found.queries == 54 + 9  # one in one for its ranking, one in six validated
+    assert found.queries == queries
     assert (found.differing, found.wrong) == (0, 0)
 
 
+@pytest.mark.thorough
 def test_a_crowd_sees_nothing_wrong(tmp_path: Path) -> None:
     found = crowd(tmp_path, shots(STABLE + 40), 3, 3, seconds=6, seed=1)
     assert (found.errors, found.locked, found.wrong) == ([], 0, [])

@@ -84,6 +84,7 @@ def one(outputs: dict[str, list[str]], heading: str, place: int = 0) -> list[dic
     return documents(outputs[heading][place].partition("# HELP")[0])
 
 
+@pytest.mark.thorough
 def test_frames_go_into_a_map(outputs: dict[str, list[str]]) -> None:
     assert one(outputs, "Start", 1)[0]["status"] == "ok"
     assert [m["title"] for m in one(outputs, "A map")] == ["Two rooms"] * 2
@@ -95,6 +96,7 @@ def test_frames_go_into_a_map(outputs: dict[str, list[str]]) -> None:
     assert recording.startswith("8 frames: 8 received, 0 already there; 8 indexed, 0 rejected")
 
 
+@pytest.mark.thorough
 def test_there_are_other_ways_in(outputs: dict[str, list[str]]) -> None:
     raw, put, cloud, once, batch, archive = outputs["More ways in"]
     assert documents(raw)[1]["state"] == "received"
@@ -113,6 +115,7 @@ def test_there_are_other_ways_in(outputs: dict[str, list[str]]) -> None:
     assert "8 frames: 0 received, 8 already there" in archive
 
 
+@pytest.mark.thorough
 def test_frames_can_be_looked_at_and_edited(outputs: dict[str, list[str]]) -> None:
     page, monday, posed = one(outputs, "Look around")
     assert len(page["items"]) == 2
@@ -126,6 +129,7 @@ def test_frames_can_be_looked_at_and_edited(outputs: dict[str, list[str]]) -> No
     assert titled["title"] == "Two rooms, and a door"
 
 
+@pytest.mark.thorough
 def test_queries_answer_as_the_page_says(outputs: dict[str, list[str]]) -> None:
     asked, of_map, listed = outputs["Where was this taken?"]
     answer = documents(asked)[0]
@@ -155,12 +159,14 @@ def test_queries_answer_as_the_page_says(outputs: dict[str, list[str]]) -> None:
     assert [each["validation"]["status"] for each in (stored, sent)] == ["accepted"] * 2
 
 
+@pytest.mark.thorough
 def test_places_are_rebuilt(outputs: dict[str, list[str]], with_open3d: None) -> None:
     rebuilt = one(outputs, "What does the place look like?")[-1]
     assert rebuilt["state"] == "succeeded"
     assert {f["name"] for f in rebuilt["files"]} == {"mesh.ply", "picture.png"}
 
 
+@pytest.mark.thorough
 def test_robots_maps_are_joined(outputs: dict[str, list[str]]) -> None:
     joined = one(outputs, "Join two robots' maps")
     (join,) = joined[-2]["result"]["joins"]
@@ -169,6 +175,7 @@ def test_robots_maps_are_joined(outputs: dict[str, list[str]]) -> None:
     assert all(edge["consistent"] for edge in joined[-1]["items"])
 
 
+@pytest.mark.thorough
 def test_operators_see_what_goes_on(outputs: dict[str, list[str]]) -> None:
     jobs = one(outputs, "Jobs")[0]
     assert [job["state"] for job in jobs["items"]] == ["succeeded"] * 3
@@ -194,9 +201,10 @@ def test_operators_see_what_goes_on(outputs: dict[str, list[str]]) -> None:
     assert one(outputs, "When something is wrong")[0]["type"] == "/problems/unknown-map"
 
 
+@pytest.mark.thorough
 def test_the_page_shows_the_fields_that_there_are(outputs: dict[str, list[str]]) -> None:
     """The examples are JSON, and have the keys of the records they stand for."""
-    from sceneprint.schemas import Answer, Match, Validation
+    from sceneprint_client.api import Answer, Match, Validation
 
     (example,) = [block for block in blocks("json") if '"milliseconds"' in block]
     shown = json.loads(example)

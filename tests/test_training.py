@@ -9,18 +9,21 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import TrainingError
-from sceneprint.geometry.bins import TableLayout
-from sceneprint.geometry.hierarchy import HierarchyParameters
-from sceneprint.geometry.mixture import MixtureParameters
-from sceneprint.geometry.segmentation import SegmentationParameters, patches_of, segment
-from sceneprint.geometry.surroundings import surroundings
-from sceneprint.geometry.whitening import WhiteningParameters
+from sceneprint.geometry.signature.mixture import MixtureParameters
+from sceneprint.geometry.signature.pair_table import TableLayout
+from sceneprint.geometry.signature.segmentation import (
+    HierarchyParameters,
+    SegmentationParameters,
+    patches_of,
+    segment,
+)
+from sceneprint.geometry.signature.whitening import WhiteningParameters
+from sceneprint.geometry.validation.patch_descriptors import patch_descriptors
+from sceneprint.lab.synth import synthesise_room
+from sceneprint.lab.training import TrainingParameters, preset_parameters, preset_whitening, train
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import distance, open_signer, sign
-from sceneprint.recipes import preset_parameters, preset_whitening
 from sceneprint.signing import see
-from sceneprint.synth import synthesise_room
-from sceneprint.training import TrainingParameters, train
 
 MODEL = ModelParameters(
     segmentation=SegmentationParameters(n_patches=200),
@@ -72,7 +75,7 @@ def test_descriptors_are_learnt_from_the_rooms(trained: tuple[Model, object]) ->
     seen = [see(synthesise_room(99, i, 1).frames[0], model.parameters) for i in range(4)]
     p = model.parameters
     patches = [patches_of(one, segment(one, p.validation_segmentation)) for one in seen]
-    rows = np.concatenate([surroundings(one, p.surroundings) for one in patches])
+    rows = np.concatenate([patch_descriptors(one, p.surroundings) for one in patches])
     left = rows - rows.mean(axis=0)
     assert ((left @ axes.T) ** 2).sum() / (left**2).sum() > 0.5  # measured: 0.62
     random = np.linalg.qr(np.random.default_rng(0).normal(size=axes.T.shape))[0].T

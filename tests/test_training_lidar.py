@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.geometry.bins import TableLayout
-from sceneprint.geometry.mixture import MixtureParameters
+from sceneprint.geometry.signature.mixture import MixtureParameters
+from sceneprint.geometry.signature.pair_table import TableLayout
+from sceneprint.lab.synth import Spinning, synthesise_survey
+from sceneprint.lab.training import TrainingParameters, preset_parameters, preset_scenes, train
 from sceneprint.models import Model, ModelParameters, read_model
 from sceneprint.pipeline import distance, open_signer, sign
-from sceneprint.recipes import preset_parameters, preset_scenes
-from sceneprint.synth import Spinning, synthesise_survey
-from sceneprint.training import TrainingParameters, train
 
 TRAINING = TrainingParameters(
     rooms=2, views=2, seed=3, pairs=3000, histograms=1500, descriptors=32, scenes="sites"

@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from sceneprint.previews import depth_view, normals_view
+from sceneprint.previews import depth_view, normals_view, onto, vista_of
 from sceneprint.types import Floats, Intrinsics, Sphere, Surface
-from sceneprint.vistas import onto, vista_of
 
 
 def surface(points: Floats, camera: Intrinsics | Sphere | None) -> Surface:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from sceneprint.writing import sync_folder, write_durable, write_whole
+from sceneprint.atomic_files import sync_folder, write_durable, write_whole
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import sys
 
 from pydantic import ValidationError
 
-from sceneprint.engine.opening import open_engine
+from sceneprint.engine.engine import open_engine
 from sceneprint.errors import SceneprintError
 from sceneprint.logs import log_as_json
 from sceneprint.settings import Settings

@@ -9,16 +9,15 @@ import os
 import random
 import time
 
-from sceneprint.descriptors import raise_descriptors
 from sceneprint.engine import Engine
-from sceneprint.engine.opening import open_engine
+from sceneprint.engine.engine import open_engine
 from sceneprint.errors import SceneprintError, StoreAway
 from sceneprint.logs import log_as_json, of_request
-from sceneprint.maintenance.shelf import LONGEST_S as SNAPSHOT_S
-from sceneprint.maintenance.shelf import SNAPSHOT, snapshot_handler
+from sceneprint.maintenance.snapshot.catalog import LONGEST_S as SNAPSHOT_S
+from sceneprint.maintenance.snapshot.catalog import SNAPSHOT, snapshot_handler
+from sceneprint.process_limits import StopSignal, limit_memory, raise_descriptors
 from sceneprint.settings import Settings
-from sceneprint.store.bell import Listening, process_name
-from worker.limits import Stop, limit_memory
+from sceneprint.store.wakeup import Listening, process_name
 from worker.traces import Trace
 
 log = logging.getLogger(__name__)
@@ -50,7 +49,7 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
     os.nice(NICENESS)
     raise_descriptors()
     trace.watch()
-    stop = Stop()
+    stop = StopSignal()
 
     def may_go_on(seconds: float) -> bool:
         stop.wait(seconds)
@@ -84,7 +83,7 @@ class Worker:
     listener : of the engine's bell
     """
 
-    def __init__(self, engine: Engine, listener: Listening, trace: Trace, stop: Stop) -> None:
+    def __init__(self, engine: Engine, listener: Listening, trace: Trace, stop: StopSignal) -> None:
         self._engine, self._listener, self._trace, self._stop = engine, listener, trace, stop
         self.name = process_name()
         self.unsound = False  # an error came that nobody raised on purpose
@@ -102,7 +101,7 @@ class Worker:
             if not found:
                 self._listener.wait(self._pause(), *self._wakers)
         except SceneprintError as error:
-            log.error("the store does not answer", extra={"error": str(error)})
+            log.error("store unreachable", extra={"error": str(error)})
             self._stop.wait(TROUBLE_S)
 
     def _work(self) -> bool:
@@ -129,7 +128,7 @@ class Worker:
         try:
             self._engine.publish_due()
         except MemoryError:  # the next process would have no more
-            log.error("no memory to publish an index; set SCENEPRINT_WORKER_BYTES higher")
+            log.error("not enough memory to publish an index; raise SCENEPRINT_WORKER_BYTES")
             self._upkeep_at = time.monotonic() + POOR_S
 
     def _pause(self) -> float:

@@ -119,7 +119,7 @@ class Supervisor:
             log.error("worker died", extra=about)
             if left.job_id is None:
                 if left.text:
-                    log.error("where it died", extra={"pid": pid, "traceback": left.text})
+                    log.error("worker traceback", extra={"pid": pid, "traceback": left.text})
                 post.free_at += RESTART_S
                 return
         self._fill(post)
@@ -136,14 +136,14 @@ class Supervisor:
             with Engine(self._settings) as engine:
                 engine.worker_died(left.job_id, left.token, error, text, counts=counts)
         except SceneprintError as trouble:  # its lease will end it
-            log.error("the store does not answer", extra={"error": str(trouble)})
+            log.error("store unreachable", extra={"error": str(trouble)})
 
 
 def _cause(code: int, left: Left, job_s: float) -> str:
     if left.too_long:
-        return f"its worker ran longer than {job_s:g} s, and was ended"
+        return f"its worker ran longer than {job_s:g} s and was stopped"
     if code == -signal.SIGKILL:
-        return "its worker was killed by signal 9 (perhaps for want of memory)"
+        return "its worker was killed by signal 9 (possibly out of memory)"
     if code < 0:
         return f"its worker was killed by signal {-code} ({signal.strsignal(-code)})"
     return f"its worker ended with exit code {code}"

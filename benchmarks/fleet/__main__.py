@@ -15,7 +15,7 @@ from pathlib import Path
 from benchmarks.fleet.driving import FleetFigures, Plan, drive
 from benchmarks.machine import describe_machine
 from benchmarks.pages import put_between
-from sceneprint.cli.signals import ended_by_signals
+from sceneprint.cli.options import ended_by_signals
 
 #: Marks in the page, by whether the standby is asynchronous.
 MARKS = {

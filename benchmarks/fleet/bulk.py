@@ -14,12 +14,12 @@ import numpy as np
 from sqlalchemy import insert, select, update
 
 from sceneprint.models import Model, write_model
-from sceneprint.schemas import FrameState
 from sceneprint.store import Database
-from sceneprint.store.events import tell
+from sceneprint.store.events import record_event
 from sceneprint.store.maps import keep_model
 from sceneprint.store.tables import frames, maps, signatures
 from sceneprint.types import Bytes
+from sceneprint_client.api import FrameState
 
 #: Frames of one commit.
 BLOCK = 500
@@ -77,7 +77,7 @@ def _block(
             keep_model(connection, model.id, model.name, write_model(model))
             values = {"name": name, "model_id": model.id, "revision": 0, "created_at": now}
             connection.execute(insert(maps).values(values))
-            tell(connection, "map.created", name)
+            record_event(connection, "map.created", name)
             number = connection.execute(select(maps.c.number).where(maps.c.name == name)).scalar()
         asked = update(maps).where(maps.c.number == number)
         last = connection.execute(

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 
 from benchmarks.fleet.recordings import Shot
 from benchmarks.fleet.robots import Kept, Listener
-from sceneprint.client import Client
-from sceneprint.schemas import Frame, FrameState
+from sceneprint_client import Client
+from sceneprint_client.api import Frame, FrameState
 
 #: Seconds for the workers to come to the end of the queue, and for events to come.
 PATIENCE_S, EVENTS_S = 600.0, 20.0

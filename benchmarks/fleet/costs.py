@@ -24,14 +24,14 @@ from benchmarks.fleet.paper import Costs, paper
 from benchmarks.fleet.recordings import ROOM_FRAMES, recordings
 from benchmarks.machine import describe_machine
 from benchmarks.pages import put_between
-from sceneprint.datasets import FrameReference, find_sequences
-from sceneprint.datasets.metas import meta_of
 from sceneprint.engine import Engine
+from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.models import read_model
-from sceneprint.schemas import NewMap, Query
 from sceneprint.settings import Settings
-from sceneprint.store import vectors
 from sceneprint.store.database import Database
+from sceneprint.store.postgres import vectors
+from sceneprint_client.api import NewMap, Query
+from sceneprint_client.frame_files import meta_of
 
 BEGIN, END = "<!-- fleet-costs:begin -->", "<!-- fleet-costs:end -->"
 MAP = "costs"

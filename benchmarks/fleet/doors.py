@@ -14,7 +14,7 @@ from typing import Any
 
 import httpx
 
-from sceneprint.client.retrying import retry_after_s
+from sceneprint_client.http import retry_after_s
 
 #: Seconds before the addresses are asked again, once each has refused.
 PAUSE_S = 0.25

@@ -23,7 +23,7 @@ from benchmarks.fleet.fleet import Fleet, await_service
 from benchmarks.fleet.recordings import Shot, recordings, walks
 from benchmarks.fleet.robots import Ledger, Listener, Robot, asked
 from benchmarks.fleet.saboteur import Kill, Promotion, Saboteur, schedule
-from sceneprint.client import Client
+from sceneprint_client import Client
 
 #: The map that most robots share; every so many robots have one of their own.
 MAP, MODEL, OWN = "fleet", "depth", 4

@@ -16,7 +16,7 @@ from benchmarks.fleet.pair import Pair
 from benchmarks.fleet.s3 import ObjectServer
 from benchmarks.soak.load import Part, free_port
 from sceneprint.engine import Engine
-from sceneprint.maintenance.fsck import fsck
+from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
 
 #: Seconds for all service processes to begin, on a machine that is busy with much else.

@@ -22,9 +22,9 @@ from benchmarks.fleet.bulk import fill, walk
 from benchmarks.fleet.postgres import Server
 from sceneprint.engine import Engine
 from sceneprint.models import Model, read_model
-from sceneprint.schemas import Answer, NamedFrame, Query
-from sceneprint.schemas.options import Stage
 from sceneprint.settings import Settings
+from sceneprint_client.api import Answer, NamedFrame, Query
+from sceneprint_client.api.options import Stage
 
 #: Frames that are compared of each ranking, to see what a shortlist missed.
 NEAR = 10

@@ -18,10 +18,10 @@ from sqlalchemy import Connection
 
 from benchmarks.fleet.pair import Pair
 from benchmarks.machine import own_bytes
-from sceneprint.cli.served import serving
-from sceneprint.client import Client
-from sceneprint.datasets import FrameReference
+from sceneprint.cli.demo import serving
+from sceneprint.formats.dataset import FrameReference
 from sceneprint.store.database import Database
+from sceneprint_client import Client
 
 #: Ticks of a process's clock in a second.
 _TICKS = os.sysconf("SC_CLK_TCK")

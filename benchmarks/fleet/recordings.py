@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprint.cli.demo_building import write_building
-from sceneprint.datasets import FrameReference, find_sequences, write_depth_png
-from sceneprint.datasets.metas import meta_of
+from sceneprint.cli.demo import write_building
 from sceneprint.errors import DatasetError
-from sceneprint.schemas import CameraIntrinsics, FrameMeta
-from sceneprint.types import Frame
+from sceneprint.formats.dataset import FrameReference, find_sequences, write_depth_png
+from sceneprint.types import DepthFrame
+from sceneprint_client.api import CameraIntrinsics, FrameMeta
+from sceneprint_client.frame_files import meta_of
 
 #: Every so many samples of a frame, so that signing costs little; there are as many walks in a
 #: recording as such grids, and no two of their frames have the same content.
@@ -106,5 +106,5 @@ def thinned(frame: FrameReference, grid: int) -> Shot:
 
 
 @lru_cache(maxsize=128)  # robots of one recording take the same frames, one after the other
-def _read(frame: FrameReference) -> Frame:
+def _read(frame: FrameReference) -> DepthFrame:
     return frame.read_depth()

@@ -17,9 +17,9 @@ import httpx
 
 from benchmarks.fleet.doors import PAUSE_S, Diary, Doors, Shut
 from benchmarks.fleet.recordings import Shot
-from sceneprint.client.messages import form
-from sceneprint.client.streams import Place, messages
-from sceneprint.schemas import Added, Answer
+from sceneprint_client.api import Added, Answer
+from sceneprint_client.http import StreamPosition, read_events
+from sceneprint_client.requests import frame_form
 
 #: Of so many uploads one is followed by a query.
 ASK_EVERY = 5
@@ -102,7 +102,7 @@ class Robot(threading.Thread):
         meta = shot.meta.model_copy(update={"robot": self.name, "session": self.name})
         response = self._doors.ask(
             "upload", "POST", f"/v1/maps/{self._map}/frames",
-            headers={"Idempotency-Key": f"{self.name}-{number}"}, **form(shot.png, meta),
+            headers={"Idempotency-Key": f"{self.name}-{number}"}, **frame_form(shot.png, meta),
         )  # fmt: skip
         if not response.is_success:
             self._diary.fault(f"upload: {response.status_code} {response.text:.300}")
@@ -125,7 +125,7 @@ class Robot(threading.Thread):
 
 def asked(shot: Shot, **options: str) -> dict[str, Any]:
     """Arguments of a request that asks where a frame was taken."""
-    sent = form(shot.png, shot.meta.model_copy(update={"pose": None}))
+    sent = frame_form(shot.png, shot.meta.model_copy(update={"pose": None}))
     sent["data"].update(options)
     return sent
 
@@ -153,7 +153,7 @@ class Listener(threading.Thread):
 
     def run(self) -> None:
         """Listen until told to stop."""
-        place = Place("0")  # all that is kept
+        place = StreamPosition("0")  # all that is kept
         with self._doors:
             for client in cycle(self._doors.clients):
                 with suppress(httpx.TransportError):  # it was killed, or is not there yet
@@ -161,7 +161,7 @@ class Listener(threading.Thread):
                 if self._ending.wait(PAUSE_S):
                     return
 
-    def _listen(self, client: httpx.Client, place: Place) -> None:
+    def _listen(self, client: httpx.Client, place: StreamPosition) -> None:
         request = client.build_request(
             "GET", "/v1/events", params={"map": self.map_name}, timeout=SILENCE_S,
             headers={"Accept": "text/event-stream", "Last-Event-ID": place.last or "0"},
@@ -169,7 +169,7 @@ class Listener(threading.Thread):
         with closing(client.send(request, stream=True)) as response:
             if not response.is_success:
                 return
-            for event in messages(response.iter_lines(), place):
+            for event in read_events(response.iter_lines(), place):
                 self.heard[event.kind, event.frame_id] += 1
                 if self._ending.is_set():
                     return

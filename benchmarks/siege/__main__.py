@@ -21,9 +21,9 @@ from benchmarks.siege.contract import ContractFigures, try_contract
 from benchmarks.siege.mutations import MutationFigures, besiege
 from benchmarks.siege.overload import OverloadFigures, overload
 from benchmarks.soak.load import MODEL, Part, Shot, free_port, service, shots
-from sceneprint.client import Client
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
+from sceneprint_client import Client
 
 #: Seconds in which a service has to begin, on a machine that others use too.
 _BEGIN_S = 90.0

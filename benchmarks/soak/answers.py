@@ -12,11 +12,11 @@ from typing import Any
 from sqlalchemy import func, select
 
 from benchmarks.soak.load import MAP
-from sceneprint.client import Client
 from sceneprint.engine import Engine
-from sceneprint.schemas import Answer
 from sceneprint.settings import Settings
 from sceneprint.store.tables import frames, jobs, signatures
+from sceneprint_client import Client
+from sceneprint_client.api import Answer
 
 #: Frames that are looked up: so many of them for their ranking, so many validated too.
 RANKED, VALIDATED = 40, 8

@@ -72,7 +72,7 @@ def check(
 
 def _signed(shots: list[Shot]) -> Bytes:
     """Signatures of all shots, by the library alone."""
-    from sceneprint.engine.frames import read_upload
+    from sceneprint.engine.ingest.frame_decoder import read_upload
 
     signer = open_signer(MODEL)
     return np.stack([sign(read_upload(one.png, one.meta).frame, signer).vector for one in shots])

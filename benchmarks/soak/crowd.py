@@ -18,8 +18,8 @@ from typing import Any
 from benchmarks.soak.checking import CrowdFigures, K, check
 from benchmarks.soak.load import MAP, MODEL, Shot, free_port, service, workers
 from benchmarks.soak.writers import read_shots, write_shots
-from sceneprint.client import Client
 from sceneprint.errors import SceneprintError, UnknownFrame
+from sceneprint_client import Client
 
 #: Frames that are there from the beginning to the end: these are asked for.
 STABLE = 40

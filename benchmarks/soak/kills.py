@@ -24,8 +24,8 @@ from tqdm import tqdm
 from benchmarks.soak.answers import State, state_of
 from benchmarks.soak.load import MAP, MODEL, Part, Shot, free_port, service, workers
 from benchmarks.soak.writers import EmbeddedWriter, Plan, RemoteWriter, write_shots
-from sceneprint.client import Client
 from sceneprint.errors import SceneprintError
+from sceneprint_client import Client
 
 #: Seconds between two kills: sometimes less than a part takes to begin, sometimes more.
 PAUSE_S = (0.2, 2.0)

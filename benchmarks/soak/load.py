@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from sceneprint.datasets import write_depth_png
-from sceneprint.schemas import CameraIntrinsics, FrameMeta
-from sceneprint.synth import synthesise_room
+from sceneprint.formats.dataset import write_depth_png
+from sceneprint.lab.synth import synthesise_room
 from sceneprint.types import Intrinsics
+from sceneprint_client.api import CameraIntrinsics, FrameMeta
 
 #: Every so many samples of a frame, so that signing costs little; there are as many such frames
 #: in one as samples that are left out.

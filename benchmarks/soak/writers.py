@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from benchmarks.soak.load import MAP, Shot
-from sceneprint.client import Client
 from sceneprint.errors import SceneprintError, UnknownFrame
-from sceneprint.schemas import FrameMeta
+from sceneprint_client import Client
+from sceneprint_client.api import FrameMeta
 
 T = TypeVar("T")
 

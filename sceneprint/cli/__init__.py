@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module
 
@@ -16,16 +16,40 @@ from sceneprint.errors import SceneprintError
 USAGE = 2
 
 
-#: In the order in which the help lists them; each is a module of this package.
-COMMANDS = (
-    "demo", "serve", "work", "keys", "audit", "maps", "upload", "query", "localize", "similarity",
-    "associate", "frames", "reconstruct", "jobs", "events", "doctor", "fsck", "reencode", "thin",
-    "index", "snapshot", "restore", "sign", "picture", "evaluate", "evaluate-pairs", "synth",
-    "train",
-)  # fmt: skip
+#: The module of this package that has each command, in the order in which the help lists them.
+COMMANDS = {
+    "demo": "demo",
+    "serve": "serve",
+    "work": "serve",
+    "keys": "admin",
+    "audit": "admin",
+    "maps": "inventory",
+    "upload": "upload",
+    "query": "query",
+    "localize": "query",
+    "similarity": "query",
+    "associate": "sessions",
+    "frames": "inventory",
+    "reconstruct": "sessions",
+    "jobs": "inventory",
+    "events": "inventory",
+    "doctor": "doctor",
+    "fsck": "storage",
+    "reencode": "storage",
+    "thin": "storage",
+    "index": "storage",
+    "snapshot": "storage",
+    "restore": "storage",
+    "sign": "offline",
+    "picture": "offline",
+    "evaluate": "evaluate",
+    "evaluate-pairs": "evaluate",
+    "synth": "offline",
+    "train": "offline",
+}
 
 
-def parser(names: Sequence[str] = COMMANDS) -> argparse.ArgumentParser:
+def parser(names: Iterable[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
     """Commands with their options.
 
     Parameters
@@ -39,11 +63,12 @@ def parser(names: Sequence[str] = COMMANDS) -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"sceneprint {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in names:
-        import_module(f"sceneprint.cli.{name.replace('-', '_')}").add_to(commands)
+        module = import_module(f"sceneprint.cli.{COMMANDS[name]}")
+        getattr(module, f"add_{name.replace('-', '_')}")(commands)
     return top
 
 
-def _asked(arguments: Sequence[str]) -> Sequence[str]:
+def _needed(arguments: Sequence[str]) -> Iterable[str]:
     """Names of the commands that have to be known to read these arguments.
 
     To load them all takes a second, which is most of what a small command needs.
@@ -62,13 +87,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = "sceneprint"
     given = sys.argv[1:] if arguments is None else arguments
     try:  # from the first import on, which takes a second
-        options = parser(_asked(given)).parse_args(given)
+        options = parser(_needed(given)).parse_args(given)
         command = f"sceneprint {options.command}"
         return int(options.run(options))
     except SceneprintError as error:
         return _refuse(command, str(error))
     except UnicodeEncodeError as error:  # of an argument: what we print ourselves is escaped
-        return _refuse(command, f"{error.object!a:.80} is not text in UTF-8. Use another name.")
+        return _refuse(command, f"{error.object!a:.80} is not valid UTF-8. Use another name.")
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

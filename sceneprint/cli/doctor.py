@@ -3,103 +3,641 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import ctypes
+import errno
+import os
+import shutil
+import sqlite3
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import unquote, urlsplit
 
 from sceneprint import __version__
-from sceneprint.cli.checks import machine
-from sceneprint.cli.connection import add_service_options, one_line, open_client
-from sceneprint.cli.findings import Finding
+from sceneprint.cli.options import add_service_options, one_line, open_client
 from sceneprint.cli.serve import add_data_option, settings_of
-from sceneprint.client.client import DEFAULT_URL
 from sceneprint.errors import KeyRequired, SceneprintError, Unreachable
+from sceneprint_client.addresses import DEFAULT_URL
 
 if TYPE_CHECKING:
-    from sceneprint.client import Client, Status
+    from sqlalchemy import URL, Engine
+
+    from sceneprint.settings import Settings
+    from sceneprint.store import Database
+    from sceneprint_client import Client, Status
+
+# What a look at one part of the machine has shown.
+
+Verdict = Literal["ok", "note", "WRONG"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """What one look has shown.
+
+    Parameters
+    ----------
+    verdict : ok; note: something optional is missing, or will be made when it is needed; WRONG:
+        something needed is not there
+    subject : what was looked at
+    text : what is there, and what to do
+    """
+
+    verdict: Verdict
+    subject: str
+    text: str
+
+
+# What `sceneprint doctor` says of the database, which is only ever read.
+
+_CHECK = "Check SCENEPRINT_DATABASE_URL, or the data folder."
+
+
+def database(settings: Settings) -> Check:
+    """What is at the address of the database.
+
+    Parameters
+    ----------
+    settings : whose database is looked at
+    """
+    from sqlalchemy import make_url
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        url = make_url(settings.database)
+    except ValueError:  # what was taken for the port may be half of a password: it is not shown
+        text = (
+            "SCENEPRINT_DATABASE_URL: the port is not a number. Correct it; in a password, "
+            "write @ : and / as %40 %3A and %2F."
+        )
+        return _wrong(text)
+    except SQLAlchemyError:
+        return _wrong(f"cannot be opened (not an SQLAlchemy URL). {_CHECK}")
+    try:
+        return (
+            _sqlite_file(settings, url)
+            if url.get_backend_name() == "sqlite"
+            else _database_server(settings)
+        )
+    except (SQLAlchemyError, ImportError) as error:
+        reason = str(getattr(error, "orig", None) or error).partition("\n")[0]
+        return _wrong(f"cannot be opened ({reason}). {_CHECK}")
+
+
+def _sqlite_file(settings: Settings, url: URL) -> Check:
+    """The file, opened so that SQLite writes nothing, not even beside it."""
+    from sqlalchemy import NullPool, create_engine
+
+    path = _path_of(url)
+    if path is None:
+        text = "is an in-memory database, which processes cannot share. Name a file."
+        return _wrong(text)
+    if not path.exists():
+        # the data folder is made with the file, another one is not
+        if settings.database_url is not None and not path.parent.is_dir():
+            return _wrong(f"the folder of {path} does not exist. Create it, or name another file.")
+        return Check("ok", "database", f"none yet; the first use creates {path}")
+    wal, shm = (path.with_name(path.name + end) for end in ("-wal", "-shm"))
+    if wal.exists() and not shm.exists():  # reading it would make the latter
+        text = f"{path} was not closed cleanly; the next use recovers it"
+        return Check("note", "database", text)
+    # without a log nobody writes, and the file is all there is; with one, its index is not renewed
+    how = "readonly_shm=1" if wal.exists() else "immutable=1"
+
+    def connect() -> sqlite3.Connection:
+        return sqlite3.connect(f"{path.as_uri()}?mode=ro&{how}", uri=True)
+
+    found = _schema(create_engine(url, creator=connect, poolclass=NullPool))
+    # a folder that may not be written is a finding of its own
+    if (
+        found.verdict != "WRONG"
+        and os.access(path.parent, os.W_OK)
+        and not os.access(path, os.W_OK)
+    ):
+        text = f"{path} is readable but not writable, so uploads fail. Check its permissions."
+        return _wrong(text)
+    return found
+
+
+def _database_server(settings: Settings) -> Check:
+    from sceneprint.errors import SceneprintError
+    from sceneprint.store.database import reach_database
+    from sceneprint.store.schema import revision_of
+
+    try:
+        database = reach_database(settings.database)
+        try:
+            with database.read() as connection:
+                return _compared(revision_of(connection), database.shown)
+        finally:
+            database.close()
+    except SceneprintError as error:
+        return _wrong(str(error))
+
+
+def _path_of(url: URL) -> Path | None:
+    """File of an SQLite URL; None: in memory."""
+    name = url.database or ""
+    if name.startswith("file:") and "uri" in url.query:
+        if url.query.get("mode") == "memory":
+            return None
+        name = unquote(urlsplit(name).path)
+    return None if name in ("", ":memory:") else Path(name).absolute()
+
+
+def _schema(engine: Engine) -> Check:
+    """Compare the schema with the one of this version; the database is not touched."""
+    from sceneprint.store.schema import revision_of
+
+    try:
+        with engine.connect() as connection:
+            found = revision_of(connection)
+    finally:
+        engine.dispose()
+    return _compared(found, repr(engine.url))
+
+
+def _compared(found: str | None, place: str) -> Check:
+    from sceneprint.store.schema import known_revisions
+
+    head, known = known_revisions()
+    place = f"{place}, schema {found}"
+    if found == head:
+        return Check("ok", "database", place)
+    if found is None or found in known:
+        return Check("note", "database", f"{place}; the next use migrates it to {head}")
+    text = (
+        f"{place}: it was written by a later version of sceneprint. Use that version, or another "
+        "folder."
+    )
+    return _wrong(text)
+
+
+def _wrong(text: str) -> Check:
+    return Check("WRONG", "database", text)
+
+
+# What `sceneprint doctor` says of object stores: a small object is written, read and removed.
+
+
+def object_stores(settings: Settings) -> Iterator[Check]:
+    """Findings about the stores of blobs and of snapshots, where they are in none of the folders.
+
+    Parameters
+    ----------
+    settings : whose stores are looked at
+    """
+    blobs = None if settings.blob_url is None else settings.blob_url.get_secret_value()
+    for subject, setting, url in (
+        ("blobs", "SCENEPRINT_BLOB_URL", blobs),
+        ("snapshots", "SCENEPRINT_SNAPSHOT_URL", settings.snapshot_url),
+    ):
+        if url is not None:
+            yield _looked_at(subject, setting, url)
+
+
+def _looked_at(subject: str, setting: str, url: str) -> Check:
+    from sceneprint.errors import SceneprintError
+    from sceneprint.store.blobs.object_client import VARIABLES, check_objects, open_objects
+
+    try:
+        objects = open_objects(url, setting)
+        seconds = check_objects(objects)
+    except SceneprintError as error:
+        return Check("WRONG", subject, str(error))
+    begin = VARIABLES[url.partition(":")[0].lower()]
+    of = f", with credentials from {begin}... in the environment" if begin else ""
+    text = f"{objects.url}: written, read and removed in {seconds:.2f} s{of}"
+    return Check("ok", subject, text)
+
+
+# What `sceneprint doctor` says of a database server and its replica; they are only read.
+
+#: Clocks that differ by more are told, and by more than a lease are wrong, seconds.
+APART_S = 2.0
+#: What a commit that was acknowledged needs to survive the loss of power.
+_DURABLE = ("fsync", "full_page_writes")
+_ASKED = """
+SELECT current_setting('server_version') AS version,
+  current_setting('server_encoding') AS encoding,
+  current_setting('fsync') AS fsync,
+  current_setting('full_page_writes') AS full_page_writes,
+  current_setting('synchronous_commit') AS synchronous_commit,
+  current_setting('synchronous_standby_names') AS standbys,
+  current_setting('data_checksums') AS checksums,
+  current_setting('max_connections')::int
+    - current_setting('superuser_reserved_connections')::int AS connections,
+  (SELECT count(*) FROM pg_stat_activity WHERE backend_type = 'client backend') AS taken,
+  pg_is_in_recovery() AS standby,
+  (SELECT extversion FROM pg_extension WHERE extname = 'vector') AS vector,
+  (SELECT default_version FROM pg_available_extensions WHERE name = 'vector') AS installable,
+  has_database_privilege(current_database(), 'CREATE') AS creates
+"""
+_BEHIND = """
+SELECT pg_is_in_recovery(), CASE WHEN pg_last_wal_receive_lsn() = pg_last_wal_replay_lsn() THEN 0
+  ELSE extract(epoch FROM clock_timestamp() - pg_last_xact_replay_timestamp()) END,
+  (SELECT count(*) FROM pg_stat_wal_receiver)
+"""
+
+
+def server(settings: Settings) -> Iterator[Check]:
+    """Findings about the database server, and the replica where one is named.
+
+    Parameters
+    ----------
+    settings : whose database is looked at; of SQLite there is nothing to say
+    """
+    from sceneprint.errors import SceneprintError
+    from sceneprint.store.database import reach_database
+
+    database = reach_database(settings.database)
+    try:
+        if database.is_sqlite:
+            return
+        yield from _server_settings(database, settings)
+    except SceneprintError as error:
+        yield Check("WRONG", "database server", str(error))
+        return
+    finally:
+        database.close()
+    if settings.replica_url is not None:
+        yield _replica(settings.replica_url.get_secret_value(), settings)
+
+
+def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
+    with database.read() as connection:
+        told = dict(connection.exec_driver_sql(_ASKED).mappings().one())
+        before = time.time()
+        there = float(
+            connection.exec_driver_sql("SELECT extract(epoch FROM clock_timestamp())").scalar_one()
+        )
+        after = time.time()
+    text = f"PostgreSQL {told['version']}, {told['encoding']}"
+    if told["standby"]:
+        text += "; it is a read-only standby. Name the primary."
+        yield Check("WRONG", "database server", text)
+        return
+    yield Check("ok", "database server", text)
+    yield _durability(told)
+    yield _connections(told, settings)
+    yield _vector(told, settings)
+    yield _clock(before, there, after, settings)
+
+
+def _durability(told: Mapping[str, object]) -> Check:
+    off = [name for name in _DURABLE if told[name] == "off"]
+    if off:
+        text = (
+            f"{', '.join(off)} off: acknowledged data may be lost when the server's host fails. "
+            "Turn it on."
+        )
+        return Check("WRONG", "durability", text)
+    text = "commits survive the loss of power"
+    if told["standbys"] and told["synchronous_commit"] == "local":
+        text += "; synchronous_commit is local, so commits do not wait for a standby. Turn it on."
+        return Check("note", "durability", text)
+    if told["standbys"]:
+        text += f", and of the host: commits wait for a standby ({told['standbys']})"
+    else:
+        text += (
+            "; commits do not wait for a standby, so the last ones may be lost with the host's disk"
+        )
+    if told["checksums"] == "off":
+        text += "; data_checksums are off, so a damaged page may go unnoticed"
+        return Check("note", "durability", text)
+    return Check("ok", "durability", text)
+
+
+def _connections(told: Mapping[str, object], settings: Settings) -> Check:
+    from sceneprint.store.postgres.connection import MOST
+
+    most, taken = int(str(told["connections"])), int(str(told["taken"]))
+    # a worker takes one for its work, one for its lease and one to be woken; a service as many as
+    # it answers at once, and one
+    wanted = 3 * settings.workers + min(settings.concurrency + settings.waiting, MOST) + 3
+    text = (
+        f"{most} connections allowed (max_connections), {taken} in use; a service and "
+        f"{settings.workers} workers may use {wanted}"
+    )
+    if taken + wanted > most:
+        return Check("note", "connections", f"{text}. Raise max_connections, or run fewer workers.")
+    return Check("ok", "connections", text)
+
+
+def _vector(told: Mapping[str, object], settings: Settings) -> Check:
+    wanted = settings.search == "database"
+    if told["vector"] is not None:
+        return Check("ok", "pgvector", f"{told['vector']}")
+    if told["installable"] is not None and told["creates"]:
+        text = f"{told['installable']} is installed; the first use enables it (CREATE EXTENSION)"
+        return Check("ok", "pgvector", text)
+    why = "not installed" if told["installable"] is None else "this user may not enable it"
+    text = (
+        f"{why}: each node loads the index of every map that it searches, and waits for it at "
+        "startup; everything else works. Run CREATE EXTENSION vector in this database"
+    )
+    verdict: Verdict = "WRONG" if wanted else "note"
+    return Check(verdict, "pgvector", f"{text}." if not wanted else f"{text}, or set "
+                   "SCENEPRINT_SEARCH=auto.")  # fmt: skip
+
+
+def _clock(before: float, there: float, after: float, settings: Settings) -> Check:
+    """The clocks of this host and of the server, as far as the answer's way can tell."""
+    apart = max(before - there, there - after, 0.0)
+    text = f"the server's clock differs from this host's by {apart:.1f} s"
+    if apart > APART_S:
+        verdict: Verdict = "WRONG" if apart > settings.lease_s else "note"
+        return Check(verdict, "clock", f"{text}. Synchronize both with a time server.")
+    return Check("ok", "clock", text)
+
+
+def _replica(url: str, settings: Settings) -> Check:
+    from sceneprint.errors import SceneprintError
+    from sceneprint.store.database import reach_database
+    from sceneprint.store.schema import known_revisions, revision_of
+
+    try:
+        database = reach_database(url)
+    except SceneprintError as error:
+        return Check("WRONG", "replica", f"SCENEPRINT_REPLICA_URL: {error}")
+    try:
+        if database.is_sqlite:
+            text = "SCENEPRINT_REPLICA_URL is not a PostgreSQL URL. Correct it, or unset it."
+            return Check("WRONG", "replica", text)
+        with database.read() as connection:
+            standby, behind, receives = connection.exec_driver_sql(_BEHIND).one()
+            schema = revision_of(connection)
+    except SceneprintError as error:
+        text = f"{error} Until then, queries go to the primary."
+        return Check("WRONG", "replica", text)
+    finally:
+        database.close()
+    if not standby:
+        return Check("note", "replica", f"{database.shown} is a primary, not a standby")
+    if schema != known_revisions()[0]:
+        return Check("note", "replica", f"{database.shown} has schema {schema}: not used yet")
+    text = f"{database.shown} is {'some time' if behind is None else f'{behind:.1f} s'} behind"
+    if not receives:
+        text += ", and does not receive from its primary. See its log."
+        return Check("note", "replica", text)
+    if behind is None or behind > settings.replica_lag_s:
+        text += f"; SCENEPRINT_REPLICA_LAG_S is {settings.replica_lag_s:g} s: it is not used"
+        return Check("note", "replica", text)
+    return Check("ok", "replica", text)
+
+
+# What `sceneprint doctor` looks at on this machine; nothing is changed by looking.
+
+#: The oldest SQLite with all that the store asks for (UPDATE ... RETURNING).
+OLDEST_SQLITE = (3, 35, 0)
+#: Free space below which uploads are soon refused, and below which it is time to look, bytes.
+LEAST_FREE, LITTLE_FREE = 100 << 20, 5 << 30
+#: What open3d loads of the system, and the Debian packages that bring it.
+OPEN3D_LIBRARIES = {
+    "libGL.so.1": "libgl1",
+    "libEGL.so.1": "libegl1",
+    "libX11.so.6": "libx11-6",
+    "libusb-1.0.so.0": "libusb-1.0-0",
+    "libgomp.so.1": "libgomp1",
+}
+
+
+def machine(settings: Settings) -> Iterator[Check]:
+    """Findings about this machine.
+
+    Parameters
+    ----------
+    settings : whose folders are looked at
+    """
+    yield _python()
+    yield _sqlite_version()
+    yield _kernels()
+    yield from _tables(settings.cache_dir)
+    yield from _folder(settings.data_dir)
+    found = database(settings)
+    yield found
+    if found.verdict != "WRONG":
+        yield from server(settings)
+    yield from object_stores(settings)
+    yield _embree()
+    yield _open3d()
+
+
+def _python() -> Check:
+    version = ".".join(map(str, sys.version_info[:3]))  # an older than 3.11 cannot install this
+    return Check("ok", "python", f"{version}, sceneprint {__version__}")
+
+
+def _sqlite_version() -> Check:
+    if sqlite3.sqlite_version_info < OLDEST_SQLITE:
+        least = ".".join(map(str, OLDEST_SQLITE))
+        text = f"{sqlite3.sqlite_version} is too old. Use a Python with SQLite {least} or later."
+        return Check("WRONG", "sqlite", text)
+    return Check("ok", "sqlite", sqlite3.sqlite_version)
+
+
+def _kernels() -> Check:
+    from sceneprint.geometry.signature.pair_table import compiled_at
+
+    folder, pattern = compiled_at()
+    if folder and any(Path(folder).glob(pattern)):
+        return Check("ok", "kernels", f"compiled, in {folder}")
+    if folder and _may_write(Path(folder)):
+        return Check(
+            "note", "kernels", ("not compiled yet; the first use compiles for about a minute")
+        )
+    text = (
+        f"{folder or 'no folder'} is not writable, so every process compiles for about a minute. "
+        "Set NUMBA_CACHE_DIR to a writable folder."
+    )
+    return Check("note", "kernels", text)
+
+
+def _tables(cache_dir: Path) -> Iterator[Check]:
+    from sceneprint.models import PRESETS, read_model
+    from sceneprint.models.table_cache import CACHE_VERSION
+
+    for preset in PRESETS:
+        subject, model = f"table {preset}", read_model(preset)
+        path = cache_dir / f"table-v{CACHE_VERSION}-{model.id}.bin"
+        if path.is_file():
+            yield Check("ok", subject, str(path))
+        elif _may_write(cache_dir):
+            yield Check("note", subject, "not built yet; the first use builds it in seconds")
+        else:
+            text = (
+                f"{cache_dir} is not writable, so every process rebuilds it. Set "
+                "SCENEPRINT_CACHE_DIR to a writable folder."
+            )
+            yield Check("note", subject, text)
+
+
+def _folder(data_dir: Path) -> Iterator[Check]:
+    there = _nearest(data_dir)
+    why = _unwritable(data_dir)
+    if why == errno.ENOSPC:
+        text = f"{data_dir} is on a full disk. Free some space: until then, uploads fail."
+        yield Check("WRONG", "data folder", text)
+    elif why is not None and (data_dir / "sceneprint.db").is_file():
+        text = (
+            f"{data_dir} is read-only ({os.strerror(why)}): `sceneprint serve` can answer "
+            "queries from it but cannot accept uploads. Make it writable, or name another with "
+            "--data."
+        )
+        yield Check("WRONG", "data folder", text)
+    elif why is not None:
+        text = (
+            f"{data_dir} is not writable ({os.strerror(why)}). Check its permissions, or name "
+            "another with --data."
+        )
+        yield Check("WRONG", "data folder", text)
+    else:
+        text = f"{data_dir} is writable" if there == data_dir else f"{data_dir} can be created"
+        yield Check("ok", "data folder", text)
+    free = shutil.disk_usage(there).free
+    text = f"{free / 1e9:.1f} GB free; a frame takes about 0.8 MB"
+    if free < LEAST_FREE:
+        yield Check("WRONG", "disk", f"{text}. Free some space, or uploads will be rejected.")
+    else:
+        yield Check("note" if free < LITTLE_FREE else "ok", "disk", text)
+
+
+def _embree() -> Check:
+    try:
+        import_module("embreex.rtcore_scene")
+    except ImportError as error:
+        text = f"cannot be imported ({error}); only `synth`, `train` and `demo` need it"
+        return Check("note", "embreex", text)
+    return Check("ok", "embreex", "can be imported (needed for synthetic rooms)")
+
+
+def _open3d() -> Check:
+    missing = []
+    for library, package in OPEN3D_LIBRARIES.items():
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            missing.append(package)
+    if missing:
+        packages = " ".join(missing)
+        text = f"only reconstructions and benchmarks need them: apt-get install {packages}"
+        return Check("note", "open3d libraries", text)
+    return Check("ok", "open3d libraries", "installed")
+
+
+def _nearest(folder: Path) -> Path:
+    """The folder, or the first above it that is there."""
+    folder = folder.absolute()
+    return next(one for one in (folder, *folder.parents) if one.is_dir())
+
+
+def _may_write(folder: Path) -> bool:
+    """Whether a file can be made in the folder, or where the folder is missing, above it."""
+    return _unwritable(folder) is None
+
+
+def _unwritable(folder: Path) -> int | None:
+    """Why no file can be made there, as `errno`; None where one can."""
+    try:  # tried, as permissions say little of read-only disks and to root; leaves no trace
+        with tempfile.TemporaryFile(dir=_nearest(folder)) as file:
+            file.write(b"x")  # a full disk may still have room for a name
+            file.flush()
+        return None
+    except OSError as error:
+        return error.errno or errno.EIO
+
 
 #: Age of a frame that nobody signs at which workers are missed, seconds.
 LONGEST_S = 60.0
 
 
-def add_to(commands: Any) -> None:
+def add_doctor(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "doctor",
-        help="say what is fine on this machine and with the service, and what to do",
-        description="Look at this machine, the data folder and the service. Nothing is changed. "
-        "Exit code 2 where something needed is missing; what is optional is noted.",
+        help="check this machine, the data folder and the service",
+        description="Check this machine, the data folder and the service, and suggest fixes. "
+        "Changes nothing. Exit code 2 if something required is missing; missing optional parts "
+        "are noted.",
     )
     add_data_option(command)
     add_service_options(command)
-    command.set_defaults(run=run)
+    command.set_defaults(run=run_doctor)
 
 
-def run(options: argparse.Namespace) -> int:
+def run_doctor(options: argparse.Namespace) -> int:
     """Look at everything; returns 2 where something needed is wrong."""
     wrong = 0
     for finding in (*_all(options),):
         print(f"{finding.verdict:5}  {finding.subject:16}  {one_line(finding.text)}", flush=True)
         wrong += finding.verdict == "WRONG"
-    things = "1 thing is wrong" if wrong == 1 else f"{wrong} things are wrong"
-    print(things if wrong else "all that is needed is fine")
+    things = "1 problem found" if wrong == 1 else f"{wrong} problems found"
+    print(things if wrong else "no problems found")
     return 2 if wrong else 0
 
 
-def _all(options: argparse.Namespace) -> Iterator[Finding]:
+def _all(options: argparse.Namespace) -> Iterator[Check]:
     yield from machine(settings_of(options))
     yield from _service(options)
 
 
-def _service(options: argparse.Namespace) -> Iterator[Finding]:
+def _service(options: argparse.Namespace) -> Iterator[Check]:
     """Findings about the service; that none runs is wrong only where one was named."""
     url = options.url or DEFAULT_URL
     try:
         with open_client(options) as client:
             if not client.healthy():
-                text = f"none answers at {url}; `sceneprint serve` starts one"
-                yield Finding("WRONG" if options.url else "note", "service", text)
+                text = f"no service answers at {url}; `sceneprint serve` starts one"
+                yield Check("WRONG" if options.url else "note", "service", text)
                 return
             status = client.status()
             yield _version(url, status)
             yield _workers(client, status)
     except KeyRequired:
-        text = f"{url} asks for a key; give it with --key to see whether workers keep up"
-        yield Finding("note", "workers", text)
+        text = f"{url} requires a key; pass one with --key to see whether workers keep up"
+        yield Check("note", "workers", text)
     except (Unreachable, SceneprintError) as error:
-        yield Finding("WRONG", "service", str(error))
+        yield Check("WRONG", "service", str(error))
 
 
-def _version(url: str, status: Status) -> Finding:
+def _version(url: str, status: Status) -> Check:
     text = f"{url} answers, version {status.version}"
     if status.frames is not None:
         text += f", {sum(status.frames.values())} frames"
     if status.version == __version__:
-        return Finding("ok", "service", text)
-    return Finding("note", "service", f"{text}; this is version {__version__}")
+        return Check("ok", "service", text)
+    return Check("note", "service", f"{text}; this is version {__version__}")
 
 
-def _workers(client: Client, status: Status) -> Finding:
+def _workers(client: Client, status: Status) -> Check:
     if status.jobs is None:
-        text = "the service tells of them only to a key for all maps; give one with --key"
-        return Finding("note", "workers", text)
+        text = "the service shows them only to a key for all maps; pass one with --key"
+        return Check("note", "workers", text)
     queued, running = status.jobs.get("queued", 0), status.jobs.get("running", 0)
-    text = f"{queued} jobs wait, {running} are being done"
+    text = f"{queued} jobs waiting, {running} running"
     oldest = _oldest_s(client) if queued else 0.0
     if queued:
-        text += f", the oldest came {oldest:.0f} s ago"
+        text += f", the oldest for {oldest:.0f} s"
     if running == 0 and oldest > LONGEST_S:
-        text += ". No worker seems to run: `sceneprint work` starts some; see their log."
-        return Finding("WRONG", "workers", text)
+        text += (
+            ". No worker seems to be running. Start some with `sceneprint work`, and see their log."
+        )
+        return Check("WRONG", "workers", text)
     dead = status.jobs.get("dead", 0)
     if dead:
-        text += f"; {dead} were given up, and `traceback` of these jobs says why"
-    return Finding("note" if dead else "ok", "workers", text)
+        text += f"; {dead} failed for good; see the `traceback` of these jobs"
+    return Check("note" if dead else "ok", "workers", text)
 
 
 def _oldest_s(client: Client) -> float:
     """Age of the frame that has waited longest, seconds."""
-    from sceneprint.schemas import FrameState
+    from sceneprint_client.api import FrameState
 
     now, ages = datetime.now(UTC), [0.0]
     for one in client.maps():

@@ -11,15 +11,19 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
-from sceneprint.cli.judging import add_judging_options
-from sceneprint.cli.numbers import positive, whole
-from sceneprint.cli.signer import add_model_options, open_for
+from sceneprint.atomic_files import check_writable, write_whole
+from sceneprint.cli.options import (
+    add_judging_options,
+    add_model_options,
+    open_for,
+    positive,
+    whole_number,
+)
 from sceneprint.errors import DatasetError
 from sceneprint.settings import Settings
-from sceneprint.writing import check_writable, write_whole
 
 if TYPE_CHECKING:
-    from sceneprint.evaluation.protocol import Protocol
+    from sceneprint.lab.evaluation.protocol import EvaluationProtocol
     from sceneprint.models import Model
 
 T = TypeVar("T")
@@ -27,24 +31,24 @@ T = TypeVar("T")
 _EXAMPLES = """\
 frames are counted from 0 over all sequences of a PATH, in order; STOP is not included:
   sceneprint evaluate redkitchen --db 0:600:2 --queries 650:1000:2
-each PATH may have ranges of its own, several joined by +; all PATHs make one database:
+each PATH may have its own ranges, joined by +; all PATHs form one database:
   sceneprint evaluate redkitchen@db=0:600:2,queries=650:1000:2 \\
       fr1_rpy@db=0:217,queries=235: studyroom2@db=0:25+50:75,queries=30:50
-without ranges, the TrainSplit.txt and TestSplit.txt of each scene say what is what: one row for
+without ranges, TrainSplit.txt and TestSplit.txt of each scene define the split: one row for
 each scene, and with several also Average and Combine (all scenes in one database):
   sceneprint evaluate 7scenes --db-step 10 --query-step 10
-a scanner that comes back to where it was, more than 30 m of travel later:
+a scanner that returns to a place after more than 30 m of travel:
   sceneprint evaluate hall --model lidar --gap-m 30 --within 5 --baselines
 """
 
 
-def add_to(commands: Any) -> None:
+def add_evaluate(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "evaluate",
-        help="measure retrieval, validation and poses on frames with known poses",
-        description="Ask a database of frames for each query frame, and judge the answers by the "
-        "true\nposes: the rows R, VR, DR, VDR of the paper, and the averaged pose.",
+        help="measure retrieval, validation and pose accuracy on frames with known poses",
+        description="Query a database of frames with each query frame, and compare the answers "
+        "with the true\nposes: the rows R, VR, DR, VDR of the paper, and the averaged pose.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -54,11 +58,14 @@ def add_to(commands: Any) -> None:
     add_model_options(command)
     _add_frames(command)
     _add_method(command)
-    command.add_argument("--json", type=Path, metavar="FILE", help="write every figure")
+    command.add_argument("--json", type=Path, metavar="FILE", help="write all figures as JSON")
     command.add_argument(
-        "--plots", type=Path, metavar="DIR", help="draw curves, bars, a contact sheet and clouds"
+        "--plots",
+        type=Path,
+        metavar="DIR",
+        help="draw curves, bars, a contact sheet and clouds into this folder",
     )
-    command.set_defaults(run=run)
+    command.set_defaults(run=run_evaluate)
 
 
 def _add_frames(command: argparse.ArgumentParser) -> None:
@@ -70,13 +77,13 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
             type=positive,
             default=1,
             metavar="N",
-            help=f"every N-th {what} frame, where a range names no step (default: 1)",
+            help=f"use every N-th {what} frame where a range has no step (default: 1)",
         )
     command.add_argument(
         "--max-overlap",
         type=_share,
         metavar="X",
-        help="a query may find only frames that overlap it by less, 0 to 1",
+        help="hide from a query the frames that overlap it by more than this, 0 to 1",
     )
     command.add_argument(
         "--distractors",
@@ -84,26 +91,27 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="PATH",
-        help="all of their frames are in the database",
+        help="use all frames of these in the database",
     )
     command.add_argument(
         "--gap-m",
         type=_metres,
         metavar="METRES",
-        help="a frame is query and database frame at once (--db and --queries may meet, and are "
-        "everything without), and finds only what was taken more than so much travel before it",
+        help="use each frame as query and as database frame (--db and --queries may overlap, "
+        "and default to all frames); a query finds only frames taken more than this distance of "
+        "travel before it",
     )
     command.add_argument(
         "--within",
         type=_metres,
         metavar="METRES",
-        help="recall: a frame is the query's place where its pose is this near (default: where "
+        help="recall: count a frame as the query's place if its pose is this near (default: if "
         "the two overlap by half)",
     )
     command.add_argument(
         "--absent",
         action="store_true",
-        help="a query may find only frames of other scenes: everything accepted is wrong",
+        help="let a query find only frames of other scenes, so that every accepted match is wrong",
     )
 
 
@@ -112,11 +120,11 @@ def _add_method(command: argparse.ArgumentParser) -> None:
         "--signature",
         choices=("stored", "psi"),
         default="stored",
-        help="rank by what a service stores, or by psi as the paper does: of the model, or of the "
-        "preset paper where none is named (default: stored)",
+        help="rank by the signature that a service stores, or by psi as in the paper, from the "
+        "given model or else the preset paper (default: stored)",
     )
     command.add_argument(
-        "--metric", choices=("l1", "l2"), help="default: l2, and of psi l1, as in the paper"
+        "--metric", choices=("l1", "l2"), help="default: l2; for psi l1, as in the paper"
     )
     command.add_argument(
         "--levels", type=positive, metavar="H", help="levels of psi to use (default: all)"
@@ -126,23 +134,24 @@ def _add_method(command: argparse.ArgumentParser) -> None:
         "--baselines",
         nargs="*",
         metavar="NAME",
-        help="rank by these as well: thumbnail_l1, thumbnail_zncc, fpfh_vlad, rings (after the "
-        "PATHs; without names: by all, and those not made for the frames say so)",
+        help="also rank by these baselines: thumbnail_l1, thumbnail_zncc, fpfh_vlad, rings "
+        "(give it after the PATHs; without names: all, with a notice for those that do not "
+        "support the frames)",
     )
     command.add_argument(
         "--candidates",
         type=positive,
         default=10,
         metavar="N",
-        help="size of C, and how many of R are validated (default: 10)",
+        help="size of C, and number of frames of R to validate (default: 10)",
     )
-    command.add_argument("--seed", type=whole, default=0, metavar="S", help="default: 0")
+    command.add_argument("--seed", type=whole_number, default=0, metavar="S", help="default: 0")
     command.add_argument(
         "--jobs",
         type=positive,
         default=os.cpu_count() or 1,
         metavar="N",
-        help="processes; no figure depends on it",
+        help="number of processes; results do not depend on it",
     )
 
 
@@ -168,13 +177,11 @@ def _metres(text: str) -> float:
     return metres
 
 
-def run(options: argparse.Namespace) -> int:
+def run_evaluate(options: argparse.Namespace) -> int:
     """Evaluate, print, and write what was asked for."""
-    from sceneprint.evaluation.frames import Store
-    from sceneprint.evaluation.report import figures, to_json
-    from sceneprint.evaluation.run import Settings as EvaluationSettings
-    from sceneprint.evaluation.run import evaluate
-    from sceneprint.evaluation.table import table
+    from sceneprint.lab.evaluation.protocol import FrameStore
+    from sceneprint.lab.evaluation.report import figures, table, to_json
+    from sceneprint.lab.evaluation.run import EvaluationSettings, evaluate
 
     protocol = _protocol(options)
     baselines = _baselines(options.baselines)
@@ -182,8 +189,8 @@ def run(options: argparse.Namespace) -> int:
     signer = open_for(options, own, psi=options.signature == "psi")
     if options.levels is not None and signer.model.whitening is not None:
         raise DatasetError(
-            f"--levels {options.levels}: the signatures of model {signer.model.label} are not of "
-            "levels end to end. Add --signature psi, or leave it out."
+            f"--levels {options.levels}: the signatures of model {signer.model.label} cannot be "
+            "split by level. Add --signature psi, or leave --levels out."
         )
     if (options.levels or 1) > (most := len(signer.model.levels)):
         raise DatasetError(
@@ -207,11 +214,13 @@ def run(options: argparse.Namespace) -> int:
         cache_dir=own.cache_dir,
     )
     with TemporaryDirectory(prefix="sceneprint-") as folder:
-        store = Store(Path(folder))
+        store = FrameStore(Path(folder))
         evaluation = evaluate(protocol, signer, store, settings, _watch)
         database = evaluation.prepared.database
         found = figures(
-            evaluation, lambda match: store.frame(database[match]), _asked(options, signer.model)
+            evaluation,
+            lambda match: store.frame(database[match]),
+            _settings_of(options, signer.model),
         )
         # figures first: a picture that cannot be drawn must not cost an hour's work
         if options.json is not None:
@@ -219,7 +228,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"model {signer.model.label}: {_counts(found)}")
         print("\n".join(table(found)))
         if options.plots is not None:
-            from sceneprint.evaluation.pictures import save_pictures
+            from sceneprint.lab.evaluation.plots import save_pictures
 
             for path in save_pictures(options.plots, evaluation, found, store, signer.model):
                 print(f"picture: {path}")
@@ -234,8 +243,8 @@ def _make_room(options: argparse.Namespace) -> None:
             check_writable(file)
 
 
-def _protocol(options: argparse.Namespace) -> Protocol:
-    from sceneprint.evaluation.protocol import choose, parse_part, parse_ranges
+def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
+    from sceneprint.lab.evaluation.protocol import choose, parse_part, parse_ranges
 
     parts = [parse_part(text) for text in options.paths]
     both = options.db is not None, options.queries is not None
@@ -243,11 +252,11 @@ def _protocol(options: argparse.Namespace) -> Protocol:
     elsewhere = options.distractors or any(part.database for part in parts)
     if any(both) and not all(both) and not (both[1] and elsewhere):
         given, missing = ("--db", "--queries") if both[0] else ("--queries", "--db")
-        raise DatasetError(f"{given} is given without {missing}. Give both, or neither.")
+        raise DatasetError(f"{given} needs {missing}. Give both or neither.")
     if any(both) and not ranged:
         raise DatasetError(
-            "--db and --queries apply to a PATH without ranges of its own, and there is none. "
-            "Leave them out."
+            "--db and --queries apply only to a PATH without its own ranges, and every PATH has "
+            "some. Leave them out."
         )
     return choose(
         parts,
@@ -262,20 +271,20 @@ def _protocol(options: argparse.Namespace) -> Protocol:
 
 def _baselines(names: list[str] | None) -> tuple[str, ...]:
     """The baselines to ask, in the order of BASELINES."""
-    from sceneprint.evaluation.baselines.baseline import BASELINES
+    from sceneprint.lab.evaluation.baselines.baseline import BASELINES
 
     if names is None:
         return ()
     unknown = [name for name in names if name not in BASELINES]
     if unknown:
         raise DatasetError(
-            f"--baselines {unknown[0]}: There is no such baseline. Choose from "
-            f"{', '.join(BASELINES)}; the PATHs go before."
+            f"--baselines {unknown[0]}: no such baseline. Choose from {', '.join(BASELINES)}; "
+            "put the PATHs first."
         )
     return tuple(name for name in BASELINES if name in names or not names)
 
 
-def _asked(options: argparse.Namespace, model: Model) -> dict[str, Any]:
+def _settings_of(options: argparse.Namespace, model: Model) -> dict[str, Any]:
     """Everything that is needed to repeat the evaluation."""
     from sceneprint import __version__
 
@@ -310,9 +319,180 @@ def _asked(options: argparse.Namespace, model: Model) -> dict[str, Any]:
 
 def _counts(found: dict[str, Any]) -> str:
     counts = found["counts"]
-    left_out = f", {counts['left_out']} frames left out" if counts["left_out"] else ""
+    left_out = f", {counts['left_out']} frames skipped" if counts["left_out"] else ""
     return f"{counts['queries']} queries, {counts['database']} database frames{left_out}"
 
 
 def _watch(items: Iterable[T], stage: str, total: int) -> Iterable[T]:
     return tqdm(items, desc=stage, total=total, disable=None)
+
+
+# `sceneprint evaluate-pairs`: how well two frames are registered, and rightly believed.
+
+#: Frames of a scene at the most: overlap is of all with all.
+_MOST = 2000
+_PAIR_EXAMPLES = """\
+pairs of one PATH, or of several of one scene, may overlap; pairs of two scenes are
+negatives, a quarter of them drawn from pairs with a frame that shows little but
+one plane:
+  sceneprint evaluate-pairs redkitchen studyroom2 fr1_rpy --negatives 3000 --json pairs.json
+compare with Open3D (FPFH with RANSAC or FGR, then ICP), and draw curves and failures into a folder:
+  sceneprint evaluate-pairs redkitchen --baselines --out pairs
+"""
+
+
+def add_evaluate_pairs(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "evaluate-pairs",
+        help="measure registration and acceptance on pairs of frames with known poses",
+        description="Sample pairs of frames by their true overlap, validate each, and compare "
+        "the result with the\ntrue poses: success by overlap, precision, recall, false accepts.",
+        epilog=_PAIR_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="of sequences")
+    add_model_options(command)
+    _add_drawing(command)
+    add_judging_options(command)
+    command.add_argument(
+        "--right",
+        nargs=2,
+        type=_limit,
+        default=[0.1, 10.0],
+        metavar=("METRES", "DEGREES"),
+        help="errors up to which a transform counts as correct (default: 0.1 10)",
+    )
+    command.add_argument(
+        "--baselines",
+        action="store_true",
+        help="also register overlapping pairs with Open3D, at about a second each",
+    )
+    command.add_argument(
+        "--jobs",
+        type=positive,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="number of processes; only the times depend on it",
+    )
+    command.add_argument("--json", type=Path, metavar="FILE", help="write all figures as JSON")
+    command.add_argument(
+        "--out", type=Path, metavar="DIR", help="draw curves and failed pairs into this folder"
+    )
+    command.set_defaults(run=run_evaluate_pairs)
+
+
+def _add_drawing(command: argparse.ArgumentParser) -> None:
+    for option, default, kind, what in (
+        ("--pairs", 120, positive, "pairs for each overlap bin of each scene"),
+        ("--negatives", 400, whole_number, "pairs of two scenes, in total"),
+        (
+            "--apart",
+            30,
+            whole_number,
+            "minimum distance in the recording between two frames, in frames",
+        ),
+        ("--frames", 300, _frames, "maximum number of frames of each scene, evenly spread"),
+        ("--seed", 0, whole_number, "random seed of sampling and validation"),
+    ):
+        command.add_argument(
+            option, type=kind, default=default, metavar="N", help=f"{what} (default: {default})"
+        )
+
+
+def _frames(text: str) -> int:
+    """A whole number from 2 to _MOST."""
+    number = positive(text)
+    if not 2 <= number <= _MOST:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 2 to {_MOST}")
+    return number
+
+
+def _limit(text: str) -> float:
+    """A number above 0, up to 180."""
+    try:
+        limit = float(text)
+    except ValueError:
+        limit = -1.0
+    if not 0 < limit <= 180:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0, up to 180")
+    return limit
+
+
+def run_evaluate_pairs(options: argparse.Namespace) -> int:
+    """Evaluate, print, and write what was asked for."""
+    from sceneprint.lab.evaluation.pairs.pair_report import pair_figures, pair_table
+    from sceneprint.lab.evaluation.pairs.pair_run import Drawing, PairSettings, evaluate_pairs
+    from sceneprint.lab.evaluation.protocol import FrameStore
+    from sceneprint.lab.evaluation.report import to_json
+
+    own = Settings()
+    _make_pair_room(options)
+    signer = open_for(options, own)
+    settings = PairSettings(
+        drawing=Drawing(options.pairs, options.negatives, options.apart, options.seed),
+        frames=options.frames,
+        mode=options.mode,
+        matching=options.matching,
+        seed=options.seed,
+        limits=(options.right[0], options.right[1]),
+        baselines=options.baselines,
+        jobs=options.jobs,
+        cache_dir=own.cache_dir,
+    )
+    with TemporaryDirectory(prefix="sceneprint-") as folder:
+        store = FrameStore(Path(folder))
+        evaluation = evaluate_pairs(options.paths, signer, store, settings, _watch)
+        found = pair_figures(evaluation, _pair_settings(options, signer.model.id))
+        # figures first: a picture that cannot be drawn must not cost an hour's work
+        if options.json is not None:
+            write_whole(options.json, to_json(found))
+        print(f"model {signer.model.label}: {_pair_counts(found)}")
+        print("\n".join(pair_table(found)))
+        if options.out is not None:
+            from sceneprint.lab.evaluation.pairs.pair_report import save_pair_pictures
+
+            for path in save_pair_pictures(options.out, evaluation, found, store):
+                print(f"picture: {path}")
+    return 0
+
+
+def _make_pair_room(options: argparse.Namespace) -> None:
+    """Folders for what is to be written; what cannot be written must not cost an hour's work."""
+    for file in (options.json, options.out / "roc.png" if options.out else None):
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            check_writable(file)
+
+
+def _pair_settings(options: argparse.Namespace, model_id: str) -> dict[str, Any]:
+    """Everything that is needed to repeat the evaluation."""
+    from sceneprint import __version__
+
+    keys = (
+        "pairs",
+        "negatives",
+        "apart",
+        "frames",
+        "seed",
+        "mode",
+        "matching",
+        "right",
+        "baselines",
+    )
+    return {
+        "version": __version__,
+        "model_id": model_id,
+        "paths": [str(path) for path in options.paths],
+        **{key: getattr(options, key) for key in keys},
+    }
+
+
+def _pair_counts(found: dict[str, Any]) -> str:
+    counts = found["counts"]
+    frames = ", ".join(
+        f"{n} frames of {scene} ({counts['planar'][scene]} planar)"
+        for scene, n in counts["frames"].items()
+    )
+    left_out = f", {counts['left_out']} frames skipped" if counts["left_out"] else ""
+    return f"{counts['pairs']} pairs of {frames}{left_out}"

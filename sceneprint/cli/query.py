@@ -5,33 +5,107 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sceneprint.cli.asking import add_asking_options, explained_lines, options_of
-from sceneprint.cli.connection import add_service_options, one_line, open_client
-from sceneprint.cli.overlaying import add_overlay_options, check_overlay, save_overlay
-from sceneprint.datasets import FrameReference, find_sequences
-from sceneprint.errors import DatasetError, FrameError, MissingDependency, TooLarge
+from sceneprint.atomic_files import check_writable, write_whole
+from sceneprint.cli.options import (
+    add_asking_options,
+    add_service_options,
+    explained_lines,
+    one_line,
+    open_client,
+    options_of,
+    setting,
+    settings_of,
+    whole_number,
+)
+from sceneprint.errors import DatasetError, FrameError, MissingDependency, TooLarge, UnknownFrame
+from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint_client.api.results import COLOURS, TRANSFORMS
 
 if TYPE_CHECKING:
-    from sceneprint.schemas import Answer, Match, Transform
+    from sceneprint_client import Client
+    from sceneprint_client.api import Answer, Localization, Match, Similarity, Transform
+
+# The query's points laid on those of its best match, as a file for any viewer of clouds.
 
 
-def add_to(commands: Any) -> None:
+def add_overlay_options(command: argparse.ArgumentParser) -> None:
+    """Describe the overlay to the parser of a command that asks for one frame."""
+    command.add_argument(
+        "--overlay",
+        type=Path,
+        metavar="FILE.ply",
+        help="for a single frame: write its points, aligned with those of its first match",
+    )
+    command.add_argument(
+        "--color",
+        choices=COLOURS,
+        default="source",
+        help="colour the overlay by frame, by normal, or by distance from the other surface "
+        "(default: source)",
+    )
+    command.add_argument(
+        "--by",
+        choices=TRANSFORMS,
+        default="aligned",
+        help="transform of the overlay: the match's, its best rival, or none (default: aligned)",
+    )
+
+
+def check_overlay(options: argparse.Namespace, frames: int) -> None:
+    """See before the first query that the overlay can be written.
+
+    Raises
+    ------
+    DatasetError : several frames would go to one file.
+    OSError : the file cannot be written.
+    """
+    if options.overlay is None:
+        return
+    if frames != 1:
+        raise DatasetError(
+            f"{options.path}: has {frames} frames, but --overlay writes a single file. Choose a "
+            "frame with --frame."
+        )
+    check_writable(options.overlay)
+
+
+def save_overlay(client: Client, answer: Answer, options: argparse.Namespace) -> str:
+    """Write the overlay; returns a line about it.
+
+    Raises
+    ------
+    UnknownFrame : the answer has no match.
+    InvalidRequest : its first match has no such transform.
+    NotIndexed : the query was asked without validation.
+    """
+    if not answer.matches:
+        raise UnknownFrame("The query has no match to overlay. Query a map that has frames.")
+    best = answer.matches[0]
+    data = client.overlay(
+        answer.query_id, best.frame_id, best.map, color=options.color, transform=options.by
+    )
+    write_whole(options.overlay, data)
+    return f"{options.overlay}: the query aligned with {best.frame_id}"
+
+
+def add_query(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "query",
-        help="ask a service where frames were taken",
-        description="Look depth frames or point clouds up in a map: one file, or the frames of a "
-        "folder (7-Scenes, TUM RGB-D or plain depth images, with an intrinsics.json beside them or "
-        "above; or clouds). They are not kept.",
+        help="find frames of the same place in a map",
+        description="Query a map with depth frames or point clouds: one file, or the frames of "
+        "a folder (7-Scenes, TUM RGB-D or plain depth images, with an intrinsics.json beside "
+        "them or in a folder above; or clouds). They are not added to the map.",
     )
     command.add_argument("map", metavar="MAP")
     command.add_argument("path", type=Path, metavar="PATH")
     command.add_argument(
-        "--frame", metavar="N|FILE", help="of a folder, only this one: its place from 0, or name"
+        "--frame", metavar="N|FILE", help="use only this frame of a folder: index from 0, or name"
     )
     command.add_argument(
         "--map",
@@ -39,24 +113,27 @@ def add_to(commands: Any) -> None:
         default=[],
         metavar="NAME",
         dest="also",
-        help="ask this map too, as one with MAP; several: all of them (MAP may be '*' for every "
-        "map that you may read)",
+        help="search this map together with MAP; repeatable (MAP may be '*' for every map that "
+        "you may read)",
     )
     command.add_argument(
         "--stages",
         default="retrieve,diversify,validate",
-        help="comma separated, from `retrieve` (default: retrieve,diversify,validate)",
+        help=(
+            "comma-separated stages, starting with `retrieve` (default: "
+            "retrieve,diversify,validate)"
+        ),
     )
-    command.add_argument("--json", action="store_true", help="print each answer as a line of JSON")
+    command.add_argument("--json", action="store_true", help="print one JSON answer per line")
     add_asking_options(command)
     add_overlay_options(command)
     add_service_options(command)
-    command.set_defaults(run=run)
+    command.set_defaults(run=run_query)
 
 
-def run(options: argparse.Namespace) -> int:
+def run_query(options: argparse.Namespace) -> int:
     """Ask; returns 2 where a frame could not be looked up."""
-    references = chosen(options.path, options.frame)
+    references = query_frames(options.path, options.frame)
     how: dict[str, Any] = {**options_of(options), "stages": options.stages}
     several = options.map == "*" or options.also
     if several:
@@ -75,14 +152,14 @@ def run(options: argparse.Namespace) -> int:
                 told = {"name": reference.name, **answer.model_dump(mode="json")}
                 print(json.dumps(told), flush=True)
             else:
-                lines = [*lines_of(reference.name, answer), *explained_lines(answer)]
+                lines = [*answer_lines(reference.name, answer), *explained_lines(answer)]
                 print("\n".join(lines), flush=True)
             if options.overlay is not None:
                 print(save_overlay(client, answer, options), file=sys.stderr)
     return 2 if failed else 0
 
 
-def chosen(path: Path, wanted: str | None) -> list[FrameReference]:
+def query_frames(path: Path, wanted: str | None) -> list[FrameReference]:
     """The frames to look up.
 
     Raises
@@ -96,7 +173,7 @@ def chosen(path: Path, wanted: str | None) -> list[FrameReference]:
         if int(wanted) < len(references):
             return [references[int(wanted)]]
         raise DatasetError(
-            f"{path}: has {len(references)} frames. Give --frame a place from 0 to "
+            f"{path}: has {len(references)} frames. Set --frame to an index from 0 to "
             f"{len(references) - 1}."
         )
     named = [
@@ -109,18 +186,18 @@ def chosen(path: Path, wanted: str | None) -> list[FrameReference]:
         return named
     found = f"{len(named)} frames are called" if named else "no frame is called"
     raise DatasetError(
-        f"{path}: {found} {wanted}. Give --frame a place from 0, or a name such as "
+        f"{path}: {found} {wanted}. Set --frame to an index from 0, or to a name such as "
         f"{references[0].name}."
     )
 
 
-def lines_of(name: str, answer: Answer) -> list[str]:
+def answer_lines(name: str, answer: Answer) -> list[str]:
     """An answer for people: a line of what came out, a line each match, and the pose."""
     counts = answer.counts
     tried = f"{counts.accepted} of {counts.validated} validated, " if counts.validated else ""
     of = f"{counts.map}"
     if counts.passed != counts.map:
-        of = f"{counts.passed} that pass, of {counts.map}"
+        of = f"{counts.passed} that pass the filter, of {counts.map}"
     lines = [
         f"{one_line(name)}: {answer.status.replace('_', ' ')} ({tried}{counts.ranked} ranked of "
         f"{of} frames, {answer.milliseconds.get('total', 0.0):.0f} ms)"
@@ -172,3 +249,124 @@ def _degrees(transform: Transform | None) -> str:
         return ""
     r = transform.rotation
     return f"{math.degrees(2 * math.atan2(math.hypot(r.x, r.y, r.z), abs(r.w))):.1f}"
+
+
+# `sceneprint localize`: where in a map was this frame taken? One pose, or why there is none.
+
+
+def add_localize(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "localize",
+        help="find the pose of a frame in a map",
+        description="Find the pose in a map at which a depth frame or cloud was taken. The "
+        "frame is not added to the map. Exit code 0: found; 1: ambiguous or not found.",
+    )
+    command.add_argument("map", metavar="MAP")
+    command.add_argument(
+        "path", type=Path, metavar="FRAME", help="a depth image, a cloud or a folder"
+    )
+    command.add_argument(
+        "--frame", metavar="N|FILE", help="frame of a folder: index from 0, or name (default: 0)"
+    )
+    command.add_argument("--json", action="store_true", help="print JSON")
+    add_asking_options(command)
+    add_service_options(command)
+    command.set_defaults(run=run_localize)
+
+
+def run_localize(options: argparse.Namespace) -> int:
+    """Ask; returns 1 where the frame is not found."""
+    reference = query_frames(options.path, options.frame)[0]
+    how: dict[str, Any] = options_of(options)
+    with open_client(options) as client:
+        there = client.localize(options.map, reference, **how)
+    if options.json:
+        print(there.model_dump_json())
+    else:
+        print("\n".join(localization_lines(reference.name, there)))
+    return 0 if there.status == "found" else 1
+
+
+def localization_lines(name: str, there: Localization) -> list[str]:
+    """A localization for people."""
+    sure = f" ({there.strength})" if there.strength else ""
+    lines = [
+        f"{one_line(name)}: {there.status.replace('_', ' ')}{sure}; {one_line(there.reason)} "
+        f"({there.milliseconds.get('total', 0.0):.0f} ms)"
+    ]
+    if there.pose is not None:
+        r = there.pose.rotation
+        lines.append(
+            f"  at {metres(there.pose)} m in {one_line(there.pose.parent_frame)}, rotation "
+            f"{r.x:.4f} {r.y:.4f} {r.z:.4f} {r.w:.4f} (x y z w)"
+        )
+    elif there.best is not None:
+        lines.append(f"  at {metres(there.best.transform)} m from frame {there.best.frame_id}")
+    return lines
+
+
+# `sceneprint similarity`: how alike are two frames, and do they see one place?
+
+
+def add_similarity(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "similarity",
+        help="compare two frames",
+        description="Compare two frames, each a file or a stored frame, MAP:FRAME_ID. Uploaded "
+        "files are not stored. Exit code 0: they show the same place; 1: they do not, or it is "
+        "ambiguous.",
+    )
+    command.add_argument("a", metavar="A")
+    command.add_argument("b", metavar="B")
+    command.add_argument(
+        "--no-validate", action="store_true", help="compare only the signatures (exit code 0)"
+    )
+    command.add_argument(
+        "--validation", type=setting, action="append", metavar="NAME=VALUE",
+        help="set a validation option, such as mode=paper; repeatable",
+    )  # fmt: skip
+    command.add_argument(
+        "--seed",
+        type=whole_number,
+        default=0,
+        metavar="S",
+        help="random seed (default: 0)",
+    )
+    command.add_argument("--model", help="model that signs two uploaded files (default: depth)")
+    command.add_argument("--json", action="store_true", help="print JSON")
+    add_service_options(command)
+    command.set_defaults(run=run_similarity)
+
+
+def run_similarity(options: argparse.Namespace) -> int:
+    """Compare; returns 1 where the frames do not see one place."""
+    with open_client(options) as client:
+        found = client.similarity(
+            frame_argument(options.a), frame_argument(options.b), validate=not options.no_validate,
+            validation=settings_of(options.validation), seed=options.seed, model=options.model,
+        )  # fmt: skip
+    print(found.model_dump_json() if options.json else line_of(found))
+    return 0 if found.validation is None or found.validation.status == "accepted" else 1
+
+
+def frame_argument(text: str) -> Path | tuple[str, str]:
+    """A file, or the map and the id of a stored frame."""
+    path = Path(text)
+    stored = re.fullmatch(r"([a-z0-9][a-z0-9_-]*):([A-Za-z0-9._:-]+)", text)
+    if stored is not None and not path.exists():
+        return stored[1], stored[2]
+    return path
+
+
+def line_of(found: Similarity) -> str:
+    """A comparison for people."""
+    told = f"similarity {found.similarity:.3f} (distance {found.distance}, {found.model})"
+    made = found.validation
+    if made is not None:
+        status = f"{made.status} {made.strength}" if made.strength else made.status
+        told += f"; {status}: {one_line(made.reason)}"
+    if found.transform is not None:
+        told += f"; b lies at {metres(found.transform)} m from a"
+    return told

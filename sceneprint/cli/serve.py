@@ -9,25 +9,32 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from sceneprint.cli.numbers import whole
+from sceneprint.cli.options import whole_number
 from sceneprint.settings import Settings
 
 
-def add_to(commands: Any) -> None:
+def add_serve(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "serve",
-        help="run the HTTP service and workers that sign what it receives",
-        description="Run the HTTP service and its workers. Nothing has to be configured; every "
-        "option can also be set in the environment (SCENEPRINT_HOST, _PORT, _WORKERS, _DATA_DIR).",
+        help="run the HTTP service and its workers",
+        description="Run the HTTP service and its workers. It needs no configuration; you can "
+        "also set every option in the environment (SCENEPRINT_HOST, _PORT, _WORKERS, _DATA_DIR).",
     )
     add_data_option(command)
-    command.add_argument("--host", metavar="ADDRESS", help="default: 127.0.0.1, this machine only")
     command.add_argument(
-        "--port", type=whole, metavar="N", help="default: 8008; 0 for a free one, which is printed"
+        "--host",
+        metavar="ADDRESS",
+        help="address to listen on (default: 127.0.0.1, this machine only)",
+    )
+    command.add_argument(
+        "--port",
+        type=whole_number,
+        metavar="N",
+        help="port to listen on (default: 8008); 0 picks a free port and prints it",
     )
     add_workers_option(command)
-    command.set_defaults(run=run)
+    command.set_defaults(run=run_serve)
 
 
 def add_data_option(command: argparse.ArgumentParser) -> None:
@@ -36,14 +43,17 @@ def add_data_option(command: argparse.ArgumentParser) -> None:
         "--data",
         type=Path,
         metavar="DIR",
-        help="folder of database and blobs (default: the user's)",
+        help="data folder, with database and blobs (default: the user's data folder)",
     )
 
 
 def add_workers_option(command: argparse.ArgumentParser) -> None:
     """`--workers`."""
     command.add_argument(
-        "--workers", type=whole, metavar="N", help="processes that sign (default: processors - 1)"
+        "--workers",
+        type=whole_number,
+        metavar="N",
+        help="number of worker processes (default: processors - 1)",
     )
 
 
@@ -78,23 +88,34 @@ def settings_of(options: argparse.Namespace) -> Settings:
         ) from (None if secret else error)
 
 
-def run(options: argparse.Namespace) -> int:
+def run_serve(options: argparse.Namespace) -> int:
     """Serve until told to stop."""
-    from sceneprint.cli.signer import prepare_presets
+    from sceneprint.cli.options import prepare_presets
     from sceneprint.logs import log_as_json
     from service.server import run as serve
     from worker.supervisor import Supervisor
 
     settings = settings_of(options)
     log_as_json()  # from the first line on
-    prepare_presets(settings, logging.getLogger(__name__).info)
     supervisor, stop = Supervisor(settings), threading.Event()
-    watching = threading.Thread(target=supervisor.watch, args=(stop,), name="supervisor")
+    failures: list[Exception] = []
+
+    def work(read_only: bool) -> None:
+        try:
+            prepare_presets(settings, logging.getLogger(__name__).info)
+            if not (read_only or stop.is_set()):  # there would be nothing for workers to do
+                supervisor.start()
+                supervisor.watch(stop)
+        except Exception as error:  # a service without its workers must not go on
+            failures.append(error)
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+
+    threads: list[threading.Thread] = []
 
     def ready(url: str, read_only: bool) -> None:
-        if not read_only:  # there would be nothing for workers to do
-            supervisor.start()  # after the service has brought the database to its schema
-            watching.start()
+        # the service answers while kernels are compiled; workers begin once they are
+        threads.append(threading.Thread(target=work, args=(read_only,), name="supervisor"))
+        threads[0].start()
         print(f"sceneprint: serving {url}\nsceneprint: dashboard {url}/dashboard", flush=True)
 
     # uvicorn handles both signals while it runs; before and after, leave by the same way out
@@ -105,6 +126,39 @@ def run(options: argparse.Namespace) -> int:
         pass  # the ordinary end
     finally:
         stop.set()
-        if watching.is_alive():
-            watching.join()
+        for thread in threads:
+            thread.join()
+    if failures:
+        raise failures[0]
+    return 0
+
+
+# `sceneprint work`: workers alone, beside a service that runs elsewhere on the same store.
+
+
+def add_work(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "work",
+        help="run workers without the HTTP service",
+        description="Run worker processes for a service that uses the same store.",
+    )
+    add_data_option(command)
+    add_workers_option(command)
+    command.set_defaults(run=run_work)
+
+
+def run_work(options: argparse.Namespace) -> int:
+    """Work until told to stop."""
+    from sceneprint.cli.options import prepare_presets
+    from sceneprint.engine.engine import open_engine
+    from sceneprint.logs import log_as_json
+    from worker.supervisor import run as work
+
+    settings = settings_of(options)
+    log_as_json()  # from the first line on
+    with open_engine(settings) as engine:  # what is wrong is said once, and not by every worker
+        engine.store.database.require_writable()
+    prepare_presets(settings, logging.getLogger(__name__).info)
+    work(settings)
     return 0

@@ -7,18 +7,21 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from sceneprint.cli.archive import import_all, is_archive_file
-from sceneprint.cli.awaiting import STALL_S, wait_for_all
-from sceneprint.cli.connection import add_service_options, open_client
-from sceneprint.cli.numbers import positive
-from sceneprint.cli.saying import base_of, priority_of, share_of
-from sceneprint.cli.tally import Tally
-from sceneprint.datasets import FrameReference, Sequence, find_sequences
+from sceneprint.cli.options import (
+    add_service_options,
+    base_of,
+    one_line,
+    open_client,
+    positive,
+    priority_of,
+    share_of,
+)
 from sceneprint.errors import (
     DatasetError,
     FrameConflict,
@@ -27,14 +30,219 @@ from sceneprint.errors import (
     MapExists,
     MissingDependency,
     Refused,
+    UnknownFrame,
     UnknownMap,
 )
+from sceneprint.formats.archive.entries import is_archive
+from sceneprint.formats.dataset import FrameReference, FrameSequence, find_sequences
 from sceneprint.models import PRESETS
-from sceneprint.schemas.novelty import NOVEL
+from sceneprint_client.api.base import checked
+from sceneprint_client.api.frames import NOVEL, ImportOptions
 
 if TYPE_CHECKING:
-    from sceneprint.client import Client
-    from sceneprint.schemas import Added
+    from sceneprint_client import Client
+    from sceneprint_client.api import Added, Job
+
+# What has become of the frames of an upload.
+
+
+@dataclass
+class Tally:
+    """Counts frames by what has become of them."""
+
+    new: int = 0
+    there: int = 0  #: in the map before
+    refused: int = 0
+    indexed: int = 0
+    rejected: int = 0
+    failed: int = 0
+    redundant: int = 0  #: not kept, as the map had their places
+    #: Names of the frames that are not signed yet, by their jobs; one content has one job.
+    waiting: dict[str, list[str]] = field(default_factory=dict)
+    errors: list[tuple[str, str]] = field(default_factory=list)  #: name of a frame, and why
+
+    def count(self, name: str, added: Added, new: bool) -> None:
+        """A frame that was received, or is there."""
+        from sceneprint_client.api import FrameState
+
+        self.new += new
+        self.there += not new
+        if added.state in (FrameState.RECEIVED, FrameState.SIGNING):
+            self.waiting.setdefault(added.job_id, []).append(name)
+        elif added.state is FrameState.INDEXED:
+            self.indexed += 1
+        elif added.state is FrameState.REDUNDANT:
+            self.redundant += 1
+        else:
+            self._lose(name, added.reason, rejected=added.state is FrameState.REJECTED)
+
+    def refuse(self, name: str, reason: str) -> None:
+        """A frame that was not received."""
+        self.refused += 1
+        self.errors.append((name, reason))
+
+    def end(self, job: Job, *, redundant: bool = False) -> None:
+        """A job that is over, and whether its frame was not kept."""
+        from sceneprint_client.api import JobState
+
+        for name in self.waiting.pop(job.job_id):
+            if redundant:
+                self.redundant += 1
+            elif job.state is JobState.SUCCEEDED:
+                self.indexed += 1
+            else:
+                reason = job.error or job.state.sentence
+                self._lose(name, reason, rejected=job.state is JobState.FAILED)
+
+    def report(self, total: int, seconds: float) -> None:
+        """Print the sum, and a line for each frame that was not indexed."""
+        refused = f", {self.refused} refused" if self.refused else ""
+        waiting = f", {len(self.waiting)} waiting" if self.waiting else ""
+        redundant = f", {self.redundant} redundant" if self.redundant else ""
+        print(
+            f"{total} frames: {self.new} received, {self.there} already there{refused}; "
+            f"{self.indexed} indexed, {self.rejected} rejected, {self.failed} failed"
+            f"{redundant}{waiting}; {(self.new + self.there) / max(seconds, 1e-9):.1f} frames/s"
+        )
+        for name, reason in sorted(self.errors):
+            print(f"{one_line(name)}: {one_line(reason)}", file=sys.stderr)
+
+    def _lose(self, name: str, reason: str | None, *, rejected: bool) -> None:
+        self.rejected += rejected
+        self.failed += not rejected
+        what = "rejected" if rejected else "failed"
+        self.errors.append((name, f"{what}: {reason or 'no reason'}"))
+
+
+# Waiting until the frames of an upload are signed.
+
+#: Seconds without a frame signed after which no worker is believed to be there.
+STALL_S = 120.0
+
+
+def wait_for_all(client: Client, map_name: str, tally: Tally, *, may_be_redundant: bool) -> bool:
+    """Wait for the jobs as long as some end now and then; whether all did.
+
+    Parameters
+    ----------
+    client : of the service
+    map_name : of the map
+    tally : of the upload, which is told of every job that is over
+    may_be_redundant : whether frames were sent to be kept only where the map lacks the place
+    """
+    total = len(tally.waiting)
+    with tqdm(total=total, desc="sign", unit="frame", disable=None) as bar:
+        while tally.waiting:
+            before = total - len(tally.waiting)
+
+            def progress(done: int, _: int, before: int = before) -> None:
+                bar.update(before + done - bar.n)
+
+            over = [
+                job
+                for job in client.wait(tally.waiting, timeout_s=STALL_S, progress=progress)
+                if job.state.over
+            ]
+            for job in over:
+                redundant = may_be_redundant and _is_redundant(client, map_name, job)
+                tally.end(job, redundant=redundant)
+            if not over:
+                return False
+    return True
+
+
+def _is_redundant(client: Client, map_name: str, job: Job) -> bool:
+    """Whether a frame was signed and not kept: its job alone does not tell."""
+    from sceneprint_client.api import FrameState, JobState
+
+    if job.state is not JobState.SUCCEEDED:
+        return False
+    return client.frame(map_name, str(job.frame_id)).state is FrameState.REDUNDANT
+
+
+# Archives given to `sceneprint upload`: sent whole, and waited for until all frames are taken.
+
+#: Bytes that tell whether a file is an archive, and seconds between two looks at an import.
+_HEAD, _PAUSE_S = 512, 2.0
+
+
+def is_archive_file(path: Path) -> bool:
+    """Whether a path is a file that begins as an archive does."""
+    try:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return is_archive(file.read(_HEAD))
+    except OSError:  # whoever reads it says so
+        return False
+
+
+def import_all(
+    client: Client, options: argparse.Namespace, archives: list[Path], tally: Tally
+) -> bool:
+    """Send archives and count their frames; False where workers do nothing for long."""
+    for path in archives:
+        said = checked(
+            ImportOptions,
+            f"The metadata of {path.name}",
+            name=path.name.partition(".")[0][:64] or "import",
+            robot=options.robot,
+            session=options.session,
+            tags=options.tag,
+            parent_frame=options.parent_frame,
+            with_poses=not options.no_pose,
+            every=options.every,
+            T_base_sensor=options.base,
+            priority=options.priority,
+            if_novel=options.if_novel,
+        )
+        with path.open("rb") as file:
+            job = client.import_archive(options.map, file, said)
+        if options.no_wait:
+            print(f"{path.name}: received; import {job.job_id} adds its frames")
+            continue
+        job, moves = _waited(client, path.name, job)
+        _count(client, options.map, job, tally)
+        if not moves:
+            return False
+        if job.error is not None:
+            tally.refuse(path.name, job.error)
+    return True
+
+
+def _waited(client: Client, name: str, job: Job) -> tuple[Job, bool]:
+    """An import once it is over, or when it has not moved for long."""
+    moved, seen = time.monotonic(), -1
+    with tqdm(desc=name, unit="frame", disable=None) as bar:
+        while not job.state.over:
+            [job] = client.wait([job.job_id], timeout_s=_PAUSE_S)
+            if job.progress is not None:
+                bar.total = job.progress.total
+                bar.update(job.progress.done - bar.n)
+            done = -1 if job.progress is None else job.progress.done
+            if done != seen:
+                moved, seen = time.monotonic(), done
+            elif time.monotonic() - moved > STALL_S:
+                return job, False
+    return job, True
+
+
+def _count(client: Client, map_name: str, job: Job, tally: Tally) -> None:
+    from sceneprint_client.api import Added, FrameState
+
+    for item in client.import_items(map_name, job.job_id):
+        if item.frame_id is None or item.job_id is None:
+            tally.refuse(item.name, "refused" if item.problem is None else item.problem.detail)
+            continue
+        state = FrameState.RECEIVED
+        if item.status == 200:  # it may be over long since
+            try:
+                state = client.frame(map_name, item.frame_id).state
+            except UnknownFrame:  # deleted meanwhile
+                continue
+        added = Added(frame_id=item.frame_id, job_id=item.job_id, state=state, reason=None)
+        tally.count(item.name, added, item.status == 202)
+
 
 #: What is wrong with one frame, and says nothing of the next.
 _OF_FRAME = (
@@ -42,61 +250,68 @@ _OF_FRAME = (
 )  # fmt: skip
 
 
-def add_to(commands: Any) -> None:
-    """Describe the command to the parser."""
+def add_upload(commands: Any) -> None:
+    """Describe the command to the parser.
+
+    Length: a statement for each option, in the order of `--help`.
+    """
     command = commands.add_parser(
         "upload",
         help="upload depth frames and point clouds to a map of a service",
         description="Upload every frame of the given files and folders (7-Scenes, TUM RGB-D or "
-        "plain depth images, with an intrinsics.json beside them or above; or point clouds), and "
-        "wait until they are signed. A zip or tar of them is sent whole, and unpacked by the "
-        "service. A frame that is in the map already is not stored twice.",
+        "plain depth images, with an intrinsics.json beside them or in a folder above; or point "
+        "clouds), and wait until they are signed. A zip or tar archive is sent whole and "
+        "unpacked by the service. A frame that the map already has is not stored twice.",
     )
-    command.add_argument("map", metavar="MAP", help="made where missing")
+    command.add_argument(
+        "map", metavar="MAP", help="map to upload to; created if it does not exist"
+    )
     command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
     command.add_argument(
-        "--robot", metavar="NAME", help="who took the frames, and whose the poses' frame is"
+        "--robot",
+        metavar="NAME",
+        help="robot that took the frames; also qualifies the parent frame of the poses",
     )
     command.add_argument(
-        "--session", metavar="NAME", help="in which run (default: the sequence's name)"
+        "--session", metavar="NAME", help="session of the frames (default: the sequence's name)"
     )
     command.add_argument(
-        "--tag", action="append", default=[], metavar="TAG", help="may be given several times"
+        "--tag", action="append", default=[], metavar="TAG", help="tag of the frames; repeatable"
     )
     command.add_argument(
         "--parent-frame",
         metavar="NAME",
-        help="what all poses lead to: poses of several uploads are combined where they share it "
+        help="parent frame of all poses; poses of several uploads are combined if they share it "
         "(default: the name of the scene's folder, with --robot ROBOT/SCENE)",
     )
-    command.add_argument("--no-pose", action="store_true", help="leave known poses out")
+    command.add_argument("--no-pose", action="store_true", help="do not upload known poses")
     command.add_argument(
         "--base",
         type=base_of,
         metavar="TX,TY,TZ,QX,QY,QZ,QW",
-        help="where the sensor sits on the robot: metres and a unit quaternion, sensor to base",
+        help="mounting pose of the sensor, sensor to base: metres and a unit quaternion",
     )
     command.add_argument(
-        "--base-frame", metavar="NAME", help="what the robot calls its base (default: base_link)"
+        "--base-frame", metavar="NAME", help="name of the robot's base frame (default: base_link)"
     )
     command.add_argument(
         "--create",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="make the map where it is missing (default)",
+        help="create the map if it does not exist (default)",
     )
     command.add_argument(
-        "--model", choices=PRESETS, help=f"of a map that is made (default: {PRESETS[0]})"
+        "--model", choices=PRESETS, help=f"model of a new map (default: {PRESETS[0]})"
     )
     command.add_argument(
-        "--every", type=positive, default=1, metavar="N", help="take every Nth frame"
+        "--every", type=positive, default=1, metavar="N", help="upload every Nth frame"
     )
     command.add_argument(
         "--priority",
         type=priority_of,
         default=0,
         metavar="N",
-        help="from -10 to 10: frames of a greater one are signed first (default: 0)",
+        help="-10 to 10; frames with a higher priority are signed first (default: 0)",
     )
     command.add_argument(
         "--if-novel",
@@ -104,22 +319,26 @@ def add_to(commands: Any) -> None:
         type=share_of,
         const=True,
         metavar="D",
-        help="keep a frame only if the map lacks its place: if the nearest frame is farther than D "
-        f"of the distance of unrelated frames (without a number: {NOVEL:g})",
+        help="keep a frame only if its place is new to the map: the nearest frame is farther "
+        f"than D, as a share of the distance of unrelated frames (without a number: {NOVEL:g})",
     )
-    command.add_argument("--no-wait", action="store_true", help="do not wait until all are signed")
+    command.add_argument("--no-wait", action="store_true", help="do not wait for signing")
     command.add_argument(
-        "--parallel", type=positive, default=4, metavar="N", help="in flight at once (default: 4)"
+        "--parallel",
+        type=positive,
+        default=4,
+        metavar="N",
+        help="number of concurrent uploads (default: 4)",
     )
     add_service_options(command)
-    command.set_defaults(run=run)
+    command.set_defaults(run=run_upload)
 
 
-def run(options: argparse.Namespace) -> int:
+def run_upload(options: argparse.Namespace) -> int:
     """Upload; returns 2 where a frame was not indexed."""
     archives = [path for path in options.paths if is_archive_file(path)]
     paths = [path for path in options.paths if path not in archives]
-    found = list(_found(paths, options.every, one_frame=options.parent_frame is not None))
+    found = list(_frames_of(paths, options.every, one_frame=options.parent_frame is not None))
     if options.base is not None and options.base_frame is not None:
         options.base = options.base.model_copy(update={"base_frame": options.base_frame})
     tally, start, stalled = Tally(), time.perf_counter(), False
@@ -136,16 +355,17 @@ def run(options: argparse.Namespace) -> int:
             tally.report(max(len(found), counted), time.perf_counter() - start)
             if stalled:
                 print(
-                    f"{len(tally.waiting)} frames are safe and wait, but none was signed for "
-                    f"{STALL_S:.0f} s. See that workers run: `sceneprint work` starts some.",
+                    f"{len(tally.waiting)} frames are stored and waiting, but none was signed "
+                    f"for {STALL_S:.0f} s. Check that workers are running; `sceneprint work` "
+                    "starts some.",
                     file=sys.stderr,
                 )
     return 2 if tally.errors or stalled else 0
 
 
-def _found(
+def _frames_of(
     paths: list[Path], every: int, *, one_frame: bool
-) -> Iterator[tuple[Sequence, FrameReference]]:
+) -> Iterator[tuple[FrameSequence, FrameReference]]:
     """Frames with their sequences.
 
     Parameters
@@ -164,10 +384,10 @@ def _found(
             place = (sequence.folder.parent if shared else sequence.folder).resolve()
             if places.setdefault(sequence.parent_frame, place) != place and not one_frame:
                 raise DatasetError(
-                    f"{path}: Another place is called {sequence.parent_frame} too, "
+                    f"{path}: The name {sequence.parent_frame} is also used for "
                     f"{places[sequence.parent_frame]}, and poses of the two would be mixed. "
-                    "Upload a folder above both, rename one, or where poses of both lead to one "
-                    "frame, name it with --parent-frame."
+                    "Upload a folder above both, rename one, or, if their poses share one "
+                    "parent frame, name it with --parent-frame."
                 )
             for reference in sequence.frames[::every]:
                 yield sequence, reference
@@ -180,18 +400,19 @@ def _see_to_map(client: Client, options: argparse.Namespace) -> None:
         if not options.create:
             raise
         made = client.create_map(options.map, model=options.model or PRESETS[0])
-        print(f"map {made.name} is made, with model {made.model}")
+        print(f"created map {made.name} with model {made.model}")
         return
     if options.model is not None and model.rpartition("-")[0] != options.model:
         raise MapExists(
-            f"Map {options.map} is there, with model {model}. Leave --model out, or name another."
+            f"Map {options.map} already exists with model {model}. Leave --model out, or use "
+            "another map."
         )
 
 
 def _send_all(
     client: Client,
     options: argparse.Namespace,
-    found: list[tuple[Sequence, FrameReference]],
+    found: list[tuple[FrameSequence, FrameReference]],
     tally: Tally,
 ) -> None:
     """Upload all, several at a time; what is wrong with the service ends it."""
@@ -214,9 +435,10 @@ def _send_all(
 
 
 def _send(
-    client: Client, options: argparse.Namespace, sequence: Sequence, reference: FrameReference
+    client: Client, options: argparse.Namespace, sequence: FrameSequence, reference: FrameReference
 ) -> tuple[Added, bool]:
-    from sceneprint.datasets.metas import meta_of, parent_frame_of, session_of
+    from sceneprint.formats.dataset.upload_metadata import parent_frame_of, session_of
+    from sceneprint_client.frame_files import meta_of
 
     meta = meta_of(
         reference,

@@ -3,7 +3,7 @@
 Engine.add_frame  -->  store  --Engine.work-->  signature in the store  --Engine.query-->  Answer
 """
 
-from sceneprint.engine.endings import Work
 from sceneprint.engine.engine import Engine
+from sceneprint.engine.jobs.lifecycle import Work
 
 __all__ = ["Engine", "Work"]

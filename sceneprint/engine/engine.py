@@ -3,42 +3,72 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Collection, Mapping
+from datetime import datetime
+from pathlib import Path
 from types import TracebackType
 
-from sceneprint.engine import jobs
-from sceneprint.engine import work as working
-from sceneprint.engine.administration import Administration
-from sceneprint.engine.browsing import list_frames
-from sceneprint.engine.endings import Work, put_back
-from sceneprint.engine.slices import Task
-from sceneprint.engine.sweeping import sweep_deleted
-from sceneprint.engine.uploads import Upload
-from sceneprint.engine.views import View
-from sceneprint.engine.wire import tell_frames
-from sceneprint.errors import BusyIndex
+from sceneprint.engine.admin import keys
+from sceneprint.engine.admin.keys import Audit
+from sceneprint.engine.admin.operations import OperatorTasks
+from sceneprint.engine.ingest.archive_import import Imports
+from sceneprint.engine.ingest.uploads import Upload, Uploads
+from sceneprint.engine.jobs import lifecycle
+from sceneprint.engine.jobs import signature_job as working
+from sceneprint.engine.jobs.lifecycle import Work, put_back
+from sceneprint.engine.jobs.tasks import LongJob, Tasks
+from sceneprint.engine.maps import maps, model_switch
+from sceneprint.engine.maps.map_frames import FrameFiles, list_frames
+from sceneprint.engine.maps.model_switch import ModelSwitches
+from sceneprint.engine.models import Signers, warm
+from sceneprint.engine.reconstruction import ReconstructionJobs
+from sceneprint.engine.results.inspection import Inspection, PointClouds
+from sceneprint.engine.results.rerun import Rerun
+from sceneprint.engine.results.stored_results import ResultValidity, open_results
+from sceneprint.engine.search.index_view import IndexView
+from sceneprint.engine.search.local_index import Readers
+from sceneprint.engine.search.query import Queries
+from sceneprint.engine.serializers import frame_records, map_record
+from sceneprint.engine.sessions.association_job import Associating
+from sceneprint.engine.sessions.associations import AssociationJobs
+from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
+from sceneprint.engine.upkeep.deletion import Purging, Retention
+from sceneprint.engine.upkeep.index_upkeep import Upkeep
+from sceneprint.engine.upkeep.vector_tables import VectorTables
+from sceneprint.errors import BusyIndex, ModelError, StoreAway, UnusableStore
 from sceneprint.models import Model
-from sceneprint.schemas import (
+from sceneprint.settings import Settings
+from sceneprint.store import frames as stored_frames
+from sceneprint.store import keys as stored_keys
+from sceneprint.store import maps as stored_maps
+from sceneprint.store import open_store, queue
+from sceneprint.store.associations import ASSOCIATE
+from sceneprint.store.model_switch import models_of
+from sceneprint.store.postgres.notify import Notices
+from sceneprint.store.tables import MapRow
+from sceneprint.store.wakeup import Wakeup
+from sceneprint_client.api import (
     Added,
     Answer,
     Frame,
     FrameMeta,
     FrameState,
+    Job,
     JobState,
+    Map,
     NamedFrame,
+    NewMap,
     Page,
     Query,
 )
-from sceneprint.schemas.browsing import FrameListing
-from sceneprint.store import cancelling, listing, queue
-from sceneprint.store import frames as stored_frames
-from sceneprint.store import maps as stored_maps
-from sceneprint.store.records import MapRow
+from sceneprint_client.api.admin import Key, MadeKey, Scope
+from sceneprint_client.api.listing import FrameListing
 
 log = logging.getLogger(__name__)
 
 
-class Engine(Administration):
+class Engine:
     """Maps, frames, queries and jobs over one store; safe to share between threads.
 
     Parameters
@@ -49,6 +79,159 @@ class Engine(Administration):
     ------
     UnusableStore, NewerSchema : the store cannot be opened.
     """
+
+    def __init__(self, settings: Settings) -> None:
+        from threadpoolctl import threadpool_limits
+
+        self.settings = settings
+        replica = settings.replica_url
+        self.store = open_store(
+            settings.database, settings.blobs,
+            None if replica is None else replica.get_secret_value(), settings.replica_lag_s,
+            settings.purge_s,
+        )  # fmt: skip
+        self.signers = Signers(self.store.database, settings.cache_dir)
+        self._upkeep = Upkeep(
+            self.store, self.signers, settings.indexes, settings.tail_frames, settings.scrub_s
+        )
+        self._reencoding = ModelSwitches(self.store, self._upkeep)
+        self._readers = Readers(self.signers, settings.indexes, settings.search)
+        self._vector_tables = VectorTables(self.signers, settings.search)
+        self.kept = open_results(
+            settings, self.store.blobs, lambda kept: ResultValidity(self.store).asked(kept)
+        )
+        self.inspection = Inspection(self.store, self.signers, self.kept)
+        self.queries = Queries(self.store, self.signers, self._readers, self.kept)
+        self.again = Rerun(self.store, self.kept, self.queries)
+        # threads of the service work side by side, and sums have one order: the same bytes always
+        self._limits = threadpool_limits(1)
+        server = not self.store.database.is_sqlite
+        self.bell = Notices(self.store.database) if server else Wakeup(settings.bell_dir)
+        self.uploads = Uploads(self.store, self.bell, settings.concurrency)
+        self.tasks = Tasks(self.store, self.bell)
+        self.imports = Imports(self.store, self.tasks, self.uploads, settings.import_bytes)
+        self.associations = AssociationJobs(self.store, self.tasks)
+        associating = Associating(self.store, self.signers, self._readers)
+        self.tasks.register(ASSOCIATE, associating)
+        self.audit = Audit(self.store)
+        self.outputs = FrameFiles(self.store, self.signers)
+        self.points = PointClouds(self.store, self.inspection.pairs, self.kept)
+        self.reconstructions = ReconstructionJobs(self.store, self.tasks)
+        self.retiring = Retention(self.store)
+        self.purging = Purging(
+            self.store, self._upkeep, self.kept, self.reconstructions, settings.purge_s
+        )
+        self._purged = time.monotonic()
+        self.operations = OperatorTasks(self.store, settings, self.bell)
+
+    def close(self) -> None:
+        """Give back what was opened."""
+        self._limits.restore_original_limits()
+        self.bell.close()
+        self.store.close()
+
+    def warm(self) -> None:
+        """Load code and tables of every model in use before a request needs them."""
+        with self.store.database.read() as connection:
+            used = {one for row in stored_maps.list_maps(connection) for one in models_of(row)}
+        for model_id in used:
+            try:
+                warm(self.signers(model_id))
+            except ModelError as error:  # it costs the maps of this model, and no others
+                log.error("model unusable", extra={"model": model_id, "error": str(error)})
+
+    # maps
+
+    def create_map(self, new: NewMap) -> tuple[Map, bool]:
+        """Make a map, or find it there as wanted; see `maps.create_map`."""
+        return maps.create_map(self.store, new)
+
+    def list_maps(self) -> Page[Map]:
+        """All maps by name."""
+        with self.store.database.read() as connection:
+            rows = stored_maps.list_maps(connection)
+            return Page[Map](items=[map_record(connection, row) for row in rows])
+
+    def get_map(self, name: str) -> Map:
+        """A map; UnknownMap where there is none."""
+        with self.store.database.read() as connection:
+            return map_record(connection, stored_maps.find_map(connection, name))
+
+    def delete_map(self, name: str) -> None:
+        """Remove a map with all that is in it; UnknownMap where there is none."""
+        with self.store.database.write() as connection:
+            blobs = stored_maps.remove_map(connection, stored_maps.find_map(connection, name))
+        self._readers.forget(name)
+        collect_deleted_blobs(self.store, blobs)
+
+    def reencode(self, name: str, model: str | Path | Model) -> Map:
+        """Have a map signed with another model, to which it then switches; see
+        `model_switch.begin`.
+        """
+        told = model_switch.begin(self.store, name, model)
+        self.bell.ring()
+        return told
+
+    def forget_gone(self) -> None:
+        """Give up what is held of maps that another process deleted, and now and then of frames."""
+        with self.store.database.read() as connection:
+            if time.monotonic() - self._purged < self.settings.purge_s / 2:
+                self._readers.tidy(connection)
+                return
+            self._purged = time.monotonic()
+            self._readers.purge(connection)
+        self.kept.forget(ResultValidity(self.store).all_of)  # this node may have no worker
+
+    def cancel_reencode(self, name: str) -> Map:
+        """Let a map keep the model it has; see `model_switch.cancel`."""
+        return model_switch.cancel(self.store, name)
+
+    # jobs
+
+    def get_job(self, job_id: str) -> Job:
+        """A job; UnknownJob where there is none."""
+        return lifecycle.get_job(self.store, job_id)
+
+    def list_jobs(
+        self, state: JobState | None = None, cursor: str | None = None, limit: int = 100,
+        kind: str | None = None, map_names: Collection[str] | None = None,
+    ) -> Page[Job]:  # fmt: skip
+        """Jobs, the newest first; see `lifecycle.list_jobs`."""
+        return lifecycle.list_jobs(self.store, state, cursor, limit, kind, map_names)
+
+    def cancel_job(self, job_id: str) -> Job:
+        """Give up a job that is not over; see `lifecycle.cancel`."""
+        return lifecycle.cancel(self.store, job_id)
+
+    def retry_job(self, job_id: str) -> tuple[Job, bool]:
+        """Try again what was given up, in a new job; see `lifecycle.retry`."""
+        job, new = lifecycle.retry(self.store, job_id)
+        if new:
+            self.bell.ring()
+        return job, new
+
+    # keys
+
+    def create_key(
+        self, name: str, grants: Mapping[str, Scope] | None = None,
+        expires_at: datetime | None = None,
+    ) -> MadeKey:  # fmt: skip
+        """Make a key, and show its secret; see `keys.create_key`."""
+        return keys.create_key(self.store, name, grants, expires_at)
+
+    def list_keys(self, cursor: str | None = None, limit: int = 100) -> Page[Key]:
+        """Keys by name; see `keys.list_keys`."""
+        return keys.list_keys(self.store, cursor, limit)
+
+    def revoke_key(self, name: str) -> None:
+        """Let a key open nothing any more; UnknownKey where there is none."""
+        with self.store.database.write() as connection:
+            stored_keys.revoke_key(connection, name)
+
+    def find_key(self, secret: str) -> stored_keys.KeyRow | None:
+        """The key with that secret, or None; also one that has expired."""
+        with self.store.database.read() as connection:
+            return stored_keys.find_key(connection, secret)
 
     def __enter__(self) -> Engine:
         return self
@@ -96,7 +279,7 @@ class Engine(Administration):
         with self.store.database.read() as connection:
             row = stored_maps.find_map(connection, map_name)
             frame = stored_frames.find_frame(connection, row, frame_id)
-            return tell_frames(connection, row, [frame])[0]
+            return frame_records(connection, row, [frame])[0]
 
     def delete_frame(self, map_name: str, frame_id: str) -> None:
         """Take a frame out of its map, effective at once.
@@ -108,9 +291,9 @@ class Engine(Administration):
         with self.store.database.write() as connection:
             row = stored_maps.find_map(connection, map_name)
             frame = stored_frames.find_frame(connection, row, frame_id)
-            cancelling.cancel_of(connection, frame.number)
+            queue.cancel_of(connection, frame.number)
             blobs = stored_frames.delete_frame(connection, row, frame)
-        sweep_deleted(self.store, blobs)
+        collect_deleted_blobs(self.store, blobs)
 
     # queries
 
@@ -127,7 +310,7 @@ class Engine(Administration):
         frame = NamedFrame.model_construct(map=map_name, frame_id=frame_id)
         return self.queries.stored([map_name], frame, query, since)
 
-    def view(self, map_name: str) -> tuple[MapRow, Model, View]:
+    def view(self, map_name: str) -> tuple[MapRow, Model, IndexView]:
         """A map with its model and all its signatures, as they are now; UnknownMap."""
         row = self._row(map_name)
         while True:  # its signer opened while no connection is held
@@ -143,8 +326,8 @@ class Engine(Administration):
 
     # work
 
-    def claim(self, worker: str) -> Work | Task | None:
-        """Take the next job, or None; see `work.claim`."""
+    def claim(self, worker: str) -> Work | LongJob | None:
+        """Take the next job, or None; see `signature_job.claim`."""
         return working.claim(self.store, worker, self.settings.lease_s)
 
     def due_in_s(self) -> float | None:
@@ -152,9 +335,9 @@ class Engine(Administration):
         with self.store.database.read() as connection:
             return queue.due_in_s(connection)
 
-    def run(self, work: Work | Task, broke: Callable[[], None] | None = None) -> JobState | None:
-        """Do a claimed job, or a slice of a long one; see `work.run` and `Tasks.run`."""
-        if isinstance(work, Task):
+    def run(self, work: Work | LongJob, broke: Callable[[], None] | None = None) -> JobState | None:
+        """Do a claimed job, or a slice of a long one; see `signature_job.run` and `Tasks.run`."""
+        if isinstance(work, LongJob):
             return self.tasks.run(work, self.settings.lease_s, self.settings.job_s, broke)
         return working.run(
             self.store, self.signers, self._readers, work, self.settings.lease_s,
@@ -164,12 +347,12 @@ class Engine(Administration):
     def worker_died(
         self, job_id: str, token: int, error: str, traceback: str, *, counts: bool
     ) -> JobState | None:
-        """Take a job from a worker that died over it; see `jobs.worker_died`."""
-        return jobs.worker_died(self.store, job_id, token, error, traceback, counts=counts)
+        """Take a job from a worker that died over it; see `lifecycle.worker_died`."""
+        return lifecycle.worker_died(self.store, job_id, token, error, traceback, counts=counts)
 
-    def put_back(self, work: Work | Task) -> None:
+    def put_back(self, work: Work | LongJob) -> None:
         """Return a claimed job undone."""
-        if isinstance(work, Task):
+        if isinstance(work, LongJob):
             self.tasks.put_back(work)
         else:
             put_back(self.store, work)
@@ -178,7 +361,7 @@ class Engine(Administration):
     def counts(self) -> tuple[dict[str, int], dict[str, int]]:
         """How many frames and how many jobs are in each state."""
         with self.store.database.read() as connection:
-            return stored_frames.count_states(connection), listing.count_jobs(connection)
+            return stored_frames.count_states(connection), queue.count_jobs(connection)
 
     def publish_due(self) -> int:
         """Bring maps on to their next models, delete what is too old, publish the indexes that have
@@ -208,7 +391,51 @@ class Engine(Administration):
         generation = self._upkeep.rebuild(self._row(map_name))
         if generation is None:
             raise BusyIndex(
-                f"The index of map {map_name!r} is being built by another process. Try again "
-                "when it is done."
+                f"The index of map {map_name!r} is being built by another process. Try again later."
             )
         return generation.number
+
+
+# Opening a store whose server may be away: what is started beside it may be there before it.
+
+#: Seconds that who is started waits for a server before it gives up, and says why.
+PATIENCE_S = 60.0
+#: Seconds between two tries.
+AGAIN_S = 1.0
+
+
+def open_engine(
+    settings: Settings, patience_s: float = PATIENCE_S,
+    may_go_on: Callable[[float], bool] | None = None,
+) -> Engine:  # fmt: skip
+    """An engine, as soon as its database answers; a fault that waiting cannot mend is told at once.
+
+    Parameters
+    ----------
+    settings : see Settings
+    patience_s : seconds to wait at most
+    may_go_on : waits so many seconds, and says whether to try again; default: it always is
+
+    Raises
+    ------
+    UnusableStore, NewerSchema : see Engine. Of a server that is away, once it was waited for.
+    """
+    if str(settings.blobs).startswith("memory:"):
+        raise UnusableStore(
+            "SCENEPRINT_BLOB_URL=memory:/// keeps blobs inside one process, so the workers of a "
+            "service cannot read them. Use file:///folder, or `Client.embedded`."
+        )
+    until, said = time.monotonic() + patience_s, False
+    while True:
+        try:
+            return Engine(settings)
+        except StoreAway as error:
+            if time.monotonic() + AGAIN_S > until:
+                raise
+            if not said:
+                log.warning("waiting for the database", extra={"error": str(error)})
+                said = True
+            if may_go_on is None:
+                time.sleep(AGAIN_S)
+            elif not may_go_on(AGAIN_S):
+                raise

@@ -79,16 +79,16 @@ def _named(name: str, value: object, module: str) -> str:
         return ";".join(
             f"{name}.{key}={told}"
             for key, one in sorted(inside)
-            if not key.startswith("__") and (told := _told(one, module))
+            if not key.startswith("__") and (told := _constant_text(one, module))
         )
-    told = _told(value, module)
+    told = _constant_text(value, module)
     return f"{name}={told}" if told else ""
 
 
-def _told(value: Any, module: str) -> str:
+def _constant_text(value: Any, module: str) -> str:
     """What of a value can be built into a kernel of a module; "": nothing, or its own file's."""
     if isinstance(value, tuple):
-        return f"({','.join(_told(one, module) for one in value)})"
+        return f"({','.join(_constant_text(one, module) for one in value)})"
     if isinstance(value, bool | int | float | complex | str):
         return repr(value)
     if isinstance(value, np.ndarray):

@@ -9,15 +9,14 @@ processes of a machine share in memory. A search compares all of them; only a ma
 truth: deleting the folder loses nothing but the time to publish it again.
 """
 
-from sceneprint.index.generations import Generation, newest
-from sceneprint.index.manifests import manifests, newest_number, scrub
+from sceneprint.index.generation import Generation, newest
+from sceneprint.index.manifest import manifests, newest_number, scrub
 from sceneprint.index.publication import clear, publish
-from sceneprint.index.search import Hits, search
-from sceneprint.index.tails import Tail, signatures_of
+from sceneprint.index.search import SearchHits, Tail, search, signatures_of
 
 __all__ = [
     "Generation",
-    "Hits",
+    "SearchHits",
     "Tail",
     "clear",
     "manifests",

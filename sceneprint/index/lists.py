@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.geometry.retrieval import distances
-from sceneprint.index.files import BLOCK_BYTES, mapped
+from sceneprint.geometry.retrieval.distance import distances
 from sceneprint.index.flat import library
-from sceneprint.index.keys import draw
-from sceneprint.index.manifests import Recall
+from sceneprint.index.manifest import Recall
+from sceneprint.index.mapped_files import BLOCK_BYTES, draw, mapped
 from sceneprint.types import Bytes, Floats32, Ints32
 
 #: Lists of N signatures: this many times the square root of N.

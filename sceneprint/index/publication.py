@@ -16,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index.files import BLOCK_BYTES, building, is_ours, put, unfinished
 from sceneprint.index.flat import allocate, write_index
-from sceneprint.index.generations import Generation, newest, open_generation
-from sceneprint.index.keys import Block, Keys, Places, check_block
+from sceneprint.index.generation import Generation, newest, open_generation
 from sceneprint.index.lists import (
     GROWTH,
     NEAR,
@@ -31,7 +29,24 @@ from sceneprint.index.lists import (
     train_lists,
     write_lists,
 )
-from sceneprint.index.manifests import Manifest, Recall, manifests, read_manifest, write_manifest
+from sceneprint.index.manifest import (
+    GenerationManifest,
+    Recall,
+    manifests,
+    read_manifest,
+    write_manifest,
+)
+from sceneprint.index.mapped_files import (
+    BLOCK_BYTES,
+    Block,
+    Keys,
+    Places,
+    building,
+    check_block,
+    is_ours,
+    put,
+    unfinished,
+)
 from sceneprint.types import Bytes
 
 if TYPE_CHECKING:
@@ -112,7 +127,7 @@ def publish(
         ]
         if lists is not None:
             files.append(put(folder, "lists", lambda take: write_lists(lists, take)))
-        manifest = Manifest(
+        manifest = GenerationManifest(
             number=listed[0][0] + 1 if listed else 1,
             revision=revision,
             model_id=model_id,

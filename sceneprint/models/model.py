@@ -13,20 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableModel
-from sceneprint.geometry.bins import TableLayout
-from sceneprint.geometry.clouds import CloudParameters
-from sceneprint.geometry.depth import DepthParameters
-from sceneprint.geometry.hierarchy import HierarchyParameters
-from sceneprint.geometry.mixture import Mixture
-from sceneprint.geometry.normals import NormalParameters
-from sceneprint.geometry.projection import Projection
-from sceneprint.geometry.properties import PropertyParameters
-from sceneprint.geometry.retrieval import Metric
-from sceneprint.geometry.segmentation import SegmentationParameters
-from sceneprint.geometry.surroundings import Compression, SurroundingsParameters
-from sceneprint.geometry.validation import ValidationParameters
-from sceneprint.geometry.weights import WeightParameters
-from sceneprint.geometry.whitening import Ints8, Whitening
+from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.geometry.signature.mixture import Mixture
+from sceneprint.geometry.signature.pair_features import Projection, PropertyParameters
+from sceneprint.geometry.signature.pair_table import TableLayout
+from sceneprint.geometry.signature.segmentation import (
+    HierarchyParameters,
+    SegmentationParameters,
+    WeightParameters,
+)
+from sceneprint.geometry.signature.whitening import Ints8, Whitening
+from sceneprint.geometry.surface.cloud import CloudParameters
+from sceneprint.geometry.surface.depth_image import DepthParameters, NormalParameters
+from sceneprint.geometry.validation.patch_descriptors import Compression, PatchDescriptorParameters
+from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.types import Floats32
 
 #: Of the file and of what the numbers in it mean. Raise it when code changes signatures. Models
@@ -54,7 +54,7 @@ class ModelParameters:
     validation_segmentation: SegmentationParameters = field(
         default_factory=lambda: SegmentationParameters(n_patches=400)
     )
-    surroundings: SurroundingsParameters = field(default_factory=SurroundingsParameters)
+    surroundings: PatchDescriptorParameters = field(default_factory=PatchDescriptorParameters)
     cloud: CloudParameters = field(default_factory=CloudParameters)
     validation: ValidationParameters = field(default_factory=ValidationParameters)
 

@@ -15,19 +15,17 @@ from pathlib import Path
 from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError
 
+from sceneprint.atomic_files import make_folder
 from sceneprint.errors import StoreAway, UnusableStore
-from sceneprint.store.blobs import Blobs
+from sceneprint.store.blobs.folder import Blobs, FileLocks, FolderBlobs, Locks
+from sceneprint.store.blobs.object_client import open_objects
+from sceneprint.store.blobs.object_store import ObjectBlobs
 from sceneprint.store.database import Database, is_there, open_database
-from sceneprint.store.faults import unusable
-from sceneprint.store.folders import FolderBlobs
-from sceneprint.store.locks import FileLocks, Locks
-from sceneprint.store.object_blobs import ObjectBlobs
-from sceneprint.store.object_urls import open_objects
-from sceneprint.store.replica import Replica, current
-from sceneprint.store.sealed import is_sealed
-from sceneprint.store.seals import Seals
-from sceneprint.store.session_locks import SessionLocks
-from sceneprint.writing import make_folder
+from sceneprint.store.database_errors import unusable
+from sceneprint.store.opaque_ids import OpaqueIds
+from sceneprint.store.postgres.locks import SessionLocks
+from sceneprint.store.postgres.replica import Replica, current
+from sceneprint.store.sqlite import is_read_only
 
 __all__ = [
     "Blobs", "Database", "FolderBlobs", "Store", "open_blobs", "open_database", "open_store",
@@ -51,9 +49,9 @@ class Store:
         return self.database if near is None else near.database
 
     @cached_property
-    def seals(self) -> Seals:
+    def seals(self) -> OpaqueIds:
         """What numbers of its rows look like from outside."""
-        return Seals(self.database)
+        return OpaqueIds(self.database)
 
     def close(self) -> None:
         """Give back all connections."""
@@ -94,7 +92,7 @@ def open_store(
 
 
 def _open_store(url: str, blobs: Path | str, purge_s: float) -> Store:
-    new = not is_sealed(url) and not is_there(url)
+    new = not is_read_only(url) and not is_there(url)
     if isinstance(blobs, Path):
         kept = FolderBlobs(blobs, make=new)  # the data folder is made with it
         return Store(open_database(url), kept)
@@ -138,11 +136,11 @@ def open_blobs(
         raise UnusableStore("Blobs in an object store need a database that is kept: name a file.")
     else:
         locks = SessionLocks(database)
-    found = ObjectBlobs(objects, locks, lambda: Seals(database).owner, purge_s)
+    found = ObjectBlobs(objects, locks, lambda: OpaqueIds(database).owner, purge_s)
     try:
         found.claim(anew=claim and not database.read_only)
     except StoreAway as error:
-        log.warning("the object store is away", extra={"error": str(error)})
+        log.warning("object store unreachable", extra={"error": str(error)})
     return found
 
 

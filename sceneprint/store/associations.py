@@ -8,11 +8,10 @@ from typing import Any
 
 from sqlalchemy import Connection, Select, delete, null, select
 
-from sceneprint.schemas import FrameState
-from sceneprint.schemas.frames import Kind
-from sceneprint.store.parts import remove_parts
-from sceneprint.store.records import JobRow
-from sceneprint.store.tables import frames, jobs
+from sceneprint.store.queue import remove_parts
+from sceneprint.store.tables import JobRow, frames, jobs
+from sceneprint_client.api import FrameState
+from sceneprint_client.api.frames import Kind
 
 #: Kind of the jobs.
 ASSOCIATE = "associate"
@@ -21,7 +20,7 @@ _BLOCK = 500
 
 
 @dataclass(frozen=True)
-class Stop:
+class PathFrame:
     """A frame of a run, as far as associations need it.
 
     Parameters
@@ -66,18 +65,18 @@ def numbers_of_session(
     return list(connection.execute(asked.order_by(time.is_(None), time, frames.c.number)).scalars())
 
 
-def stops_of(connection: Connection, numbers: Iterable[int]) -> dict[int, Stop]:
+def stops_of(connection: Connection, numbers: Iterable[int]) -> dict[int, PathFrame]:
     """Frames by their numbers; those that are deleted, or not indexed any more, are left out."""
     wanted = list(numbers)
-    found: dict[int, Stop] = {}
+    found: dict[int, PathFrame] = {}
     for start in range(0, len(wanted), _BLOCK):
         rows = connection.execute(
-            _asked().where(
+            _select_path_frames().where(
                 frames.c.number.in_(wanted[start : start + _BLOCK]),
                 frames.c.state == FrameState.INDEXED,
             )
         )
-        found |= {row["number"]: Stop(**row) for row in rows.mappings()}
+        found |= {row["number"]: PathFrame(**row) for row in rows.mappings()}
     return found
 
 
@@ -93,7 +92,7 @@ def remove_job(connection: Connection, job: JobRow) -> list[str]:
     return blobs
 
 
-def _asked() -> Select[Any]:
+def _select_path_frames() -> Select[Any]:
     return select(
         frames.c.number, frames.c.id, frames.c.robot, frames.c.session, frames.c.captured_at,
         frames.c.pose_parent.label("parent"), frames.c.pose,

@@ -13,25 +13,90 @@ from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Connection, Engine, event
 
-from sceneprint.errors import StoreLocked, UnusableStore
-from sceneprint.store.faults import explained, shown
-from sceneprint.store.migrating import migrate
-from sceneprint.store.postgres import HELD_S as HELD_OF_FLEET_S
-from sceneprint.store.postgres import (
+from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
+from sceneprint.store.database_errors import database_label, explained
+from sceneprint.store.postgres.connection import HELD_S as HELD_OF_FLEET_S
+from sceneprint.store.postgres.connection import (
     MIGRATION_S,
     configure,
     connect_options,
     history_of,
     open_postgres,
-    require_kept,
+    require_synchronous,
 )
-from sceneprint.store.revisions import revision_of
-from sceneprint.store.sealed import Sealed
-from sceneprint.store.sqlite import BUSY_S, HELD_S, open_sqlite, shrink_log
-from sceneprint.store.urls import database_url
+from sceneprint.store.schema import (
+    create_schema,
+    database_url,
+    known_revisions,
+    migration_config,
+    revision_of,
+)
+from sceneprint.store.sqlite import BUSY_S, HELD_S, ReadOnlyFile, open_sqlite, shrink_log
 
 if TYPE_CHECKING:
     import psycopg
+
+# A database brought to the schema of this version: by one process, while others wait.
+
+#: Alembic keeps the migration that runs in a variable of its module.
+_migrating = threading.Lock()
+
+
+def migrate(database: Database, engine: Engine) -> None:
+    """Bring a database to the schema of this version, in one transaction.
+
+    Raises
+    ------
+    ReadOnlyStore : it may be read alone, and an earlier version wrote it.
+    NewerSchema : a later version of sceneprint wrote it; nothing is touched.
+    UnusableStore : it cannot be written, or its rows refer to others that are not there.
+    """
+    head, known = known_revisions()
+    with database.read() as connection:
+        current = _current(connection, known, engine)
+    if current == head:
+        return
+    if database.read_only:
+        raise ReadOnlyStore(
+            f"{database_label(engine.url)} has schema {current}, this version needs {head}, and "
+            "the file is read-only. Open it once where it may be written, or use the version that "
+            "wrote it."
+        )
+    with database.write(unchecked=True) as connection:  # another process may have been first
+        current = _current(connection, known, engine)
+        if current is None and database.is_sqlite:
+            create_schema(connection)
+        elif current != head:
+            from alembic import command
+
+            config = migration_config()
+            config.attributes["connection"] = connection
+            with _migrating:
+                command.upgrade(config, "head")
+            if database.is_sqlite:
+                _require_whole(connection, engine)
+
+
+def _require_whole(connection: Connection, engine: Engine) -> None:
+    """What `unchecked` did not look at, looked at in the end."""
+    if connection.exec_driver_sql("PRAGMA foreign_key_check").first() is not None:
+        raise UnusableStore(
+            f"{database_label(engine.url)}: rows refer to others that are not there, so it is "
+            "not brought "
+            "to the schema of this version, and nothing was changed. Run `sceneprint fsck` of the "
+            "version that wrote it."
+        )
+
+
+def _current(connection: Connection, known: frozenset[str], engine: Engine) -> str | None:
+    current = revision_of(connection)
+    if current is not None and current not in known:
+        raise NewerSchema(
+            f"{database_label(engine.url)} has schema {current}, which this version of "
+            "sceneprint does not know: a later one wrote it. Use that version, or another data "
+            "folder."
+        )
+    return current
 
 
 class Database:
@@ -43,7 +108,7 @@ class Database:
     sealed : where the file may be read alone
     """
 
-    def __init__(self, engine: Engine, sealed: Sealed | None = None) -> None:
+    def __init__(self, engine: Engine, sealed: ReadOnlyFile | None = None) -> None:
         self._engine, self._sealed = engine, sealed
         # what a transaction sees is one state on both: in SQLite any does
         self._readers = engine if self.is_sqlite else engine.execution_options(
@@ -81,7 +146,7 @@ class Database:
     @property
     def shown(self) -> str:
         """Which database it is, to be told: without a password."""
-        return shown(self._engine.url)
+        return database_label(self._engine.url)
 
     @property
     def file(self) -> Path | None:
@@ -158,7 +223,7 @@ class Database:
                     self._held = False
                     yield writing
                 if not self.is_sqlite:
-                    require_kept(writing)
+                    require_synchronous(writing)
         except StoreLocked:
             self._held = True
             raise

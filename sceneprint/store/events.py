@@ -11,7 +11,7 @@ from sqlalchemy import Connection, func, insert, or_, select
 from sceneprint.store.tables import events
 
 
-def tell(
+def record_event(
     connection: Connection,
     kind: str,
     map_name: str | None = None,
@@ -19,7 +19,7 @@ def tell(
     job_id: str | None = None,
     **data: Any,
 ) -> None:
-    """Note an event; `kind` is one of schemas.events.KINDS."""
+    """Note an event; `kind` is one of `KINDS` of the API."""
     connection.execute(
         insert(events).values(
             at=time.time(), kind=kind, map=map_name, frame_id=frame_id, job_id=job_id, data=data
@@ -35,7 +35,7 @@ def anchor_of(connection: Connection, map_name: str) -> str:
         .order_by(events.c.number.desc())
         .limit(1)
     ).one()
-    return _mark(*last)
+    return _fingerprint(*last)
 
 
 def holds_anchor(connection: Connection, anchor: str) -> bool:
@@ -50,10 +50,10 @@ def holds_anchor(connection: Connection, anchor: str) -> bool:
     found = connection.execute(
         select(events.c.number, events.c.at, events.c.frame_id).where(events.c.number == number)
     ).first()
-    return found is not None and _mark(*found) == anchor
+    return found is not None and _fingerprint(*found) == anchor
 
 
-def _mark(number: int, at: float, frame_id: str | None) -> str:
+def _fingerprint(number: int, at: float, frame_id: str | None) -> str:
     return f"{number} {at!r} {frame_id}"
 
 

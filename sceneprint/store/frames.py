@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, delete, func, insert, select, update
 
 from sceneprint.errors import UnknownFrame
-from sceneprint.schemas import FrameState
-from sceneprint.store.blocks import among, blocks
-from sceneprint.store.clock import now
-from sceneprint.store.deleting import delete_frames
+from sceneprint.store.batching import among, blocks
+from sceneprint.store.deletion import delete_frames
+from sceneprint.store.events import record_event
+from sceneprint.store.maps import find_map
+from sceneprint.store.queue import now
 from sceneprint.store.quotas import ROOMLESS, count_on
-from sceneprint.store.records import FrameRow, MapRow, frame_row
-from sceneprint.store.tables import frame_tags, frames, job_files, signatures
+from sceneprint.store.tables import (
+    FrameRow,
+    MapRow,
+    frame_row,
+    frame_tags,
+    frames,
+    job_files,
+    maps,
+    signatures,
+)
+from sceneprint_client.api import FrameState
 
 #: Frames of one content that are looked at: nobody needs more.
 _MOST_ALIKE = 100
@@ -101,21 +111,6 @@ def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
             f"GET /v1/maps/{row.name}/frames."
         )
     return frame_row(found)
-
-
-def find_content(connection: Connection, map_number: int, content_id: str) -> FrameRow | None:
-    """The frame of a map with that content, the first that came if there are more; or None."""
-    found = (
-        connection.execute(
-            select(frames)
-            .where(frames.c.map_number == map_number, frames.c.content_id == content_id)
-            .order_by(frames.c.number)
-            .limit(1)
-        )
-        .mappings()
-        .first()
-    )
-    return None if found is None else frame_row(found)
 
 
 def frames_of_content(connection: Connection, map_number: int, content_id: str) -> list[FrameRow]:
@@ -241,3 +236,68 @@ def _weigh(connection: Connection, number: int, state: FrameState | None, size: 
 
 def _one(connection: Connection, condition: ColumnElement[bool]) -> FrameRow:
     return frame_row(connection.execute(select(frames).where(condition)).mappings().one())
+
+
+# What a frame was uploaded on condition of: that its map lacks the place.
+
+
+def loosen(connection: Connection, number: int, novelty: float | None) -> None:
+    """Keep a frame that is not signed yet on the weaker of two conditions.
+
+    Who sends it with a weaker one, or with none, is told that it is there.
+    """
+    weaker: ColumnElement[bool] = frames.c.novelty.is_not(None)
+    if novelty is not None:
+        weaker = frames.c.novelty > novelty
+    connection.execute(
+        update(frames)
+        .where(
+            frames.c.number == number,
+            frames.c.state.in_((FrameState.RECEIVED, FrameState.SIGNING)),
+            weaker,
+        )
+        .values(novelty=novelty)
+    )
+
+
+# Metadata written anew, with all that is searched for beside it.
+
+
+def write_frame(
+    connection: Connection, row: MapRow, frame: FrameRow, values: Mapping[str, Any]
+) -> FrameRow:
+    """Change columns of a frame's metadata.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    row : of the map
+    frame : as it is
+    values : by column; position and tags that are searched for follow `pose` and `tags`
+    """
+    changed = {name: new for name, new in values.items() if getattr(frame, name) != new}
+    if not changed:
+        return frame
+    written = dict(changed)
+    if "pose" in changed:
+        pose = changed["pose"]
+        written |= {f"pose_{a}": pose and pose[i][3] for i, a in enumerate("xyz")}
+    connection.execute(update(frames).where(frames.c.number == frame.number).values(**written))
+    if "tags" in changed:
+        connection.execute(delete(frame_tags).where(frame_tags.c.frame_number == frame.number))
+        named = [{"frame_number": frame.number, "tag": tag} for tag in sorted(set(changed["tags"]))]
+        if named:
+            connection.execute(insert(frame_tags), named)
+    record_event(connection, "frame.edited", row.name, frame.id, fields=sorted(changed))
+    return frame_of(connection, frame.number)
+
+
+def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) -> MapRow:
+    """Change columns of a map: title, quotas, retention."""
+    changed = {name: new for name, new in values.items() if getattr(row, name) != new}
+    if not changed:
+        return row
+    connection.execute(update(maps).where(maps.c.number == row.number).values(**changed))
+    # not what they are: who may read the map sees it there
+    record_event(connection, "map.edited", row.name, fields=sorted(changed))
+    return find_map(connection, row.name)

@@ -19,7 +19,7 @@ KEPT_S = 86_400.0
 
 
 @dataclass(frozen=True)
-class Once:
+class IdempotentRequest:
     """A request that is to take effect once.
 
     Parameters

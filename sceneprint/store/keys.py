@@ -8,13 +8,14 @@ import time
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-from sqlalchemy import Connection, Select, delete, insert, select
+from sqlalchemy import Connection, Select, String, delete, insert, select
 
 from sceneprint.errors import Conflict, UnknownKey
-from sceneprint.schemas.keys import Scope
-from sceneprint.store.events import tell
-from sceneprint.store.tables import keys
+from sceneprint.store.events import record_event
+from sceneprint.store.tables import audit, keys
+from sceneprint_client.api.admin import Scope
 
 #: So that a key is known for one where it should not be, such as in a public file.
 PREFIX = "sp_"
@@ -56,14 +57,14 @@ def create_key(
             created_at=time.time(), expires_at=expires_at,
         )
     )  # fmt: skip
-    tell(connection, "key.created", name=name)
+    record_event(connection, "key.created", name=name)
     return secret
 
 
 def find_key(connection: Connection, secret: str) -> KeyRow | None:
     """The key with that secret, or None; also one that has expired."""
     own = keys.c.digest == _digest(secret)
-    found = connection.execute(_asked().where(own)).mappings().first()
+    found = connection.execute(_select_keys().where(own)).mappings().first()
     return None if found is None else KeyRow(**found)
 
 
@@ -71,7 +72,7 @@ def list_keys(
     connection: Connection, after: str | None = None, limit: int | None = None
 ) -> list[KeyRow]:
     """Keys by name, from behind `after` on; default: all."""
-    asked = _asked().order_by(keys.c.name).limit(limit)
+    asked = _select_keys().order_by(keys.c.name).limit(limit)
     if after is not None:
         asked = asked.where(keys.c.name > after)
     return [KeyRow(**row) for row in connection.execute(asked).mappings()]
@@ -88,12 +89,81 @@ def revoke_key(connection: Connection, name: str) -> None:
         raise UnknownKey(
             f"There is no key named {name!r:.80}. List them with `sceneprint keys --list`."
         )
-    tell(connection, "key.revoked", name=name)
+    record_event(connection, "key.revoked", name=name)
 
 
-def _asked() -> Select[tuple[str, dict[str, Scope], float, float | None]]:
+def _select_keys() -> Select[tuple[str, dict[str, Scope], float, float | None]]:
     return select(keys.c.name, keys.c.grants, keys.c.created_at, keys.c.expires_at)
 
 
 def _digest(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
+
+
+# Who changed what: the newest lines of it.
+
+#: Lines that are kept.
+KEPT = 100_000
+
+
+@dataclass(frozen=True)
+class KeyChange:
+    """A change.
+
+    Parameters
+    ----------
+    action : the operation
+    actor : name of the key that was shown; "" where none was asked for
+    address : where the request came from
+    map, target : what was changed
+    request_id : as in the log
+    data : more about it
+    at : seconds since 1970; None: now
+    number : of the line; 0 before it is one
+    """
+
+    action: str
+    actor: str
+    address: str | None = None
+    map: str | None = None
+    target: str | None = None
+    request_id: str | None = None
+    data: dict[str, Any] | None = None
+    at: float | None = None
+    number: int = 0
+
+
+#: Columns whose texts may be whatever somebody asked for.
+_TEXTS = ("actor", "address", "action", "map", "target", "request_id")
+
+
+def _cut(name: str, text: str | None) -> str | None:
+    """As much of a text as its column takes."""
+    kind = audit.c[name].type
+    return text if text is None or not isinstance(kind, String) else text[: kind.length]
+
+
+def note(connection: Connection, change: KeyChange, kept: int = KEPT) -> None:
+    """Add a line; the oldest go where there are too many."""
+    added = connection.execute(
+        insert(audit).values(
+            at=time.time() if change.at is None else change.at, data=change.data or {},
+            **{name: _cut(name, getattr(change, name)) for name in _TEXTS},
+        )
+    ).inserted_primary_key  # fmt: skip
+    assert added is not None
+    connection.execute(delete(audit).where(audit.c.number <= added[0] - kept))
+
+
+def list_changes(
+    connection: Connection, before: int | None, limit: int, actor: str | None, map_name: str | None
+) -> list[KeyChange]:
+    """Changes, the newest first, from below number `before` on."""
+    asked = select(audit).order_by(audit.c.number.desc()).limit(limit)
+    if before is not None:
+        asked = asked.where(audit.c.number < before)
+    if actor is not None:
+        asked = asked.where(audit.c.actor == actor)
+    if map_name is not None:
+        asked = asked.where(audit.c.map == map_name)
+    return [KeyChange(**row) for row in connection.execute(asked).mappings()]

@@ -8,16 +8,17 @@ from collections.abc import Mapping, Sequence
 from sqlalchemy import Connection, delete, func, insert, select, update
 
 from sceneprint.errors import UnknownMap
-from sceneprint.store.deleting import doom_found
-from sceneprint.store.events import tell
-from sceneprint.store.former import inherited, remember
-from sceneprint.store.records import MapRow, map_row
+from sceneprint.store.deletion import doom_found
+from sceneprint.store.events import record_event
+from sceneprint.store.quotas import inherited, remember
 from sceneprint.store.tables import (
+    MapRow,
     frame_tags,
     frames,
     job_files,
     job_items,
     jobs,
+    map_row,
     maps,
     models,
     signatures,
@@ -89,7 +90,7 @@ def add_map(
             **(inherited(connection, name) | dict(limits or {})),
         )
     )  # fmt: skip
-    tell(connection, "map.created", name)
+    record_event(connection, "map.created", name)
     return find_map(connection, name)
 
 
@@ -137,7 +138,7 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(own)))
     connection.execute(delete(frames).where(frames.c.map_number == row.number))
     connection.execute(delete(maps).where(maps.c.number == row.number))
-    tell(connection, "map.deleted", row.name)
+    record_event(connection, "map.deleted", row.name)
     remember(connection, row)
     return referred
 

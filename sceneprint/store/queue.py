@@ -21,24 +21,179 @@ would stand in the way of uploads. What keeps them apart is the row of the job, 
   then finds that it holds no more, or finds nothing.
 
 A claim locks the job, then its frame; whoever has the turn does so in the same order, so that none
-waits in a circle. Times are the database's (`clock`): hosts may differ by hours.
+waits in a circle. Times are the database's (`now`): hosts may differ by hours.
 """
 
 from __future__ import annotations
 
+import time
 import uuid
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, and_, func, insert, or_, select, update
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Float,
+    and_,
+    cast,
+    delete,
+    extract,
+    func,
+    insert,
+    literal,
+    or_,
+    select,
+    update,
+)
 
-from sceneprint.errors import LostLease
+from sceneprint.errors import JobOver, LostLease, UnknownJob
 from sceneprint.logs import request_id
-from sceneprint.schemas import JobState
-from sceneprint.store.clock import now, read_clock
-from sceneprint.store.listing import find_job
-from sceneprint.store.records import JobRow, job_row
-from sceneprint.store.tables import frames, jobs
+from sceneprint.store.batching import among, blocks
+from sceneprint.store.tables import JobRow, frames, job_files, job_items, job_row, jobs, maps
+from sceneprint_client.api import JobState
+
+# Jobs, one by one and as a list.
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A job with the names of what it is about."""
+
+    job: JobRow
+    frame_id: str | None
+    map_name: str | None
+    followed_by: str | None  # id of the latest job of the same frame and kind, if it is another
+
+
+def list_jobs(
+    connection: Connection, before: int | None, limit: int, state: JobState | None,
+    kind: str | None = None, map_names: Collection[str] | None = None,
+) -> list[Listed]:  # fmt: skip
+    """Jobs, the newest first, from below number `before` on.
+
+    Parameters
+    ----------
+    connection : of the database
+    before, limit : see above
+    state, kind : of those that are wanted
+    map_names : of those that are wanted; jobs of no map are not among them
+    """
+    later = jobs.alias()
+    last = (
+        select(later.c.id)
+        .where(
+            later.c.frame_number == jobs.c.frame_number, later.c.kind == jobs.c.kind,
+            later.c.model_id.is_not_distinct_from(jobs.c.model_id), later.c.number > jobs.c.number,
+        )
+        .order_by(later.c.number.desc())
+        .limit(1)
+        .correlate(jobs)
+        .scalar_subquery()
+    )  # fmt: skip
+    asked = (
+        select(
+            jobs, frames.c.id.label("frame_id"), maps.c.name.label("map_name"),
+            last.label("followed_by"),
+        )
+        .join(frames, frames.c.number == jobs.c.frame_number, isouter=True)
+        .join(maps, maps.c.number == jobs.c.map_number, isouter=True)
+        .order_by(jobs.c.number.desc())
+        .limit(limit)
+    )  # fmt: skip
+    if kind is not None:
+        asked = asked.where(jobs.c.kind == kind)
+    if map_names is not None:
+        asked = asked.where(maps.c.name.in_(list(map_names)))
+    if before is not None:
+        asked = asked.where(jobs.c.number < before)
+    if state is not None:
+        asked = asked.where(jobs.c.state == state)
+    found = []
+    for row in connection.execute(asked).mappings():
+        own = {column.name: row[column.name] for column in jobs.columns}
+        found.append(Listed(JobRow(**{**own, "state": JobState(own["state"])}),
+                            row["frame_id"], row["map_name"], row["followed_by"]))  # fmt: skip
+    return found
+
+
+def find_job(connection: Connection, job_id: str) -> JobRow:
+    """The job of an id.
+
+    Raises
+    ------
+    UnknownJob : there is none.
+    """
+    row = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().first()
+    if row is None:
+        raise unknown_job(job_id)
+    return job_row(row)
+
+
+def unknown_job(job_id: str) -> UnknownJob:
+    """What is said of a job that is not there, or not for whoever asks: the same words."""
+    return UnknownJob(
+        f"There is no job {job_id!r:.80}. An upload answers with the id of its job, and "
+        "deleting a map deletes its jobs."
+    )
+
+
+def last_of(
+    connection: Connection, kind: str, frame_number: int, model_id: str | None = None
+) -> JobRow | None:
+    """The latest job of a kind, and for a model, of a frame."""
+    row = connection.execute(
+        select(jobs)
+        .where(
+            jobs.c.frame_number == frame_number, jobs.c.kind == kind,
+            jobs.c.model_id.is_(None) if model_id is None else jobs.c.model_id == model_id,
+        )
+        .order_by(jobs.c.number.desc())
+        .limit(1)
+    ).mappings().first()  # fmt: skip
+    return None if row is None else job_row(row)
+
+
+def jobs_of(connection: Connection, frame_numbers: list[int]) -> dict[int, JobRow]:
+    """The latest job of each frame that is to have it indexed, not those that sign it again."""
+    found: dict[int, JobRow] = {}
+    for some in blocks(frame_numbers):
+        rows = connection.execute(
+            select(jobs)
+            .where(among(connection, jobs.c.frame_number, some), jobs.c.kind == "sign")
+            .order_by(jobs.c.number)
+        ).mappings()
+        found |= {row["frame_number"]: job_row(row) for row in rows}
+    return found
+
+
+def count_jobs(connection: Connection) -> dict[str, int]:
+    """How many jobs are in each state that has any."""
+    rows = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state))
+    return {row[0]: row[1] for row in rows}
+
+
+# The clock by which leases end and jobs are due: of the database, as those of its hosts differ.
+#
+# A SQLite file has one host, and so one clock.
+
+
+def now(connection: Connection) -> ColumnElement[float]:
+    """The time of the statement it is part of, seconds since 1970."""
+    if connection.dialect.name == "sqlite":
+        return literal(time.time())
+    # of the statement: the transaction may have waited for its turn since it began. Not
+    # clock_timestamp(), which is another time for each row, so that no index would be used
+    return cast(extract("epoch", func.statement_timestamp()), Float(53))
+
+
+def read_clock(connection: Connection) -> float:
+    """The time now, seconds since 1970."""
+    if connection.dialect.name == "sqlite":
+        return time.time()
+    return float(connection.execute(select(now(connection))).scalar_one())
+
 
 #: Tries that broke down before a job is dead.
 MAXIMUM_FAILURES = 3
@@ -285,3 +440,242 @@ def _lost(held: Claim) -> LostLease:
         f"Job {held.job.id} is no longer held by this worker: its lease ran out, or it was "
         "cancelled. Nothing was stored."
     )
+
+
+# Jobs whose workers died over them.
+#
+# Who started the workers sees one die at once, and need not wait for its lease to run out.
+
+
+def is_given_up(connection: Connection) -> bool:
+    """Whether there is a job to `bury`; costs no lock."""
+    asked = select(jobs.c.number).where(*_out_of_tries(now(connection))).limit(1)
+    return connection.execute(asked).first() is not None
+
+
+def dead_letter(connection: Connection) -> list[JobRow]:
+    """Give up jobs whose workers fall silent again and again: a frame that kills its worker."""
+    at = now(connection)
+    rows = connection.execute(
+        update(jobs)
+        .where(*_out_of_tries(at))
+        .values(
+            state=JobState.DEAD, finished_at=at, leased_until=None,
+            error=f"its worker fell silent, and {MAXIMUM_ATTEMPTS} tries are over",
+        )
+        .returning(jobs)
+    ).mappings()  # fmt: skip
+    return [job_row(row) for row in rows]
+
+
+def fail_of_dead(
+    connection: Connection, job_id: str, token: int, error: str, traceback: str, *, counts: bool
+) -> JobRow | None:
+    """Take a job from a worker that died over it: queued for another try, or dead.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    job_id, token : of the dead worker's claim
+    error, traceback : what is known of its death
+    counts : whether the job may have been the cause; if not, it is an attempt and no failure
+
+    Returns
+    -------
+    job : as it is now; None where the death changes nothing: the job is over, or is another
+        worker's, who took it when the lease of this one ran out, and may still do it
+    """
+    # locked: a claim, which waits for no turn, may be about to take it
+    asked = select(jobs).where(jobs.c.id == job_id).with_for_update()
+    row = connection.execute(asked).mappings().first()
+    if row is None or JobState(row["state"]).over:
+        return None
+    held = row["token"] == token and row["state"] == JobState.RUNNING
+    if not held and (row["token"] == token or not counts):
+        return None
+    failures = row["failures"] + counts
+    known = {"failures": failures, "error": error, "traceback": traceback}
+    if failures >= MAXIMUM_FAILURES or (held and row["attempts"] >= MAXIMUM_ATTEMPTS):
+        known |= {"state": JobState.DEAD, "leased_until": None, "finished_at": now(connection)}
+    elif held:
+        again = now(connection) + pause_s(max(failures, 1))
+        known |= {"state": JobState.QUEUED, "leased_until": None, "run_after": again}
+    change = update(jobs).where(jobs.c.number == row["number"]).values(**known).returning(jobs)
+    job = job_row(connection.execute(change).mappings().one())
+    return None if job.state == JobState.RUNNING else job
+
+
+def _out_of_tries(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
+    """What holds of a job that fell silent in the last of its tries."""
+    return (
+        jobs.c.state == JobState.RUNNING,
+        jobs.c.leased_until < at,
+        jobs.c.attempts >= MAXIMUM_ATTEMPTS,
+    )
+
+
+# What others than its worker do to a job: give it up, or have it tried once more.
+
+
+def cancel(connection: Connection, job: JobRow) -> None:
+    """Cancel a job; a worker that is at it learns so when it brings its result.
+
+    Raises
+    ------
+    JobOver : there is nothing left to cancel.
+    """
+    if job.state.over:
+        raise JobOver(f"Job {job.id} is {job.state}: {job.state.sentence} Nothing is left to do.")
+    connection.execute(
+        update(jobs)
+        .where(jobs.c.number == job.number)
+        .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
+    )
+
+
+def cancel_of(connection: Connection, frame_number: int) -> None:
+    """Cancel what is still to be done for a frame."""
+    connection.execute(
+        update(jobs)
+        .where(
+            jobs.c.frame_number == frame_number,
+            jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING)),
+        )
+        .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
+    )
+
+
+def revive(connection: Connection, job: JobRow) -> None:
+    """Queue a job again that is over, with all its tries before it."""
+    connection.execute(
+        update(jobs)
+        .where(jobs.c.number == job.number)
+        .values(
+            state=JobState.QUEUED, attempts=0, failures=0, error=None, traceback=None,
+            finished_at=None, leased_until=None, worker=None, run_after=now(connection),
+        )
+    )  # fmt: skip
+
+
+# What long jobs find and make: items, appended slice by slice, and files.
+
+#: Rows that are inserted at once.
+_BLOCK = 500
+
+
+@dataclass(frozen=True)
+class JobFile:
+    """A file of a job.
+
+    Parameters
+    ----------
+    name : such as mesh.ply, once a job
+    blob : that holds its bytes, and is there
+    bytes : size
+    media_type : of its content
+    """
+
+    name: str
+    blob: str
+    bytes: int
+    media_type: str
+
+
+def append_items(connection: Connection, job_number: int, items: list[dict[str, Any]]) -> None:
+    """Add to what a job has found."""
+    first = count_items(connection, job_number)
+    for start in range(0, len(items), _BLOCK):
+        rows = [
+            {"job_number": job_number, "number": first + start + i, "data": item}
+            for i, item in enumerate(items[start : start + _BLOCK])
+        ]
+        connection.execute(insert(job_items), rows)
+
+
+def count_items(connection: Connection, job_number: int) -> int:
+    """How many items a job has found: they are numbered from 0."""
+    asked = select(func.count()).where(job_items.c.job_number == job_number)
+    return int(connection.execute(asked).scalar_one())
+
+
+def items_of(
+    connection: Connection, job_number: int, first: int = 0, limit: int | None = None
+) -> list[dict[str, Any]]:
+    """Items of a job in the order in which they were found, from number `first` on."""
+    asked = (
+        select(job_items.c.data)
+        .where(job_items.c.job_number == job_number, job_items.c.number >= first)
+        .order_by(job_items.c.number)
+    )
+    return list(connection.execute(asked if limit is None else asked.limit(limit)).scalars())
+
+
+def add_files(connection: Connection, job_number: int, files: Iterable[JobFile]) -> None:
+    """Let a job have files; one of the same name gives way."""
+    for one in files:
+        own = (job_files.c.job_number == job_number) & (job_files.c.name == one.name)
+        connection.execute(delete(job_files).where(own))
+        connection.execute(
+            insert(job_files).values(
+                job_number=job_number, name=one.name, blob=one.blob, bytes=one.bytes,
+                media_type=one.media_type,
+            )
+        )  # fmt: skip
+
+
+def files_of(connection: Connection, job_number: int) -> dict[str, JobFile]:
+    """Files of a job by their names."""
+    asked = select(job_files).where(job_files.c.job_number == job_number).order_by(job_files.c.name)
+    return {
+        row["name"]: JobFile(row["name"], row["blob"], row["bytes"], row["media_type"])
+        for row in connection.execute(asked).mappings()
+    }
+
+
+def jobs_with_files(connection: Connection, kind: str) -> list[JobRow]:
+    """Jobs of a kind that have any file, the oldest first."""
+    having = select(job_files.c.job_number)
+    asked = select(jobs).where(jobs.c.number.in_(having), jobs.c.kind == kind)
+    return [job_row(row) for row in connection.execute(asked.order_by(jobs.c.number)).mappings()]
+
+
+def finished_with_file(connection: Connection, kind: str, name: str, before: float) -> list[int]:
+    """Numbers of the jobs of a kind that were over by a time, and still have a file of a name."""
+    asked = (
+        select(jobs.c.number)
+        .join(job_files, job_files.c.job_number == jobs.c.number)
+        .where(
+            job_files.c.name == name,
+            jobs.c.kind == kind,
+            jobs.c.state.in_([state for state in JobState if state.over]),
+            jobs.c.finished_at < before,
+        )
+    )
+    return list(connection.execute(asked).scalars())
+
+
+def remove_parts(
+    connection: Connection, job_number: int, *, items: bool = True,
+    files: Iterable[str] | None = None,
+) -> list[str]:  # fmt: skip
+    """Forget what a job found and made.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    job_number : of the job
+    items : whether its items go
+    files : names of the files that go; default: all
+
+    Returns
+    -------
+    blobs : that it referred to: sweep them when this is committed
+    """
+    if items:
+        connection.execute(delete(job_items).where(job_items.c.job_number == job_number))
+    own = job_files.c.job_number == job_number
+    if files is not None:
+        own &= job_files.c.name.in_(list(files))
+    blobs = list(connection.execute(select(job_files.c.blob).where(own)).scalars())
+    connection.execute(delete(job_files).where(own))
+    return blobs

@@ -6,9 +6,9 @@ from collections.abc import Collection, Iterator, Sequence
 
 from sqlalchemy import ColumnElement, Connection, delete, func, or_, select
 
-from sceneprint.store.blocks import among, blocks
+from sceneprint.store.batching import among, blocks
 from sceneprint.store.events import Wanted, newest_number
-from sceneprint.store.former import last_event
+from sceneprint.store.quotas import last_event
 from sceneprint.store.tables import events, maps
 
 

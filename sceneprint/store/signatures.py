@@ -10,12 +10,19 @@ from zlib import crc32
 from sqlalchemy import Connection, delete, func, insert, select, update
 
 from sceneprint.errors import DamagedSignature
-from sceneprint.schemas import FrameState
-from sceneprint.store import vectors
-from sceneprint.store.blocks import among, blocks
+from sceneprint.store.batching import among, blocks
 from sceneprint.store.maps import next_revision
-from sceneprint.store.records import FrameRow, MapRow
-from sceneprint.store.tables import frames, maps, signatures
+from sceneprint.store.model_switch import (
+    PENDING,
+    QUEUED_AT_ONCE,
+    REENCODE,
+    REMOVED_AT_ONCE,
+    models_of,
+)
+from sceneprint.store.postgres import vectors
+from sceneprint.store.queue import now
+from sceneprint.store.tables import FrameRow, MapRow, frames, jobs, maps, signatures
+from sceneprint_client.api import FrameState, JobState
 
 
 @dataclass(frozen=True)
@@ -38,7 +45,7 @@ class StoredSignature:
 
 
 @dataclass(frozen=True)
-class Sizes:
+class PatchCounts:
     """Patches and ordered pairs of each level of a frame, the finest first."""
 
     n_patches: tuple[int, ...]
@@ -46,7 +53,7 @@ class Sizes:
 
 
 @dataclass(frozen=True)
-class Change:
+class SignatureChange:
     """A frame that was indexed, or is searched no more; `vector` is None then, or is damaged.
 
     `deleted` says that it was deleted, or rejected by a model that its map came to have.
@@ -122,7 +129,7 @@ def replace_signature(connection: Connection, frame: FrameRow, made: StoredSigna
 
 def changes_since(
     connection: Connection, row: MapRow, revision: int, limit: int = 256
-) -> Iterator[list[Change]]:
+) -> Iterator[list[SignatureChange]]:
     """What was indexed and deleted after a revision, in order, in blocks of at most `limit`."""
     while True:
         found = connection.execute(
@@ -146,11 +153,11 @@ def changes_since(
 def _change(
     number: int, frame_id: str, revision: int, state: str, vector: bytes | None,
     checksum: int | None,
-) -> Change:  # fmt: skip
+) -> SignatureChange:  # fmt: skip
     if state != FrameState.INDEXED:
-        return Change(number, frame_id, revision, None, deleted=True)
+        return SignatureChange(number, frame_id, revision, None, deleted=True)
     sound = vector is not None and crc32(vector) == checksum
-    return Change(number, frame_id, revision, vector if sound else None)
+    return SignatureChange(number, frame_id, revision, vector if sound else None)
 
 
 def count_indexed(
@@ -229,14 +236,14 @@ def stored_vector(connection: Connection, number: int, model_id: str) -> bytes |
     return bytes(found.vector)
 
 
-def signature_sizes(connection: Connection, number: int, model_id: str) -> Sizes | None:
+def signature_sizes(connection: Connection, number: int, model_id: str) -> PatchCounts | None:
     """How much of a frame went into its signature, or None where it has none."""
     found = connection.execute(
         select(signatures.c.n_patches, signatures.c.n_pairs).where(
             signatures.c.frame_number == number, signatures.c.model_id == model_id
         )
     ).first()
-    return None if found is None else Sizes(tuple(found.n_patches), tuple(found.n_pairs))
+    return None if found is None else PatchCounts(tuple(found.n_patches), tuple(found.n_pairs))
 
 
 def stored_signatures(
@@ -253,3 +260,59 @@ def stored_signatures(
         )
         found |= {n: bytes(vector) for n, vector, checksum in rows if crc32(vector) == checksum}
     return found
+
+
+# What is left of the models that a map no longer has, nor is to have.
+
+
+def stale_signatures(connection: Connection, row: MapRow, after: int) -> list[tuple[int, str]]:
+    """The next signatures of a map that are of neither of its models: frame, model.
+
+    Parameters
+    ----------
+    connection : of a transaction
+    row : of the map
+    after : number of a frame
+    """
+    found = connection.execute(
+        select(signatures.c.frame_number, signatures.c.model_id)
+        .join(frames, frames.c.number == signatures.c.frame_number)
+        .where(
+            frames.c.map_number == row.number, frames.c.number > after,
+            signatures.c.model_id.not_in(models_of(row)),
+        )
+        .order_by(frames.c.number)
+        .limit(REMOVED_AT_ONCE)
+    )  # fmt: skip
+    return [(number, model_id) for number, model_id in found]
+
+
+def remove_signature(connection: Connection, number: int, model_id: str) -> list[str]:
+    """Forget what a model made of a frame; returns the blobs that it referred to."""
+    own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
+    blobs = list(connection.execute(select(signatures.c.geometry).where(own)).scalars())
+    connection.execute(delete(signatures).where(own))
+    return blobs
+
+
+def stale_jobs(connection: Connection, row: MapRow) -> list[int]:
+    """Some jobs that wait or run for a model that is neither of a map's."""
+    found = connection.execute(
+        select(jobs.c.number)
+        .join(frames, frames.c.number == jobs.c.frame_number)
+        .where(
+            jobs.c.state.in_(PENDING), jobs.c.kind == REENCODE,
+            jobs.c.model_id.not_in(models_of(row)), frames.c.map_number == row.number,
+        )
+        .limit(QUEUED_AT_ONCE)
+    )  # fmt: skip
+    return list(found.scalars())
+
+
+def cancel_jobs(connection: Connection, numbers: list[int]) -> None:
+    """Cancel jobs that wait or run."""
+    connection.execute(
+        update(jobs)
+        .where(jobs.c.number.in_(numbers), jobs.c.state.in_(PENDING))
+        .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
+    )

@@ -15,7 +15,7 @@ from pathlib import Path
 from fastapi import APIRouter, Request, Response
 from starlette.exceptions import HTTPException
 
-from service.conditions import is_known
+from service.responses import is_known
 
 PAGES = Path(__file__).parent / "pages"
 #: The page that all others are shown in.
@@ -68,7 +68,7 @@ def routes(files: Mapping[str, File]) -> APIRouter:
     def sent(request: Request, name: str) -> Response:
         found = files.get(name)
         if found is None:
-            raise HTTPException(404, "the dashboard has no such file")
+            raise HTTPException(404, "the dashboard does not have this file")
         return _answer(request, found)
 
     @router.api_route("/", methods=["GET", "HEAD"])

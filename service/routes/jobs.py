@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import time
+from collections.abc import AsyncGenerator, Callable
+from contextlib import aclosing
+from dataclasses import replace
+from typing import Annotated, Literal
 
-from fastapi import APIRouter, Query, Response
+from anyio import to_thread
+from fastapi import Header, Query, Request, Response
 
-from sceneprint.schemas import Job, JobState, Page
-from service.access import Asking
-from service.context import Here
+from sceneprint.engine.admin.operations import MOST_KINDS, event_record
+from sceneprint.engine.maps.map_frames import event_of, opened_cursor
+from sceneprint.store.events import Wanted
+from sceneprint.store.opaque_ids import OpaqueIds
+from sceneprint_client.api import Job, JobState, Page
+from sceneprint_client.api.admin import EventPage
+from service.auth import Asking, Caller, v1_router
+from service.context import Context, Here
+from service.events import BEGIN, MEDIA_TYPE, EventStream, Feed, alive, message
 from service.problems import declared
 
-router = APIRouter(prefix="/jobs", tags=["jobs"])
+router = v1_router("/jobs", "jobs")
 
 
 @router.get("", responses=declared(404, 422))
@@ -68,3 +79,117 @@ def retry_job(job_id: str, here: Here, asking: Asking, response: Response) -> Jo
     response.headers["Location"] = f"/v1/jobs/{job.job_id}"
     response.status_code = 202 if is_new else 200
     return job
+
+
+# Events: as a stream while they happen, or as pages of those that are kept.
+
+events_router = v1_router("/events", "operations")
+
+_STREAM = {
+    "description": "A page of events; or, where `Accept` names text/event-stream, a stream that "
+    "goes on: each message has the event's `id` and the event as JSON in `data`. "
+    "A comment comes every 15 s.",
+    "model": EventPage,
+    "content": {MEDIA_TYPE: {"schema": {"type": "string"}}},
+}
+
+
+@events_router.get("", response_model=EventPage, responses={200: _STREAM, **declared(404, 422)})
+async def events(
+    request: Request,
+    here: Here,
+    asking: Asking,
+    map_name: Annotated[str | None, Query(alias="map", description="Of this map alone.")] = None,
+    kind: Annotated[
+        list[str],
+        Query(
+            max_length=MOST_KINDS,
+            description="Beginning of the kinds that are wanted, such as `frame.` or "
+            "`frame.indexed`; more than once for several.",
+        ),
+    ] = [],  # noqa: B006  (FastAPI copies it)
+    after: Annotated[
+        str | None,
+        Query(
+            max_length=64,
+            description="Only events that followed the one of this id; `0`: all that are kept. "
+            "Without it a stream begins with what happens from now on.",
+        ),
+    ] = None,
+    order: Annotated[
+        Literal["newest", "oldest"] | None,
+        Query(description="Of a page: which come first; the oldest where `after` is given."),
+    ] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000, description="Of a page.")] = 100,
+    last_event_id: Annotated[
+        str | None,
+        Header(description="Of the last event that came: a stream goes on there. Goes before "
+               "`after`."),
+    ] = None,
+) -> EventPage | Response:  # fmt: skip
+    """What happened: frames that came, were indexed or deleted, maps made and removed.
+
+    With `Accept: text/event-stream` the events come as they happen, half a second late at most,
+    each once and in order, also where several processes work on the store. Who lost the stream
+    sends the id of the last event as `Last-Event-ID`, as browsers do by themselves, and
+    misses nothing. Where what is asked for is no longer kept, an event `events.missed` says so.
+
+    With a key, events of the maps that it may read; those of no map are for admins of all.
+    """
+    seals, place = here.engine.store.seals, "after" if last_event_id is None else "Last-Event-ID"
+    last = after if last_event_id is None else last_event_id
+
+    def asked() -> tuple[Wanted, int | None]:
+        opened_cursor(
+            seals, "event", cursor
+        )  # a stream has no pages; what is wrong is told all the same
+        wanted = _wanted(here, asking, map_name, kind)
+        return wanted, None if last is None else event_of(seals, last, place)
+
+    wanted, number = await to_thread.run_sync(asked)
+    if MEDIA_TYPE in request.headers.get("accept", ""):
+        here.feed.join()
+        told = _told(here.feed, seals, wanted, number, _still(request, here, asking))
+        return EventStream(told, here.feed.leave)
+    newest_first = order == "newest" or (order is None and last is None)
+    return await to_thread.run_sync(
+        lambda: here.engine.operations.events(
+            wanted, after=last, cursor=cursor, limit=limit, newest_first=newest_first
+        )
+    )
+
+
+def _wanted(here: Context, asking: Caller, map_name: str | None, kinds: list[str]) -> Wanted:
+    if map_name is not None:
+        asking.require(map_name, "read")
+    wanted = here.engine.operations.wanted(map_name, kinds)
+    if map_name is not None or asking.may("admin"):
+        return wanted
+    if asking.named is not None:
+        return replace(wanted, maps=frozenset(asking.named))
+    return replace(wanted, of_maps=True)
+
+
+def _still(request: Request, here: Context, asking: Caller) -> Callable[[], bool]:
+    """Asks whether the key that was shown still opens what it did."""
+    secret = request.headers.get("authorization", "").partition(" ")[2].strip()
+
+    def ask() -> bool:
+        if not asking.name:
+            return True  # none was asked for
+        key = here.engine.find_key(secret)
+        lasts = key is not None and (key.expires_at is None or key.expires_at > time.time())
+        return key is not None and lasts and dict(key.grants) == dict(asking.grants)
+
+    return ask
+
+
+async def _told(
+    feed: Feed, seals: OpaqueIds, wanted: Wanted, after: int | None, still: Callable[[], bool]
+) -> AsyncGenerator[bytes, None]:
+    yield BEGIN
+    async with aclosing(feed.batches(wanted, after, still)) as batches:
+        async for found, seen in batches:
+            messages = [message(event_record(seals, one)) for one in found]
+            yield b"".join(messages) if found else alive(seals.seal("event", seen))

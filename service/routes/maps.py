@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from functools import partial
+from typing import Annotated, Any
 
 from anyio import to_thread
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import Depends, Query, Request, Response
 from pydantic import ValidationError
 
+from sceneprint.engine.maps.maps import LIMITS, edit_frame, edit_map
 from sceneprint.errors import InvalidRequest, UnsupportedType
-from sceneprint.schemas import Map, NewMap, Page
-from sceneprint.schemas.edits import OPERATORS
-from service.access import Asking, may_admin, may_read
+from sceneprint_client.api import Frame, Map, NewMap, Page
+from sceneprint_client.api.listing import OPERATORS
+from service.auth import Asking, may_admin, may_read, may_write, v1_router
 from service.bodies import media_type, read_json
 from service.context import Here
 from service.problems import declared, invalid
+from service.responses import expected
 
-router = APIRouter(prefix="/maps", tags=["maps"])
+router = v1_router("/maps", "maps")
 
 
 BODY: dict[str, Any] = {
@@ -75,10 +79,100 @@ def delete_map(map_name: str, here: Here) -> None:
 def _new(given: object) -> NewMap:
     if not isinstance(given, dict):
         raise InvalidRequest(
-            "The map is not as it should be: it is no JSON object. See /docs for its fields.",
+            "The map is not a JSON object. See /docs for its fields.",
             (("", "not an object"),),
         )
     try:
         return NewMap.model_validate(given)
     except ValidationError as error:
         raise invalid(error, "The map") from error
+
+
+# Metadata of frames and maps, edited.
+
+edits_router = v1_router("/maps/{map_name}")
+
+MERGE_PATCH = "application/merge-patch+json"
+_KINDS = (MERGE_PATCH, "application/json")
+
+
+DryRun = Annotated[
+    bool,
+    Query(
+        description="Change nothing; the map is told as it would be: `overdue` is how many frames "
+        "`retention_days` would delete at once."
+    ),
+]
+
+
+def _document(record: str) -> dict[str, Any]:
+    """The parts of an operation that FastAPI does not see."""
+    schema = {"schema": {"$ref": f"#/components/schemas/{record}"}}
+    if_match = {
+        "name": "If-Match",
+        "in": "header",
+        "required": False,
+        "schema": {"type": "string"},
+        "description": "The ETag of what was read: 412 where it has been edited since. Without "
+        "it the last edit wins.",
+    }
+    body = {"required": True, "content": dict.fromkeys(_KINDS, schema)}
+    return {"requestBody": body, "parameters": [if_match]}
+
+
+@edits_router.patch(
+    "/frames/{frame_id}",
+    tags=["frames"],
+    responses=declared(400, 404, 412, 413, 415, 422),
+    openapi_extra=_document("FrameEdit"),
+    dependencies=[Depends(may_write)],
+)
+async def patch_frame(
+    map_name: str, frame_id: str, request: Request, here: Here, response: Response
+) -> Frame:
+    """Change the metadata of a frame (JSON merge patch, RFC 7396); filters see it at once."""
+    patch, tags = await _patch(request), expected(request)
+    frame = await to_thread.run_sync(edit_frame, here.engine.store, map_name, frame_id, patch, tags)
+    response.headers["ETag"] = f'"{frame.etag}"'
+    return frame
+
+
+@edits_router.patch(
+    "",
+    tags=["maps"],
+    responses=declared(400, 404, 412, 413, 415, 422),
+    openapi_extra=_document("MapEdit"),
+    dependencies=[Depends(may_admin)],
+)
+async def patch_map(
+    map_name: str, request: Request, here: Here, asking: Asking, response: Response,
+    dry_run: DryRun = False,
+) -> Map:  # fmt: skip
+    """Change title, quotas and retention of a map (JSON merge patch, RFC 7396).
+
+    Quotas are the operator's: `quota_frames` and `quota_bytes` ask for `admin` for `*`.
+    """
+    patch, tags = await _patch(request), expected(request)
+    if OPERATORS & patch.keys():
+        asking.require_every("admin")
+    edit = partial(edit_map, here.engine.store, map_name, patch, tags, dry_run=dry_run)
+    edited = await to_thread.run_sync(edit)
+    told = {name: getattr(edited, name) for name in sorted(LIMITS & patch.keys())}
+    request.state.audited = {"dry_run": True} if dry_run else told
+    response.headers["ETag"] = f'"{edited.etag}"'
+    return edited
+
+
+async def _patch(request: Request) -> Mapping[str, Any]:
+    if media_type(request) not in _KINDS:
+        raise UnsupportedType(
+            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
+            f"{MERGE_PATCH} or application/json."
+        )
+    given = await read_json(request)
+    if not isinstance(given, dict):
+        raise InvalidRequest(
+            "The edit is not a JSON object. See /docs for its fields.",
+            (("", "not an object"),),
+        )
+    return given

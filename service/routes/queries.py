@@ -7,16 +7,25 @@ from functools import partial
 from typing import Any
 
 from anyio import to_thread
-from fastapi import APIRouter, Depends, Request
+from fastapi import Depends, Request
 
-from sceneprint.engine.localizing import check_localizes, localization_of
-from sceneprint.schemas import Answer, Localization, Query, SeveralQuery
-from service.access import Asking, may_read
+from sceneprint.engine.search.query import check_localizes, localization_of
+from sceneprint_client.api import (
+    Answer,
+    Comparison,
+    Localization,
+    NamedFrame,
+    Query,
+    SeveralQuery,
+    Similarity,
+)
+from service.auth import Asking, may_read, v1_router
+from service.bodies import FORM
 from service.context import Context, Here
 from service.problems import declared
-from service.questions import described, question, unnamed
+from service.query_bodies import JSON, TEMPLATE, Sent, as_text, described, pair, question, unnamed
 
-router = APIRouter(tags=["queries"])
+router = v1_router(tag="queries")
 
 _FRAME_ID: dict[str, Any] = {
     "frame_id": {"type": "string", "description": "A frame of the map, in place of an upload."}
@@ -93,3 +102,58 @@ async def _asked(map_name: str, request: Request, here: Context, *, localizes: b
             )
     here.metrics.answer(answer)
     return answer
+
+
+# Two frames compared.
+
+similarity_router = v1_router(tag="queries")
+
+
+def _body() -> dict[str, Any]:
+    """The ways to name two frames, for the OpenAPI document."""
+    own = Comparison.model_json_schema(ref_template=TEMPLATE)["properties"]
+    file = {"type": "string", "format": "binary", "description": "A depth image: PNG or NPY."}
+    meta = {
+        "type": "string",
+        "contentMediaType": JSON,
+        "contentSchema": {"$ref": "#/components/schemas/FrameMeta"},
+    }
+    parts = {"a": file, "meta_a": meta, "b": file, "meta_b": meta}
+    texts = {name: as_text(one) for name, one in own.items()}
+    return {
+        "required": True,
+        "content": {
+            JSON: {
+                "schema": {
+                    "type": "object", "required": ["frame_a", "frame_b"], "properties": own,
+                    "additionalProperties": False,
+                }
+            },
+            FORM: {"schema": {"type": "object", "properties": {**parts, **texts}}},
+        },
+    }  # fmt: skip
+
+
+@similarity_router.post(
+    "/similarity",
+    responses=declared(400, 404, 413, 415, 422),
+    openapi_extra={"requestBody": _body()},
+)
+async def compare(request: Request, here: Here, asking: Asking) -> Similarity:
+    """How alike are two frames, and do they see one place? Neither is kept.
+
+    Each is stored, or sent: file part `a` with `meta_a`, `b` with `meta_b`. Stored frames must be
+    of one model; what is sent is signed with theirs. The transform maps b to a.
+    """
+    async with here.gate.place(), pair(request) as asked:
+        a, b = asked.a, asked.b
+        for side in (a, b):
+            if isinstance(side, NamedFrame):
+                asking.require(side.map, "read")
+        return await here.gate.run(
+            lambda: here.engine.queries.compare(
+                a.read() if isinstance(a, Sent) else a,
+                b.read() if isinstance(b, Sent) else b,
+                asked.how,
+            )
+        )

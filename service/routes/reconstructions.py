@@ -6,22 +6,21 @@ from contextlib import suppress
 from typing import Any
 
 from anyio import to_thread
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 from pydantic import ValidationError
 
-from sceneprint.engine.kept import Kept, unknown_query
-from sceneprint.engine.reconstructions import MEDIA_TYPES, MESH, PICTURE
+from sceneprint.engine.reconstruction import MEDIA_TYPES, MESH, PICTURE
+from sceneprint.engine.results.stored_results import StoredResult, unknown_query
 from sceneprint.errors import DamagedBlob, InvalidRequest, UnsupportedType
-from sceneprint.schemas.reconstructions import NewReconstruction, Reconstruction
-from sceneprint.store.listing import unknown_job
-from service.access import Asking, Caller
+from sceneprint.store.queue import unknown_job
+from sceneprint_client.api.reconstructions import NewReconstruction, Reconstruction
+from service.auth import Asking, Caller, v1_router
 from service.bodies import media_type, read_json
-from service.conditions import is_known
 from service.context import Context, Here
-from service.files import files, send_file
 from service.problems import declared, invalid
+from service.responses import files, is_known, send_file
 
-router = APIRouter(tags=["reconstructions"])
+router = v1_router(tag="reconstructions")
 
 _BODY: dict[str, Any] = {
     "requestBody": {
@@ -47,7 +46,7 @@ async def reconstruct(
     A worker does it, with Open3D. The answer may expire meanwhile. Ask under `Location` until
     `state` is `succeeded`; then mesh.ply and picture.png are there. It takes the scope `write`.
     """
-    kept = await to_thread.run_sync(lambda: _kept(here, asking, query_id))
+    kept = await to_thread.run_sync(lambda: _stored_answer(here, asking, query_id))
     wanted = await _wanted(request)
     made = await to_thread.run_sync(lambda: here.engine.reconstructions.begin(kept, wanted))
     response.headers["Location"] = f"/v1/reconstructions/{made.job_id}"
@@ -57,7 +56,7 @@ async def reconstruct(
 @router.get("/reconstructions/{job_id}", responses=declared(404))
 def get_reconstruction(job_id: str, here: Here, asking: Asking) -> Reconstruction:
     """A reconstruction: how far it is, and what its views show together when it is done."""
-    return _found(here, asking, job_id)
+    return _find_reconstruction(here, asking, job_id)
 
 
 @router.get(
@@ -90,12 +89,12 @@ async def get_picture(job_id: str, request: Request, here: Here, asking: Asking)
 @router.delete("/reconstructions/{job_id}", status_code=204, responses=declared(404))
 def delete_reconstruction(job_id: str, here: Here, asking: Asking) -> None:
     """Remove a reconstruction with its files; one that is under way is given up."""
-    for name in _found(here, asking, job_id).maps:
+    for name in _find_reconstruction(here, asking, job_id).maps:
         asking.require(name, "write")
     here.engine.reconstructions.delete(job_id)
 
 
-def _kept(here: Context, asking: Caller, query_id: str) -> Kept:
+def _stored_answer(here: Context, asking: Caller, query_id: str) -> StoredResult:
     """The answer, for who may read the maps that it was asked of, and write to those it names."""
     kept = here.engine.kept.find(query_id)
     answer = kept.answer
@@ -108,7 +107,7 @@ def _kept(here: Context, asking: Caller, query_id: str) -> Kept:
     return kept
 
 
-def _found(here: Context, asking: Caller, job_id: str) -> Reconstruction:
+def _find_reconstruction(here: Context, asking: Caller, job_id: str) -> Reconstruction:
     found = here.engine.reconstructions.find(job_id)
     if not all(asking.may("read", name) for name in found.maps):
         raise unknown_job(job_id)
@@ -119,7 +118,7 @@ async def _sent(
     request: Request, here: Context, asking: Caller, job_id: str, name: str
 ) -> Response:
     """A file of a reconstruction, which is read whole before: when it is its turn."""
-    await to_thread.run_sync(_found, here, asking, job_id)
+    await to_thread.run_sync(_find_reconstruction, here, asking, job_id)
     async with here.gate.place():
         return await here.gate.run(lambda: _file(request, here, job_id, name))
 
@@ -133,7 +132,9 @@ def _file(request: Request, here: Context, job_id: str, name: str) -> Response:
                 f"{job_id[:12]}-{name}",
             )  # fmt: skip
     here.engine.reconstructions.file(job_id, name)  # UnknownJob where it was deleted meanwhile
-    raise DamagedBlob(f"{name} of reconstruction {job_id} is damaged. Reconstruct it again.")
+    raise DamagedBlob(
+        f"{name} of reconstruction {job_id} is damaged. Start the reconstruction again."
+    )
 
 
 async def _wanted(request: Request) -> NewReconstruction:
@@ -149,7 +150,7 @@ async def _wanted(request: Request) -> NewReconstruction:
         )
     given = await read_json(request)
     if not isinstance(given, dict):
-        raise InvalidRequest("The body is no JSON object.", (("", "not an object"),))
+        raise InvalidRequest("The body is not a JSON object.", (("", "not an object"),))
     try:
         return NewReconstruction.model_validate(given)
     except ValidationError as error:

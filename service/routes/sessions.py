@@ -4,27 +4,32 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from anyio import to_thread
+from fastapi import Depends, Query, Request, Response
+from pydantic import ValidationError
 
-from sceneprint.engine.browsing import list_sessions, trajectory, trajectory_file
-from sceneprint.engine.growth import growth
-from sceneprint.schemas import Page
-from sceneprint.schemas.browsing import Run, Session, Trajectory
-from sceneprint.schemas.growth import Growth, GrowthOf
-from service.access import may_read
-from service.conditions import chosen
+from sceneprint.engine.maps.map_frames import growth, list_sessions, trajectory, trajectory_file
+from sceneprint.engine.sessions.pose_graph import MEDIA_TYPES
+from sceneprint.errors import InvalidRequest, UnsupportedType
+from sceneprint_client.api import Page
+from sceneprint_client.api.listing import Run, Session, Trajectory
+from sceneprint_client.api.maps import Growth, GrowthOf
+from sceneprint_client.api.sessions import Association, Edge, Graph, GraphFormat, NewAssociation
+from service.auth import may_read, may_write, v1_router
+from service.bodies import media_type, read_json
 from service.context import Here
-from service.problems import declared
+from service.problems import declared, invalid
+from service.responses import preferred_media_type
 
-router = APIRouter(prefix="/maps/{map_name}", tags=["sessions"], dependencies=[Depends(may_read)])
+router = v1_router("/maps/{map_name}", "sessions", may_read)
 
-_TEXT, _JSON = "text/plain", "application/json"
+_PLAIN, _JSON = "text/plain", "application/json"
 _TRAJECTORY: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "By Accept: TUM lines `t tx ty tz qx qy qz qw`, their frames in comments; "
         "or JSON with the ids of the frames.",
         "model": Trajectory,
-        "content": {_TEXT: {"schema": {"type": "string"}}},
+        "content": {_PLAIN: {"schema": {"type": "string"}}},
     },
     **declared(404, 422),
 }
@@ -56,7 +61,7 @@ async def get_trajectory(
     At most 100,000 frames at once; ask for parts of a longer one by time, or for `most` of them,
     which are evenly taken along it.
     """
-    kind = chosen(request, (_TEXT, _JSON))
+    kind = preferred_media_type(request, (_PLAIN, _JSON))
 
     def make() -> bytes:
         found = trajectory(here.engine.store, map_name, run)
@@ -71,3 +76,153 @@ async def get_trajectory(
 def get_growth(map_name: str, here: Here, asked: Annotated[GrowthOf, Query()]) -> Growth:
     """How many frames a map has, by the hour or the day (UTC) in which they were indexed."""
     return growth(here.engine.store, map_name, asked.by, asked.last)
+
+
+# Associations: sessions joined, loops closed.
+
+associations_router = v1_router("/maps/{map_name}/associations", "associations", may_read)
+
+BODY: dict[str, Any] = {
+    "required": True,
+    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewAssociation"}}},
+}
+_TEXT_SCHEMA = {"schema": {"type": "string"}}
+_GRAPH: dict[int | str, dict[str, Any]] = {
+    200: {
+        "model": Graph,
+        "description": "The graph as one of its files.",
+        "content": {MEDIA_TYPES["g2o"]: _TEXT_SCHEMA, MEDIA_TYPES["tum"]: _TEXT_SCHEMA},
+    }
+}
+_Overlap = Annotated[float, Query(ge=0.0, le=1.0, description="Least overlap of an edge.")]
+
+
+@associations_router.post(
+    "",
+    status_code=202,
+    responses=declared(400, 404, 413, 415, 422),
+    openapi_extra={"requestBody": BODY},
+    dependencies=[Depends(may_write)],
+)
+async def begin_association(
+    map_name: str, request: Request, here: Here, response: Response
+) -> Association:
+    """Find where sessions see the same places: two of them, which joins their maps, or one, which
+    closes its loops. A job does it: some 0.1 s a frame and worker.
+
+    Every frame of the first session is looked up among those of the second; what validation
+    accepts is an edge. Edges near each other must agree with how the robots moved between their
+    frames, and those that are left vote on how the sessions' parent frames lie to each other.
+    """
+    if media_type(request) != "application/json":
+        raise UnsupportedType(
+            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
+            "application/json."
+        )
+    asked = _association_from_json(await read_json(request))
+    begun = await to_thread.run_sync(here.engine.associations.begin, map_name, asked)
+    response.headers["Location"] = f"/v1/maps/{map_name}/associations/{begun.association_id}"
+    return begun
+
+
+@associations_router.get("", responses=declared(404, 422))
+def list_associations(
+    map_name: str,
+    here: Here,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> Page[Association]:
+    """Associations of a map, the newest first."""
+    return here.engine.associations.list_all(map_name, cursor, limit)
+
+
+@associations_router.get("/{job_id}", responses=declared(404))
+def get_association(map_name: str, job_id: str, here: Here) -> Association:
+    """How far an association has come, and what it came to: whether the sessions are joined, by
+    which transform, and how many edges agree on it.
+    """
+    return here.engine.associations.get(map_name, job_id)
+
+
+@associations_router.delete(
+    "/{job_id}", status_code=204, responses=declared(404), dependencies=[Depends(may_write)]
+)
+def delete_association(map_name: str, job_id: str, here: Here) -> None:
+    """Forget an association with its edges; one that is not over is given up."""
+    here.engine.associations.remove(map_name, job_id)
+
+
+@associations_router.get("/{job_id}/edges", responses=declared(404, 422))
+def list_edges(
+    map_name: str,
+    job_id: str,
+    here: Here,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    min_overlap: _Overlap = 0.0,
+    consistent: Annotated[
+        bool | None,
+        Query(description="`true`: those that loops confirm. `false`: those that were outvoted."),
+    ] = None,
+) -> Page[Edge]:
+    """Edges in the order in which they were found, also while more are."""
+    return here.engine.associations.edges(
+        map_name, job_id, cursor, limit, min_overlap, consistent=consistent
+    )
+
+
+@associations_router.get(
+    "/{job_id}/graph",
+    response_class=Response,
+    responses={**_GRAPH, **declared(404, 409, 422)},
+)
+async def get_graph(
+    map_name: str,
+    job_id: str,
+    request: Request,
+    here: Here,
+    kind: Annotated[
+        GraphFormat | None,
+        Query(
+            alias="format",
+            description="`g2o` (VERTEX_SE3:QUAT, EDGE_SE3:QUAT), `tum` (the vertices as a "
+            "trajectory), or `json`; default: by Accept, else g2o.",
+        ),
+    ] = None,
+    min_overlap: _Overlap = 0.0,
+    odometry: Annotated[
+        bool,
+        Query(description="With an edge between each two consecutive frames, from their poses."),
+    ] = False,
+    consistent: Annotated[
+        bool, Query(description="Only edges that loops confirm; else all not outvoted.")
+    ] = False,
+) -> Response:
+    """The pose graph of an association that has succeeded, for an optimiser.
+
+    Vertices are all frames of the sessions, run after run in the order of time, numbered from 0;
+    their poses are in one frame where the sessions are joined. Edges that were outvoted are left
+    out. `format=json` tells which vertex is which frame.
+    """
+    kinds = {media: name for name, media in MEDIA_TYPES.items()}
+    wanted: Any = kind or kinds[preferred_media_type(request, list(kinds))]
+    async with here.gate.place():
+        text = await here.gate.run(
+            lambda: here.engine.associations.graph(
+                map_name, job_id, wanted, min_overlap, odometry=odometry, consistent=consistent
+            )
+        )
+    name = f'attachment; filename="{job_id}.{wanted}"'
+    return Response(text, media_type=MEDIA_TYPES[wanted], headers={"Content-Disposition": name})
+
+
+def _association_from_json(given: object) -> NewAssociation:
+    if not isinstance(given, dict):
+        raise InvalidRequest(
+            "The association is not a JSON object. See /docs for its fields.",
+            (("", "not an object"),),
+        )
+    try:
+        return NewAssociation.model_validate(given)
+    except ValidationError as error:
+        raise invalid(error, "The association") from error

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import pytest
 
 from sceneprint.cli import main
-from sceneprint.cli.served import serving
-from sceneprint.datasets import Camera, write_depth_png, write_intrinsics, write_pose
-from sceneprint.types import Frame
+from sceneprint.cli.demo import serving
+from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
+from sceneprint.types import DepthFrame
 
 
 class Said(NamedTuple):
@@ -54,7 +54,7 @@ def sceneprint(
 
 
 @pytest.fixture(scope="session")
-def rooms(room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def rooms(room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three views of each of two rooms, with poses, in 7-Scenes layout."""
     root = tmp_path_factory.mktemp("rooms")
     for number, frame in enumerate(room_frames):

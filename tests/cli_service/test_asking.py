@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from sceneprint.cli.similarity import side_of
-from sceneprint.client import Client
+from sceneprint.cli.query import frame_argument
+from sceneprint_client import Client
 
 Run = Callable[..., Any]
 
@@ -18,7 +18,7 @@ Run = Callable[..., Any]
 @pytest.fixture(scope="module")
 def maps(service_url: str, rooms: Path) -> dict[str, list[str]]:
     """`near` has two views of the first room, `far` one of each."""
-    from sceneprint.datasets import find_sequences
+    from sceneprint.formats.dataset import find_sequences
 
     found: dict[str, list[str]] = {}
     frames = [one for sequence in find_sequences(rooms) for one in sequence.frames]
@@ -42,7 +42,7 @@ def test_a_query_says_where_frames_were_lost(
     assert outcomes == ["accepted", "not_selected"]
     lines = sceneprint(*asked, "--explain", "--explain-frame", maps["near"][1]).stdout.splitlines()
     assert lines[-3].startswith(f"     1  {maps['near'][0]}  1.00  validate: accepted; accepted:")
-    assert "retrieve: not selected; most like frame" in lines[-2]
+    assert "retrieve: not selected; most similar to the selected frame" in lines[-2]
     assert lines[-1].startswith(f"  {maps['near'][1]}: rank 2 of 2; lost at selection: ")
     both = json.loads(sceneprint(*asked, "--map", "far", "--json").stdout)
     assert (both["maps"], both["counts"]["map"]) == (["near", "far"], 4)
@@ -67,7 +67,7 @@ def test_a_frame_is_localized(sceneprint: Run, maps: dict[str, list[str]], rooms
     there = json.loads(sceneprint("localize", "near", rooms / "room-0", "--json").stdout)
     assert (there["status"], there["matches"][0]) == ("found", maps["near"][0])
     lost = sceneprint("localize", "near", rooms / "room-1", "--frame", 0, expect=1).stdout
-    assert ": not found; none of 2 candidates is accepted" in lost
+    assert ": not found; none of 2 candidates was accepted" in lost
 
 
 def test_two_frames_are_compared(sceneprint: Run, maps: dict[str, list[str]], rooms: Path) -> None:
@@ -76,7 +76,7 @@ def test_two_frames_are_compared(sceneprint: Run, maps: dict[str, list[str]], ro
     same = sceneprint("similarity", own, image).stdout
     assert same.startswith("similarity 1.000 (distance 0, depth-")
     assert "; accepted strong: " in same
-    assert same.rstrip().endswith("; b lies at 0.000 0.000 0.000 m of a")
+    assert same.rstrip().endswith("; b lies at 0.000 0.000 0.000 m from a")
     told = json.loads(sceneprint("similarity", own, far, "--json", expect=1).stdout)
     assert told["validation"]["status"] in ("rejected", "ambiguous")
     assert told["b"] == {"map": "far", "frame_id": maps["far"][1]}
@@ -87,7 +87,7 @@ def test_two_frames_are_compared(sceneprint: Run, maps: dict[str, list[str]], ro
 
 def test_a_side_is_a_file_or_a_stored_frame(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.chdir(tmp_path)
-    assert side_of("hall:a.b-1") == ("hall", "a.b-1")
-    assert side_of("depth/a.png") == Path("depth/a.png")
+    assert frame_argument("hall:a.b-1") == ("hall", "a.b-1")
+    assert frame_argument("depth/a.png") == Path("depth/a.png")
     Path("hall:a").touch()
-    assert side_of("hall:a") == Path("hall:a")
+    assert frame_argument("hall:a") == Path("hall:a")

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.cli.choosing import choose_frames
-from sceneprint.datasets import write_depth_png
+from sceneprint.cli.demo import choose_frames
 from sceneprint.errors import DatasetError
+from sceneprint.formats.dataset import write_depth_png
 
 
 def sequence(folder: Path, frames: int) -> None:
@@ -61,5 +61,5 @@ def test_split_files_decide_where_they_are(scene: Path) -> None:
     assert {one.session for one in choice.database} == {"seq-02"}
     assert (len(choice.database), len(choice.queries)) == (2, 3)
     (scene / "TestSplit.txt").unlink()
-    with pytest.raises(DatasetError, match="has 2 frames for the map and 0 to look up"):
+    with pytest.raises(DatasetError, match="has 2 frames for the map and 0 to query"):
         choose_frames(scene)

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.clouds import write_ply
-from sceneprint.datasets import write_pose
-from sceneprint.types import Frame
+from sceneprint.formats.dataset import write_pose
+from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.types import DepthFrame
 
 Run = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")
-def scans(room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scans(room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What two depth images see, as a KITTI scan and a PLY, with their poses; and one that is
     none.
     """

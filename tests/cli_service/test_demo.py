@@ -16,15 +16,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sceneprint.cli import served
-from sceneprint.cli.choosing import choose_frames
-from sceneprint.cli.demo_map import fill
-from sceneprint.cli.served import serving
-from sceneprint.cli.signals import ended_by_signals
-from sceneprint.client import Client
-from sceneprint.datasets import read_pose, write_pose
+from sceneprint.cli import demo as served
+from sceneprint.cli.demo import choose_frames, fill, serving
+from sceneprint.cli.options import ended_by_signals
 from sceneprint.errors import ServiceError, Unreachable
-from sceneprint.schemas import JobState
+from sceneprint.formats.dataset import read_pose, write_pose
+from sceneprint_client import Client
+from sceneprint_client.api import JobState
 
 
 @pytest.fixture
@@ -73,7 +71,7 @@ def test_demo_goes_the_whole_way_and_leaves_nothing(
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
     service, uploaded, queries, head, *lines = out.splitlines()
-    assert re.match(r"service: http://127\.0\.0\.1:\d+, an empty folder, 1 worker", service)
+    assert re.match(r"service: http://127\.0\.0\.1:\d+, empty data folder, 1 worker", service)
     assert uploaded.startswith("map: 4 of 4 frames uploaded, signed and indexed in ")
     assert queries.startswith("queries: 2: ")
     assert head.split()[:4] == ["first", "answer", "within", "5cm/5deg"]
@@ -83,7 +81,11 @@ def test_demo_goes_the_whole_way_and_leaves_nothing(
 
 
 @pytest.mark.parametrize(
-    ("stage", "number"), [("building", signal.SIGHUP), ("serving", signal.SIGTERM)]
+    ("stage", "number"),
+    [
+        pytest.param("building", signal.SIGHUP, marks=pytest.mark.thorough),
+        ("serving", signal.SIGTERM),
+    ],
 )
 def test_demo_that_is_stopped_leaves_nothing(
     demo: Callable[..., subprocess.Popen[str]], tmp_path: Path, rooms: Path, stage: str,
@@ -113,7 +115,7 @@ def test_demo_needs_frames_for_the_map_and_to_look_up(
     _, err = process.communicate(timeout=60)
     assert process.returncode == 2
     assert len(err.splitlines()) == 1
-    assert "has 1 frames for the map and 0 to look up" in err
+    assert "has 1 frames for the map and 0 to query" in err
 
 
 @pytest.fixture
@@ -140,7 +142,7 @@ def test_what_comes_twice_is_left_out_once(
         known = fill(client, "depth", choice)
     assert len(known) == 2
     said = capsys.readouterr()
-    assert re.search(r"left out: .*frame-00000[01]: Frame \w+ has the same content", said.out)
+    assert re.search(r"skipped: .*frame-00000[01]: Frame \w+ has the same content", said.out)
     assert "map: 2 of 3 frames uploaded" in said.out
 
 
@@ -149,7 +151,10 @@ def test_frames_that_are_not_signed_in_time_end_it(
 ) -> None:
     waited = [SimpleNamespace(state=one) for one in (JobState.SUCCEEDED, JobState.RUNNING)]
     monkeypatch.setattr(Client, "wait", lambda *_, **__: waited)
-    with Client.embedded(tmp_path) as client, pytest.raises(ServiceError, match="1 of 2 frames"):
+    with (
+        Client.embedded(tmp_path) as client,
+        pytest.raises(ServiceError, match="1 of 2 map frames"),
+    ):
         fill(client, "depth", choose_frames(rooms))
 
 

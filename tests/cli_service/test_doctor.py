@@ -14,13 +14,13 @@ import pytest
 from pydantic import SecretStr
 
 from sceneprint import __version__
-from sceneprint.cli import checks, connection, doctor, signer
-from sceneprint.cli.findings import Finding
-from sceneprint.cli.signer import prepare_presets
-from sceneprint.client import Client, Status
-from sceneprint.datasets import find_sequences
-from sceneprint.geometry import counting
+from sceneprint.cli import doctor, options
+from sceneprint.cli.doctor import Check
+from sceneprint.cli.options import prepare_presets
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.geometry.signature import pair_table
 from sceneprint.settings import Settings
+from sceneprint_client import Client, Status
 
 Run = Callable[..., Any]
 
@@ -43,7 +43,7 @@ def test_a_sound_machine(sceneprint: Run, data_folder: Path, service_url: str) -
         assert found[needed] == "ok"
     assert set(found.values()) <= {"ok", "note"}
     assert f"{service_url} answers, version {__version__}" in done.stdout
-    assert done.stdout.splitlines()[-1] == "all that is needed is fine"
+    assert done.stdout.splitlines()[-1] == "no problems found"
 
 
 @pytest.mark.sqlite_only("this server is told not to wait for its disk")
@@ -51,10 +51,9 @@ def test_a_machine_where_nothing_was_used_yet(
     sceneprint: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("SCENEPRINT_URL")
-    monkeypatch.setattr(connection, "DEFAULT_URL", "http://127.0.0.1:1")
     monkeypatch.setattr(doctor, "DEFAULT_URL", "http://127.0.0.1:1")
     monkeypatch.setenv("SCENEPRINT_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(counting, "compiled_at", lambda: (str(tmp_path / "numba"), "*.nbi"))
+    monkeypatch.setattr(pair_table, "compiled_at", lambda: (str(tmp_path / "numba"), "*.nbi"))
     done = sceneprint("doctor", "--data", tmp_path / "new" / "data")
     found = verdicts(done.stdout)
     for made_later in ("kernels", "table depth", "table paper", "service"):
@@ -75,14 +74,14 @@ def test_what_is_wrong_says_what_to_do(sceneprint: Run, tmp_path: Path) -> None:
         "service",
     ]
     assert "file is not a database" in done.stdout
-    assert "none answers at http://127.0.0.1:1" in done.stdout
-    assert done.stdout.splitlines()[-1] == "2 things are wrong"
+    assert "no service answers at http://127.0.0.1:1" in done.stdout
+    assert done.stdout.splitlines()[-1] == "2 problems found"
     done = sceneprint("doctor", "--data", "/proc/none", expect=2)
     assert verdicts(done.stdout)["data folder"] == "WRONG"
 
 
-def found_in(settings: Settings) -> dict[str, Finding]:
-    return {one.subject: one for one in checks.machine(settings)}
+def found_in(settings: Settings) -> dict[str, Check]:
+    return {one.subject: one for one in doctor.machine(settings)}
 
 
 @pytest.mark.sqlite_only("what is in its file")
@@ -96,7 +95,10 @@ def test_databases_of_other_versions(tmp_path: Path) -> None:
     connection.close()
     before = path.read_bytes()
     finding = found_in(settings)["database"]
-    assert (finding.verdict, "schema 9999: a later version" in finding.text) == ("WRONG", True)
+    assert (finding.verdict, "schema 9999: it was written by a later version" in finding.text) == (
+        "WRONG",
+        True,
+    )
     assert path.read_bytes() == before
     with sqlite3.connect(path) as connection:
         connection.execute("DELETE FROM alembic_version")
@@ -149,12 +151,12 @@ def test_looking_at_a_database_changes_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("url", "verdict", "said"),
     [
-        ("sqlite:////{tmp}/x.db", "ok", "none yet; {tmp}/x.db will be made by the first use"),
-        ("sqlite:///file:{tmp}/x%20y.db?uri=true", "ok", "{tmp}/x y.db will be made"),
-        ("sqlite:////{tmp}/none/x.db", "WRONG", "the folder of {tmp}/none/x.db is missing"),
-        ("sqlite://", "WRONG", "is in memory"),
-        ("sqlite:///file:x?mode=memory&uri=true", "WRONG", "is in memory"),
-        ("postgresql://me:p@ss:hidden@host/db", "WRONG", "its port is no number"),
+        ("sqlite:////{tmp}/x.db", "ok", "none yet; the first use creates {tmp}/x.db"),
+        ("sqlite:///file:{tmp}/x%20y.db?uri=true", "ok", "the first use creates {tmp}/x y.db"),
+        ("sqlite:////{tmp}/none/x.db", "WRONG", "the folder of {tmp}/none/x.db does not exist"),
+        ("sqlite://", "WRONG", "is an in-memory database"),
+        ("sqlite:///file:x?mode=memory&uri=true", "WRONG", "is an in-memory database"),
+        ("postgresql://me:p@ss:hidden@host/db", "WRONG", "the port is not a number"),
         ("nonsense", "WRONG", "not an SQLAlchemy URL"),
         ("nosuch://host/db", "WRONG", "'nosuch' is no database that is known"),
     ],
@@ -170,15 +172,15 @@ def test_addresses_of_databases(
     assert line.startswith(verdict)
     assert said.format(tmp=tmp_path) in line
     assert "hidden" not in done.stdout + done.stderr  # half of a password
-    last = "1 thing is wrong" if verdict == "WRONG" else "all that is needed is fine"
+    last = "1 problem found" if verdict == "WRONG" else "no problems found"
     assert done.stdout.splitlines()[-1] == last
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_a_machine_may_lack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(checks.OPEN3D_LIBRARIES, "libabsent.so.1", "libabsent1")
-    monkeypatch.setattr(checks, "LEAST_FREE", 1 << 62)
-    monkeypatch.setattr(checks, "OLDEST_SQLITE", (99, 0, 0))
+    monkeypatch.setitem(doctor.OPEN3D_LIBRARIES, "libabsent.so.1", "libabsent1")
+    monkeypatch.setattr(doctor, "LEAST_FREE", 1 << 62)
+    monkeypatch.setattr(doctor, "OLDEST_SQLITE", (99, 0, 0))
     found = found_in(Settings(data_dir=tmp_path, database_url=None))
     assert found["open3d libraries"].verdict == "note"
     assert "libabsent1" in found["open3d libraries"].text.split("apt-get install ")[1].split()
@@ -198,7 +200,7 @@ def waiting(tmp_path: Path, rooms: Path) -> Iterator[Client]:
 def test_workers_that_are_missing(waiting: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     finding = doctor._workers(waiting, waiting.status())
     assert finding.verdict == "ok"
-    assert finding.text.startswith("1 jobs wait, 0 are being done, the oldest came 0 s ago")
+    assert re.match(r"1 jobs waiting, 0 running, the oldest for \d s", finding.text)
 
     class Later(datetime):
         @classmethod
@@ -208,10 +210,10 @@ def test_workers_that_are_missing(waiting: Client, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(doctor, "datetime", Later)
     finding = doctor._workers(waiting, waiting.status())
     assert finding.verdict == "WRONG"
-    assert "the oldest came 100 s ago. No worker seems to run: `sceneprint work`" in finding.text
+    assert "the oldest for 100 s. No worker seems to be running. Start some with" in finding.text
     busy = Status(version="1", frames={}, jobs={"queued": 1, "running": 1, "dead": 2})
     finding = doctor._workers(waiting, busy)
-    assert (finding.verdict, "2 were given up" in finding.text) == ("note", True)
+    assert (finding.verdict, "2 failed for good" in finding.text) == ("note", True)
 
 
 def test_a_service_of_another_version() -> None:
@@ -229,9 +231,9 @@ def test_the_first_use_says_what_it_waits_for(
     said.clear()  # of a checkout in which nothing was compiled
     prepare_presets(Settings(data_dir=tmp_path), said.append)
     assert said == []
-    monkeypatch.setattr(signer, "compiled_at", lambda: (str(tmp_path / "numba"), "*.nbi"))
+    monkeypatch.setattr(options, "compiled_at", lambda: (str(tmp_path / "numba"), "*.nbi"))
     prepare_presets(Settings(data_dir=tmp_path), said.append)
     first, second, last = said
     assert first.endswith("compiling for depth images (about 40 seconds)")
     assert re.fullmatch(r"compiled for depth images in \d+ s; now for clouds \(.+\)", second)
-    assert re.fullmatch(r"compiled, once for all, in \d+ s", last)
+    assert re.fullmatch(r"compilation finished in \d+ s", last)

@@ -9,15 +9,12 @@ import pytest
 from pydantic import SecretStr
 
 from benchmarks.fleet.postgres import Server
-from sceneprint.cli.checks_database import database
-from sceneprint.cli.checks_objects import object_stores
-from sceneprint.cli.checks_server import server
-from sceneprint.cli.findings import Finding
+from sceneprint.cli.doctor import Check, database, object_stores, server
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
 
 
-def found_in(url: str, **other: object) -> dict[str, Finding]:
+def found_in(url: str, **other: object) -> dict[str, Check]:
     settings = Settings(data_dir=Path("/nowhere"), database_url=SecretStr(url), **other)
     found = [database(settings), *server(settings), *object_stores(settings)]
     return {one.subject: one for one in found}
@@ -35,7 +32,7 @@ def test_a_server_and_its_replica(postgres: Server, tmp_path: Path) -> None:
         assert found["durability"].verdict == "WRONG"  # the server of tests syncs nothing
         assert "fsync, full_page_writes off" in found["durability"].text
         assert (found["clock"].verdict, found["connections"].verdict) == ("ok", "ok")
-        assert found["pgvector"].text.endswith("the first use makes it (CREATE EXTENSION)")
+        assert found["pgvector"].text.endswith("the first use enables it (CREATE EXTENSION)")
         assert found["replica"].verdict == "ok"
         postgres.execute("CREATE TABLE seen (number int)", "looked_at")
         seen = "SELECT to_regclass('seen') IS NOT NULL"
@@ -47,12 +44,12 @@ def test_a_server_and_its_replica(postgres: Server, tmp_path: Path) -> None:
         while found["replica"].verdict == "ok" and time.monotonic() < until:
             found = found_in(url, replica_url=SecretStr(near), replica_lag_s=0.1)
         assert "SCENEPRINT_REPLICA_LAG_S is 0.1 s: it is not used" in found["replica"].text
-        assert "is a standby, to which nothing" in found_in(near)["database server"].text
+        assert "is a read-only standby" in found_in(near)["database server"].text
     finally:
         standby.kill()
     gone = found_in(url, replica_url=SecretStr(near))["replica"]
-    assert (gone.verdict, "Until then the primary is asked" in gone.text) == ("WRONG", True)
-    assert "is no standby" in found_in(url, replica_url=SecretStr(url))["replica"].text
+    assert (gone.verdict, "Until then, queries go to the primary" in gone.text) == ("WRONG", True)
+    assert "is a primary" in found_in(url, replica_url=SecretStr(url))["replica"].text
 
 
 def test_a_user_who_may_not_make_extensions(postgres: Server) -> None:
@@ -61,7 +58,7 @@ def test_a_user_who_may_not_make_extensions(postgres: Server) -> None:
     mine = url.replace("postgres@", "robot@")
     found = found_in(mine, workers=250)
     assert found["pgvector"].verdict == "note"
-    assert "this user may not make it" in found["pgvector"].text
+    assert "this user may not enable it" in found["pgvector"].text
     assert found["connections"].verdict == "note"
     assert "Raise max_connections, or run fewer" in found["connections"].text
     assert found_in(mine, search="database")["pgvector"].verdict == "WRONG"
@@ -89,7 +86,7 @@ def test_object_stores(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     blobs, snapshots = object_stores(settings)
     assert (blobs.verdict, snapshots.verdict) == ("ok", "ok")
     assert blobs.text.startswith(f"{bucket}/blobs: written, read and removed in ")
-    assert "AWS_... of the environment" in blobs.text
+    assert "AWS_... in the environment" in blobs.text
     assert not any(path.is_file() for path in tmp_path.rglob("*"))
     lost = Settings(data_dir=tmp_path, database_url=None, snapshot_url=f"{bucket}-none")
     [found] = object_stores(lost)

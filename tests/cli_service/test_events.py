@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 
-from sceneprint.client import Client
+from sceneprint_client import Client
 
 Run = Callable[..., tuple[str, str]]
 

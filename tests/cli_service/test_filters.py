@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from sceneprint.cli.filters import add_filter_options, filter_of
-from sceneprint.client import Client
+from sceneprint.cli.options import add_filter_options, filter_of
+from sceneprint_client import Client
 
 Run = Callable[..., Any]
 
@@ -36,7 +36,7 @@ def test_a_query_names_what_it_looks_among(sceneprint: Run, service_url: str, ro
         told = json.loads(sceneprint(*ask, "--json", *options).stdout)
         assert {ids[match["frame_id"]] for match in told["matches"]} == robots
     line = sceneprint(*ask, "--robot", "room-1").stdout.splitlines()[0]
-    assert "3 ranked of 3 that pass, of 6 frames" in line
+    assert "3 ranked of 3 that pass the filter, of 6 frames" in line
     assert "6 ranked of 6 frames" in sceneprint(*ask).stdout
     for options, text in (
         (["--not-within", "5"], "no captured_at"),

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from sceneprint.datasets import read_trajectory
+from sceneprint.formats.dataset import read_trajectory
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def test_lists_files_and_edits(
     assert len(ids) == 3
     table = sceneprint("frames", name, "--newest", "--limit", "2").stdout.splitlines()
     assert [line.split()[0] for line in table] == ["frame", ids[2], ids[1]]
-    assert sceneprint("frames", name, "--tag", "nowhere").stdout == "no such frames\n"
+    assert sceneprint("frames", name, "--tag", "nowhere").stdout == "no frames match\n"
 
     png, ply, lists = tmp_path / "a.png", tmp_path / "a.ply", tmp_path / "a.json"
     said = sceneprint(
@@ -65,10 +65,10 @@ def test_lists_files_and_edits(
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (("--cloud", "a.ply"), "--cloud is of one frame"),
-        (("--edit", "{}"), "--edit is of one frame"),
-        (("--trajectory", "a.tum"), "--trajectory is of one session"),
-        (("--session", "s", "--robot", "a", "--robot", "b", "--trajectory", "a"), "of one robot"),
+        (("--cloud", "a.ply"), "--cloud applies to one frame"),
+        (("--edit", "{}"), "--edit applies to one frame"),
+        (("--trajectory", "a.tum"), "--trajectory needs a session"),
+        (("--session", "s", "--robot", "a", "--robot", "b", "--trajectory", "a"), "one robot only"),
         (("nobody", "--cloud", "a.ply"), "There is no"),
     ],
 )

@@ -13,14 +13,14 @@ from sqlalchemy import update
 from sceneprint.cli import main
 from sceneprint.engine import Engine
 from sceneprint.index import Generation, Tail, lists, newest, publication, search
-from sceneprint.index.keys import draw
-from sceneprint.maintenance import indexes
-from sceneprint.schemas import NewMap
+from sceneprint.index.mapped_files import draw
+from sceneprint.maintenance.fsck import indexes
 from sceneprint.settings import Settings
 from sceneprint.store.frames import add_frame, frame_of
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import StoredSignature, index_frame
 from sceneprint.store.tables import signatures
+from sceneprint_client.api import NewMap
 
 N, LENGTH = 60, 448
 
@@ -77,7 +77,7 @@ def test_rebuild_stats_and_verify(data: Path, capsys: pytest.CaptureFixture[str]
     on_disk = sum(path.stat().st_size for path in data.glob("index/hall-*/*"))
     assert after["index_bytes"] == round(on_disk / N)
     assert after["bytes_beyond_upload"] == LENGTH + 80 + round(on_disk / N)
-    assert told(capsys, "verify", "hall", "--data", data) == (0, "map hall: sound\n")
+    assert told(capsys, "verify", "hall", "--data", data) == (0, "map hall: ok\n")
     code, out = told(capsys, "stats", "--data", data)  # for people, and of all maps
     assert code == 0
     assert out.startswith("map empty, depth")
@@ -117,7 +117,7 @@ def test_verify_names_what_is_wrong_and_rebuild_mends_it(
         content = bytearray(path.read_bytes())
         content[7 * LENGTH + 3] ^= 1
         path.write_bytes(content)
-        expected = f"map hall: {path}: damaged or missing"
+        expected = f"map hall: {path}: a file of the index of map hall, changed"
     else:  # sound files, that are not those of this database
         with Engine(Settings(data_dir=data)) as engine:
             changed = bytes(LENGTH)
@@ -128,13 +128,13 @@ def test_verify_names_what_is_wrong_and_rebuild_mends_it(
                     .where(signatures.c.frame_number == 8)
                     .values(vector=changed, checksum=zlib.crc32(changed))
                 )
-        expected = f"the signature of frame {frame} is not that of the database"
+        expected = f"has other signatures than the database, or lacks some: frames {frame}"
     code, out = told(capsys, "verify", "hall", "--data", data)
     assert code == 1
     assert expected in out.splitlines()[0]
     assert "sceneprint index rebuild hall" in out.splitlines()[-1]
     assert told(capsys, "rebuild", "hall", "--data", data)[0] == 0
-    assert told(capsys, "verify", "hall", "--data", data) == (0, "map hall: sound\n")
+    assert told(capsys, "verify", "hall", "--data", data) == (0, "map hall: ok\n")
 
 
 def test_what_cannot_be_done_is_said_in_one_line(

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from sceneprint.cli import main
-from sceneprint.client import Client
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
+from sceneprint_client import Client
 
 Run = Callable[..., tuple[str, str]]
 
@@ -53,13 +53,13 @@ def test_dead_jobs_are_listed_and_tried_again(
     (said, _) = sceneprint("jobs", "--retry-dead")
     first, last = said.splitlines()
     assert first.endswith(" of map jobs, queued")
-    assert last == "1 jobs are tried again, 0 cannot be"
+    assert last == "1 jobs queued again, 0 cannot be retried"
     again = first.split()[1]
     with Client(service_url) as client:
         (job,) = client.wait([again], timeout_s=60)
         assert job.state == "succeeded"
     (said, _) = sceneprint("jobs", "--retry-dead")  # it is history now
-    assert said == "0 jobs are tried again, 0 cannot be\n"
+    assert said == "0 jobs queued again, 0 cannot be retried\n"
     (said, _) = sceneprint("jobs", "--json")
     ids = [json.loads(line)["job_id"] for line in said.splitlines()]
     assert ids[:3] == [again, *dead]
@@ -75,9 +75,9 @@ def test_what_has_lost_its_upload_cannot_be_tried_again(
         )
         engine.store.blobs.remove(base.exec_driver_sql(asked).scalar_one())
     said = sceneprint("jobs", "--retry-dead", expect=2)
-    assert "is gone from the data folder" in said[1]
-    assert said[0] == "0 jobs are tried again, 1 cannot be\n"
-    assert "is gone from the data folder" in sceneprint("jobs", "--retry", dead[0], expect=2)[1]
+    assert "is missing from the data folder" in said[1]
+    assert said[0] == "0 jobs queued again, 1 cannot be retried\n"
+    assert "is missing from the data folder" in sceneprint("jobs", "--retry", dead[0], expect=2)[1]
 
 
 def test_one_job_is_cancelled_or_tried_again(sceneprint: Run, dead: tuple[str, str]) -> None:
@@ -87,10 +87,10 @@ def test_one_job_is_cancelled_or_tried_again(sceneprint: Run, dead: tuple[str, s
     again = json.loads(said_out)
     assert (again["state"], again["map"], again["priority"]) == ("queued", "jobs", -3)
     assert "There is no job" in sceneprint("jobs", "--cancel", "nobody", expect=2)[1]
-    assert "--state is for listing" in sceneprint(
+    assert "--state only filters the list" in sceneprint(
         "jobs", "--state", "dead", "--retry", dead[0], expect=2
     )[1]  # fmt: skip
-    assert sceneprint("jobs", "--state", "cancelled") == ("no such jobs\n", "")
+    assert sceneprint("jobs", "--state", "cancelled") == ("no jobs match\n", "")
 
 
 def test_a_priority_out_of_its_range_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.settings import Settings
-from sceneprint.store.audit import Change
+from sceneprint.store.keys import KeyChange
 
 Run = Callable[..., Any]
 
@@ -75,18 +75,18 @@ def test_a_time_is_written_as_it_is_read(sceneprint: Run, time: str) -> None:
 
 def test_what_a_key_may_is_said_when_it_is_made(sceneprint: Run, tmp_path: Path) -> None:
     done = sceneprint("keys", "--list", "--scope", "read", "--data", tmp_path, expect=2)
-    assert "Give it with --create" in done.stderr
+    assert "Use it with --create" in done.stderr
     done = sceneprint("keys", "--create", "x", "--map", "No Map", "--data", tmp_path, expect=2)
-    assert "'No Map' is no name of a map" in done.stderr
+    assert "'No Map' is not a valid map name" in done.stderr
     done = sceneprint("keys", "--create", "command", "--data", tmp_path, expect=2)
-    assert "is no name for a key" in done.stderr
+    assert "is not a valid key name" in done.stderr
 
 
 def test_who_changed_what_is_printed(sceneprint: Run, tmp_path: Path) -> None:
     for arguments in (("--create", "robot"), ("--create", "screen"), ("--revoke", "robot")):
         sceneprint("keys", *arguments, "--data", tmp_path)
     with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
-        engine.audit.note(Change("delete_map", "screen", "192.0.2.7", "hall", request_id="r1"))
+        engine.audit.note(KeyChange("delete_map", "screen", "192.0.2.7", "hall", request_id="r1"))
     lines = sceneprint("audit", "--data", tmp_path).stdout.splitlines()
     assert [line[22:] for line in lines] == [
         "screen from 192.0.2.7  delete_map hall",

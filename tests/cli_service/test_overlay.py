@@ -1,4 +1,4 @@
-"""`sceneprint query --overlay`: the query laid on its best match, as a file."""
+"""`sceneprint query --overlay`: the query aligned with its best match, as a file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sceneprint.client import Client
+from sceneprint_client import Client
 
 
 def test_a_query_is_laid_on_its_match(
@@ -19,13 +19,13 @@ def test_a_query_is_laid_on_its_match(
     said = sceneprint(*one, "--overlay", path, "--color", "normal")
     answer = json.loads(said.stdout)
     best = answer["matches"][0]["frame_id"]
-    assert said.stderr == f"{path}: the query laid on {best}\n"
+    assert said.stderr == f"{path}: the query aligned with {best}\n"
     with Client(service_url) as client:
         assert path.read_bytes() == client.overlay(answer["query_id"], best, color="normal")
         client.delete_map("overlaid")
     for arguments, why in (
         (("--overlay", tmp_path / "no" / "x.ply", "--frame", "1"), "No such file"),
-        (("--overlay", path), "has 3 frames, and --overlay writes one file"),
+        (("--overlay", path), "has 3 frames, but --overlay writes a single file"),
     ):
         refused = sceneprint("query", "overlaid", rooms / "room-0", *arguments, expect=2)
         assert why in refused.stderr

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from sceneprint.client import Client
-from sceneprint.datasets import Camera, write_depth_png, write_intrinsics
-from sceneprint.synth import synthesise_room
+from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics
+from sceneprint.lab.synth import synthesise_room
+from sceneprint_client import Client
 
 Run = Callable[..., Any]
 
@@ -65,7 +65,7 @@ def test_what_cannot_be_reconstructed(sceneprint: Run, service_url: str, walk: P
     said = sceneprint("reconstruct", "nothing", first, expect=1)
     assert said.stdout == f"{first}: not found, so there is nothing to fuse\n"
     said = sceneprint("reconstruct", "nothing", walk, expect=2)
-    assert "6 frames are there. Name the file of one." in said.stderr
+    assert "6 frames found. Name a single frame file." in said.stderr
     said = sceneprint("reconstruct", "nothing", "nobody", expect=2)
     assert "There is no frame 'nobody'" in said.stderr
 
@@ -76,7 +76,7 @@ def test_a_snapshot_of_a_service(
     archive = tmp_path / "all.tar"
     said = sceneprint("snapshot", "--url", service_url, "--out", archive)
     assert re.match(rf"{archive}: \d+ maps, \d+ frames, \d+ blobs, [\d.]+ MB in", said.stdout)
-    assert "is whole" in sceneprint("restore", archive, "--verify-only").stdout
+    assert "is complete" in sceneprint("restore", archive, "--verify-only").stdout
     assert list((data_folder / "snapshots").glob("*.tar"))
     said = sceneprint("snapshot", "--url", service_url, "--data", tmp_path, expect=2)
-    assert "Give one of them" in said.stderr
+    assert "Give only one of them" in said.stderr

@@ -9,13 +9,13 @@ from typing import Any
 
 from sqlalchemy import update
 
-from sceneprint.cli import reencode as command
-from sceneprint.client import Client, meta_of
-from sceneprint.datasets import find_sequences
+from sceneprint.cli import storage as command
 from sceneprint.engine import Engine
-from sceneprint.schemas import JobState
+from sceneprint.formats.dataset import find_sequences
 from sceneprint.settings import Settings
 from sceneprint.store.tables import jobs
+from sceneprint_client import Client, meta_of
+from sceneprint_client.api import JobState
 
 Run = Callable[..., Any]
 
@@ -39,7 +39,7 @@ def test_a_map_is_signed_anew_while_its_service_runs(
     answer = sceneprint("query", "anew", frame, "--json").stdout
     assert f'"model":"{told.model}"' in answer.replace(": ", ":")
     again = reencode("--model", "paper", expect=2).stderr
-    assert again.startswith("sceneprint reencode: Map 'anew' is signed with paper-")
+    assert again.startswith("sceneprint reencode: Map 'anew' is already signed with paper-")
 
 
 def test_what_is_given_up_and_what_breaks_down_is_said(sceneprint: Run, tmp_path: Path) -> None:
@@ -55,13 +55,13 @@ def test_what_is_given_up_and_what_breaks_down_is_said(sceneprint: Run, tmp_path
         model = client.create_map("hall", model="depth").model
     first = f"map hall, model {model}\n"
     begun = reencode("--model", "paper").stdout
-    coming = r"to come: paper-[0-9a-f]{12}; 0 frames are signed with it, 0 wait\n"
+    coming = r"next model: paper-[0-9a-f]{12}; 0 frames signed, 0 waiting\n"
     assert re.fullmatch(first + coming, begun)
     assert reencode("--status").stdout == begun
     refused = reencode("--model", "depth", expect=2).stderr
-    assert re.search(r"Map 'hall' is being signed with paper-.* --cancel", refused)
+    assert re.search(r"Map 'hall' is already switching to paper-.* --cancel", refused)
     assert reencode("--cancel").stdout == first
-    assert "not being signed with another model" in reencode("--cancel", expect=2).stderr
+    assert "not switching to another model" in reencode("--cancel", expect=2).stderr
     assert "no such file" in reencode("--model", tmp_path / "none", expect=2).stderr.lower()
 
 
@@ -83,13 +83,13 @@ def test_waiting_ends_where_it_is_no_use(
         )
 
     said = wait()
-    assert "0 frames are signed with it, 1 wait\n" in said.stdout
-    assert "See that workers run: `sceneprint work` starts some." in said.stderr
+    assert "0 frames signed, 1 waiting\n" in said.stdout
+    assert "Check that workers are running; `sceneprint work` starts some." in said.stderr
     broken = update(jobs).where(jobs.c.kind == "reencode").values(state=JobState.DEAD)
     engine = Engine(Settings(data_dir=tmp_path, database_url=None))
     with engine, engine.store.database.write() as connection:
         connection.execute(broken)
     said = sceneprint("reencode", "hall", "--status", "--wait", "--data", tmp_path, expect=2)
-    assert "1 frames broke down in every try, and the map does not switch before" in said.stdout
+    assert "1 frames failed every attempt, and the map does not switch until" in said.stdout
     said = wait()  # tries it again
-    assert "0 frames are signed with it, 1 wait\n" in said.stdout
+    assert "0 frames signed, 1 waiting\n" in said.stdout

@@ -22,11 +22,11 @@ SERVER = "postgresql+psycopg://u:hunter2@host/db"
         ("BLOB_URL", "s3://bucket?secret=hunter2", "come from the environment"),
         ("SNAPSHOT_URL", "gs://bucket/p#hunter2", "come from the environment"),
         ("BLOB_URL", "s3://[hunter2", "come from the environment"),
-        ("BLOB_URL", "hunter2://bucket", "begins with none of s3://, gs://, az://"),
-        ("SNAPSHOT_URL", "hunter2", "begins with none of s3://"),
-        ("BLOB_URL", "", "begins with none of s3://"),
+        ("BLOB_URL", "hunter2://bucket", "does not start with any of s3://, gs://, az://"),
+        ("SNAPSHOT_URL", "hunter2", "does not start with any of s3://"),
+        ("BLOB_URL", "", "does not start with any of s3://"),
         ("BLOB_URL", "s3:///hunter2", "names no bucket"),
-        ("REPLICA_URL", SERVER, "SCENEPRINT_DATABASE_URL names"),
+        ("REPLICA_URL", SERVER, "a replica needs its primary"),
     ],
 )
 def test_a_url_that_is_none_is_refused_and_not_repeated(

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.client import Client, retrying
-from sceneprint.datasets import read_pose, write_depth_png
 from sceneprint.errors import MissingDependency, TooLarge
-from sceneprint.schemas import Answer, FrameState, Map
+from sceneprint.formats.dataset import read_pose, write_depth_png
+from sceneprint_client import Client, http
+from sceneprint_client.api import Answer, FrameState, Map
 
 Run = Callable[..., Any]
 
@@ -34,7 +34,7 @@ def house(service_url: str, rooms: Path) -> str:
     )
     assert done.returncode == 0, done.stderr
     first, second = done.stdout.splitlines()
-    assert re.fullmatch(r"map house is made, with model depth-[0-9a-f]{12}", first)
+    assert re.fullmatch(r"created map house with model depth-[0-9a-f]{12}", first)
     assert second.startswith(
         "6 frames: 6 received, 0 already there; 6 indexed, 0 rejected, 0 failed; "
     )
@@ -60,7 +60,9 @@ def test_uploading_again_changes_nothing(sceneprint: Run, house: str, rooms: Pat
     done = sceneprint("upload", house, rooms / "room-0", "--every", 2, expect=2)
     assert done.stdout.startswith("2 frames: 0 received, 0 already there, 2 refused; 0 indexed, ")
     first, second = done.stderr.splitlines()
-    assert re.match(r"seq-01/frame-000000: Frame \w+ has the same content, but other robot", first)
+    assert re.match(
+        r"seq-01/frame-000000: Frame \w+ has the same content, but a different robot", first
+    )
     assert second.startswith("seq-01/frame-000002: ")
 
 
@@ -121,13 +123,15 @@ def test_upload_refuses_what_would_mix(
     sceneprint: Run, house: str, rooms: Path, tmp_path: Path
 ) -> None:
     done = sceneprint("upload", house, rooms, "--model", "paper", expect=2)
-    assert re.search(r"Map house is there, with model depth-\w+\. Leave --model out", done.stderr)
+    assert re.search(
+        r"Map house already exists with model depth-\w+\. Leave --model out", done.stderr
+    )
     done = sceneprint("upload", "absent", rooms, "--no-create", expect=2)
     assert "There is no map 'absent'" in done.stderr
     other = tmp_path / "room-0"
     shutil.copytree(rooms / "room-0", other)
     done = sceneprint("upload", house, rooms / "room-0", other, expect=2)
-    assert "Another place is called room-0 too" in done.stderr
+    assert "The name room-0 is also used for" in done.stderr
     assert "name it with --parent-frame" in done.stderr
     assert done.stdout == ""
 
@@ -205,7 +209,7 @@ def test_queries_that_cannot_be_asked(
     assert len(done.stdout.splitlines()) == 2
     assert done.stderr.startswith("seq-01/frame-000000: ")
     for arguments, message in (
-        (("--frame", 3), r"has 3 frames\. Give --frame a place from 0 to 2"),
+        (("--frame", 3), r"has 3 frames\. Set --frame to an index from 0 to 2"),
         (("--frame", "x"), "no frame is called x"),
         (("--stages", "validate", "--frame", 1), "every query begins with retrieve"),
         (("--k", 51, "--frame", 1), "less than or equal to 50"),
@@ -230,7 +234,7 @@ def test_maps_are_listed_made_and_deleted(sceneprint: Run, house: str) -> None:
     assert {one.name: one.title for one in told}["hall"] == "Hall 2"
     assert "Add --yes" in sceneprint("maps", "--delete", "hall", expect=2).stderr
     done = sceneprint("maps", "--delete", "hall", "--yes")
-    assert done.stdout == "map hall and its 0 frames are deleted\n"
+    assert done.stdout == "deleted map hall and its 0 frames\n"
     assert "hall" not in sceneprint("maps").stdout
     assert (
         "There is no map 'hall'" in sceneprint("maps", "--delete", "hall", "--yes", expect=2).stderr
@@ -240,7 +244,7 @@ def test_maps_are_listed_made_and_deleted(sceneprint: Run, house: str) -> None:
 
 
 def test_a_service_that_is_not_there(sceneprint: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(retrying, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(http, "FIRST_PAUSE_S", 0.01)
     for url, message in (("http://127.0.0.1:1", "cannot be reached"), ("foo", "not the address")):
         done = sceneprint("maps", "--url", url, expect=2)
         assert done.stderr.startswith("sceneprint maps: ")
@@ -299,11 +303,11 @@ def test_a_map_has_limits(sceneprint: Run, house: str) -> None:
     [line] = [one for one in sceneprint("maps").stdout.splitlines() if one.startswith("small ")]
     assert line.endswith("  Small  (0.0 of 1.5 MB, kept 30 days)")
     told = sceneprint("maps", "--edit", house, "--retention-days", "0.000001", expect=2).stderr
-    assert "would delete 6 frames of map" in told
+    assert "would permanently delete the 6 frames of map" in told
     assert "Add --yes" in told
     told = sceneprint("maps", "--edit", house, "--retention-days", "1000", "--json").stdout
     assert Map.model_validate_json(told).frames["indexed"] == 6
     sceneprint("maps", "--edit", house, "--retention-days", "none")
-    assert "Nothing to change" in sceneprint("maps", "--edit", house, expect=2).stderr
+    assert "There is nothing to change" in sceneprint("maps", "--edit", house, expect=2).stderr
     assert "--create NAME or --edit" in sceneprint("maps", "--quota-bytes", "1", expect=2).stderr
     sceneprint("maps", "--delete", "small", "--yes")

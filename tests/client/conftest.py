@@ -15,8 +15,7 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from sceneprint.client import Client, retrying
-from sceneprint.datasets import (
+from sceneprint.formats.dataset import (
     Camera,
     FrameReference,
     find_sequences,
@@ -24,7 +23,8 @@ from sceneprint.datasets import (
     write_intrinsics,
     write_pose,
 )
-from sceneprint.types import Frame
+from sceneprint.types import DepthFrame
+from sceneprint_client import Client, http
 
 #: Largest body the service of these tests takes, bytes.
 UPLOAD_BYTES = 2 << 20
@@ -65,11 +65,11 @@ def embedded(tmp_path: Path) -> Iterator[Client]:
         yield client
 
 
-@pytest.fixture(params=["remote", "embedded"])
-def client(request: pytest.FixtureRequest) -> Client:
-    """The same test through HTTP and in process."""
-    found: Client = request.getfixturevalue(request.param)
-    return found
+@pytest.fixture(scope="session")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
+    """One service in this process for all tests; each uses maps of its own."""
+    with Client.embedded(tmp_path_factory.mktemp("client")) as client:
+        yield client
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def map_name(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="session")
 def references(
-    room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory
+    room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[FrameReference, ...]:
     """Three views of each of two rooms, with poses, as files in 7-Scenes layout."""
     root = tmp_path_factory.mktemp("rooms")
@@ -111,8 +111,8 @@ def bare_wall(
 @pytest.fixture
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tries follow each other at once."""
-    monkeypatch.setattr(retrying, "FIRST_PAUSE_S", 0.01)
-    monkeypatch.setattr(retrying, "LONGEST_PAUSE_S", 0.02)
+    monkeypatch.setattr(http, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(http, "LONGEST_PAUSE_S", 0.02)
 
 
 @dataclass

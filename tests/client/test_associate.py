@@ -1,4 +1,4 @@
-"""Associations by client, raw HTTP and command: the same answers, whoever does the work."""
+"""Associations by client, raw HTTP and command."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
 
 from sceneprint.cli import main
-from sceneprint.client import Client
-from sceneprint.datasets import write_depth_png
 from sceneprint.errors import InvalidRequest, UnknownJob, UnknownMap
-from sceneprint.schemas import FrameMeta, JobState
-from sceneprint.synth import synthesise_room
+from sceneprint.formats.dataset import write_depth_png
+from sceneprint.lab.synth import synthesise_room
+from sceneprint_client import Client
+from sceneprint_client.api import FrameMeta, JobState
 
 MAP = "associated"
 
@@ -64,61 +63,33 @@ def filled(client: Client, sent: list[Sent]) -> Filled:
 
 
 @pytest.fixture(scope="module")
-def both(
-    service_url: str, sent: list[Sent], tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[tuple[Filled, Filled]]:
-    folder = tmp_path_factory.mktemp("both")
-    with Client(service_url) as remote, Client.embedded(folder) as embedded:
-        yield filled(remote, sent), filled(embedded, sent)
+def associated(service_url: str, sent: list[Sent]) -> Iterator[Filled]:
+    with Client(service_url) as remote:
+        yield filled(remote, sent)
 
 
-def plain(told: Any, numbers: dict[str, int]) -> Any:
-    """What is told, with frames by number, and without ids and times of the job."""
-    drop = {"association_id", "created_at", "finished_at"}
-    if isinstance(told, dict):
-        return {key: plain(value, numbers) for key, value in told.items() if key not in drop}
-    if isinstance(told, list):
-        return [plain(value, numbers) for value in told]
-    if isinstance(told, str):
-        for frame_id, number in numbers.items():
-            told = told.replace(frame_id, f"frame {number}")
-    return told
-
-
-def test_a_service_and_the_engine_in_process_agree(both: tuple[Filled, Filled]) -> None:
-    told, steps = [], []
-    for one in both:
-        found = one.client.associate(
-            MAP, "a", "b", k=2, seed=3, progress=lambda *step: steps.append(step)
-        )
-        assert found.state is JobState.SUCCEEDED
-        assert one.client.association(MAP, found.association_id) == found
-        name = found.association_id
-        edges = [edge.model_dump(mode="json") for edge in one.client.edges(MAP, name)]
-        middle = sorted(edge["overlap"] for edge in edges)[len(edges) // 2]
-        told.append(
-            plain(
-                {
-                    "association": found.model_dump(mode="json"),
-                    "edges": edges,
-                    "g2o": one.client.graph(MAP, name, odometry=True),
-                    "tum": one.client.graph(MAP, name, "tum"),
-                    "json": json.loads(one.client.graph(MAP, name, "json", min_overlap=middle)),
-                },
-                one.numbers,
-            )
-        )
-    assert told[0] == told[1]
-    result = told[0]["association"]["result"]
-    assert result["edges"] == len(told[0]["edges"]) > 4
-    assert result["joins"][0]["transform"] is not None
+def test_edges_and_graphs(associated: Filled) -> None:
+    client, steps = associated.client, []
+    found = client.associate(MAP, "a", "b", k=2, seed=3, progress=lambda *n: steps.append(n))
+    assert found.state is JobState.SUCCEEDED
+    name = found.association_id
+    assert client.association(MAP, name) == found
+    edges = list(client.edges(MAP, name))
+    assert found.result is not None
+    assert found.result.edges == len(edges) > 4
+    assert found.result.joins[0].transform is not None
+    assert {one.from_frame for one in edges} <= associated.numbers.keys()
     assert steps[-1] == (3, 3)
-    assert len(told[0]["json"]["edges"]) == len(edges) - len(edges) // 2
+    middle = sorted(edge.overlap for edge in edges)[len(edges) // 2]
+    strongest = json.loads(client.graph(MAP, name, "json", min_overlap=middle))
+    assert len(strongest["edges"]) == len(edges) - len(edges) // 2
+    assert client.graph(MAP, name, odometry=True).count("EDGE_SE3:QUAT") > len(edges)
+    rows = [line.split() for line in client.graph(MAP, name, "tum").splitlines()]
+    assert len([row for row in rows if row[0] != "#"]) == 6
 
 
-@pytest.mark.parametrize("place", [0, 1], ids=["remote", "embedded"])
-def test_list_remove_and_refusals(both: tuple[Filled, Filled], place: int) -> None:
-    client = both[place].client
+def test_list_remove_and_refusals(associated: Filled) -> None:
+    client = associated.client
     before = [one.association_id for one in client.associations(MAP)]
     begun = client.associate(MAP, "a", apart=2, timeout_s=0)
     assert [one.association_id for one in client.associations(MAP)] == [
@@ -149,8 +120,8 @@ def test_list_remove_and_refusals(both: tuple[Filled, Filled], place: int) -> No
         client.associate(MAP, "a", "a")
 
 
-def test_over_http(both: tuple[Filled, Filled], service_url: str) -> None:
-    client = both[0].client
+def test_over_http(associated: Filled, service_url: str) -> None:
+    client = associated.client
     root = f"/v1/maps/{MAP}/associations"
     with httpx.Client(base_url=service_url, trust_env=False, timeout=60) as http:
         answer = http.post(root, json={"sessions": ["a", "b"]})
@@ -195,10 +166,10 @@ def test_over_http(both: tuple[Filled, Filled], service_url: str) -> None:
 
 
 def test_the_command(
-    both: tuple[Filled, Filled], service_url: str, tmp_path: Path,
+    associated: Filled, service_url: str, tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    client, out = both[0].client, tmp_path / "graph.g2o"
+    client, out = associated.client, tmp_path / "graph.g2o"
     of = ["associate", MAP, "--url", service_url, "--session", "a"]
     assert main([*of, "--session", "b", "--out", str(out), "--odometry"]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -206,16 +177,16 @@ def test_the_command(
     assert newest.result is not None
     assert lines[0].startswith(f"association {newest.association_id}: {newest.result.edges} edges")
     assert lines[2].startswith("joined surely, ann/a onto ann/b: ") or lines[2].startswith(
-        "joined weakly"
+        "joined weakly (check it before you rely on it)"
     )
-    assert lines[-1] == f"written: {out}"
+    assert lines[-1] == f"wrote {out}"
     assert out.read_text() == client.graph(MAP, newest.association_id, odometry=True)
     assert main([*of, "--apart", "2", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["asked"]["apart"] == 2
     assert told["result"]["joins"] == []
     assert main([*of, "--out", str(tmp_path / "graph.gtsam")]) == 2
-    assert "does not say what it is" in capsys.readouterr().err
+    assert "has no known file type" in capsys.readouterr().err
     begun = len(list(client.associations(MAP)))
     assert main([*of, "--out", str(tmp_path / "no" / "graph.g2o")]) == 2  # before it is begun
     assert "No such file or directory" in capsys.readouterr().err

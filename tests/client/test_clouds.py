@@ -1,4 +1,4 @@
-"""Point clouds through the client: over HTTP and in process alike."""
+"""Point clouds through the client."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.client import Client
-from sceneprint.clouds import write_ply
-from sceneprint.datasets import find_sequences, write_pose
 from sceneprint.errors import InvalidRequest, UnreadableCloud
-from sceneprint.geometry.retrieval import distances
+from sceneprint.formats.dataset import find_sequences, write_pose
+from sceneprint.formats.points import decode_cloud
+from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.geometry.retrieval.distance import distances
 from sceneprint.pipeline import open_signer, sign
-from sceneprint.scans import decode_cloud
-from sceneprint.schemas import FrameMeta
-from sceneprint.types import Floats, Frame
+from sceneprint.types import DepthFrame, Floats
+from sceneprint_client import Client
+from sceneprint_client.api import FrameMeta
 
 
 @pytest.fixture(scope="module")
-def seen(room_frames: tuple[Frame, ...]) -> list[Floats]:
+def seen(room_frames: tuple[DepthFrame, ...]) -> list[Floats]:
     """What depth images of one room see, in their optical frames."""
     found = []
     for frame in room_frames[:2]:
@@ -33,7 +33,9 @@ def seen(room_frames: tuple[Frame, ...]) -> list[Floats]:
 
 @pytest.fixture(scope="module")
 def folder(
-    seen: list[Floats], room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory
+    seen: list[Floats],
+    room_frames: tuple[DepthFrame, ...],
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Path:
     """Two scans in centimetres from a mast, with their poses."""
     place = tmp_path_factory.mktemp("scans") / "run"
@@ -75,7 +77,7 @@ def test_a_folder_of_scans(client: Client, map_name: str, folder: Path, seen: li
 
 
 def test_a_cloud_of_many_views_says_so_on_its_way(
-    client: Client, map_name: str, seen: list[Floats], room_frames: tuple[Frame, ...]
+    client: Client, map_name: str, seen: list[Floats], room_frames: tuple[DepthFrame, ...]
 ) -> None:
     client.create_map(map_name, model="depth")
     T = room_frames[0].pose

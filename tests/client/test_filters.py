@@ -1,15 +1,13 @@
-"""Filters and `if_novel`, over HTTP and in process alike."""
+"""Filters and `if_novel` through the client."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 
-from sceneprint.client import Client, meta_of
-from sceneprint.datasets import FrameReference
 from sceneprint.errors import InvalidRequest
-from sceneprint.schemas import Filter, FrameState, JobState
+from sceneprint.formats.dataset import FrameReference
+from sceneprint_client import Client, meta_of
+from sceneprint_client.api import Filter, FrameState, JobState
 
 References = tuple[FrameReference, ...]
 
@@ -58,13 +56,3 @@ def test_what_the_map_has_is_not_kept(
     assert (kept.state, kept.frame_id) == (FrameState.INDEXED, second.frame_id)
     with pytest.raises(InvalidRequest, match="above 0, up to 1"):
         client.upload(map_name, references[2], if_novel=0.0)
-
-
-@pytest.fixture(autouse=True)
-def _clean(request: pytest.FixtureRequest) -> Iterator[None]:
-    """The maps of the shared service are removed, so that its worker has nothing left to do."""
-    yield
-    if "remote" in request.node.name:
-        with Client(request.getfixturevalue("service_url")) as client:
-            for one in client.maps():
-                client.delete_map(one.name)

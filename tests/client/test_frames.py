@@ -10,10 +10,10 @@ import pytest
 
 import sceneprint
 from sceneprint import errors
-from sceneprint.client import Client, meta_of
-from sceneprint.client.frames import sendable
-from sceneprint.datasets import FrameReference
-from sceneprint.schemas import FrameState, JobState
+from sceneprint.formats.dataset import FrameReference
+from sceneprint_client import Client, meta_of
+from sceneprint_client.api import FrameState, JobState
+from sceneprint_client.frame_files import sendable
 
 
 def test_what_is_sent_of_a_data_set(references: tuple[FrameReference, ...], tmp_path: Path) -> None:
@@ -76,7 +76,7 @@ def test_a_stopped_job_waits_for_the_next_worker(
 
     embedded.create_map("m")
     with monkeypatch.context() as patch:
-        patch.setattr("sceneprint.engine.work.prepare", stopped)
+        patch.setattr("sceneprint.engine.jobs.signature_job.prepare", stopped)
         with pytest.raises(KeyboardInterrupt):
             embedded.upload("m", references[0], wait_s=30)
     (frame,) = embedded.frames("m")

@@ -1,4 +1,4 @@
-"""Uploads under an id, batches and archives: the same over HTTP and in process."""
+"""Uploads under an id, batches and archives through the client."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.client import Client, meta_of
-from sceneprint.datasets import FrameReference
 from sceneprint.errors import (
     FrameConflict,
     InvalidRequest,
@@ -19,9 +17,10 @@ from sceneprint.errors import (
     UnknownMap,
     UnreadableArchive,
 )
-from sceneprint.schemas import JobState
-from sceneprint.schemas.frames import GivenBase
-from sceneprint.schemas.ingest import ImportOptions
+from sceneprint.formats.dataset import FrameReference
+from sceneprint_client import Client, meta_of
+from sceneprint_client.api import JobState
+from sceneprint_client.api.frames import GivenBase, ImportOptions
 
 BASE = GivenBase.model_validate(
     {

@@ -1,4 +1,4 @@
-"""A client of a service that asks for a key: no call without one, and each as its scope has it."""
+"""A client of a service that requires a key: no call without one, and each as its scope has it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from typing import Any
 
 import pytest
 
-from sceneprint.client import Client
-from sceneprint.datasets import FrameReference
 from sceneprint.engine import Engine
 from sceneprint.errors import (
     Conflict,
@@ -25,9 +23,11 @@ from sceneprint.errors import (
     UnknownMap,
     UnknownQuery,
 )
-from sceneprint.schemas import FrameState
-from sceneprint.schemas.keys import Scope
+from sceneprint.formats.dataset import FrameReference
 from sceneprint.settings import Settings
+from sceneprint_client import Client
+from sceneprint_client.api import FrameState
+from sceneprint_client.api.admin import Scope
 
 ID = "0" * 32
 KEYS: dict[str, dict[str, Scope]] = {
@@ -109,7 +109,7 @@ def test_no_call_gets_by_without_a_key(
             if isinstance(found, Iterator):
                 next(found)
 
-        with pytest.raises(KeyRequired, match="asks for a key"):
+        with pytest.raises(KeyRequired, match="requires a key"):
             call()
         asked.append(name)
     assert len(asked) > 50

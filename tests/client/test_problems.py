@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sceneprint import errors
-from sceneprint.client import Client, problems
-from sceneprint.settings import is_loopback
+from sceneprint import errors as our_errors
+from sceneprint_client import Client, errors, http
+from sceneprint_client.addresses import is_loopback
 from service.problems import type_of
 
 KINDS = [
@@ -18,15 +18,13 @@ KINDS = [
 ]
 
 
-def test_every_error_keeps_its_name_over_http(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_error_keeps_its_name_over_http() -> None:
     assert errors.kebab_case("UnknownMap") == "unknown-map"
     assert errors.kebab_case("Busy") == "busy"
     assert len(KINDS) > 25
     told = {type_of(kind.__name__).removeprefix("/problems/"): kind for kind in KINDS}
-    assert problems._kinds() == told
-    monkeypatch.setattr(errors, "kebab_case", str.upper)  # both ask the same place
-    assert type_of("UnknownMap") == "/problems/UNKNOWNMAP"
-    assert problems._kinds()["UNKNOWNMAP"] is errors.UnknownMap
+    assert http.problem_kinds() == told
+    assert our_errors.kebab_case is errors.kebab_case  # both ask the same place
 
 
 @pytest.mark.parametrize(
@@ -46,7 +44,7 @@ def test_no_proxy_stands_before_this_machine(
         asked.append(given)
         return is_loopback(given)
 
-    monkeypatch.setattr("sceneprint.client.sending.is_loopback", noted)
+    monkeypatch.setattr("sceneprint_client.http.is_loopback", noted)
     with Client(f"http://{host}:8008") as client:
-        mounts = client._backend._http._mounts  # type: ignore[attr-defined]
+        mounts = client._http._mounts
     assert (len(mounts) > 0, asked) == (proxied, [host.strip("[]").lower()])

@@ -1,17 +1,15 @@
-"""Reconstructions over HTTP and in process: the same files, the same figures."""
+"""Reconstructions through the client: files, figures, refusals."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
 import numpy as np
 import pytest
 
-from sceneprint.client import Client
-from sceneprint.datasets import (
+from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownQuery
+from sceneprint.formats.dataset import (
     Camera,
     FrameReference,
     find_sequences,
@@ -19,9 +17,9 @@ from sceneprint.datasets import (
     write_intrinsics,
     write_pose,
 )
-from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownQuery
-from sceneprint.schemas import Answer, JobState
-from sceneprint.synth import synthesise_room
+from sceneprint.lab.synth import synthesise_room
+from sceneprint_client import Client
+from sceneprint_client.api import Answer, JobState
 
 NAME = "rebuilt"
 
@@ -40,25 +38,14 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> list[FrameReference]:
 
 
 @pytest.fixture(scope="module")
-def both(
-    service_url: str,
-    views: list[FrameReference],
-    with_open3d: None,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[list[tuple[Client, Answer]]]:
-    """A service and a folder that hold the same frames, each with the answer to the same query."""
-    clients = [Client(service_url), Client.embedded(tmp_path_factory.mktemp("rebuilt"))]
-    found = []
-    for client in clients:
-        client.create_map(NAME, model="depth")
-        for view in views[1:]:
-            assert client.upload(NAME, view, wait_s=60).state == "indexed"
-        answer = client.query(NAME, views[0], k=4)
-        assert answer.status == "found"
-        found.append((client, answer))
-    yield found
-    for client in clients:
-        client.close()
+def answered(client: Client, views: list[FrameReference], with_open3d: None) -> Answer:
+    """The answer to a query of a map with the other views."""
+    client.create_map(NAME, model="depth")
+    for view in views[1:]:
+        assert client.upload(NAME, view, wait_s=60).state == "indexed"
+    answer = client.query(NAME, views[0], k=4)
+    assert answer.status == "found"
+    return answer
 
 
 def files(folder: Path) -> set[Path]:
@@ -76,46 +63,41 @@ def ply(data: bytes) -> tuple[int, int, str]:
     return points, faces, next(line for line in lines if line.startswith("comment"))
 
 
-def test_both_ways_give_the_same_surface(both: list[tuple[Client, Answer]]) -> None:
-    meshes, coverages = [], []
-    for client, answer in both:
-        made = client.reconstruct(answer, voxel_m=0.04)
-        assert made.state == JobState.QUEUED
-        assert (made.query_id, made.maps, made.coverage) == (answer.query_id, [NAME], None)
-        [job] = client.wait([made.job_id], timeout_s=120)
-        assert (job.state, job.kind, job.map) == ("succeeded", "reconstruct", NAME), job.error
-        done = client.reconstruction(made.job_id)
-        assert done.coverage is not None
-        mesh = client.reconstruction_mesh(made.job_id)
-        picture = client.reconstruction_picture(made.job_id)
-        assert [(one.name, one.bytes) for one in done.files] == [
-            ("mesh.ply", len(mesh)),
-            ("picture.png", len(picture)),
-        ]
-        points, triangles, comment = ply(mesh)
-        assert (points, triangles) == (done.coverage.points, done.coverage.triangles)
-        assert comment == "comment frame query.optical: x right, y down, z ahead, metres"
-        width, height = struct.unpack(">II", picture[16:24])
-        assert (width, height) == (1440, 920)
-        meshes.append(mesh.partition(b"end_header\n")[2])
-        coverages.append(done.coverage)
-    assert meshes[0] == meshes[1]
-    here, there = coverages
-    assert (here.area_m2, here.query_explained) == (there.area_m2, there.query_explained)
-    accepted = [m for m in both[0][1].matches if m.validation.status == "accepted"]
-    views = here.views
+def test_a_surface_and_its_figures(client: Client, answered: Answer) -> None:
+    made = client.reconstruct(answered, voxel_m=0.04)
+    assert made.state == JobState.QUEUED
+    assert (made.query_id, made.maps, made.coverage) == (answered.query_id, [NAME], None)
+    [job] = client.wait([made.job_id], timeout_s=120)
+    assert (job.state, job.kind, job.map) == ("succeeded", "reconstruct", NAME), job.error
+    done = client.reconstruction(made.job_id)
+    coverage = done.coverage
+    assert coverage is not None
+    mesh = client.reconstruction_mesh(made.job_id)
+    picture = client.reconstruction_picture(made.job_id)
+    assert [(one.name, one.bytes) for one in done.files] == [
+        ("mesh.ply", len(mesh)),
+        ("picture.png", len(picture)),
+    ]
+    points, triangles, comment = ply(mesh)
+    assert (points, triangles) == (coverage.points, coverage.triangles)
+    assert comment == "comment frame query.optical: x right, y down, z ahead, metres"
+    assert struct.unpack(">II", picture[16:24]) == (1440, 920)
+    again = client.reconstruct(answered, voxel_m=0.04, wait_s=60)
+    assert client.reconstruction_mesh(again.job_id) == mesh
+    accepted = [m for m in answered.matches if m.validation.status == "accepted"]
+    views = coverage.views
     assert [one.frame_id for one in views[1:]] == [
         match.frame_id for match in sorted(accepted, key=lambda match: match.rank)
     ]
     assert (views[0].frame_id, views[0].source) == (None, "geometry")
     assert all(one.source == "upload" for one in views[1:])
-    assert sum(one.added_m2 for one in views) == pytest.approx(here.area_m2)
-    assert 0.5 < here.query_explained <= 1.0
-    assert here.left_out == []
+    assert sum(one.added_m2 for one in views) == pytest.approx(coverage.area_m2)
+    assert 0.5 < coverage.query_explained <= 1.0
+    assert coverage.left_out == []
 
 
-def test_what_is_wanted_is_what_is_fused(both: list[tuple[Client, Answer]]) -> None:
-    client, answer = both[1]
+def test_what_is_wanted_is_what_is_fused(client: Client, answered: Answer) -> None:
+    answer = answered
     first = next(match for match in answer.matches if match.validation.status == "accepted")
     made = client.reconstruct(
         answer.query_id, frames=[first.frame_id], include_query=False, voxel_m=0.05,
@@ -130,11 +112,10 @@ def test_what_is_wanted_is_what_is_fused(both: list[tuple[Client, Answer]]) -> N
 
 
 def test_the_surface_lies_where_the_query_saw_it(
-    both: list[tuple[Client, Answer]], views: list[FrameReference]
+    client: Client, answered: Answer, views: list[FrameReference]
 ) -> None:
     """Matches alone, in the query's camera: their points project onto the query's depth."""
-    client, answer = both[1]
-    made = client.reconstruct(answer, include_query=False, strength="strong", wait_s=60)
+    made = client.reconstruct(answered, include_query=False, strength="strong", wait_s=60)
     data = client.reconstruction_mesh(made.job_id).partition(b"end_header\n")[2]
     assert made.coverage is not None
     rows = np.frombuffer(data[: 27 * made.coverage.points], np.uint8).reshape(-1, 27)
@@ -152,30 +133,29 @@ def test_the_surface_lies_where_the_query_saw_it(
     assert np.median(np.abs(behind[visible])) < 0.02
 
 
-def test_refusals(both: list[tuple[Client, Answer]]) -> None:
-    for client, answer in both:
-        with pytest.raises(UnknownQuery, match="no answer"):
-            client.reconstruct("0" * 32)
-        with pytest.raises(InvalidRequest, match="'nobody' is no accepted match"):
-            client.reconstruct(answer, frames=["nobody"])
-        with pytest.raises(InvalidRequest, match="voxel_m"):
-            client.reconstruct(answer, voxel_m=0.0001)
-        with pytest.raises(UnknownJob, match="no job"):
-            client.reconstruction("nothing")
-        made = client.reconstruct(answer, voxel_m=0.002)  # finer than memory allows for a room
-        [job] = client.wait([made.job_id], timeout_s=60)
-        assert (job.state, job.attempts) == ("failed", 1)
-        assert "Ask for" in str(job.error)
-        with pytest.raises(NotIndexed, match=r"is failed, and mesh\.ply is made at its end"):
-            client.reconstruction_mesh(made.job_id)
+def test_refusals(client: Client, answered: Answer) -> None:
+    with pytest.raises(UnknownQuery, match="no answer"):
+        client.reconstruct("0" * 32)
+    with pytest.raises(InvalidRequest, match="'nobody' is not an accepted match"):
+        client.reconstruct(answered, frames=["nobody"])
+    with pytest.raises(InvalidRequest, match="voxel_m"):
+        client.reconstruct(answered, voxel_m=0.0001)
+    with pytest.raises(UnknownJob, match="no job"):
+        client.reconstruction("nothing")
+    made = client.reconstruct(answered, voxel_m=0.002)  # finer than memory allows for a room
+    [job] = client.wait([made.job_id], timeout_s=60)
+    assert (job.state, job.attempts) == ("failed", 1)
+    assert "Ask for" in str(job.error)
+    with pytest.raises(NotIndexed, match=r"is failed, and mesh\.ply exists once it has succeeded"):
+        client.reconstruction_mesh(made.job_id)
+    client.delete_reconstruction(made.job_id)
+    with pytest.raises(UnknownJob):
+        client.job(made.job_id)
+    with pytest.raises(UnknownJob):
         client.delete_reconstruction(made.job_id)
-        with pytest.raises(UnknownJob):
-            client.job(made.job_id)
-        with pytest.raises(UnknownJob):
-            client.delete_reconstruction(made.job_id)
-        unvalidated = client.query(NAME, frame_id=answer.matches[0].frame_id, stages=["retrieve"])
-        with pytest.raises(InvalidRequest, match="no accepted match, so"):
-            client.reconstruct(unvalidated)
+    unvalidated = client.query(NAME, frame_id=answered.matches[0].frame_id, stages=["retrieve"])
+    with pytest.raises(InvalidRequest, match="no accepted match, so"):
+        client.reconstruct(unvalidated)
 
 
 @pytest.mark.usefixtures("with_open3d")
@@ -203,39 +183,39 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
         sources = {one.frame_id: one.source for one in coverage.views}
         assert sources[lost] == "geometry"
         assert [one.frame_id for one in coverage.left_out] == [deleted]
-        assert "another has its id" in coverage.left_out[0].reason
+        assert "a new frame has its id" in coverage.left_out[0].reason
         # what the query saw is not kept beyond the job, and all goes with it
         before = files(tmp_path)
         client.delete_reconstruction(made.job_id)
         assert len(before - files(tmp_path)) == 2
 
 
-def test_files_are_sent_in_ranges(both: list[tuple[Client, Answer]], service_url: str) -> None:
-    client, answer = both[0]
-    made = client.reconstruct(answer, voxel_m=0.05, wait_s=60)
+def test_files_are_sent_in_ranges(client: Client, answered: Answer) -> None:
+    made = client.reconstruct(answered, voxel_m=0.05, wait_s=60)
     whole = client.reconstruction_picture(made.job_id)
-    url = f"{service_url}/v1/reconstructions/{made.job_id}/picture.png"
-    answered = httpx.get(url)
-    tag = answered.headers["ETag"]
-    assert (answered.content, answered.headers["Content-Type"]) == (whole, "image/png")
+    url = f"/v1/reconstructions/{made.job_id}/picture.png"
+    http = client._http
+    given = http.get(url)
+    tag = given.headers["ETag"]
+    assert (given.content, given.headers["Content-Type"]) == (whole, "image/png")
     for asked, first, last in (("0-99", 0, 99), ("100-", 100, len(whole) - 1), ("-7", -7, None)):
-        part = httpx.get(url, headers={"Range": f"bytes={asked}", "If-Range": tag})
+        part = http.get(url, headers={"Range": f"bytes={asked}", "If-Range": tag})
         assert part.status_code == 206
         stop = None if last is None else last + 1
         assert part.content == whole[first:stop]
         assert part.headers["Content-Range"].endswith(f"/{len(whole)}")
     for asked in ("1-2,5-6", "x", "9-3", ""):  # not understood, or more than is done: all of it
-        assert httpx.get(url, headers={"Range": f"bytes={asked}"}).content == whole
-    assert httpx.get(url, headers={"Range": "bytes=0-9", "If-Range": '"old"'}).content == whole
-    refused = httpx.get(url, headers={"Range": f"bytes={len(whole)}-"})
+        assert http.get(url, headers={"Range": f"bytes={asked}"}).content == whole
+    assert http.get(url, headers={"Range": "bytes=0-9", "If-Range": '"old"'}).content == whole
+    refused = http.get(url, headers={"Range": f"bytes={len(whole)}-"})
     assert (refused.status_code, refused.json()["type"]) == (416, "/problems/range-not-satisfiable")
     assert refused.headers["Content-Range"] == f"bytes */{len(whole)}"
-    assert httpx.get(url, headers={"If-None-Match": tag}).status_code == 304
+    assert http.get(url, headers={"If-None-Match": tag}).status_code == 304
     # a body is not needed, and what is not JSON is told of
-    post = f"{service_url}/v1/queries/{answer.query_id}/reconstruction"
-    begun = httpx.post(post)
+    post = f"/v1/queries/{answered.query_id}/reconstruction"
+    begun = http.post(post)
     assert begun.status_code == 202
     assert begun.headers["Location"] == f"/v1/reconstructions/{begun.json()['job_id']}"
-    assert httpx.post(post, content=b"x", headers={"Content-Type": "text/plain"}).status_code == 415
-    assert httpx.post(post, json=[1]).status_code == 422
-    assert httpx.post(post, json={"voxels": 1}).status_code == 422
+    assert http.post(post, content=b"x", headers={"Content-Type": "text/plain"}).status_code == 415
+    assert http.post(post, json=[1]).status_code == 422
+    assert http.post(post, json={"voxels": 1}).status_code == 422

@@ -8,14 +8,14 @@ from pathlib import Path
 import httpx
 import pytest
 
-from sceneprint.client import Client
-from sceneprint.datasets import FrameReference
 from sceneprint.errors import SnapshotError, UnknownSnapshot
-from sceneprint.maintenance.fsck import fsck
-from sceneprint.maintenance.restoring import restore_snapshot
-from sceneprint.maintenance.shelf import Shelf
-from sceneprint.schemas import JobState
+from sceneprint.formats.dataset import FrameReference
+from sceneprint.maintenance.fsck.check import fsck
+from sceneprint.maintenance.snapshot.catalog import SnapshotCatalog
+from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 from sceneprint.settings import Settings
+from sceneprint_client import Client
+from sceneprint_client.api import JobState
 
 
 @pytest.mark.sqlite_only("it is restored to a folder; for PostgreSQL see test_fleets")
@@ -73,7 +73,7 @@ def test_only_the_newest_are_kept_and_fsck_has_nothing_to_say(
         assert job.state == JobState.SUCCEEDED
         [first] = client.snapshots()
         assert (first.maps, first.frames, first.blobs) == (1, 1, 2)
-        shelf = Shelf(Settings(data_dir=data, database_url=None, snapshots_kept=2))
+        shelf = SnapshotCatalog(Settings(data_dir=data, database_url=None, snapshots_kept=2))
         stale = data / "snapshots" / "20200101T000000Z-0123abcd.tar"
         stale.write_bytes(b"")
         names = [f"2999010{n}T000000Z-0000000{n}" for n in range(1, 4)]

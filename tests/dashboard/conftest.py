@@ -25,8 +25,8 @@ from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
 from playwright.sync_api import Browser, Page, Request, sync_playwright
 
-from sceneprint.datasets import write_depth_png
-from sceneprint.synth import synthesise_room
+from sceneprint.formats.dataset import write_depth_png
+from sceneprint.lab.synth import synthesise_room
 
 FLAGS = [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",

@@ -105,7 +105,7 @@ def test_a_chart_reads_out_what_the_keys_point_at_and_keeps_it(call, page):
     assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "Apples"
     page.keyboard.press("End")
     assert told() == "09:04: red 7 pc, green 7 pc, all 14 pc"
-    page.get_by_text("As a table").click()
+    page.get_by_text("Show as table").click()
     rows = page.get_by_role("region", name="Apples, table").locator("tr").all_inner_texts()
     assert [row.split("\t") for row in rows] == [
         ["Minute", "red", "green", "all"],

@@ -111,7 +111,7 @@ def test_gallery_shows_and_filters_what_the_api_lists(
     assert ids(page) == listed(station, "building", tag="door", captured_after=later)
     assert ids(page) == [station.frames[8].frame_id]
     page.get_by_label("State").select_option("rejected")
-    expect(page.get_by_role("heading", name="No frame passes")).to_be_visible()
+    expect(page.get_by_role("heading", name="No frame matches")).to_be_visible()
     page.get_by_role("button", name="Clear filters").last.click()
     settle(page)
     assert len(ids(page)) == 16
@@ -162,7 +162,7 @@ def test_gallery_pages_by_cursor_and_says_why_frames_were_rejected(
     # an address that was cut off is refused each time: there is a way on
     page.allowed.append("422")  # type: ignore[attr-defined]
     page.goto(f"{station.home}#/maps/walls?cursor=abc&page=2")
-    expect(page.get_by_role("main")).to_contain_text("The cursor 'abc' was not given out")
+    expect(page.get_by_role("main")).to_contain_text("The cursor 'abc' is not valid")
     page.get_by_role("button", name="First page").click()
     settle(page)
     assert ids(page) == newest[:24]
@@ -247,7 +247,7 @@ def test_frame_page_tells_what_the_api_tells(
     assert near.first.locator(".tile-when").inner_text() == (
         f"distance {answer['matches'][0]['distance']:,}"
     )
-    assert page.get_by_role("link", name="Ask where this is").get_attribute("href") == (
+    assert page.get_by_role("link", name="Locate this frame").get_attribute("href") == (
         f"#/maps/building/query?frame={shown['frame_id']}"
     )
     points = station.client.get(f"{path}/points").content
@@ -257,7 +257,7 @@ def test_frame_page_tells_what_the_api_tells(
     assert colours is not None
     assert len(colours) > 50, "nothing was drawn in 3-D"
 
-    page.locator(".card", has_text="What the sensor saw").get_by_role(
+    page.locator(".card", has_text="Sensor view").get_by_role(
         "button", name="Patches"
     ).first.click()
     settle(page)
@@ -291,7 +291,7 @@ def test_an_edit_of_somebody_else_is_not_overwritten_unseen(
     dialog.get_by_role("button", name="Save").click()
     expect(dialog.get_by_role("alert")).to_contain_text("Session is now theirs")
     assert station.client.get(mine).json()["tags"] == ["a, b"]
-    dialog.get_by_role("button", name="Save mine over it").click()
+    dialog.get_by_role("button", name="Overwrite with mine").click()
     expect(dialog).not_to_be_visible()
     now = station.client.get(mine).json()
     assert (now["session"], now["robot"], now["tags"]) == ("mine", "r9", ["a, b", "door", "north"])

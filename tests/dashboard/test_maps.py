@@ -24,14 +24,14 @@ def test_a_card_tells_what_the_api_does(station: Any, page: Page, settle: Settle
     assert told["frames"] == {"indexed": 16}
     expect(one.get_by_role("heading")).to_have_text("Two rooms")
     expect(one.locator(".map-number")).to_have_text("16")
-    expect(one).to_contain_text("nothing waits")
+    expect(one).to_contain_text("Up to date")
     expect(one).to_contain_text(told["model"])
     sizes = station.client.get("/v1/stats", params={"map": "building"}).json()["bytes"]
     used = sum(sizes[part] for part in ("database", "blobs", "index"))
     expect(one.locator("dd").last).to_have_text(f"{used / 1e6:.1f} MB")
     expect(one).to_contain_text("none needed")  # a query compares all 16 frames
     expect(one.get_by_role("img")).to_have_attribute(
-        "aria-label", "Indexed frames since it was made: from 0 to 16"
+        "aria-label", "Indexed frames since its creation: from 0 to 16"
     )
     empty = card(page, "marked-up")
     expect(empty.get_by_role("heading")).to_have_text(MARKUP)  # letter by letter
@@ -64,7 +64,7 @@ def test_a_map_is_made(
     page.get_by_role("radio", name="Rooms").check()
     page.keyboard.press("Enter")
     expect(page).to_have_url(f"{station.home}#/maps/made-here")
-    expect(page.get_by_role("status").filter(has_text="made-here was made")).to_be_visible()
+    expect(page.get_by_role("status").filter(has_text="made-here was created")).to_be_visible()
     made = station.client.get("/v1/maps/made-here").json()
     assert (made["title"], made["model"].partition("-")[0]) == ("Made by hand", "depth")
 
@@ -76,7 +76,7 @@ def test_a_map_is_retitled_and_an_edit_of_another_not_overwritten_unseen(
     path = station.make_map("retitled", title="Before")
     page.goto(station.home)
     settle(page)
-    page.get_by_role("button", name="Retitle retitled").click()
+    page.get_by_role("button", name="Rename retitled").click()
     station.client.patch(path, json={"title": "Theirs"})
     field, save = (
         page.get_by_role("textbox", name="Title"),
@@ -122,7 +122,7 @@ def test_counts_move_while_workers_sign(station: Any, page: Page, settle: Settle
     for frame in station.frames[:2]:
         station.client.post(f"{path}/frames", **frame.form())
     expect(one.locator(".map-number")).to_have_text("2", timeout=30_000)
-    expect(one).to_contain_text("nothing waits")
+    expect(one).to_contain_text("Up to date")
     expect(page.locator("#summary")).to_contain_text("frames indexed")
 
 
@@ -151,4 +151,4 @@ def test_many_maps_are_few_requests(station: Any, page: Page, settle: Settle) ->
     assert "many-39" in names  # now it is in view
     assert len(names) == len(set(names))
     page.get_by_label("Find a map").fill("nothing like it")
-    expect(page.get_by_role("main")).to_contain_text("No map is called like")
+    expect(page.get_by_role("main")).to_contain_text("No map matches")

@@ -80,7 +80,7 @@ def test_what_is_shown_is_what_the_service_counted(station, page, settle, axe, u
     settle(page)
     until(lambda: page.evaluate(FIGURES)["live"] == "live")
 
-    page.locator("figure", has_text="Frames a minute").get_by_text("As a table").click()
+    page.locator("figure", has_text="Frames a minute").get_by_text("Show as table").click()
 
     def told():
         """What is shown at one moment, and the answer that it is of: the page asks again."""
@@ -101,7 +101,7 @@ def test_what_is_shown_is_what_the_service_counted(station, page, settle, axe, u
     for one in stats["workers"]:
         assert page.get_by_text(one["name"], exact=True).is_visible()
     assert shown["indexes"] == [
-        [one["map"], "none", str(one["tail"]), "compared whole"] for one in stats["indexes"]
+        [one["map"], "none", str(one["tail"]), "exact search"] for one in stats["indexes"]
     ]
     names = ("indexed", "redundant", "rejected", "failed", "received")
     assert [row[1:] for row in reversed(shown["minutes"])] == [
@@ -124,7 +124,7 @@ def test_dead_jobs_are_shown_with_their_tracebacks_and_tried_again(
     assert "is damaged: its content has another hash" in first.inner_text()
     trace = first.get_by_role("region", name="Traceback")
     assert not trace.is_visible()
-    first.get_by_text("Traceback of the last try").click()
+    first.get_by_text("Traceback of the last attempt").click()
     assert "sceneprint.errors.DamagedBlob" in trace.inner_text()
     assert axe(page) == []
     place = first.get_by_role("link", name="sign").get_attribute("href")
@@ -143,8 +143,8 @@ def test_dead_jobs_are_shown_with_their_tracebacks_and_tried_again(
     page.get_by_role("dialog").get_by_role("button", name="Retry 2 dead jobs").click()
     frames = lambda: station.client.get("/v1/maps/spoilt").json()["frames"]  # noqa: E731
     until(lambda: frames() == {"indexed": 3})
-    assert page.get_by_text("2 queued once more.").is_visible()
-    until(lambda: page.locator("li.job").get_by_text("tried again").count() == 3)
+    assert page.get_by_text("2 queued again.").is_visible()
+    until(lambda: page.locator("li.job").get_by_text("retried").count() == 3)
 
 
 def test_events_come_live_and_take_no_focus(station, page, settle, until, axe):
@@ -179,11 +179,11 @@ def test_a_key_for_one_map_is_told_of_that_and_what_it_may_not_see(station, open
     settle(page)
     page.locator("#key").fill(secret)
     page.get_by_role("button", name="Use this key").click()
-    page.get_by_text("are told to keys that may read all maps").wait_for()
+    page.get_by_text("need a key for all maps").wait_for()
     settle(page)
     assert page.evaluate(FIGURES)["indexed"] == "16"
     assert page.get_by_role("link", name="Snapshots").count() == 0
-    assert page.get_by_text("are shown to keys that are admin of all maps").is_visible()
+    assert page.get_by_text("need a key with admin access to all maps").is_visible()
     assert page.locator("#operations-map option").all_inner_texts() == ["building"]
     assert page.get_by_role("heading", name="Workers").count() == 0
     use = page.get_by_role("region", name="Quota and retention")
@@ -199,16 +199,16 @@ def test_a_key_for_one_map_is_told_of_that_and_what_it_may_not_see(station, open
 def test_keys_are_made_shown_once_and_withdrawn(station, page, settle, axe):
     page.goto(f"{station.home}#/operations?tab=keys")
     settle(page)
-    page.get_by_role("button", name="Make a key").click()
-    page.get_by_label("Name: who it is for").fill("robot/7")
+    page.get_by_role("button", name="Create a key").click()
+    page.get_by_label("Name of its user").fill("robot/7")
     page.get_by_role("combobox", name="Map").fill("no such name")
-    page.get_by_role("button", name="Make the key").click()
+    page.get_by_role("button", name="Create key").click()
     page.allowed.append("422")
     page.get_by_role("alert").filter(has_text="grants").wait_for()
     assert axe(page) == []
     page.get_by_role("combobox", name="Map").fill("building")
     page.get_by_role("combobox", name="Scope").select_option("write")
-    page.get_by_role("button", name="Make the key").click()
+    page.get_by_role("button", name="Create key").click()
     secret = page.get_by_label("Secret").input_value()
     shown = {"Authorization": f"Bearer {secret}", "X-Forwarded-For": "192.0.2.7"}
     me = httpx.get(f"{station.url}/v1/keys/me", headers=shown).json()
@@ -217,15 +217,15 @@ def test_keys_are_made_shown_once_and_withdrawn(station, page, settle, axe):
     assert secret not in page.content()
     row = page.get_by_role("row", name="robot/7")
     assert "building: write" in row.inner_text()
-    row.get_by_role("button", name="Withdraw").click()
+    row.get_by_role("button", name="Revoke").click()
     page.get_by_role("dialog").get_by_role("textbox").fill("robot/7")
-    page.get_by_role("dialog").get_by_role("button", name="Withdraw").click()
+    page.get_by_role("dialog").get_by_role("button", name="Revoke").click()
     row.wait_for(state="detached")
     assert httpx.get(f"{station.url}/v1/keys/me", headers=shown).status_code == 401
     page.goto(f"{station.home}#/operations?tab=audit")
     settle(page)
     newest = page.locator("tbody tr").first.inner_text().split("\t")
-    assert newest[1:5] == ["no key asked for", "revoke key", "–", "robot/7"]
+    assert newest[1:5] == ["no key required", "revoke key", "–", "robot/7"]
     assert axe(page) == []
 
 

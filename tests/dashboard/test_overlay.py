@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Page
 
-from sceneprint.points import HEADER, POINT
+from sceneprint.formats.points.web import HEADER, POINT
 
 
 def ask(station: Any, frame: int, **more: object) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def test_what_is_shown_is_what_the_api_says(
     path = f"/v1/queries/{answer['query_id']}/matches/{best['frame_id']}"
     details = station.client.get(path).json()
     assert told["Patches"] == f"{len(details['patches']['query']):,}"
-    assert "No direction is free" in text(page, ".overlay-side")
+    assert "All six directions are constrained" in text(page, ".overlay-side")
     T = np.array(details["transform"]["matrix"])
     assert matrix(page) == pytest.approx(T)
     shift = np.linalg.norm(T[:3, 3])
@@ -98,7 +98,7 @@ def test_what_is_shown_is_what_the_api_says(
     for words, share in (
         ("within 10 mm", (found <= 50).mean()),
         ("within 20 mm", ((found > 50) & (found <= 100)).mean()),
-        ("the other saw through", (found == 254).mean()),
+        ("the other sensor saw through", (found == 254).mean()),
         ("did not look", (found == 253).mean()),
     ):  # fmt: skip
         assert f"{words} {percent(share)}" in legend
@@ -143,7 +143,7 @@ def test_before_after_and_what_is_drawn(
     until(lambda: np.allclose(matrix(page), T))
     assert shown() == aligned
     for name in ("Query", "Match", "Patches", "Violations", "Sensors"):
-        button = page.get_by_role("group", name="What is drawn").get_by_role("button", name=name)
+        button = page.get_by_role("group", name="Layers").get_by_role("button", name=name)
         button.click()
         assert shown() != aligned, name
         button.click()
@@ -223,7 +223,7 @@ def test_an_ambiguous_match_has_its_rival(
         picture = np.asarray(pixels(page.locator(".overlay-canvas"))).astype(int)
         return int((abs(picture - (38, 130, 60)).max(axis=2) <= 2).sum())
 
-    assert "Comparing the points" in text(page, ".overlay-legend")
+    assert "Comparing points" in text(page, ".overlay-legend")
     assert green() == 0
     for route in waiting:
         route.continue_()
@@ -247,7 +247,7 @@ def test_an_ambiguous_match_has_its_rival(
     assert lost["matches"][0]["transform"] is None
     page.goto(address(station, lost, lost["matches"][0]))
     settle(page)
-    assert "The frames gave no transform" in text(page, ".overlay-side")
+    assert "No transform was found" in text(page, ".overlay-side")
     assert "No transform." in text(page, ".overlay-none")
     assert page.get_by_role("button", name="Aligned").is_disabled()
     assert matrix(page).tolist() == np.eye(4).tolist()
@@ -276,11 +276,11 @@ def test_what_is_gone_says_so(page: Page, station: Any, answer: Any, settle: Any
     gone = {"query_id": "0" * 32}
     page.goto(address(station, gone, answer["matches"][0]))
     settle(page)
-    assert "no longer kept" in text(page, "main h2")
+    assert "has expired" in text(page, "main h2")
     bare = ask(station, 3, stages="retrieve")
     page.goto(address(station, bare, bare["matches"][0]))
     settle(page)
-    assert "nothing to lay on each other" in text(page, "main h2")
+    assert "nothing to overlay" in text(page, "main h2")
     assert "without validation" in text(page, "main")
     assert axe(page) == []
 

@@ -64,7 +64,7 @@ def test_runs_are_joined_from_here(
     expect(page.locator(".paths-run")).to_have_text(["1ann4 poses"])
     expect(page.locator(".paths-left li")).to_have_text([
         "carol · 1 frame: no poses",
-        "bob · 4 frames: poses in bob/odom, which nothing joins to ann/odom",
+        "bob · 4 frames: poses in bob/odom, which no association joins to ann/odom",
     ])  # fmt: skip
     (thinned,) = [parse_qs(one.query) for one in asked if one.path.endswith("/trajectory")]
     assert int(thinned["most"][0]) <= 2000  # however many there are
@@ -73,8 +73,8 @@ def test_runs_are_joined_from_here(
 
     page.get_by_role("button", name="New association…").click()
     dialog = page.get_by_role("dialog")
-    expect(dialog.get_by_label("Look up the frames of")).to_have_value("0")
-    dialog.get_by_role("button", name="Begin").click()
+    expect(dialog.get_by_label("Query the frames of")).to_have_value("0")
+    dialog.get_by_role("button", name="Start").click()
     expect(page.locator(".paths-run")).to_have_text(
         ["1ann4 poses", "2bob4 poses"], timeout=PATIENCE_MS
     )
@@ -181,7 +181,7 @@ def test_what_is_not_there_is_told(
     expect(page.get_by_role("heading", name="There is no path to draw")).to_be_visible()
     page.allowed.append("404")  # type: ignore[attr-defined]
     page.goto(f"{station.home}#/maps/building/paths?query={'0' * 32}")
-    expect(page.get_by_text("Its answer is not kept any more")).to_be_visible()
+    expect(page.get_by_text("Its answer has expired")).to_be_visible()
     expect(page.locator(".paths-run")).to_have_count(2)
 
     # as through a proxy, with a key that may not write
@@ -191,7 +191,7 @@ def test_what_is_not_there_is_told(
     far.goto(f"{station.home}#/maps/building/paths")
     settle(far)
     expect(far.locator(".paths-run")).to_have_count(2)
-    expect(far.get_by_text("takes a key that may write")).to_be_visible()
+    expect(far.get_by_text("need a key with write access")).to_be_visible()
     expect(far.get_by_role("button", name="New association…")).to_have_count(0)
 
 

@@ -136,7 +136,7 @@ def test_a_control_asks_again(station, page, ask, settle):
     first = ask()
     sent = []
     page.on("request", lambda one: one.method == "POST" and sent.append(one))
-    page.locator(".query-group > summary", has_text="What a match must stand").click()
+    page.locator(".query-group > summary", has_text="Validation").click()
     field = page.locator("#ask-residual_m")
     assert field.input_value() == "0.08"  # the default of the map's model
     field.fill("0.00001")
@@ -212,7 +212,7 @@ def test_why_not_is_told_as_the_api_explains_it(station, page, ask, settle):
     page.locator("#why-frame").fill(left[-1])
     page.locator("#why-frame").press("Enter")
     settle(page)
-    page.get_by_role("button", name="Ask for more matches").click()
+    page.get_by_role("button", name="Query for more matches").click()
     page.wait_for_timeout(100)
     settle(page)
     later = shown(station, page)
@@ -277,7 +277,7 @@ def test_a_file_is_asked_and_looked_at_again(station, page, settle, axe):
     assert cells[0] == "100 %"
     assert len(cells) == n + 1
     # and on from there with other options
-    page.get_by_role("link", name="Ask with other options").click()
+    page.get_by_role("link", name="Query with other options").click()
     settle(page)
     assert page.locator("#ask-k").input_value() == "1"
     assert shown(station, page)["matches"] == answer["matches"]
@@ -289,14 +289,14 @@ def test_what_is_no_longer_kept_is_asked_again_where_it_can_be(station, page, as
     page.allowed.append("404")
     page.goto(f"{station.home}#/queries/{answer['query_id']}")
     settle(page)
-    assert "no longer kept" in page.locator("h2").first.inner_text()
-    page.get_by_role("link", name="Ask again as before").click()
+    assert "has expired" in page.locator("h2").first.inner_text()
+    page.get_by_role("link", name="Repeat the query").click()
     settle(page)
     assert shown(station, page)["matches"] == answer["matches"]
     page.goto(f"{station.home}#/queries/{'0' * 32}")
     settle(page)
-    assert "no longer kept" in page.locator("h2").first.inner_text()
-    assert page.get_by_role("link", name="Ask again as before").count() == 0
+    assert "has expired" in page.locator("h2").first.inner_text()
+    assert page.get_by_role("link", name="Repeat the query").count() == 0
 
 
 def test_an_answer_outlives_frames_of_its_ranking(station, page, settle, until):

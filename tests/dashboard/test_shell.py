@@ -55,7 +55,7 @@ def test_a_theme_is_kept(station: Any, page: Page, settle: Callable[[Page], None
     page.reload()
     settle(page)
     assert page.evaluate(colour) == dark
-    page.get_by_role("button", name="Theme: As the system").click()
+    page.get_by_role("button", name="Theme: System").click()
     assert page.evaluate(colour) == light
     page.emulate_media(color_scheme="dark")
     assert page.evaluate(colour) == dark
@@ -74,7 +74,7 @@ def test_keys(
     page.allowed += ["401", "403", "404"]
     page.goto(station.home)
     settle(page)
-    expect(page.get_by_role("heading", name="This service asks for a key")).to_be_visible()
+    expect(page.get_by_role("heading", name="This service requires a key")).to_be_visible()
     assert axe(page) == []
     field = page.get_by_label("Key", exact=True)
     for wrong, told in (
@@ -103,7 +103,7 @@ def test_keys(
     settle(page)
     expect(page.locator(".map")).to_have_count(1)
     page.get_by_role("button", name="Forget").click()
-    expect(page.get_by_role("heading", name="This service asks for a key")).to_be_visible()
+    expect(page.get_by_role("heading", name="This service requires a key")).to_be_visible()
     assert page.evaluate("() => Object.keys(sessionStorage)") == []
 
 
@@ -112,13 +112,13 @@ def test_addresses_focus_and_keyboard(
 ) -> None:
     page.goto(f"{station.home}#/maps/a/b/c/d")
     settle(page)
-    expect(page.get_by_role("heading", name="There is no such page")).to_be_visible()
+    expect(page.get_by_role("heading", name="Page not found")).to_be_visible()
     page.get_by_role("link", name="To the maps").click()
     settle(page)
     assert page.evaluate("() => document.activeElement.id") == "title"  # told as a page of its own
     page.go_back()
     settle(page)
-    expect(page.get_by_role("heading", name="There is no such page")).to_be_visible()
+    expect(page.get_by_role("heading", name="Page not found")).to_be_visible()
     page.go_forward()
     settle(page)
     page.reload()
@@ -140,12 +140,12 @@ def test_addresses_focus_and_keyboard(
     settle(page)
     expect(page.get_by_role("dialog")).to_have_count(1)
     page.go_back()
-    expect(page.get_by_role("heading", name="There is no such page")).to_be_visible()
+    expect(page.get_by_role("heading", name="Page not found")).to_be_visible()
     expect(page.get_by_role("dialog")).to_have_count(0)
     # steps upwards in an address lead to nothing else of the API
     page.goto(f"{station.home}#/maps/building/frames/..")
     settle(page)
-    expect(page.get_by_role("main")).to_contain_text("The address leads nowhere.")
+    expect(page.get_by_role("main")).to_contain_text("There is no page at this address.")
 
 
 def test_a_page_looks_the_same_wherever_one_comes_from(

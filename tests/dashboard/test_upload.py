@@ -83,7 +83,7 @@ def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(
             named("empty.png", b""),
         ]
     )
-    expect(page.get_by_text("1 file is no frame, and left out: notes.txt")).to_be_visible()
+    expect(page.get_by_text("1 file was skipped, not a frame: notes.txt")).to_be_visible()
     expect(page.get_by_label("fx")).to_have_value("60")
     start = page.get_by_role("button", name="Upload 7 files")
     start.click()  # a pose leads to a frame that has a name
@@ -146,7 +146,7 @@ def test_a_drop_waits_for_its_camera_and_an_archive_goes_to_imports(
     page.locator(".drop").dispatch_event("drop", {"dataTransfer": transfer})
     start = page.get_by_role("button", name="Upload 2 files")
     start.click()
-    expect(page.get_by_role("alert")).to_contain_text("lone.png is a depth image: give its camera")
+    expect(page.get_by_role("alert")).to_contain_text("lone.png is a depth image: enter its camera")
     page.get_by_label("Preset").select_option(label="Kinect, 640 × 480, f 585")
     expect(page.get_by_label("cx")).to_have_value("320")
     for name, value in LENS.items():

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page
 
-from sceneprint.geometry.overlays import STEP_COLOURS
-from sceneprint.points import encode_points
+from sceneprint.formats.points.web import encode_points
+from sceneprint.geometry.validation.inspection import STEP_COLOURS
 
 #: Of the canvas, CSS pixels, and pixels of an angle whose tangent is 1.
 WIDTH, HEIGHT = 400, 300
@@ -152,7 +152,8 @@ def test_points_are_read_as_they_were_written(stage: Page) -> None:
         """(text) => { try { points.parsePoints(bytes(text)); } catch (e) { return e.message; } }"""
     )
     for wrong, said in (
-        (data[:-1], "cut short"), (b"ply" + data[3:], "no points"), (data[:20], "no points"),
+        (data[:-1], "incomplete"), (b"ply" + data[3:], "not point data"),
+        (data[:20], "not point data"),
         (data[:4] + b"\2" + data[5:], "version 2"),
     ):  # fmt: skip
         assert said in stage.evaluate(why, base64.b64encode(wrong).decode())

@@ -22,20 +22,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.datasets import (
+from sceneprint.errors import SceneprintError, UnreadableArchive
+from sceneprint.formats.archive import archive as archives
+from sceneprint.formats.archive import entries as inflating
+from sceneprint.formats.archive.archive import Archive, open_archive
+from sceneprint.formats.archive.entries import Inflater, is_archive
+from sceneprint.formats.dataset import (
     Camera,
     FrameReference,
-    Sequence,
-    archives,
+    FrameSequence,
     find_sequences,
-    inflating,
     write_depth_png,
     write_intrinsics,
     write_pose,
 )
-from sceneprint.datasets.archives import Archive, open_archive
-from sceneprint.datasets.inflating import Inflater, is_archive
-from sceneprint.errors import SceneprintError, UnreadableArchive
 from sceneprint.types import Intrinsics
 
 CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)
@@ -48,7 +48,7 @@ PACKERS: dict[str, Callable[[bytes], bytes]] = {
 FULL = """
 import subprocess, sys
 from pathlib import Path
-from sceneprint.datasets.archives import open_archive
+from sceneprint.formats.archive.archive import open_archive
 
 archive, folder = map(Path, sys.argv[1:])
 subprocess.run(["mount", "-t", "tmpfs", "-o", "nr_inodes=12", "none", folder], check=True)
@@ -142,7 +142,7 @@ def looked_into(data: bytes, folder: Path, name: str = "import") -> Iterator[Arc
         yield archive
 
 
-def said(sequence: Sequence, frame: FrameReference, data: bytes) -> tuple[object, ...]:
+def said(sequence: FrameSequence, frame: FrameReference, data: bytes) -> tuple[object, ...]:
     """All that is known of a frame."""
     pose = None if frame.pose is None else frame.pose.tolist()
     of_all = (sequence.name, sequence.parent_frame, sequence.layout, sequence.split)
@@ -266,7 +266,7 @@ def test_a_damaged_member_costs_itself_alone(kitchen: Path, tmp_path: Path) -> N
     with looked_into(bytes(data), tmp_path) as archive:
         frames = {f.name: f for s in archive.sequences for f in s.frames}
         assert len(frames) == 6
-        with pytest.raises(UnreadableArchive, match=r"000001.depth.png: it is damaged: its check"):
+        with pytest.raises(UnreadableArchive, match=r"000001.depth.png: it is damaged \(Bad CRC"):
             archive.data_of(frames["seq-01/frame-000001"])
         assert [name for name, _ in archive.refused] == ["kitchen/seq-02/frame-000002.pose.txt"]
         with pytest.raises(SceneprintError, match="pose") as caught:
@@ -367,13 +367,69 @@ def test_bombs_are_refused_while_they_burst(
         pass
 
 
+def extended(kind: bytes, content: bytes) -> bytes:
+    """A header of a tar that tells more of what follows it."""
+    info = tarfile.TarInfo("more")
+    info.type, info.size = kind, len(content)
+    return info.tobuf(tarfile.GNU_FORMAT) + content + bytes(-len(content) % 512)
+
+
+def sparse(blocks: int) -> bytes:
+    """A member with holes, whose list of them goes on for some blocks."""
+    info = tarfile.TarInfo("s/holes.npy")
+    info.type = b"S"
+    head = bytearray(info.tobuf(tarfile.GNU_FORMAT))
+    head[482] = 1
+    head[148:156] = b" " * 8
+    head[148:155] = b"%06o\0" % sum(head)
+    return bytes(head) + (bytes([0] * 504) + b"\1" + bytes(7)) * blocks
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        extended(b"x", b"12 path=abcd\n" * 100_000),
+        extended(b"g", b"12 path=abcd\n" * 100_000),
+        extended(b"L", b"n" * 1_000_000),
+        extended(b"L", b"name") * 2000,
+        extended(b"x", b"11 size=-7\n") + tar_of(("s/a.png", b"x"))[:1024],
+        sparse(2000),
+    ],
+    ids=["pax", "global", "long name", "chain", "backwards", "holes"],
+)
+def test_headers_of_a_tar_are_bounded(head: bytes, tmp_path: Path) -> None:
+    sound = tar_of(("s/a.png", b"x"))[:1024]
+    with looked_into(sound + head + tar_of(("s/b.png", b"y")), tmp_path) as archive:
+        assert archive.refused[0] == ("s/a.png", f"s/a.png: {inflating._DAMAGED}.")
+
+
+def test_a_zip_of_too_many_members_is_refused_before_they_are_read(
+    kitchen: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inflating, "MOST_MEMBERS", 14)  # of 16
+    with (
+        pytest.raises(UnreadableArchive, match="more than 14"),
+        looked_into(zipped(kitchen), tmp_path),
+    ):
+        pass
+
+
+def test_names_of_a_zip_that_are_no_utf8_are_read(kitchen: Path, tmp_path: Path) -> None:
+    data = zipped(kitchen, method=zipfile.ZIP_STORED).replace(b"kitchen/", b"k\x81tchen/")
+    with looked_into(data, tmp_path) as archive:
+        assert [s.name for s in archive.sequences] == ["seq-01", "seq-02"]
+        reference = archive.sequences[0].frames[0]
+        assert archive.name_of(reference) == "kütchen/seq-01/frame-000000.depth.png"
+        assert len(archive.data_of(reference)) == archive.size_of(reference)
+
+
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
         (b"", "no archive that is read"),
         (b"\x89PNG\r\n\x1a\n" + bytes(600), "no archive that is read"),
         (bytes(1024), "no archive that is read"),
-        (b"PK\x03\x04" + bytes(600), "ends early, and has no directory"),
+        (b"PK\x03\x04" + bytes(600), "The zip is damaged, or ends early"),
         (gzip.compress(b""), "is no tar"),
         (gzip.compress(tar_of(("a.png", b"x")))[:-9], "ends early"),
         (gzip.compress(tar_of(("a.png", b"x"))) + b"more", "damaged"),

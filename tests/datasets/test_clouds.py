@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.clouds import write_ply
-from sceneprint.datasets import (
+from sceneprint.errors import DatasetError, UnreadableCloud
+from sceneprint.formats.archive.archive import open_archive
+from sceneprint.formats.dataset import (
     CloudSource,
     FrameReference,
     Layout,
@@ -18,8 +19,7 @@ from sceneprint.datasets import (
     write_depth_png,
     write_pose,
 )
-from sceneprint.datasets.archives import open_archive
-from sceneprint.errors import DatasetError, UnreadableCloud
+from sceneprint.formats.points.ply_export import write_ply
 from sceneprint.types import Cloud
 
 POINTS = np.arange(36, dtype=np.float32).reshape(12, 3) / 8

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.datasets import decode_png, make_frame, png, read_frame, write_depth_png
 from sceneprint.errors import InvalidIntrinsics, InvalidPose, UnreadableFrame, UselessFrame
+from sceneprint.formats.dataset import decode_png, make_frame, read_frame, write_depth_png
+from sceneprint.formats.image import depth_file
 from sceneprint.types import Intrinsics
 
 CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)
@@ -74,7 +75,12 @@ def test_read_frame_by_content(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("data", "message"),
-    [(b"", "empty"), (png.SIGNATURE, "ends early"), (b"\x93NUMPY", "header"), (b"P5", "neither")],
+    [
+        (b"", "empty"),
+        (depth_file.PNG_SIGNATURE, "ends early"),
+        (b"\x93NUMPY", "header"),
+        (b"P5", "neither"),
+    ],
 )
 def test_errors_of_a_file_name_it_on_one_line(data: bytes, message: str, tmp_path: Path) -> None:
     path = tmp_path / "seven.png"
@@ -99,7 +105,7 @@ def test_what_is_no_file(tmp_path: Path, monkeypatch) -> None:
         read_frame(tmp_path / "a.jpg", CAMERA)
     with (tmp_path / "huge.png").open("wb") as file:
         file.truncate(10**12)  # sparse
-    monkeypatch.setattr(png, "MAXIMUM_BYTES", 1000)
+    monkeypatch.setattr(depth_file, "MAXIMUM_IMAGE_BYTES", 1000)
     with pytest.raises(UnreadableFrame, match="more than 1000 bytes"):
         read_frame(tmp_path / "huge.png", CAMERA)
     with pytest.raises(UnreadableFrame, match="1001 bytes, the limit is 1000"):

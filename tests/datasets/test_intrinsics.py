@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from sceneprint.datasets import Camera, find_camera, read_camera, write_intrinsics
 from sceneprint.errors import DatasetError, InvalidIntrinsics
+from sceneprint.formats.dataset import Camera, find_camera, read_camera, write_intrinsics
 from sceneprint.types import Intrinsics
 
 GOOD = {"width": 640, "height": 480, "fx": 525, "fy": 526.5, "cx": 319.5, "cy": 239}

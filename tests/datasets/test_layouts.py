@@ -5,9 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.datasets import Camera, Layout, find_sequences, write_depth_png, write_intrinsics
-from sceneprint.datasets.layouts import natural
 from sceneprint.errors import DatasetError
+from sceneprint.formats.dataset import (
+    Camera,
+    Layout,
+    find_sequences,
+    write_depth_png,
+    write_intrinsics,
+)
+from sceneprint.formats.dataset.sequences import natural
 from sceneprint.types import Intrinsics
 
 CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)

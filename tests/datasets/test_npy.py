@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.datasets import decode_npy, make_frame
 from sceneprint.errors import FrameError, UnreadableFrame
-from sceneprint.types import Frame, Intrinsics
+from sceneprint.formats.dataset import decode_npy, make_frame
+from sceneprint.types import DepthFrame, Intrinsics
 
 CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)
 METRES = np.array([[0, 0.001, 1, 0], [1.234, 65.534, 0.002, 0.003], [0.5, 0.501, 0.502, 0.503]])
@@ -113,7 +113,7 @@ def test_bad_npy(case: str) -> None:
         decode_npy(data)
 
 
-def frame_or_error(data: bytes) -> Frame | None:
+def frame_or_error(data: bytes) -> DepthFrame | None:
     """Whatever the bytes: a frame that can be used, or a FrameError on one line."""
     try:
         frame = make_frame(decode_npy(data), CAMERA)

@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageFile
 
-from sceneprint.datasets import decode_png, make_frame, png
 from sceneprint.errors import FrameError, UnreadableFrame
-from sceneprint.types import MAXIMUM_SAMPLES, Frame, Intrinsics
+from sceneprint.formats.dataset import decode_png, make_frame
+from sceneprint.formats.image.depth_file import PNG_SIGNATURE
+from sceneprint.types import MAXIMUM_SAMPLES, DepthFrame, Intrinsics
 
 CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)
 SAMPLES = np.array([[0, 1, 1000, 65535], [1234, 65534, 2, 3], [500, 501, 502, 503]], np.uint16)
@@ -36,7 +37,7 @@ def raw_png(
 ) -> bytes:  # fmt: skip
     header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, interlace)
     return b"".join([
-        png.SIGNATURE, chunk(b"IHDR", header), before, chunk(b"IDAT", zlib.compress(rows)), after,
+        PNG_SIGNATURE, chunk(b"IHDR", header), before, chunk(b"IDAT", zlib.compress(rows)), after,
         chunk(b"IEND"),
     ])  # fmt: skip
 
@@ -62,7 +63,7 @@ def test_png_of_many_data_chunks_and_trailing_bytes() -> None:
     data = zlib.compress(rows_of(SAMPLES))
     header = struct.pack(">IIBBBBB", 4, 3, 16, 0, 0, 0, 0)
     pieces = b"".join(chunk(b"IDAT", data[i : i + 1]) for i in range(len(data)))
-    file = png.SIGNATURE + chunk(b"IHDR", header) + pieces + chunk(b"IDAT") + chunk(b"IEND")
+    file = PNG_SIGNATURE + chunk(b"IHDR", header) + pieces + chunk(b"IDAT") + chunk(b"IEND")
     np.testing.assert_array_equal(decode_png(file + b"and more"), SAMPLES)
 
 
@@ -101,7 +102,7 @@ def test_the_largest_image_is_read() -> None:
 BAD_PNG = {
     "empty": (b"", "empty"),
     "no PNG": (b"\xff\xd8\xff\xe0JFIF" * 9, "no PNG"),
-    "only the signature": (png.SIGNATURE, "ends early"),
+    "only the signature": (PNG_SIGNATURE, "ends early"),
     "truncated in the data": (GOOD_PNG[:-20], "ends early"),
     "truncated in the end": (GOOD_PNG[:-1], "ends early"),
     "damaged": (GOOD_PNG[:45] + bytes([GOOD_PNG[45] ^ 1]) + GOOD_PNG[46:], "check sum"),
@@ -123,26 +124,26 @@ BAD_PNG = {
     "fewer rows than announced": (raw_png(4, 4, rows_of(SAMPLES)), "holds fewer"),
     "more rows than announced": (raw_png(4, 2, rows_of(SAMPLES)), "holds more"),
     "bomb in the data": (raw_png(4, 3, b"\0" * 30_000_000), "holds more"),
-    "no data": (png.SIGNATURE + GOOD_PNG[8:33] + chunk(b"IEND"), "holds fewer"),
+    "no data": (PNG_SIGNATURE + GOOD_PNG[8:33] + chunk(b"IEND"), "holds fewer"),
     "no zlib": (
-        png.SIGNATURE + GOOD_PNG[8:33] + chunk(b"IDAT", b"hello world") + chunk(b"IEND"),
+        PNG_SIGNATURE + GOOD_PNG[8:33] + chunk(b"IDAT", b"hello world") + chunk(b"IEND"),
         "do not decompress",
     ),
     "data without their end": (
-        png.SIGNATURE + GOOD_PNG[8:33]
+        PNG_SIGNATURE + GOOD_PNG[8:33]
         + chunk(b"IDAT", zlib.compress(rows_of(SAMPLES))[:-3]) + chunk(b"IEND"),
         "holds fewer",
     ),
     "unknown filter": (raw_png(4, 3, b"\x09" + rows_of(SAMPLES)[1:]), "rows do not decode"),
     "unknown interlacing": (raw_png(4, 3, rows_of(SAMPLES), interlace=2), "interlacing"),
-    "no header": (png.SIGNATURE + chunk(b"IEND"), "begin with its header"),
+    "no header": (PNG_SIGNATURE + chunk(b"IEND"), "begin with its header"),
     "two headers": (GOOD_PNG[:33] + GOOD_PNG[8:], "two headers"),
-    "short header": (png.SIGNATURE + chunk(b"IHDR", b"abc") + chunk(b"IEND"), "wrong length"),
+    "short header": (PNG_SIGNATURE + chunk(b"IHDR", b"abc") + chunk(b"IEND"), "wrong length"),
     "chunk longer than the file": (
         GOOD_PNG[:33] + b"\xff\xff\xff\xff" + GOOD_PNG[37:], "ends early",
     ),
     "endless chunks": (
-        png.SIGNATURE + GOOD_PNG[8:33] + chunk(b"tEXt") * 65_536, "more than 65536 chunks",
+        PNG_SIGNATURE + GOOD_PNG[8:33] + chunk(b"tEXt") * 65_536, "more than 65536 chunks",
     ),
 }  # fmt: skip
 
@@ -161,10 +162,10 @@ def test_truncated_png_whatever_the_program_told_pillow(monkeypatch) -> None:
         with pytest.raises(UnreadableFrame):
             decode_png(BAD_PNG[case][0])
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1)  # a program's own, lower limit
-    np.testing.assert_array_equal(decode_png(GOOD_PNG), SAMPLES)  # Pillow is not asked
+    np.testing.assert_array_equal(decode_png(GOOD_PNG), SAMPLES)
 
 
-def frame_or_error(data: bytes) -> Frame | None:
+def frame_or_error(data: bytes) -> DepthFrame | None:
     """Whatever the bytes: a frame that can be used, or a FrameError on one line."""
     try:
         frame = make_frame(decode_png(data), CAMERA)
@@ -214,7 +215,7 @@ def test_mutations() -> None:
     for data in (GOOD_PNG, text):
         for mutated in mutations(data, 1000):
             both = [mutated]
-            if mutated.startswith(png.SIGNATURE):
+            if mutated.startswith(PNG_SIGNATURE):
                 both.append(repaired(mutated))
             outcomes = [frame_or_error(one) for one in both]
             frames += sum(one is not None for one in outcomes)
@@ -223,7 +224,7 @@ def test_mutations() -> None:
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.binary(max_size=300), st.sampled_from([b"", png.SIGNATURE, GOOD_PNG[:33]]))
+@given(st.binary(max_size=300), st.sampled_from([b"", PNG_SIGNATURE, GOOD_PNG[:33]]))
 def test_any_bytes(data: bytes, start: bytes) -> None:
     frame_or_error(start + data)
     frame_or_error(repaired(start + data))

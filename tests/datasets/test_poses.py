@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from sceneprint.datasets import (
-    Trajectory,
+from sceneprint.errors import InvalidPose
+from sceneprint.formats.dataset import (
+    SensorTrajectory,
     interpolate,
     read_pose,
     read_trajectory,
     rigid_transform,
     write_pose,
 )
-from sceneprint.errors import InvalidPose
 
 HALF = math.sqrt(0.5)
 
@@ -107,7 +107,7 @@ def test_only_whole_poses_are_written(tmp_path: Path) -> None:
 
 def test_slerp_by_hand() -> None:
     # 90 deg about z within 1 s; a third of the way is 30 deg
-    trajectory = Trajectory(
+    trajectory = SensorTrajectory(
         np.array([10.0, 11.0]),
         np.array([[0.0, 0.0, 0.0], [3.0, -6.0, 9.0]]),
         np.array([[0, 0, 0, 1.0], [0, 0, HALF, HALF]]),
@@ -137,7 +137,7 @@ def test_interpolation_equals_scipy() -> None:
     stamps = np.cumsum(random.uniform(0.01, 0.09, 40)) + 1.3e9
     rotations = Rotation.random(40, random)
     signs = random.choice([-1.0, 1.0], (40, 1))  # q and -q are the same rotation
-    trajectory = Trajectory(stamps, random.normal(size=(40, 3)), signs * rotations.as_quat())
+    trajectory = SensorTrajectory(stamps, random.normal(size=(40, 3)), signs * rotations.as_quat())
     times = random.uniform(stamps[0], stamps[-1], 200)
     expected = Slerp(stamps, rotations)(times).as_matrix()
     for i, pose in enumerate(interpolate(trajectory, times)):
@@ -149,7 +149,7 @@ def test_interpolation_equals_scipy() -> None:
 
 def test_nothing_is_made_up() -> None:
     one = np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
-    trajectory = Trajectory(np.array([1.0, 1.05, 2.0, 2.05]), np.eye(4)[:, :3], one)
+    trajectory = SensorTrajectory(np.array([1.0, 1.05, 2.0, 2.05]), np.eye(4)[:, :3], one)
     stamps = [0.99, 1.0, 1.02, 1.05, 1.06, 1.99, 2.0, 2.05, 2.06, math.nan]
     known = [pose is not None for pose in interpolate(trajectory, stamps)]
     assert known == [False, True, True, True, False, False, True, True, False, False]

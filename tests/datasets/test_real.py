@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprint.datasets import Layout, find_sequences
-from sceneprint.types import Frame
+from sceneprint.formats.dataset import Layout, find_sequences
+from sceneprint.types import DepthFrame
 
 
-def agreement(a: Frame, b: Frame) -> float:
+def agreement(a: DepthFrame, b: DepthFrame) -> float:
     """Share of the samples of a that land in b within 5 cm + 3 % of its depth."""
     c, v, u = a.intrinsics, *np.indices(a.depth.shape)[:, ::10, ::10]
     z = a.depth[v, u].astype(np.float64)
@@ -50,7 +50,7 @@ def test_poses_and_depth_agree(data_root: Path) -> None:
         assert agreement(a, b) > 0.85, path
         assert agreement(b, a) > 0.85, path
         # a wrong direction of the transform would be noticed
-        turned = [Frame(f.depth, f.intrinsics, f.name, np.linalg.inv(f.pose)) for f in (a, b)]
+        turned = [DepthFrame(f.depth, f.intrinsics, f.name, np.linalg.inv(f.pose)) for f in (a, b)]
         assert agreement(*turned) < 0.7, path
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.datasets import (
+from sceneprint.errors import DatasetError, InvalidPose, UnreadableFrame
+from sceneprint.formats.dataset import (
     Camera,
     Layout,
     find_sequences,
@@ -15,7 +16,6 @@ from sceneprint.datasets import (
     write_intrinsics,
     write_pose,
 )
-from sceneprint.errors import DatasetError, InvalidPose, UnreadableFrame
 from sceneprint.types import Intrinsics
 
 CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprint.datasets import (
+from sceneprint.formats.dataset import (
     decode_png,
     read_trajectory,
     trajectory_row,
@@ -15,7 +15,7 @@ from sceneprint.datasets import (
     write_depth_png,
     write_pose,
 )
-from sceneprint.geometry.quaternions import rotation_of
+from sceneprint.geometry.pose.rigid import rotation_of
 
 
 def test_depth_by_hand(tmp_path: Path) -> None:

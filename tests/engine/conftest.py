@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from sqlalchemy import select, update
 
-from sceneprint.artifacts import read_geometry, write_geometry
-from sceneprint.datasets import decode_frame, write_depth_png
 from sceneprint.engine import Engine
-from sceneprint.geometry.whitening import Whitening
+from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.formats.dataset import decode_frame, write_depth_png
+from sceneprint.geometry.signature.whitening import Whitening
+from sceneprint.lab.synth import synthesise_room
 from sceneprint.models import Model
 from sceneprint.pipeline import Signature, Signer, open_signer, prepare
-from sceneprint.schemas import CameraIntrinsics, FrameMeta, GivenPose, JobState, NewMap
 from sceneprint.settings import Settings
 from sceneprint.store.tables import events, jobs
-from sceneprint.synth import synthesise_room
-from sceneprint.types import Floats, Frame, Geometry
+from sceneprint.types import DepthFrame, Floats, Geometry
+from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, JobState, NewMap
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Upload:
 
     data: bytes
     meta: FrameMeta
-    frame: Frame
+    frame: DepthFrame
     pose: Floats
     room: str
 
@@ -39,7 +39,7 @@ class Upload:
 def make_upload(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Upload]:
     path = tmp_path_factory.mktemp("upload") / "depth.png"
 
-    def make(frame: Frame, room: str, **more: object) -> Upload:
+    def make(frame: DepthFrame, room: str, **more: object) -> Upload:
         write_depth_png(path, frame.depth, 1000.0)
         data, k, pose = path.read_bytes(), frame.intrinsics, frame.pose
         assert pose is not None

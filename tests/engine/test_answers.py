@@ -13,8 +13,8 @@ from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
 from sceneprint.matches import associate, locate
 from sceneprint.pipeline import Signature, Signer, diversify, retrieve
-from sceneprint.schemas import Answer, NewMap, Query
 from sceneprint.types import Geometry
+from sceneprint_client.api import Answer, NewMap, Query
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]
@@ -96,7 +96,7 @@ def test_an_answer_has_the_numbers_of_the_library(
     rest = [m.rank for m in answer.matches[len(matches) :]]
     assert rest == sorted(rest)
     assert {m.validation.reason for m in answer.matches[len(matches) :]} <= {
-        "enough were accepted before it"
+        "enough matches were accepted before it"
     }
 
 
@@ -128,7 +128,7 @@ def test_stages_are_done_as_asked(
     else:
         assert answer.status == "unvalidated"
         assert (counts.accepted, answer.location) == (0, None)
-        assert {m.validation.reason for m in answer.matches} == {"not asked for"}
+        assert {m.validation.reason for m in answer.matches} == {"not requested"}
         assert {m.validation.status for m in answer.matches} == {"skipped"}
         assert all(
             a.rank < b.rank and a.distance <= b.distance for a, b in pairwise(answer.matches)

@@ -15,17 +15,18 @@ import numpy as np
 import pytest
 from sqlalchemy import select, update
 
-from sceneprint.engine import Engine, sides
-from sceneprint.engine.associating import Associating
-from sceneprint.engine.slices import Task
+from sceneprint.engine import Engine
+from sceneprint.engine.jobs.tasks import LongJob
+from sceneprint.engine.sessions import associations
+from sceneprint.engine.sessions.association_job import Associating
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
-from sceneprint.geometry.rigid import difference, inverse
-from sceneprint.schemas import Filter, JobState, NewMap
-from sceneprint.schemas.associations import Association, NewAssociation
+from sceneprint.geometry.pose.rigid import difference, inverse
+from sceneprint.lab.synth import synthesise_room
 from sceneprint.settings import Settings
 from sceneprint.store.tables import events, frames, job_items, jobs
-from sceneprint.synth import synthesise_room
 from sceneprint.types import Floats
+from sceneprint_client.api import Filter, JobState, NewMap
+from sceneprint_client.api.sessions import Association, NewAssociation
 
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 
@@ -174,11 +175,11 @@ def test_a_slice_that_was_lost_is_done_again_with_the_same_edges(
     slices = 0
     while True:  # a frame a slice, and each is lost once
         lost = engine.claim("dies")
-        assert isinstance(lost, Task)
+        assert isinstance(lost, LongJob)
         first = handler(lost, 0.0)
         due_now(engine)
         again = engine.claim("lives")
-        assert isinstance(again, Task)
+        assert isinstance(again, LongJob)
         assert engine.tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
         second = handler(again, 0.0)
         assert asdict(first) == asdict(second)
@@ -254,7 +255,7 @@ def test_deleted_frames_vanish(engine: Engine, work_off: Callable[[Engine], Any]
     begun = engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
     handler = Associating(engine.store, engine.signers, engine._readers)
     task = engine.claim("w")
-    assert isinstance(task, Task)
+    assert isinstance(task, LongJob)
     engine.tasks._keep(task, handler(task, time.monotonic() - 1))
     name = begun.association_id
     before = engine.associations.edges("hall", name).items
@@ -289,7 +290,7 @@ def test_listed_and_removed(engine: Engine, work_off: Callable[[Engine], Any]) -
     rest = engine.associations.list_all("hall", page.next_cursor)
     assert page.items + rest.items == listed.items
     task = engine.claim("w")
-    assert isinstance(task, Task)
+    assert isinstance(task, LongJob)
     for one in (first, second):  # the second while a worker is at it
         engine.associations.remove("hall", one.association_id)
         assert stored(engine, one.association_id) == []
@@ -333,8 +334,8 @@ def test_a_session_of_two_robots_needs_a_name(
 def test_too_many_frames_are_refused_in_words(
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sides, "MOST_FRAMES", 8)
-    with pytest.raises(InvalidRequest, match="have 12 frames, and an association takes at most 8"):
+    monkeypatch.setattr(associations, "MOST_FRAMES", 8)
+    with pytest.raises(InvalidRequest, match="have 12 frames, but an association takes at most 8"):
         engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
     late = Filter(captured_after=BEGIN + timedelta(seconds=4))
     begun = engine.associations.begin("hall", NewAssociation(sessions=["a", "b"], filter=late))
@@ -362,11 +363,11 @@ def test_what_makes_no_sense(asked: dict[str, Any], words: str) -> None:
 def test_a_map_that_is_deleted_meanwhile_ends_the_job_quietly(engine: Engine) -> None:
     engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
     task = engine.claim("w")
-    assert isinstance(task, Task)
+    assert isinstance(task, LongJob)
     handler = Associating(engine.store, engine.signers, engine._readers)
     engine.tasks._keep(task, handler(task, 0.0))
     task = engine.claim("w")
-    assert isinstance(task, Task)
+    assert isinstance(task, LongJob)
     engine.delete_map("hall")
     engine.create_map(NewMap(name="hall", model="depth"))
     broke: list[bool] = []

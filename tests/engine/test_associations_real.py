@@ -1,4 +1,4 @@
-"""Two stretches of a real recording with origins of their own; see benchmarks/loops.py."""
+"""Two stretches of a real recording with origins of their own; see docs/associations.md."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from sceneprint.client.frames import sendable
-from sceneprint.datasets import find_sequences
 from sceneprint.engine import Engine
-from sceneprint.geometry.rigid import difference, inverse
-from sceneprint.schemas import FrameMeta
-from sceneprint.schemas.associations import NewAssociation
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.geometry.pose.rigid import difference, inverse
 from sceneprint.types import Floats
+from sceneprint_client.api import FrameMeta
+from sceneprint_client.api.sessions import NewAssociation
+from sceneprint_client.frame_files import sendable
 
 #: Frames of redkitchen: the second stretch comes back to what the first saw.
 FIRST, SECOND = range(100, 180, 10), range(640, 720, 10)

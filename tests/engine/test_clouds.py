@@ -11,27 +11,27 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from sceneprint.clouds import write_ply
 from sceneprint.engine import Engine
-from sceneprint.engine.frames import content_id, read_upload
-from sceneprint.engine.fusing import View, fused
-from sceneprint.engine.validating import thresholds
+from sceneprint.engine.ingest.frame_decoder import content_id, read_upload
+from sceneprint.engine.reconstruction import JobView, fused
+from sceneprint.engine.search.verification import thresholds
 from sceneprint.errors import UnreadableCloud
-from sceneprint.geometry.acceptance import Evidence, belief, objection
-from sceneprint.geometry.validation import ValidationParameters
+from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.geometry.validation.acceptance import Evidence, belief, objection
+from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.pipeline import open_signer, sign
-from sceneprint.schemas import FrameMeta, JobState, Query
-from sceneprint.schemas.options import ValidationOptions
-from sceneprint.schemas.reconstructions import NewReconstruction
 from sceneprint.store.tables import frames
-from sceneprint.types import Floats, Frame
+from sceneprint.types import DepthFrame, Floats
+from sceneprint_client.api import FrameMeta, JobState, Query
+from sceneprint_client.api.options import ValidationOptions
+from sceneprint_client.api.reconstructions import NewReconstruction
 
 WorkOff = Callable[[Engine], list[JobState | None]]
 #: Where clouds were seen from, metres in their own coordinates.
 VIEWPOINT = np.array((2.0, -1.0, 0.5))
 
 
-def points_of(frame: Frame) -> Floats:
+def points_of(frame: DepthFrame) -> Floats:
     """What a depth image sees, in its optical frame."""
     depth, k = frame.depth[::2, ::2].astype(float), frame.intrinsics
     y, x = np.nonzero(depth)
@@ -63,7 +63,7 @@ def lose(engine: Engine, frame_id: str) -> None:
 def test_what_could_not_be_read_again_is_not_let_in() -> None:
     """A format that only its caller knows is lost with him."""
     odd = write_ply(np.eye(3)[np.arange(12) % 3]).replace(b"ply\n", b"ply\t\n", 1)
-    with pytest.raises(UnreadableCloud, match="does not begin as such files do"):
+    with pytest.raises(UnreadableCloud, match="does not start like one"):
         read_upload(odd, said(format="ply"))
 
 
@@ -156,7 +156,7 @@ def test_a_cloud_that_cannot_be_unpacked_here_costs_no_reconstruction(
     monkeypatch.setitem(sys.modules, "lazrs", None)
     still = np.eye(4).tolist()
     views = [
-        View("hall", one, i + 1, "strong", still) for i, one in enumerate((cloud_id, image_id))
+        JobView("hall", one, i + 1, "strong", still) for i, one in enumerate((cloud_id, image_id))
     ]
     model = empty.get_map("hall").model_id
     made = fused(empty.store, views, None, None, NewReconstruction(), model, "query.sensor", 1e12)

@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import select
 
 from sceneprint.engine import Engine
-from sceneprint.engine.edits import edit_frame, edit_map
+from sceneprint.engine.maps.maps import edit_frame, edit_map
 from sceneprint.errors import (
     FrameConflict,
     InvalidPose,
@@ -21,10 +21,10 @@ from sceneprint.errors import (
     UnknownFrame,
     UnknownMap,
 )
-from sceneprint.maintenance.fsck import fsck
-from sceneprint.schemas import Filter, Frame, NewMap, Query
-from sceneprint.schemas.browsing import FrameListing
+from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.store.tables import events
+from sceneprint_client.api import Filter, Frame, NewMap, Query
+from sceneprint_client.api.listing import FrameListing
 
 Ids = Callable[[Engine], list[str]]
 EDITABLE = ("robot", "session", "captured_at", "tags", "pose", "base_frame", "T_base_sensor")
@@ -121,10 +121,10 @@ def test_where_the_camera_sits(edit: Callable[..., Frame], full: Engine) -> None
 @pytest.mark.parametrize(
     ("patch", "text"),
     [
-        ({"intrinsics": {}}, "`intrinsics` is part of what the frame is"),
-        ({"depth_scale": 5000}, "`depth_scale` is part of what the frame is"),
-        ({"depth_along_ray": None}, "`depth_along_ray` is part of what the frame is"),
-        ({"state": "indexed"}, "a field 'state' that is not known. Its fields are robot, session"),
+        ({"intrinsics": {}}, "`intrinsics` is part of the identity of the frame"),
+        ({"depth_scale": 5000}, "`depth_scale` is part of the identity of the frame"),
+        ({"depth_along_ray": None}, "`depth_along_ray` is part of the identity of the frame"),
+        ({"state": "indexed"}, "an unknown field 'state'. Its fields are robot, session"),
         ({"robot": ""}, "robot: "),
         ({"robot": 5}, "robot: "),
         ({"tags": "a"}, "tags: "),
@@ -196,7 +196,7 @@ def test_events_tell_what_was_edited(full: Engine, ids: Ids) -> None:
 def test_an_upload_is_compared_with_what_it_is_by_now(full: Engine, uploads: Any, ids: Ids) -> None:
     one, name = uploads[0], ids(full)[0]
     edit_frame(full.store, "hall", name, {"robot": "r1"})
-    with pytest.raises(FrameConflict, match="other robot"):
+    with pytest.raises(FrameConflict, match="a different robot"):
         full.add_frame("hall", one.data, one.meta)
     now = one.meta.model_copy(update={"robot": "r1"})
     added, new = full.add_frame("hall", one.data, now)
@@ -218,7 +218,7 @@ def test_of_many_who_read_the_same_one_edits(full: Engine, ids: Ids) -> None:
         won = list(pool.map(one, range(8)))
     assert won.count(True) == 1
     assert full.get_frame("hall", name).robot == f"r{won.index(True)}"
-    with pytest.raises(PreconditionFailed, match="has been edited since it was read") as told:
+    with pytest.raises(PreconditionFailed, match="was edited after you read it") as told:
         edit_frame(full.store, "hall", name, {"robot": None}, [tag])
     now = full.get_frame("hall", name).etag
     assert f'"{now}"' in str(told.value)
@@ -232,7 +232,7 @@ def test_a_map_has_a_title(full: Engine) -> None:
     assert before.etag is not None
     told = edit_map(full.store, "hall", {"title": "Küche"}, [before.etag])
     assert (told.title, told) == ("Küche", full.get_map("hall"))
-    with pytest.raises(PreconditionFailed, match="Map 'hall' has been edited"):
+    with pytest.raises(PreconditionFailed, match="Map 'hall' was edited"):
         edit_map(full.store, "hall", {"title": None}, [before.etag])
     assert edit_map(full.store, "hall", {}) == told
     assert edit_map(full.store, "hall", {"title": None}).title is None

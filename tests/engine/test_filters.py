@@ -13,10 +13,10 @@ import pytest
 from sceneprint.engine import Engine
 from sceneprint.engine.engine import stored_maps
 from sceneprint.errors import InvalidRequest
-from sceneprint.geometry.retrieval import ranking_size
-from sceneprint.schemas import Answer, Filter, NewMap, Query
+from sceneprint.geometry.retrieval.distance import ranking_size
 from sceneprint.store.frames import add_frame
 from sceneprint.store.signatures import StoredSignature, index_frame
+from sceneprint_client.api import Answer, Filter, NewMap, Query
 
 Make = Callable[..., Engine]
 Ids = Callable[[Engine], list[str]]
@@ -281,20 +281,20 @@ def test_frames_between_view_and_filter_do_no_harm(
     make_engine: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One is deleted, and one indexed, after the view was made and before the filter is asked."""
-    from sceneprint.engine import searching
+    from sceneprint.engine.search import retrieval
 
     engine = make_engine()
     engine.create_map(NewMap(name="hall", model="depth"))
     frames = fill(engine, 20, 6)
-    passing, gone = searching.passing, frames[3]
+    passing, gone = retrieval.passing, frames[3]
 
     def late(*given: Any) -> Any:
-        monkeypatch.setattr(searching, "passing", passing)
+        monkeypatch.setattr(retrieval, "passing", passing)
         engine.delete_frame("hall", gone.id)
         fill(engine, 5, 7)
         return passing(*given)
 
-    monkeypatch.setattr(searching, "passing", late)
+    monkeypatch.setattr(retrieval, "passing", late)
     answer = ask(engine, frames[0], Filter())
     left = [one for one in frames if one is not gone]
     assert [m.frame_id for m in answer.matches] == [i for i, _ in ranked(left, frames[0], Filter())]
@@ -305,7 +305,7 @@ def test_frames_between_view_and_filter_do_no_harm(
         engine.delete_frame("hall", frames[4].id)
         return numbers
 
-    monkeypatch.setattr(searching, "passing", early)
+    monkeypatch.setattr(retrieval, "passing", early)
     answer = ask(engine, frames[0], Filter())
     assert frames[4].id not in {m.frame_id for m in answer.matches}  # though it was compared
     assert len(answer.matches) == 22

@@ -9,18 +9,17 @@ from typing import Any
 import pytest
 from sqlalchemy import func, select, update
 
-from sceneprint.datasets import read_trajectory
 from sceneprint.engine import Engine
-from sceneprint.engine import growth as growing
-from sceneprint.engine import sizes as measuring
-from sceneprint.engine.browsing import trajectory, trajectory_file
-from sceneprint.engine.edits import edit_frame
-from sceneprint.engine.growth import growth
+from sceneprint.engine.admin import statistics as measuring
+from sceneprint.engine.maps import map_frames as growing
+from sceneprint.engine.maps.map_frames import growth, trajectory, trajectory_file
+from sceneprint.engine.maps.maps import edit_frame
 from sceneprint.errors import UnknownMap
-from sceneprint.schemas import NewMap
-from sceneprint.schemas.browsing import Run
+from sceneprint.formats.dataset import read_trajectory
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, signatures
+from sceneprint_client.api import NewMap
+from sceneprint_client.api.listing import Run
 
 Ids = Callable[[Engine], list[str]]
 HOUR_S = 3600.0
@@ -111,7 +110,7 @@ def test_a_map_is_weighed(full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatc
 def test_a_long_trajectory_is_thinned(
     full: Engine, ids: Ids, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sceneprint.engine import browsing
+    from sceneprint.engine.maps import map_frames
 
     names = ids(full)
     for i, name in enumerate(names[:7]):
@@ -119,14 +118,14 @@ def test_a_long_trajectory_is_thinned(
         pose: dict[str, Any] = {"parent_frame": "hall"}
         edit_frame(full.store, "hall", name, {"session": "s", "captured_at": at, "pose": pose})
     whole = trajectory(full.store, "hall", Run(session="s"))
-    monkeypatch.setattr(browsing, "MOST_POSES", 3)  # a part of a run may be one of any length
+    monkeypatch.setattr(map_frames, "MOST_POSES", 3)  # a part of a run may be one of any length
     told = trajectory(full.store, "hall", Run(session="s", most=3))
     assert told.frame_ids == [names[i] for i in (0, 3, 5)]
     assert told.poses == [whole.poses[i] for i in (0, 3, 5)]
     assert (told.posed, told.left_out) == (6, 4)
     assert (whole.posed, whole.left_out) == (6, 1)
     text = trajectory_file(told)
-    assert "# poses: 3 of 6, evenly taken; frames left out: 4" in text
+    assert "# poses: 3 of 6, evenly spaced; frames left out: 4" in text
     (tmp_path / "a.tum").write_text(text)
     assert len(read_trajectory(tmp_path / "a.tum").stamps) == 3
     monkeypatch.undo()

@@ -9,14 +9,14 @@ from typing import Any
 import pytest
 from sqlalchemy import select, update
 
-from sceneprint.engine import Engine, healing
-from sceneprint.engine.healing import MOST, PAUSE_S, PRIORITY, sign_again
+from sceneprint.engine import Engine
+from sceneprint.engine.upkeep import repair
+from sceneprint.engine.upkeep.repair import MOST, PAUSE_S, PRIORITY, resign_frames
 from sceneprint.errors import DamagedBlob, DamagedSignature
-from sceneprint.schemas import FrameState, JobState, Query
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import find_map
-from sceneprint.store.records import MapRow
-from sceneprint.store.tables import frames, jobs, signatures
+from sceneprint.store.tables import MapRow, frames, jobs, signatures
+from sceneprint_client.api import FrameState, JobState, Query
 
 Ids = Callable[[Engine], list[str]]
 WorkOff = Callable[[Engine], list[JobState | None]]
@@ -243,11 +243,11 @@ def test_at_most_so_many_a_query_and_none_that_is_not_indexed(full: Engine, ids:
     full.delete_frame("hall", ids(full)[0])
     with full.store.database.write() as connection:
         set_state(connection, numbers[6], FrameState.FAILED)
-    assert sign_again(full.store, row, [numbers[0], numbers[6]], row.model_id) == 0
-    assert sign_again(full.store, row, [numbers[1]] * 3 + [10**6], row.model_id) == 1
-    assert sign_again(full.store, row, numbers[1:3], row.model_id) == 1
+    assert resign_frames(full.store, row, [numbers[0], numbers[6]], row.model_id) == 0
+    assert resign_frames(full.store, row, [numbers[1]] * 3 + [10**6], row.model_id) == 1
+    assert resign_frames(full.store, row, numbers[1:3], row.model_id) == 1
     assert len(numbers) < MOST < 100
-    assert sign_again(full.store, row, list(range(10**6, 10**6 + 100)), row.model_id) == 0
+    assert resign_frames(full.store, row, list(range(10**6, 10**6 + 100)), row.model_id) == 0
 
 
 def test_a_store_that_cannot_be_written_costs_no_answer(
@@ -260,24 +260,24 @@ def test_a_store_that_cannot_be_written_costs_no_answer(
     answer = full.query_upload("hall", uploads[0].data, uploads[0].meta, Query())
     assert statuses(answer)[frame][0] == "skipped"
     assert answer.status == "found"
-    assert "damage not healed" in caplog.text
+    assert "repair failed" in caplog.text
 
 
 def test_frames_that_cannot_be_healed_keep_no_other_from_it(
     full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(healing, "MOST", 2)
-    monkeypatch.setattr(healing, "PAUSE_S", 0.0)
+    monkeypatch.setattr(repair, "MOST", 2)
+    monkeypatch.setattr(repair, "PAUSE_S", 0.0)
     names = ids(full)
     numbers = [number_of(full, name) for name in names]
     with full.store.database.write() as connection:  # uploads of the first are known to be lost
         connection.execute(
             update(frames)
             .where(frames.c.number.in_(numbers[:6]))
-            .values(reason=healing.reason_of_loss("missing", found=True))
+            .values(reason=repair.reason_of_loss("missing", found=True))
         )
     for _ in range(200):
-        sign_again(full.store, row_of(full), numbers, row_of(full).model_id)
+        resign_frames(full.store, row_of(full), numbers, row_of(full).model_id)
         if {job.frame_number for job in waiting(full)} == set(numbers[6:]):
             break
     tried = [job.frame_number for job in waiting(full)]

@@ -12,16 +12,17 @@ from typing import Any
 import pytest
 from sqlalchemy import update
 
-from sceneprint.datasets.archives import Archive
-from sceneprint.engine import Engine, imports, members
-from sceneprint.engine import uploads as uploading
-from sceneprint.engine.slices import Task
-from sceneprint.engine.sweeping import sweep
+from sceneprint.engine import Engine
+from sceneprint.engine.ingest import archive_import
+from sceneprint.engine.ingest import uploads as uploading
+from sceneprint.engine.jobs.tasks import LongJob
+from sceneprint.engine.upkeep.blob_garbage import collect_blobs
 from sceneprint.errors import LostLease, UnknownMap, UnusableStore
-from sceneprint.schemas import Job, JobState, NewMap
-from sceneprint.schemas.ingest import ImportOptions
-from sceneprint.store.parts import files_of
+from sceneprint.formats.archive.archive import Archive
+from sceneprint.store.queue import files_of
 from sceneprint.store.tables import jobs
+from sceneprint_client.api import Job, JobState, NewMap
+from sceneprint_client.api.frames import ImportOptions
 
 
 def packed(uploads: Any) -> bytes:
@@ -44,10 +45,10 @@ def begun(engine: Engine, data: bytes, map_name: str = "hall") -> Job:
     return engine.imports.begin(map_name, archive, ImportOptions())[0]
 
 
-def claimed(engine: Engine) -> Task:
+def claimed(engine: Engine) -> LongJob:
     while True:  # frames that wait to be signed are left waiting
         work = engine.claim("test")
-        if isinstance(work, Task):
+        if isinstance(work, LongJob):
             return work
         assert work is not None
 
@@ -55,7 +56,7 @@ def claimed(engine: Engine) -> Task:
 def test_a_slice_that_was_lost_is_done_again(
     empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(members, "_AT_ONCE", 2)
+    monkeypatch.setattr(archive_import, "_AT_ONCE", 2)
     job = begun(empty, packed(uploads[:5]))
     task = claimed(empty)
     over = time.monotonic() - 1  # at least some are taken, so that it comes to an end
@@ -87,7 +88,7 @@ def test_large_frames_are_not_in_memory_together(
     task, over = claimed(empty), time.monotonic() - 1
     taken = []
     for most in (max(sizes) - 1, sizes[0] + sizes[1], sum(sizes)):
-        monkeypatch.setattr(members, "_BYTES_AT_ONCE", most)
+        monkeypatch.setattr(archive_import, "_BYTES_AT_ONCE", most)
         taken.append(len(empty.imports.handle(task, over).items))
     assert taken == [1, 2, 3]
 
@@ -137,7 +138,7 @@ class Between:
 def test_a_cancelled_import_takes_no_frame_more(
     empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(members, "_AT_ONCE", 2)
+    monkeypatch.setattr(archive_import, "_AT_ONCE", 2)
     job = begun(empty, packed(uploads[:4]))
     until: Any = Between(lambda: empty.cancel_job(job.job_id))
     with pytest.raises(LostLease):
@@ -149,7 +150,7 @@ def test_a_cancelled_import_takes_no_frame_more(
 def test_a_map_that_is_made_anew_takes_nothing_of_an_import_into_the_one_before(
     empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(members, "_AT_ONCE", 2)
+    monkeypatch.setattr(archive_import, "_AT_ONCE", 2)
     begun(empty, packed(uploads[:4]))
 
     def make_anew() -> None:
@@ -166,14 +167,14 @@ def test_a_map_that_is_made_anew_takes_nothing_of_an_import_into_the_one_before(
 def test_the_archive_of_an_import_that_was_given_up_is_kept_for_a_day(
     empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(imports, "TIDY_S", 0.0)
+    monkeypatch.setattr(archive_import, "TIDY_S", 0.0)
     job = begun(empty, packed(uploads[:1]))
     waiting = begun(empty, packed(uploads[:2]))
     empty.cancel_job(job.job_id)
     empty.publish_due()
     assert len(list(empty.store.blobs.digests())) == 2
     with empty.store.database.write() as connection:
-        long_ago = time.time() - imports.KEPT_S - 1
+        long_ago = time.time() - archive_import.KEPT_S - 1
         connection.execute(update(jobs).values(created_at=long_ago))
         connection.execute(
             update(jobs).where(jobs.c.finished_at.is_not(None)).values(finished_at=long_ago)
@@ -182,7 +183,7 @@ def test_the_archive_of_an_import_that_was_given_up_is_kept_for_a_day(
     assert len(list(empty.store.blobs.digests())) == 1
     empty.retry_job(job.job_id)
     assert empty.run(claimed(empty)) == JobState.FAILED
-    assert "given up long ago" in str(empty.get_job(job.job_id).error)
+    assert "cancelled too long ago" in str(empty.get_job(job.job_id).error)
     assert empty.run(claimed(empty)) == JobState.SUCCEEDED
     assert empty.get_job(waiting.job_id).state == JobState.SUCCEEDED
 
@@ -193,8 +194,8 @@ def test_an_archive_that_was_swept_before_its_job_was_there_is_not_acknowledged(
     with empty.imports.receive("hall") as receiver:
         receiver.write(packed(uploads[:1]))
         archive = receiver.end()
-    sweep(empty.store, [archive.blob])  # an import of the same archive ends at this moment
-    with pytest.raises(UnusableStore, match="Send the archive once more"):
+    collect_blobs(empty.store, [archive.blob])  # an import of the same archive ends at this moment
+    with pytest.raises(UnusableStore, match="Send the archive again"):
         empty.imports.begin("hall", archive, ImportOptions())
     assert list(empty.list_jobs().items) == []
 
@@ -225,5 +226,5 @@ def test_a_frame_that_memory_does_not_do_for_costs_no_other(
     assert len(asked) == 5  # two of three together, then each alone
     for refused in (items[0], items[2]):
         assert refused.problem is not None
-        assert "takes more memory than a worker may have" in refused.problem.detail
+        assert "needs more memory than a worker may use" in refused.problem.detail
     assert len(empty.list_frames("hall").items) == 2

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine, growing, readers
-from sceneprint.engine.growing import Growing
+from sceneprint.engine import Engine
+from sceneprint.engine.search import local_index
+from sceneprint.engine.search.local_index import AppendBuffer
 from sceneprint.errors import UnusableStore
 from sceneprint.index import newest, scrub
 from sceneprint.models import read_model
-from sceneprint.schemas import Query
-from sceneprint.store.signatures import Change
+from sceneprint.store.signatures import SignatureChange
+from sceneprint_client.api import Query
 
 Make = Callable[..., Engine]
 ALL = Query(stages=("retrieve",), k=50)
@@ -27,7 +28,7 @@ LENGTH = read_model("depth").signature_bytes
 
 @pytest.fixture
 def data(signed_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(readers, "_LOOK_S", 0.0)
+    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
     shutil.copytree(signed_folder, tmp_path / "data")
     return tmp_path / "data"
 
@@ -110,12 +111,12 @@ def test_rebuilding_makes_the_same_index_from_nothing(
 
 
 def test_a_frame_signed_anew_is_found_once_with_its_new_signature() -> None:
-    tail = Growing(4, Path("unused"))
-    tail.append(Change(7, "", 1, None), np.full(4, 1, np.uint8))
-    tail.append(Change(8, "", 2, None), np.full(4, 2, np.uint8))
+    tail = AppendBuffer(4, Path("unused"))
+    tail.append(SignatureChange(7, "", 1, None), np.full(4, 1, np.uint8))
+    tail.append(SignatureChange(8, "", 2, None), np.full(4, 2, np.uint8))
     handed_out = tail.tail()
     other = tail.without({7})
-    other.append(Change(7, "", 3, None), np.full(4, 3, np.uint8))
+    other.append(SignatureChange(7, "", 3, None), np.full(4, 3, np.uint8))
     assert (tail.revision_of(7), other.revision_of(7), other.revision_of(9)) == (1, 3, 0)
     np.testing.assert_array_equal(other.tail().keys, [8, 7])
     np.testing.assert_array_equal(other.tail().signatures[:, 0], [2, 3])
@@ -126,11 +127,11 @@ def test_a_frame_signed_anew_is_found_once_with_its_new_signature() -> None:
 def test_a_tail_in_a_file_is_as_one_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_memory: int
 ) -> None:
-    monkeypatch.setattr(growing, "IN_MEMORY", in_memory)
+    monkeypatch.setattr(local_index, "IN_MEMORY", in_memory)
     rows = np.random.default_rng(3).integers(0, 256, (300, 50), np.uint8)
-    tail, views = Growing(50, tmp_path / "index"), []
+    tail, views = AppendBuffer(50, tmp_path / "index"), []
     for i, row in enumerate(rows):
-        tail.append(Change(i, "", i + 1, None), row)
+        tail.append(SignatureChange(i, "", i + 1, None), row)
         if i % 50 == 0:
             views.append(tail.tail())
     assert tail.bytes_held == (512 * 50 if in_memory else 0)
@@ -167,7 +168,7 @@ def test_a_damaged_index_is_read_once_and_not_with_every_query(
     engine = make_engine(data)
     for _ in range(5):
         assert ask(engine, uploads)[1] == 0
-    said = [r for r in caplog.records if r.message.startswith("A damaged index is passed over")]
+    said = [r for r in caplog.records if r.message.startswith("Damaged index skipped")]
     assert len(said) == 1
     flip(path, path.stat().st_size - 5 * LENGTH)  # as it was: out of reach for a moment
     _, reader = engine._readers._open["hall"]
@@ -196,17 +197,17 @@ def test_what_is_out_of_reach_for_a_moment_is_not_removed(
 def test_a_tail_that_finds_no_room_is_as_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tail, row = Growing(50, tmp_path), np.ones(50, np.uint8)
+    tail, row = AppendBuffer(50, tmp_path), np.ones(50, np.uint8)
     for i in range(64):
-        tail.append(Change(i, "", i + 1, None), row)
+        tail.append(SignatureChange(i, "", i + 1, None), row)
 
     def full(*_: object) -> None:
         raise UnusableStore("no room")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Growing, "_room", full)
+        patch.setattr(AppendBuffer, "_room", full)
         with pytest.raises(UnusableStore):
-            tail.append(Change(64, "", 65, None), row)
+            tail.append(SignatureChange(64, "", 65, None), row)
     assert len(tail.tail()) == 64
-    tail.append(Change(64, "", 65, None), row)  # there is room again
+    tail.append(SignatureChange(64, "", 65, None), row)  # there is room again
     np.testing.assert_array_equal(tail.tail().keys, np.arange(65))

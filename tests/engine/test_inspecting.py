@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.clouds import points_of
 from sceneprint.engine import Engine
-from sceneprint.engine.transforms import transform
+from sceneprint.engine.serializers import transform
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
-from sceneprint.geometry.covariance import adjoint
+from sceneprint.formats.points.ply_export import points_of
+from sceneprint.geometry.validation.icp import adjoint
 from sceneprint.pipeline import Signature, distance, validate
-from sceneprint.schemas import Answer, Query, ValidationOptions
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import geometry_blobs
 from sceneprint.types import Geometry
+from sceneprint_client.api import Answer, Query, ValidationOptions
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]

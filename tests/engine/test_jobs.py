@@ -10,13 +10,12 @@ import pytest
 from sqlalchemy import update
 
 from sceneprint.engine import Engine
-from sceneprint.engine import work as working
+from sceneprint.engine.jobs import signature_job as working
 from sceneprint.errors import CannotRetry, InvalidRequest, JobOver, UnknownJob
-from sceneprint.schemas import FrameState, JobState
-from sceneprint.store import listing
-from sceneprint.store.clock import read_clock
-from sceneprint.store.records import JobRow
-from sceneprint.store.tables import jobs
+from sceneprint.store import queue
+from sceneprint.store.queue import read_clock
+from sceneprint.store.tables import JobRow, jobs
+from sceneprint_client.api import FrameState, JobState
 
 DueNow = Callable[[Engine], None]
 Told = Callable[[Engine], list[str]]
@@ -25,7 +24,7 @@ WorkOff = Callable[[Engine], list[JobState | None]]
 
 def row(engine: Engine, job_id: str) -> JobRow:
     with engine.store.database.read() as connection:
-        return listing.find_job(connection, job_id)
+        return queue.find_job(connection, job_id)
 
 
 def due(engine: Engine) -> float:
@@ -64,15 +63,15 @@ def test_a_cancelled_job_is_done_by_nobody_and_can_be_tried_again(
     frame = empty.get_frame("hall", added.frame_id)
     assert (frame.state, frame.reason) == (FrameState.RECEIVED, None)
     assert frame.job_id == again.job_id
-    with pytest.raises(CannotRetry, match="is queued and its frame received"):
+    with pytest.raises(CannotRetry, match="is queued and its frame is received"):
         empty.retry_job(again.job_id)
     assert work_off(empty) == [JobState.SUCCEEDED]
     assert told(empty)[1:] == ["frame.received", "frame.failed", "frame.received", "frame.indexed"]
     with pytest.raises(JobOver, match=r"is succeeded: Done, .* Nothing is left to do\."):
         empty.cancel_job(again.job_id)
-    with pytest.raises(CannotRetry, match="is succeeded and its frame indexed"):
+    with pytest.raises(CannotRetry, match="is succeeded and its frame is indexed"):
         empty.retry_job(again.job_id)
-    with pytest.raises(CannotRetry, match=f"was followed by {again.job_id}, which is succeeded"):
+    with pytest.raises(CannotRetry, match=f"was replaced by {again.job_id}, which is succeeded"):
         empty.retry_job(added.job_id)
     for ask in (empty.cancel_job, empty.retry_job):
         with pytest.raises(UnknownJob, match="nobody"):
@@ -97,11 +96,11 @@ def test_what_cannot_be_signed_again_is_refused_with_the_reason(
     empty.cancel_job(lost.job_id)
     empty.cancel_job(gone.job_id)
     empty.store.blobs.remove(empty.store.blobs.put(uploads[0].data))
-    with pytest.raises(CannotRetry, match=f"The upload of frame {lost.frame_id} is gone"):
+    with pytest.raises(CannotRetry, match=f"The upload of frame {lost.frame_id} is missing"):
         empty.retry_job(lost.job_id)
     assert empty.get_frame("hall", lost.frame_id).state == FrameState.FAILED
     empty.delete_frame("hall", gone.frame_id)
-    with pytest.raises(CannotRetry, match="is cancelled and its frame deleted"):
+    with pytest.raises(CannotRetry, match="is cancelled and its frame is deleted"):
         empty.retry_job(gone.job_id)
 
 
@@ -247,7 +246,7 @@ def test_jobs_are_listed_newest_first(empty: Engine, uploads: Any, work_off: Wor
     found = empty.list_jobs(JobState.CANCELLED).items
     assert [job.job_id for job in found] == [added[1].job_id]
     assert empty.list_jobs(JobState.DEAD).items == []
-    with pytest.raises(InvalidRequest, match="was not given out"):
+    with pytest.raises(InvalidRequest, match="is not valid"):
         empty.list_jobs(cursor="x")
 
 

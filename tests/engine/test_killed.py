@@ -13,17 +13,18 @@ import pytest
 from sqlalchemy import select
 
 from sceneprint.engine import Engine
-from sceneprint.schemas import FrameState, JobState, Query
 from sceneprint.store.tables import jobs, signatures
+from sceneprint_client.api import FrameState, JobState, Query
 
 #: Works as a worker does, and stands still at a step of which it tells.
 WORKER = """
 import sys, time
 from pathlib import Path
-from sceneprint.engine import Engine, work
+from sceneprint.engine import Engine
+from sceneprint.engine.jobs import signature_job
 from sceneprint.settings import Settings
 
-step = getattr(work, sys.argv[2])
+step = getattr(signature_job, sys.argv[2])
 
 def stand_still(*given):
     if sys.argv[3] == "after":
@@ -31,7 +32,7 @@ def stand_still(*given):
     print(sys.argv[2], flush=True)
     time.sleep(600)
 
-setattr(work, sys.argv[2], stand_still)
+setattr(signature_job, sys.argv[2], stand_still)
 engine = Engine(Settings(data_dir=Path(sys.argv[1]), lease_s=0.3))
 engine.run(engine.claim("doomed"))
 """

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.engine.latencies import BINS, FIRST_S, STEP, Latencies, bin_of, merged, quantile
+from sceneprint.engine.admin.statistics import (
+    BINS,
+    FIRST_S,
+    STEP,
+    Latencies,
+    bin_of,
+    merged,
+    quantile,
+)
 
 
 @pytest.mark.parametrize("spread", [0.3, 1.0, 2.0])

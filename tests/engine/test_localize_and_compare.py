@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.engine.localizing import check_localizes, localization_of
-from sceneprint.engine.telling import tell_uncertainty
+from sceneprint.engine.search.query import check_localizes, localization_of
+from sceneprint.engine.search.response import uncertainty_record
 from sceneprint.errors import InvalidRequest, UnknownFrame
-from sceneprint.geometry.covariance import PAIR_METHOD
+from sceneprint.geometry.validation.icp import PAIR_METHOD
 from sceneprint.models import read_model
 from sceneprint.pipeline import Signature, distance, validate
-from sceneprint.schemas import Comparison, NamedFrame, NewMap, Query, Similarity
 from sceneprint.types import Geometry
+from sceneprint_client.api import Comparison, NamedFrame, NewMap, Query, Similarity
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]
@@ -48,7 +48,7 @@ def test_what_is_found_without_a_pose_has_the_transform_to_its_match(
     work_off(empty)
     there = localization_of(empty.query_upload("hall", uploads[1].data, bare, Query()))
     assert (there.status, there.pose, there.spread_m, there.votes) == ("found", None, None, 0)
-    assert "no pose of them" in there.reason
+    assert "none has a pose" in there.reason
     T = np.linalg.inv(uploads[0].pose) @ uploads[1].pose
     assert np.linalg.norm(np.array(there.best.transform.matrix)[:3, 3] - T[:3, 3]) < 0.05
 
@@ -65,16 +65,16 @@ def test_what_is_not_found_says_why(full: Engine, empty: Engine, uploads: Any, i
         [],
         None,
     )
-    assert tight.reason.startswith("none of 10 candidates is accepted; of the nearest, the two ")
+    assert tight.reason.startswith("none of 10 candidates was accepted; the nearest: the two ")
     none = ask(filter={"robot": "nobody"})
-    assert none.reason == "no frame of the map can be compared: none passes the filter"
+    assert none.reason == "the map has no frame to compare: no frame passes the filter"
     late = ask(deadline_ms=1)
     assert (late.status, late.deadline_reached) == ("not_found", True)
-    assert late.reason.startswith("the deadline came before a match was accepted: 0 of 10")
+    assert late.reason.startswith("the deadline passed before a match was accepted: 0 of 10")
     unsure = ask(validation={"ambiguous": 0.0})
     assert (unsure.status, unsure.pose) == ("ambiguous", None)
     assert "another transform explains the frames as well" in unsure.reason
-    with pytest.raises(InvalidRequest, match="rests on validated matches"):
+    with pytest.raises(InvalidRequest, match="needs validated matches"):
         check_localizes(Query(stages=("retrieve", "diversify")))
 
 
@@ -149,8 +149,8 @@ def test_what_is_free_is_told_by_the_numbers_of_the_model() -> None:
     """A radian counts five metres in a hall, and one in a room."""
     S = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 300.0]) * 1e-6
     room, hall = (read_model(one).parameters.validation.covariance for one in ("paper", "lidar"))
-    held = tell_uncertainty(S, PAIR_METHOD, room)
-    free = tell_uncertainty(S, PAIR_METHOD, hall)
+    held = uncertainty_record(S, PAIR_METHOD, room)
+    free = uncertainty_record(S, PAIR_METHOD, hall)
     assert held is not None
     assert free is not None
     assert (held.degenerate, held.covariance) == ([], free.covariance)

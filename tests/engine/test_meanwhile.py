@@ -11,13 +11,14 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from sceneprint.engine import Engine, readers, upkeep, validating, views
-from sceneprint.engine.asking import ask_stored
-from sceneprint.engine.deadlines import Deadline
+from sceneprint.engine import Engine
+from sceneprint.engine.search import index_view, local_index, verification
+from sceneprint.engine.search.retrieval import Deadline, prepare_stored
+from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import DamagedBlob, UnknownMap
 from sceneprint.matches import associate
-from sceneprint.schemas import NewMap, Query
 from sceneprint.store.tables import frames, signatures
+from sceneprint_client.api import NewMap, Query
 
 Ids = Callable[[Engine], list[str]]
 R = Query(stages=("retrieve",), k=50)
@@ -66,13 +67,13 @@ def test_a_damaged_artifact_costs_its_match_and_no_other(
     assert (after.location.support, before.location.support) == (4, 5)
     with pytest.raises(DamagedBlob):  # of the query itself there is no other
         full.query_frame("hall", bad, Query())
-    assert full.query_frame("hall", bad, R).matches[0].validation.reason == "not asked for"
+    assert full.query_frame("hall", bad, R).matches[0].validation.reason == "not requested"
 
 
 def test_what_is_deleted_while_a_query_runs_is_not_told(
     full: Engine, uploads: Any, ids: Ids, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names, search = ids(full), views.search
+    names, search = ids(full), index_view.search
     gone = [names[6], names[1]]
 
     def then_delete(*given: Any, **more: Any) -> Any:
@@ -81,7 +82,7 @@ def test_what_is_deleted_while_a_query_runs_is_not_told(
             full.delete_frame("hall", gone.pop())
         return hits
 
-    monkeypatch.setattr(views, "search", then_delete)
+    monkeypatch.setattr(index_view, "search", then_delete)
     for query, missing in ((Query(), names[1]), (R, names[6])):
         answer = full.query_upload("hall", uploads[1].data, uploads[1].meta, query)
         assert missing not in [m.frame_id for m in answer.matches]
@@ -96,7 +97,7 @@ def test_a_frame_deleted_after_it_was_asked_for_is_answered(
     work_off(empty)
     (name,) = ids(empty)
     row = empty._row("hall")
-    asked = ask_stored(empty.store, "hall", name, Query())
+    asked = prepare_stored(empty.store, "hall", name, Query())
     empty.delete_frame("hall", name)
     answer = empty.queries.answer([row], asked, Query(), Deadline(None))
     assert (answer.status, answer.matches, answer.counts.map) == ("not_found", [], 0)
@@ -108,10 +109,10 @@ def test_a_map_made_anew_while_it_was_asked_is_not_answered_for(
     empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work_off(empty)
     row = empty._row("hall")
-    asked = ask_stored(empty.store, "hall", ids(empty)[0], Query())
+    asked = prepare_stored(empty.store, "hall", ids(empty)[0], Query())
     empty.delete_map("hall")
     empty.create_map(NewMap(name="hall", model="paper"))  # whose signatures are longer
-    with pytest.raises(UnknownMap, match="made anew while it was asked"):
+    with pytest.raises(UnknownMap, match="created again during the query"):
         empty.queries.answer([row], asked, Query(), Deadline(None))
 
 
@@ -128,7 +129,7 @@ def test_matches_that_are_deleted_while_they_are_validated_are_not_found(
         empty.delete_frame("hall", name)
         return found
 
-    monkeypatch.setattr(validating, "associate", then_delete)
+    monkeypatch.setattr(verification, "associate", then_delete)
     answer = empty.query_upload("hall", uploads[0].data, uploads[0].meta, Query())
     assert (answer.status, answer.matches, answer.location) == ("not_found", [], None)
     assert (answer.counts.validated, answer.counts.accepted) == (0, 0)
@@ -150,7 +151,7 @@ def test_queries_beside_deletions_and_publishing_see_one_state(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """Frames go one by one, from the last: every answer has the first n, rightly ranked."""
-    monkeypatch.setattr(readers, "_LOOK_S", 0.0)
+    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
     engine, builder = make_engine(tail_frames=1), make_engine(tail_frames=1)
     names = ids(full)
     whole = [(m.frame_id, m.distance) for m in full.query_frame("hall", names[0], R).matches]
@@ -197,9 +198,9 @@ def test_what_is_deleted_while_an_index_is_published_stays_deleted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """The generation holds it, and readers have heard of its end but never of its beginning."""
-    monkeypatch.setattr(readers, "_LOOK_S", 0.0)
+    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
     reader, builder = make_engine(tail_frames=5), make_engine(tail_frames=5)
-    names, publish = ids(full), upkeep.publish
+    names, publish = ids(full), index_upkeep.publish
     assert full.get_map("hall").revision == 12
     reader.query_frame("hall", names[0], R)
     meta = uploads[3].meta
@@ -213,7 +214,7 @@ def test_what_is_deleted_while_an_index_is_published_stays_deleted(
         assert len(reader.query_frame("hall", names[0], R).matches) == 11
         return publish(*given, **more)
 
-    monkeypatch.setattr(upkeep, "publish", slowly)
+    monkeypatch.setattr(index_upkeep, "publish", slowly)
     assert builder.publish_due() == 1
     full.delete_frame("hall", names[11])
     for engine in (reader, make_engine(tail_frames=5)):

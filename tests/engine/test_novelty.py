@@ -12,16 +12,16 @@ import pytest
 from sqlalchemy import select
 
 from sceneprint.engine import Engine
-from sceneprint.engine import novelty as judging
-from sceneprint.engine import work as working
 from sceneprint.engine.engine import stored_maps
+from sceneprint.engine.ingest import novelty as judging
+from sceneprint.engine.jobs import signature_job as working
 from sceneprint.errors import InvalidRequest
 from sceneprint.pipeline import Signature, Signer
-from sceneprint.schemas import FrameState, JobState, NewMap, Query
-from sceneprint.schemas.novelty import NOVEL, novelty_of
 from sceneprint.store.signatures import StoredSignature
 from sceneprint.store.tables import events, signatures
 from sceneprint.types import Geometry
+from sceneprint_client.api import FrameState, JobState, NewMap, Query
+from sceneprint_client.api.frames import NOVEL, novelty_of
 
 Make = Callable[..., Engine]
 WorkOff = Callable[[Engine], list[JobState | None]]
@@ -78,8 +78,8 @@ def test_a_frame_whose_place_the_map_has_is_not_kept(
     second = send(empty, 1, between)
     assert second.state == FrameState.REDUNDANT
     assert second.reason == (
-        f"the map has this place: frame {first.frame_id} is at {near:.3f} of the distance of "
-        f"unrelated frames (asked: more than {between:g})"
+        f"the map already has this place: frame {first.frame_id} is at {near:.3f} of the distance "
+        f"of unrelated frames (required: more than {between:g})"
     )
     job = empty.get_job(second.job_id)
     assert (job.state, job.error) == (JobState.SUCCEEDED, None)

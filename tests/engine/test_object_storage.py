@@ -12,13 +12,12 @@ from typing import Any
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.engine import sizes as measuring
-from sceneprint.engine.opening import open_engine
+from sceneprint.engine.admin import statistics as measuring
+from sceneprint.engine.engine import open_engine
 from sceneprint.errors import UnusableStore
-from sceneprint.schemas import NewMap, Query
-from sceneprint.schemas.ingest import ImportOptions
-from sceneprint.store.object_urls import open_objects
-from sceneprint.store.objects import Objects
+from sceneprint.store.blobs.object_client import Objects, open_objects
+from sceneprint_client.api import NewMap, Query
+from sceneprint_client.api.frames import ImportOptions
 
 
 @pytest.fixture

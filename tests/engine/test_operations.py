@@ -13,17 +13,18 @@ from pathlib import Path
 import pytest
 from sqlalchemy import func, select, update
 
-from sceneprint.engine import Engine, readers, statistics
-from sceneprint.engine import sizes as measuring
-from sceneprint.engine.lags import anchors
-from sceneprint.engine.latencies import Latencies, bin_of
+from sceneprint.engine import Engine
+from sceneprint.engine.admin import statistics
+from sceneprint.engine.admin import statistics as measuring
+from sceneprint.engine.admin.statistics import Latencies, anchors, bin_of
+from sceneprint.engine.search import local_index
 from sceneprint.errors import Conflict, InvalidRequest, UnknownMap
 from sceneprint.models import PRESETS, read_model
-from sceneprint.schemas import NewMap, Query
-from sceneprint.schemas.operations import IndexRecall
-from sceneprint.store.events import Wanted, tell
-from sceneprint.store.samples import add_sample, samples_since
+from sceneprint.store.events import Wanted, record_event
+from sceneprint.store.metrics import add_sample, samples_since
 from sceneprint.store.tables import events, jobs, samples
+from sceneprint_client.api import NewMap, Query
+from sceneprint_client.api.admin import IndexRecall
 
 Make = Callable[..., Engine]
 
@@ -53,7 +54,7 @@ def test_history_is_that_of_all_processes(make_engine, noon):
             (5, "received", "hall"), (5, "indexed", "hall"), (65, "indexed", "hall"),
             (65, "indexed", "shop"), (100, "deleted", "hall"), (700, "received", "hall"),
         ):  # fmt: skip
-            tell(connection, f"frame.{kind}", name)
+            record_event(connection, f"frame.{kind}", name)
             number = select(func.max(events.c.number)).scalar_subquery()
             connection.execute(
                 update(events).where(events.c.number == number).values(at=noon - ago)
@@ -183,7 +184,7 @@ def test_events_that_are_not_kept_go_and_no_index_is_doubted(data, make_engine):
     assert before is not None
     with engine.store.database.write() as connection:
         for _ in range(2500):
-            tell(connection, "frame.received", "hall")
+            record_event(connection, "frame.received", "hall")
     assert engine.operations.tidy() == 0  # it is not time yet
     # of what was there before the newest 1000, the anchor stays, and the last of the map
     floor = before + 1500
@@ -199,7 +200,7 @@ def test_events_that_are_not_kept_go_and_no_index_is_doubted(data, make_engine):
 
 
 def test_a_map_that_another_process_deleted_is_let_go(data, make_engine, monkeypatch):
-    monkeypatch.setattr(readers, "_TIDY_S", 1e9)  # by `forget_gone` alone
+    monkeypatch.setattr(local_index, "_TIDY_S", 1e9)  # by `forget_gone` alone
     engine, other = make_engine(data), make_engine(data)
     engine.rebuild_index("hall")
     frame = engine.list_frames("hall").items[0].frame_id
@@ -244,5 +245,5 @@ def test_models_are_listed_with_the_maps_that_may_be_named(make_engine, small_mo
         with pytest.raises(InvalidRequest, match="There is no model"):  # another's alone
             engine.operations.catalogue.find(name, "hall".__eq__)
     assert engine.operations.catalogue.find(depth.label, lambda _: False).id == depth.id
-    with pytest.raises(Conflict, match="is being signed with"):
+    with pytest.raises(Conflict, match="is already switching to"):
         engine.reencode("shop", engine.operations.catalogue.find("paper"))

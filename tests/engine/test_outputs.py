@@ -12,24 +12,30 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprint.datasets import read_trajectory
 from sceneprint.engine import Engine
-from sceneprint.engine.browsing import list_sessions, trajectory, trajectory_file
-from sceneprint.engine.edits import edit_frame
-from sceneprint.engine.indexed import find_indexed
-from sceneprint.engine.made import BYTES, NPY, upload_type
+from sceneprint.engine.maps.map_frames import (
+    BYTES,
+    NPY,
+    find_indexed,
+    list_sessions,
+    trajectory,
+    trajectory_file,
+    upload_type,
+)
+from sceneprint.engine.maps.maps import edit_frame
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnknownFrame, UnknownMap
-from sceneprint.geometry.quaternions import rotation_of
+from sceneprint.formats.dataset import read_trajectory
+from sceneprint.geometry.pose.rigid import rotation_of
+from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.pipeline import Signature, Signer
 from sceneprint.previews import depth_view, normals_view, picture
-from sceneprint.schemas import FrameMeta, NewMap
-from sceneprint.schemas.browsing import Run
-from sceneprint.schemas.outputs import View
 from sceneprint.signing import describe
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
-from sceneprint.synth.synthesis import room_and_rng
 from sceneprint.types import Geometry
+from sceneprint_client.api import FrameMeta, NewMap
+from sceneprint_client.api.listing import Run
+from sceneprint_client.api.results import View
 
 Ids = Callable[[Engine], list[str]]
 Prepared = list[tuple[Signature, Geometry]]
@@ -257,13 +263,13 @@ def test_a_trajectory_is_read_back(full: Engine, ids: Ids, uploads: Any, tmp_pat
 def test_a_session_too_long_is_asked_for_in_parts(
     full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sceneprint.engine import browsing
+    from sceneprint.engine.maps import map_frames
 
     for i, name in enumerate(ids(full)[:3]):
         at = f"2026-11-16T09:30:0{i}Z"
         edit_frame(full.store, "hall", name, {"session": "s", "captured_at": at})
-    monkeypatch.setattr(browsing, "MOST_POSES", 2)
-    with pytest.raises(InvalidRequest, match="has 3 frames, and a trajectory at most 2"):
+    monkeypatch.setattr(map_frames, "MOST_POSES", 2)
+    with pytest.raises(InvalidRequest, match="has 3 frames, but a trajectory has at most 2"):
         trajectory(full.store, "hall", Run(session="s"))
     part = Run.model_validate({"session": "s", "captured_after": "2026-11-16T09:30:01Z"})
     assert trajectory(full.store, "hall", part).frame_ids == ids(full)[1:3]
@@ -284,7 +290,7 @@ def test_pages_of_sessions(empty: Engine, uploads: Any) -> None:
     assert [one.frames for one in found] == [{"received": 1}] * 5
     lone = base64.urlsafe_b64encode(b'["\\ud800", ""]').decode()
     for bad in ("0", "%", "W10", "WzEsIDJd", "[" * 2000, lone, "é"):
-        with pytest.raises(InvalidRequest, match="was not given out"):
+        with pytest.raises(InvalidRequest, match="is not valid"):
             list_sessions(empty.store, "hall", bad, 2)
     with pytest.raises(UnknownMap):
         list_sessions(empty.store, "nowhere", None, 2)

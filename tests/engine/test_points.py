@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.clouds import points_of
 from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
-from sceneprint.geometry.belonging import patches_at
-from sceneprint.geometry.overlays import STEP_COLOURS
-from sceneprint.geometry.rigid import moved
+from sceneprint.formats.points.ply_export import points_of
+from sceneprint.formats.points.web import HEADER, POINT
+from sceneprint.geometry.pose.rigid import moved
+from sceneprint.geometry.validation.inspection import STEP_COLOURS, patches_at
 from sceneprint.pipeline import Signature
-from sceneprint.points import HEADER, POINT
-from sceneprint.schemas import Answer, Query
 from sceneprint.types import Geometry
+from sceneprint_client.api import Answer, Query
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]
@@ -115,10 +114,10 @@ def test_one_match_is_validated_once(
     full: Engine, asked: Answer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     best, made = asked.matches[0].frame_id, []
-    from sceneprint.engine import pairs
+    from sceneprint.engine.results import inspection
 
-    whole = pairs.validate
-    monkeypatch.setattr(pairs, "validate", lambda *a: made.append(1) or whole(*a))
+    whole = inspection.validate
+    monkeypatch.setattr(inspection, "validate", lambda *a: made.append(1) or whole(*a))
     told = full.inspection.match(asked.query_id, best)
     for side in ("query", "match"):
         full.points.match(asked.query_id, best, side=side).make()  # type: ignore[arg-type]

@@ -15,22 +15,22 @@ import numpy as np
 import pytest
 from sqlalchemy import inspect, text
 
-from sceneprint.engine import Engine, purging, upkeep
-from sceneprint.engine.purging import Purging
-from sceneprint.engine.readers import index_folder
-from sceneprint.engine.uploads import Upload
+from sceneprint.engine import Engine
+from sceneprint.engine.ingest.uploads import Upload
+from sceneprint.engine.search.local_index import index_folder
+from sceneprint.engine.upkeep import deletion, index_upkeep
+from sceneprint.engine.upkeep.deletion import Purging
 from sceneprint.errors import BusyIndex, UnknownJob, UnknownQuery
 from sceneprint.index import newest, newest_number
-from sceneprint.index.files import building
+from sceneprint.index.mapped_files import building
 from sceneprint.models import read_model
-from sceneprint.schemas import NewMap, Query
-from sceneprint.schemas.reconstructions import NewReconstruction
-from sceneprint.store import postgres
-from sceneprint.store.editing import write_frame
-from sceneprint.store.frames import delete_frame, find_frame
+from sceneprint.store.frames import delete_frame, find_frame, write_frame
 from sceneprint.store.maps import find_map
+from sceneprint.store.postgres import connection as postgres
+from sceneprint.store.postgres.vectors import table_of
 from sceneprint.store.signatures import geometry_blobs, stored_vector
-from sceneprint.store.vectors import table_of
+from sceneprint_client.api import NewMap, Query
+from sceneprint_client.api.reconstructions import NewReconstruction
 
 #: Where PostgreSQL keeps the vectors of signatures.
 VECTORS = table_of(read_model("depth").signature_bytes)
@@ -214,15 +214,15 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
 ):
     first, names = lived_in, ids(lived_in)
     monkeypatch.setattr(postgres, "IDLE_S", 0.1)  # shorter than it takes to make an index
-    built = upkeep.publish
+    built = index_upkeep.publish
 
     def slow(*args, **more):
         found = built(*args, **more)
         time.sleep(0.25)
         return found
 
-    monkeypatch.setattr(upkeep, "publish", slow)
-    monkeypatch.setattr(purging, "PAUSE", 1e4)
+    monkeypatch.setattr(index_upkeep, "publish", slow)
+    monkeypatch.setattr(deletion, "PAUSE", 1e4)
     second = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2, purge_s=1)
     workers = [
         Purging(one.store, one._upkeep, one.kept, one.reconstructions, 0.0)
@@ -232,7 +232,7 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
     folder = index_folder(first.settings.indexes, first._row("hall"))
     before = newest_number(folder)
     with building(folder):
-        with pytest.raises(BusyIndex, match="bytes of deleted frames may be left"):
+        with pytest.raises(BusyIndex, match="may still contain bytes of deleted frames"):
             second.purging.now()
         assert [worker.run().indexes for worker in workers] == [0, 0]
     assert workers[0].run().indexes == 1

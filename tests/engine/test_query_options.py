@@ -13,18 +13,19 @@ import numpy as np
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine, searching, views
-from sceneprint.engine.deadlines import FIRST_S, Deadline
+from sceneprint.engine import Engine
+from sceneprint.engine.search import index_view, retrieval
+from sceneprint.engine.search.retrieval import FIRST_S, Deadline
 from sceneprint.errors import UnknownFrame
-from sceneprint.geometry.diversity import DiversityParameters, diversify
-from sceneprint.geometry.retrieval import distances, pairwise_distances
-from sceneprint.index import Hits
+from sceneprint.geometry.retrieval.distance import distances, pairwise_distances
+from sceneprint.geometry.retrieval.dpp import DiversityParameters, diversify
+from sceneprint.index import SearchHits
 from sceneprint.pipeline import Signature, Signer, retrieve, validate
-from sceneprint.schemas import Answer, Query
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames
 from sceneprint.types import Geometry
+from sceneprint_client.api import Answer, Query
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]
@@ -119,7 +120,9 @@ def test_a_deadline_stops_validation_and_says_so(
     none = ask(full, name, deadline_ms=1)
     assert (none.deadline_reached, none.status, none.location) == (True, "unvalidated", None)
     assert none.counts.selected == len(none.matches) == 10
-    assert {one.validation.reason for one in none.matches} == {"the deadline came before it"}
+    assert {one.validation.reason for one in none.matches} == {
+        "the deadline passed before it was validated"
+    }
     allows, asked = Deadline.allows, []
 
     def thrice(self: Deadline) -> bool:
@@ -154,7 +157,7 @@ def test_a_frame_that_there_is_no_time_to_explain_changes_no_answer(
     most = 3
     answer = ask(full, names[0], **how, validation=strict, explain_frame=ranked[-1].frame_id)
     assert len(asked) == 4
-    assert answer.explained_frame.validation.reason == "the deadline came before it"
+    assert answer.explained_frame.validation.reason == "the deadline passed before it was validated"
     assert answer.explained_frame.lost_at == "selection"
     assert (answer.counts.validated, answer.counts.accepted) == (3, 0)
     assert (answer.status, answer.deadline_reached) == ("not_found", False)  # all were tried
@@ -163,7 +166,7 @@ def test_a_frame_that_there_is_no_time_to_explain_changes_no_answer(
     answer = ask(full, names[0], **how, k=1, explain_frame=ranked[2].frame_id)
     assert (len(asked), answer.status, answer.deadline_reached) == (2, "found", False)
     assert (answer.explained_frame.lost_at, answer.matches[2].validation.reason) == (
-        "turn", "enough were accepted before it",
+        "turn", "enough matches were accepted before it",
     )  # fmt: skip
 
 
@@ -212,21 +215,21 @@ def test_every_frame_of_the_ranking_is_explained(
                 (distances(vectors[one.frame_id], vectors[name][None], "l2")[0], match.rank, name)
                 for name, match in matches.items()
             )
-            said = f"most like frame {nearest[2]} of the selection (distance {nearest[0]})"
+            said = f"most similar to the selected frame {nearest[2]} (distance {nearest[0]})"
             assert one.reason.startswith(said)
             continue
         match = matches[one.frame_id]
         assert (one.rank, one.similarity) == (match.rank, match.similarity)
         if match.validation.status == "skipped":
             assert (one.stage, one.outcome) == ("diversify", "skipped")
-            assert one.reason == "enough were accepted before it"
+            assert one.reason == "enough matches were accepted before it"
         else:
             assert (one.stage, one.outcome) == ("validate", match.validation.status)
             assert one.reason.startswith(f"{one.outcome}: {match.validation.reason}")
     assert {"not_selected", "skipped", "accepted"} <= outcomes
     plain = ask(full, names[0], k=3, stages=["retrieve"], explain=True).explanations
     assert [one.outcome for one in plain] == ["ranked"] * 3 + ["not_selected"] * 8
-    assert plain[3].reason == "beyond the first 3 of the ranking, which were the candidates"
+    assert plain[3].reason == "not among the first 3 of the ranking, which were the candidates"
 
 
 def test_a_frame_is_explained_where_it_was_lost(
@@ -269,7 +272,8 @@ def test_a_frame_is_explained_where_it_was_lost(
     turn = explained(near[5], k=1, stages=VR)
     right(turn)
     assert (turn.lost_at, turn.selected) == ("turn", True)
-    assert turn.reason.startswith("enough were accepted before it; aligned for this all the same")
+    said = "enough matches were accepted before it; aligned only for this explanation"
+    assert turn.reason.startswith(said)
     missed = explained(near[4], candidates=2, stages=VR)
     right(missed)
     assert (missed.lost_at, missed.ranked, missed.selected) == ("selection", True, False)
@@ -277,7 +281,7 @@ def test_a_frame_is_explained_where_it_was_lost(
     assert (barred.lost_at, barred.passes_filter, barred.ranked) == ("filter", False, False)
     assert (barred.rank, barred.of) == (3, 9)
     assert barred.validation.status == "accepted"
-    monkeypatch.setattr(searching, "ranking_size", lambda n: min(n, 4))
+    monkeypatch.setattr(retrieval, "ranking_size", lambda n: min(n, 4))
     unranked = explained(near[6], stages=VR)
     right(unranked)
     assert (unranked.lost_at, unranked.ranked, unranked.shortlisted) == ("ranking", False, True)
@@ -290,17 +294,17 @@ def test_what_an_approximate_index_missed_is_said(
 ) -> None:
     names = ids(full)
     near = [one.frame_id for one in ask(full, names[0], stages=["retrieve"], k=11).matches]
-    real, lost = views.search, near[1]
+    real, lost = index_view.search, near[1]
     with full.store.database.read() as connection:
         number = find_frame(connection, find_map(connection, "hall"), lost).number
 
-    def search(*given: Any, dead: frozenset[int], exact: bool, **more: Any) -> Hits:
+    def search(*given: Any, dead: frozenset[int], exact: bool, **more: Any) -> SearchHits:
         if exact:
             return real(*given, dead=dead, exact=True, **more)
         return replace(real(*given, dead=dead | {number}, exact=False, **more), exact=False)
 
-    monkeypatch.setattr(views, "search", search)
-    monkeypatch.setattr(searching, "ranking_size", lambda n: min(n, 3))
+    monkeypatch.setattr(index_view, "search", search)
+    monkeypatch.setattr(retrieval, "ranking_size", lambda n: min(n, 3))
     for rank, name in enumerate(near, 1):
         answer = ask(full, names[0], explain_frame=name, stages=["retrieve"], k=3)
         assert (answer.exact, answer.counts.compared) == (False, 10)
@@ -308,7 +312,7 @@ def test_what_an_approximate_index_missed_is_said(
         assert (one.rank, one.shortlisted) == (rank, name != lost)
         if name == lost:
             assert (one.lost_at, one.ranked) == ("shortlist", False)
-            assert one.reason == "the index missed it, though it has rank 2: ask with `exact`"
+            assert one.reason == "the index missed it, although its rank is 2; query with `exact`"
         elif rank <= 4:  # one place is free
             assert (one.lost_at, one.ranked) == (None, True)
         else:

@@ -10,24 +10,24 @@ import pytest
 from PIL import Image
 from sqlalchemy import select
 
-from sceneprint.engine.edits import edit_map
-from sceneprint.engine.uploads import Upload
+from sceneprint.engine.ingest.uploads import Upload
+from sceneprint.engine.maps.maps import edit_map
 from sceneprint.errors import InvalidRequest, MapExists, QuotaExceeded
-from sceneprint.schemas import FrameState, NewMap
 from sceneprint.store import frames as stored
-from sceneprint.store.idempotency import Once
+from sceneprint.store.idempotency import IdempotentRequest
 from sceneprint.store.maps import find_map
-from sceneprint.store.quotas import Use, counted_anew, use_of
+from sceneprint.store.quotas import MapUsage, counted_usage, use_of
 from sceneprint.store.tables import frames
+from sceneprint_client.api import FrameState, NewMap
 
 
-def used(engine) -> Use:
+def used(engine) -> MapUsage:
     """What `hall` says that it holds, and what it does hold."""
     told = engine.get_map("hall")
     with engine.store.database.read() as connection:
         number = find_map(connection, "hall").number
-        assert use_of(connection, number) == counted_anew(connection, number)
-    return Use(told.used_frames, told.used_bytes)
+        assert use_of(connection, number) == counted_usage(connection, number)
+    return MapUsage(told.used_frames, told.used_bytes)
 
 
 def limit(engine, **limits) -> None:
@@ -39,7 +39,7 @@ def test_a_map_takes_what_its_quota_allows(empty, uploads):
     limit(empty, quota_frames=2)
     first, _ = empty.add_frame("hall", a.data, a.meta)
     empty.add_frame("hall", b.data, b.meta)
-    assert used(empty) == Use(2, len(a.data) + len(b.data))
+    assert used(empty) == MapUsage(2, len(a.data) + len(b.data))
     with pytest.raises(QuotaExceeded, match=r"holds 2 frames of the 2 .*PATCH /v1/maps/hall"):
         empty.add_frame("hall", c.data, c.meta)
     blobs = set(empty.store.blobs.digests())
@@ -47,12 +47,12 @@ def test_a_map_takes_what_its_quota_allows(empty, uploads):
     again, new = empty.add_frame("hall", a.data, a.meta)  # no new frame
     assert (again.frame_id, new) == (first.frame_id, False)
     empty.delete_frame("hall", first.frame_id)
-    assert used(empty) == Use(1, len(b.data))
+    assert used(empty) == MapUsage(1, len(b.data))
     batch = [Upload(one.data, one.meta) for one in (b, c, d)]
     outcomes, _ = empty.uploads.add_all("hall", batch)
     assert [one.new for one in outcomes] == [False, True, False]
     assert isinstance(outcomes[2].error, QuotaExceeded)
-    assert used(empty) == Use(2, len(b.data) + len(c.data))
+    assert used(empty) == MapUsage(2, len(b.data) + len(c.data))
     limit(empty, quota_frames=None)
     empty.add_frame("hall", d.data, d.meta)
 
@@ -66,7 +66,7 @@ def test_bytes_are_those_of_uploads(empty, uploads):
     limit(empty, quota_bytes=len(a.data) + len(b.data))
     empty.add_frame("hall", b.data, b.meta)
     limit(empty, quota_bytes=1)  # what is there stays
-    assert used(empty) == Use(2, len(a.data) + len(b.data))
+    assert used(empty) == MapUsage(2, len(a.data) + len(b.data))
 
 
 def test_a_quota_holds_to_the_frame_whoever_sends_at_once(empty, make_engine, uploads):
@@ -120,20 +120,20 @@ def test_every_change_of_a_frame_is_counted(empty, uploads):
             elif kind == 5 and one.state != FrameState.DELETED:
                 stored.delete_frame(connection, row, one)
             states.add((int(kind), str(one.state)))
-            assert use_of(connection, row.number) == counted_anew(connection, row.number), step
+            assert use_of(connection, row.number) == counted_usage(connection, row.number), step
     assert {(2, "deleted"), (2, "redundant"), (3, "redundant"), (5, "redundant")} <= states
 
 
 def test_what_had_no_room_is_taken_when_it_is_sent_again(empty, uploads):
     a, b, *_ = uploads
-    once = Once("robot", "key", "f" * 64)
+    once = IdempotentRequest("robot", "key", "f" * 64)
     limit(empty, quota_frames=0)
     for _ in range(2):
         with pytest.raises(QuotaExceeded):
             empty.uploads.add("hall", Upload(a.data, a.meta), once)
     limit(empty, quota_frames=1)
     batch = [Upload(one.data, one.meta) for one in (a, b)]
-    other = Once("robot", "other", "e" * 64)
+    other = IdempotentRequest("robot", "other", "e" * 64)
     (first, second), again = empty.uploads.add_all("hall", batch, other)
     assert (first.new, second.added, again) == (True, None, False)
     limit(empty, quota_frames=2)
@@ -150,7 +150,7 @@ def test_a_map_made_anew_has_the_quota_of_the_one_before(empty):
     assert (made.quota_frames, made.quota_bytes, made.retention_days) == (3, None, None)
     assert empty.create_map(NewMap(name="hall", model="depth"))[1] is False
     assert empty.create_map(NewMap(name="hall", model="depth", quota_frames=3))[1] is False
-    with pytest.raises(MapExists, match="other limits"):
+    with pytest.raises(MapExists, match="different title, model or limits"):
         empty.create_map(NewMap(name="hall", model="depth", quota_frames=4))
     empty.delete_map("hall")
     made, _ = empty.create_map(NewMap(name="hall", model="depth", quota_frames=None))
@@ -183,6 +183,6 @@ def test_a_failed_frame_that_comes_larger_needs_room_too(empty, uploads):
     limit(empty, quota_frames=1, quota_bytes=len(loose.getvalue()) - 1)
     with pytest.raises(QuotaExceeded, match=f"so {len(loose.getvalue()) - len(one.data)} bytes m"):
         empty.add_frame("hall", loose.getvalue(), one.meta)
-    assert used(empty) == Use(1, len(one.data))
+    assert used(empty) == MapUsage(1, len(one.data))
     again, new = empty.add_frame("hall", one.data, one.meta)  # as it was: no more room than before
-    assert (again.frame_id, new, used(empty)) == (added.frame_id, True, Use(1, len(one.data)))
+    assert (again.frame_id, new, used(empty)) == (added.frame_id, True, MapUsage(1, len(one.data)))

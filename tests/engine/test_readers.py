@@ -12,10 +12,11 @@ from typing import Any
 import pytest
 from sqlalchemy import select, update
 
-from sceneprint.engine import Engine, readers
-from sceneprint.schemas import Answer, JobState, NewMap, Query
+from sceneprint.engine import Engine
+from sceneprint.engine.search import local_index
 from sceneprint.store.signatures import changes_since
 from sceneprint.store.tables import frames, signatures
+from sceneprint_client.api import Answer, JobState, NewMap, Query
 
 Make = Callable[..., Engine]
 Ids = Callable[[Engine], list[str]]
@@ -25,7 +26,7 @@ ALL = Query(stages=("retrieve",), k=50)
 
 @pytest.fixture(autouse=True)
 def _always_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(readers, "_LOOK_S", 0.0)
+    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
 
 
 @pytest.fixture
@@ -110,7 +111,7 @@ def test_a_newer_index_is_looked_for_from_time_to_time(
     data: Path, make_engine: Make, uploads: Any, monkeypatch: pytest.MonkeyPatch, pause_s: float,
     generation: int,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(readers, "_LOOK_S", pause_s)
+    monkeypatch.setattr(local_index, "_LOOK_S", pause_s)
     reader = make_engine(data)
     assert len(found(ask(reader, uploads))) == 12
     assert make_engine(data, tail_frames=1).publish_due() == 1
@@ -197,7 +198,7 @@ def test_a_damaged_signature_costs_no_more_than_its_frame(
     data: Path, make_engine: Make, uploads: Any, more: Any, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(readers, "changes_since", partial(changes_since, limit=4))
+    monkeypatch.setattr(local_index, "changes_since", partial(changes_since, limit=4))
     engine = make_engine(data, tail_frames=5)
     ask(engine, uploads)
     assert make_engine(data, tail_frames=5).publish_due() == 1
@@ -210,7 +211,7 @@ def test_a_damaged_signature_costs_no_more_than_its_frame(
     answer = ask(engine, uploads)  # all but that one
     assert bad not in [match.frame_id for match in answer.matches]
     assert answer.counts.map == 17
-    passed_over = [r for r in caplog.records if "passed over" in r.message]
+    passed_over = [r for r in caplog.records if "skipped" in r.message]
     assert [r.__dict__["frame_id"] for r in passed_over] == [bad]
     engine.delete_frame("hall", bad)
     wanted = truth(make_engine, uploads, data, tmp_path)

@@ -15,12 +15,12 @@ from sqlalchemy import select
 
 from sceneprint.engine import Engine
 from sceneprint.errors import Conflict, InvalidRequest, UnknownMap, UnreadableModel
-from sceneprint.geometry.retrieval import Metric
+from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.lab.synth import synthesise_room
 from sceneprint.models import Model, save_model
-from sceneprint.schemas import Answer, FrameState, JobState, NewMap, Query
 from sceneprint.settings import Settings
 from sceneprint.store.tables import frames, jobs, signatures
-from sceneprint.synth import synthesise_room
+from sceneprint_client.api import Answer, FrameState, JobState, NewMap, Query
 
 Make = Callable[..., Engine]
 WorkOff = Callable[[Engine], list[JobState | None]]
@@ -291,13 +291,13 @@ def test_what_cannot_be_begun(full: Engine, short_sighted: Path) -> None:
         full.reencode("nowhere", "paper")
     with pytest.raises(UnreadableModel):
         full.reencode("hall", "/nowhere.safetensors")
-    with pytest.raises(Conflict, match=r"is signed with depth-.*: nothing is to be done"):
+    with pytest.raises(Conflict, match=r"is already signed with depth-.*\. There is nothing to do"):
         full.reencode("hall", "depth")
-    with pytest.raises(Conflict, match="not being signed with another model"):
+    with pytest.raises(Conflict, match="not switching to another model"):
         full.cancel_reencode("hall")
     full.reencode("hall", short_sighted)
     assert full.reencode("hall", short_sighted).reencoding is not None  # the same again
     assert len(queued(full)) == 12
     for other in ("paper", "depth"):
-        with pytest.raises(Conflict, match=r"is being signed with short-.* --cancel"):
+        with pytest.raises(Conflict, match=r"is already switching to short-.* --cancel"):
             full.reencode("hall", other)

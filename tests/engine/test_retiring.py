@@ -7,15 +7,15 @@ import time
 import pytest
 from sqlalchemy import select, text, update
 
-from sceneprint.engine import retiring
-from sceneprint.engine.edits import edit_map
-from sceneprint.engine.retiring import Retiring
+from sceneprint.engine.maps.maps import edit_map
+from sceneprint.engine.upkeep import deletion
+from sceneprint.engine.upkeep.deletion import Retention
 from sceneprint.errors import InvalidRequest, StoreLocked
-from sceneprint.schemas import NewMap
-from sceneprint.store.aging import DAY_S, old_frames
+from sceneprint.store.deletion import DAY_S, old_frames
 from sceneprint.store.events import Wanted, list_events
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, signatures
+from sceneprint_client.api import NewMap
 
 
 @pytest.fixture
@@ -30,13 +30,13 @@ def aged(full, ids):
 
 
 def test_what_is_too_old_goes_with_its_bytes(aged, ids, uploads, monkeypatch):
-    monkeypatch.setattr(retiring, "AT_ONCE", 2)
+    monkeypatch.setattr(deletion, "AT_ONCE", 2)
     names, revision = ids(aged), aged.get_map("hall").revision
     with aged.store.database.read() as connection:
         made = select(signatures.c.geometry).order_by(signatures.c.frame_number).limit(5)
         first = list(connection.execute(made).scalars())
     assert aged.get_map("hall").overdue is None
-    assert Retiring(aged.store).run() == 0  # nobody has said how long
+    assert Retention(aged.store).run() == 0  # nobody has said how long
     told = edit_map(aged.store, "hall", {"retention_days": 7.0})
     assert told.overdue == 5
     assert aged.publish_due() == 0  # workers look after it
@@ -61,22 +61,22 @@ def test_what_is_too_old_goes_with_its_bytes(aged, ids, uploads, monkeypatch):
 
 
 def test_time_goes_on_and_keeping_all_stops_it(aged, ids):
-    names, worker = ids(aged), Retiring(aged.store)
+    names, worker = ids(aged), Retention(aged.store)
     edit_map(aged.store, "hall", {"retention_days": 20})
     now = time.time()
     assert worker.run(now) == 0
     assert worker.run(now + 100 * DAY_S) == 0  # it has just looked
-    assert Retiring(aged.store).run(now + 9 * DAY_S) == 1
+    assert Retention(aged.store).run(now + 9 * DAY_S) == 1
     edit_map(aged.store, "hall", {"retention_days": None})
-    assert Retiring(aged.store).run(now + 100 * DAY_S) == 0
+    assert Retention(aged.store).run(now + 100 * DAY_S) == 0
     assert ids(aged) == names[1:]
 
 
 def test_a_turn_is_short_and_goes_on_with_the_next(aged, ids, monkeypatch):
-    monkeypatch.setattr(retiring, "AT_ONCE", 3)
-    monkeypatch.setattr(retiring, "TURN_S", 0.0)
+    monkeypatch.setattr(deletion, "AT_ONCE", 3)
+    monkeypatch.setattr(deletion, "TURN_S", 0.0)
     edit_map(aged.store, "hall", {"retention_days": 0.01})
-    worker = Retiring(aged.store)
+    worker = Retention(aged.store)
     assert [worker.run() for _ in range(6)] == [3, 3, 3, 3, 0, 0]
     assert ids(aged) == []
 
@@ -86,7 +86,7 @@ def test_what_it_would_do_is_told_and_not_done(aged, ids):
     told = edit_map(aged.store, "hall", {"retention_days": 3}, dry_run=True)
     assert (told.retention_days, told.overdue) == (3.0, 9)
     assert (aged.get_map("hall").etag, aged.get_map("hall").retention_days) == (etag, None)
-    assert Retiring(aged.store).run() == 0
+    assert Retention(aged.store).run() == 0
     assert ids(aged) == before
     with pytest.raises(InvalidRequest):
         edit_map(aged.store, "hall", {"retention_days": -3}, dry_run=True)
@@ -98,10 +98,10 @@ def test_a_store_without_a_turn_is_asked_again_later(aged, ids, monkeypatch):
 
     edit_map(aged.store, "hall", {"retention_days": 3})
     with monkeypatch.context() as patch:
-        patch.setattr(retiring, "delete_frames", locked)
-        assert Retiring(aged.store).run() == 0
+        patch.setattr(deletion, "delete_frames", locked)
+        assert Retention(aged.store).run() == 0
     assert len(ids(aged)) == 12
-    assert Retiring(aged.store).run() == 9
+    assert Retention(aged.store).run() == 9
 
 
 @pytest.mark.sqlite_only("it asks SQLite for its plan")
@@ -128,6 +128,6 @@ def test_a_host_whose_clock_is_wrong_deletes_nothing(make_engine, postgres_url, 
         added, _ = engine.add_frame("hall", one.data, one.meta)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(time, "time", lambda: right() + 30 * DAY_S)
-        assert Retiring(engine.store).run() == 0
+        assert Retention(engine.store).run() == 0
     assert engine.get_frame("hall", added.frame_id).state == "received"
-    assert Retiring(engine.store).run(right() + 30 * DAY_S) == 1
+    assert Retention(engine.store).run(right() + 30 * DAY_S) == 1

@@ -13,9 +13,9 @@ from pydantic import BaseModel, ValidationError
 from scipy.spatial.transform import Rotation
 
 from sceneprint.engine import Engine
-from sceneprint.engine.transforms import pose_matrix, transform
+from sceneprint.engine.serializers import pose_matrix, transform
 from sceneprint.errors import InvalidPose, InvalidRequest, MapExists
-from sceneprint.schemas import FrameMeta, FrameState, GivenPose, JobState, NewMap, Query
+from sceneprint_client.api import FrameMeta, FrameState, GivenPose, JobState, NewMap, Query
 
 CAMERA: dict[str, Any] = {"width": 4, "height": 3, "fx": 2, "fy": 2, "cx": 2, "cy": 1}
 EYE = np.eye(4).tolist()
@@ -159,7 +159,7 @@ def test_maps_are_made_once(make_engine: Callable[..., Engine]) -> None:
     assert engine.create_map(NewMap(name="hall", title="Hall", model="depth")) == (made, False)
     for other in ({"title": "Room"}, {"model": "paper"}, {"title": None}):
         given = {"name": "hall", "title": "Hall", "model": "depth"} | other
-        with pytest.raises(MapExists, match="'hall' with another title or model"):
+        with pytest.raises(MapExists, match="'hall' already exists with a different title, model"):
             engine.create_map(NewMap.model_validate(given))
     assert engine.list_maps().items == [made]
 
@@ -201,5 +201,5 @@ def test_pages_hold_every_frame_once(full: Engine) -> None:
     assert full.list_frames("hall", limit=12).next_cursor is None
     assert full.list_frames("hall", state=FrameState.DELETED).items == []
     for bad in ("", "x", "-1", "1.5", "\u0663", "9" * 19, "1 "):
-        with pytest.raises(InvalidRequest, match="was not given out"):
+        with pytest.raises(InvalidRequest, match="is not valid"):
             full.list_frames("hall", bad)

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.engine.uploads import Upload
+from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
-from sceneprint.schemas import Answer, NamedFrame, NewMap, Query, SeveralQuery
+from sceneprint_client.api import Answer, NamedFrame, NewMap, Query, SeveralQuery
 
 Ids = Callable[[Engine], list[str]]
 MAPS = ["hall", "lab"]
@@ -159,9 +159,9 @@ def test_maps_are_chosen_by_who_asks(two: Engine) -> None:
         with pytest.raises(UnknownMap) as caught:
             two.queries.upload(of(maps, *may), b"", None, Query())  # type: ignore[arg-type]
         assert str(caught.value).startswith(f"There is no map {maps[1]!r}.")
-    with pytest.raises(UnknownMap, match="no map to ask"):
+    with pytest.raises(UnknownMap, match="no map to search"):
         of("*")
     for i in range(63):
         two.create_map(NewMap(name=f"m{i}", model="depth"))
-    with pytest.raises(InvalidRequest, match="65 maps, and 64"):
+    with pytest.raises(InvalidRequest, match="65 maps, but a query can search at most 64"):
         of("*", "hall", "lab", *(f"m{i}" for i in range(63)))

@@ -15,20 +15,22 @@ import pytest
 from sqlalchemy import event, select, text
 
 from benchmarks.fleet.bulk import fill, walk
-from sceneprint.engine import Engine, querying, readers, stored
+from sceneprint.engine import Engine
+from sceneprint.engine.search import local_index, pgvector_index
+from sceneprint.engine.search import query as querying
 from sceneprint.errors import InvalidRequest
-from sceneprint.geometry.retrieval import distances
-from sceneprint.maintenance.importing import copy_into
+from sceneprint.geometry.retrieval.distance import distances
+from sceneprint.maintenance.snapshot.postgres import copy_into
 from sceneprint.models import Model
-from sceneprint.schemas import Answer, ExplainedFrame, NamedFrame, Query, SeveralQuery
 from sceneprint.settings import Settings
-from sceneprint.store import open_database, vectors
+from sceneprint.store import open_database
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
-from sceneprint.store.signatures import StoredSignature, replace_signature
-from sceneprint.store.stale import remove_signature
+from sceneprint.store.postgres import vectors
+from sceneprint.store.signatures import StoredSignature, remove_signature, replace_signature
 from sceneprint.store.tables import frames, signatures
 from sceneprint.types import Bytes
+from sceneprint_client.api import Answer, ExplainedFrame, NamedFrame, Query, SeveralQuery
 
 Make = Callable[..., Engine]
 #: Frames of both maps, and bytes of a signature.
@@ -41,7 +43,7 @@ BOTH = ["hall", "yard"]
 @pytest.fixture
 def make(postgres_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     """Engines on one database, each a node of its own folder, that counts frames each time."""
-    monkeypatch.setattr(stored, "_COUNTED", 0)
+    monkeypatch.setattr(pgvector_index, "_COUNTED", 0)
     opened: list[Engine] = []
 
     def engine(node: str = "a", search: str = "database", **more: object) -> Engine:
@@ -200,12 +202,12 @@ def test_all_maps_of_a_fleet_are_asked_at_once_where_the_database_searches(
 ) -> None:
     monkeypatch.setattr(querying, "MOST_MAPS", 1)
     everywhere = SeveralQuery(maps="*")
-    with pytest.raises(InvalidRequest, match="There are 2 maps, and 1 can be asked at once"):
+    with pytest.raises(InvalidRequest, match="There are 2 maps, but a query can search at most 1"):
         filled.queries.maps_of(everywhere)
     complete(filled)
     assert filled.queries.maps_of(everywhere) == BOTH
     assert filled.queries.maps_of(everywhere, lambda name: name == "yard") == ["yard"]
-    with pytest.raises(InvalidRequest, match="1 can be asked"):
+    with pytest.raises(InvalidRequest, match="can search at most 1"):
         make("b", "local").queries.maps_of(everywhere)
 
 
@@ -267,7 +269,7 @@ def test_a_signature_has_its_vector_in_the_same_commit(
 def test_vectors_are_filled_in_beside_queries_and_made_again_where_they_are_lost(
     filled: Engine, places: dict[str, Bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sceneprint.engine.vector_tables.STEP_S", 0.0)
+    monkeypatch.setattr("sceneprint.engine.upkeep.vector_tables.STEP_S", 0.0)
     database, wanted = filled.store.database, nearest(places, "hall-500", ["hall"], 10)
     tables = filled._vector_tables
     blocks = 0
@@ -319,7 +321,7 @@ def test_a_node_asks_the_database_only_for_what_it_has_not(
     complete(filled)
     wanted = nearest(places, "hall-321", ["hall"], 10)
     node = make("b", "auto", tail_frames=1)
-    monkeypatch.setattr(readers, "READ_MOST", 600)
+    monkeypatch.setattr(local_index, "READ_MOST", 600)
     far = ask(node, "hall-321", k=10)
     assert (found(far), far.index_generation, far.exact) == (wanted, 0, True)
     assert [kind_of(node, name) for name in BOTH] == ["database"] * 2
@@ -361,7 +363,7 @@ def test_a_damaged_signature_costs_its_frame_alone(filled: Engine) -> None:
         count = connection.execute(
             select(frames.c.number).where(frames.c.map_number == hall.number)
         ).all()
-    assert isinstance(view, stored.Stored)
+    assert isinstance(view, pgvector_index.Stored)
     hits = view.search(walk(1, LENGTH, seed=0)[0], 950, dead=frozenset(), exact=True)
     assert (view.damaged, len(hits)) == ({number}, len(count) - 1)
     with filled.store.database.write() as connection:  # of all but the last thirty
@@ -392,7 +394,8 @@ def test_why_a_frame_is_not_found_says_that_the_graph_missed_it(
     missed, there = explained("hall-2"), explained("hall-2", exact=True)
     assert (missed.lost_at, missed.shortlisted, missed.ranked) == ("shortlist", False, False)
     assert missed.reason == (
-        f"pgvector in the database missed it, though it has rank {missed.rank}: ask with `exact`"
+        f"pgvector in the database missed it, although its rank is {missed.rank}; "
+        "query with `exact`"
     )
     assert (there.lost_at, there.shortlisted) == (None, True)
     assert (there.rank, there.distance) == (missed.rank, missed.distance)
@@ -413,7 +416,7 @@ def test_a_database_that_may_not_have_pgvector_leaves_all_to_the_node(
             "EXECUTE FUNCTION no()"
         ))  # fmt: skip
     assert not filled._vector_tables.run()
-    assert "the database does not search: the extension `vector` cannot be made" in caplog.text
+    assert "database search disabled: the extension `vector` cannot be made" in caplog.text
     answer = ask(filled, "hall-7", k=10)
     assert found(answer) == nearest(places, "hall-7", ["hall"], 10)
     assert (answer.exact, answer.counts.compared) == (True, 899)

@@ -16,18 +16,20 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from sceneprint.engine import Engine, querying, readers, reencoding
-from sceneprint.engine import work as working
-from sceneprint.engine.deadlines import Deadline
-from sceneprint.engine.readers import index_folder
+from sceneprint.engine import Engine
+from sceneprint.engine.jobs import signature_job as working
+from sceneprint.engine.maps import model_switch
+from sceneprint.engine.search import local_index, query
+from sceneprint.engine.search.local_index import index_folder
+from sceneprint.engine.search.retrieval import Deadline
 from sceneprint.errors import Busy, ModelMismatch, UselessFrame
-from sceneprint.geometry.retrieval import distances
+from sceneprint.geometry.retrieval.distance import distances
 from sceneprint.models import Model, save_model
 from sceneprint.pipeline import Signer, open_signer, prepare
-from sceneprint.schemas import FrameState, JobState, Query
 from sceneprint.store.signatures import StoredSignature, replace_signature
 from sceneprint.store.tables import signatures
 from sceneprint.types import Bytes
+from sceneprint_client.api import FrameState, JobState, Query
 
 Make = Callable[..., Engine]
 WorkOff = Callable[[Engine], list[JobState | None]]
@@ -147,8 +149,8 @@ def test_a_query_signed_before_the_switch_is_signed_again(
 
         return run
 
-    for name in ("ask_upload", "ask_stored", "answer"):
-        monkeypatch.setattr(querying, name, then_switch(getattr(querying, name)))
+    for name in ("prepare_upload", "prepare_stored", "answer"):
+        monkeypatch.setattr(query, name, then_switch(getattr(query, name)))
     del models[1:]
     answer = full.query_upload("hall", uploads[4].data, uploads[4].meta, Query())
     assert answer.model.startswith("small-")
@@ -160,12 +162,12 @@ def test_a_query_signed_before_the_switch_is_signed_again(
     assert answer.model.startswith("depth-")
     assert found(answer) == right(names, by_model, answer.model, 4)[1:]
     monkeypatch.undo()
-    monkeypatch.setattr(querying, "answer", then_switch(querying.answer))
+    monkeypatch.setattr(query, "answer", then_switch(query.answer))
     models[:] = [small_file]
     answer = full.query_upload("hall", uploads[4].data, uploads[4].meta, R)
     assert answer.model.startswith("small-")
     models[:] = [DEPTH, small_file] * 5
-    with pytest.raises(Busy, match="again and again"):
+    with pytest.raises(Busy, match="kept changing its model"):
         full.query_upload("hall", uploads[4].data, uploads[4].meta, R)
 
 
@@ -173,7 +175,7 @@ def test_signatures_of_two_models_are_not_compared_whatever_their_length(
     full: Engine, uploads: Any, whitened_model: Model, signer: Signer
 ) -> None:
     row = full._row("hall")
-    asked = querying.ask_upload(uploads[0].data, uploads[0].meta, signer, R)
+    asked = query.prepare_upload(uploads[0].data, uploads[0].meta, signer, R)
     given = ([row], asked, R, Deadline(None))
     assert full.queries.answer(*given).matches[0].distance == 0
     with pytest.raises(ModelMismatch, match="two models cannot be compared"):
@@ -227,7 +229,7 @@ def test_the_index_of_the_next_model_is_there_at_the_switch(
     full: Engine, make_engine: Make, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
     by_model: dict[str, tuple[Signer, Bytes]], monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(readers, "_LOOK_S", 0.0)
+    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
     engine, names = make_engine(full.settings.data_dir, tail_frames=5), ids(full)
     assert engine.publish_due() == 1
     before = index_folder(engine.settings.indexes, engine._row("hall"))
@@ -359,10 +361,10 @@ while True:
 @pytest.mark.parametrize(
     ("module", "step", "call", "when", "switched"),
     [
-        ("sceneprint.engine.work", "replace_signature", 5, "after", False),
-        ("sceneprint.engine.upkeep", "publish", 1, "after", False),
-        ("sceneprint.store.reencoding", "switch", 1, "after", False),  # and not committed
-        ("sceneprint.store.stale", "remove_signature", 4, "after", True),
+        ("sceneprint.engine.jobs.signature_job", "replace_signature", 5, "after", False),
+        ("sceneprint.engine.upkeep.index_upkeep", "publish", 1, "after", False),
+        ("sceneprint.store.model_switch", "switch_model", 1, "after", False),  # and not committed
+        ("sceneprint.store.signatures", "remove_signature", 4, "after", True),
     ],
 )
 def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
@@ -413,7 +415,7 @@ def test_a_frame_is_signed_again_by_a_model_that_the_map_goes_back_to(
     """What the first model made of it is there still, as removing it takes a while."""
     name = ids(full)[3]
     with monkeypatch.context() as patch:
-        patch.setattr(reencoding, "_tidy", lambda *_, **__: False)
+        patch.setattr(model_switch, "_tidy", lambda *_, **__: False)
         original, first = working.prepare, full.get_map("hall").model
 
         def refuse(frame: Any, signer: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -10,14 +9,13 @@ import pytest
 from sqlalchemy import select, update
 
 from sceneprint.engine import Engine
-from sceneprint.engine.slices import Outcome, Task
-from sceneprint.engine.sweeping import sweep
+from sceneprint.engine.jobs.tasks import LongJob, SliceResult
+from sceneprint.engine.upkeep.blob_garbage import collect_blobs
 from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
-from sceneprint.schemas import Job, JobState, NewMap
 from sceneprint.store.associations import remove_job
-from sceneprint.store.listing import find_job
-from sceneprint.store.parts import JobFile, files_of, items_of
+from sceneprint.store.queue import JobFile, files_of, find_job, items_of
 from sceneprint.store.tables import events, jobs
+from sceneprint_client.api import Job, JobState, NewMap
 
 
 @pytest.fixture
@@ -27,13 +25,13 @@ def engine(make_engine: Callable[..., Engine]) -> Engine:
     return engine
 
 
-def count_to(engine: Engine, most: int) -> Callable[[Task, float], Outcome]:
+def count_to(engine: Engine, most: int) -> Callable[[LongJob, float], SliceResult]:
     """A handler that finds one number a slice, and keeps a file of each."""
 
-    def handle(task: Task, _until: float) -> Outcome:
+    def handle(task: LongJob, _until: float) -> SliceResult:
         done = task.progress.get("done", 0)
         blob = engine.store.blobs.put(f"part {done}".encode())
-        return Outcome(
+        return SliceResult(
             over=done + 1 == most,
             progress={"done": done + 1, "total": most},
             items=[{"n": done}],
@@ -56,7 +54,7 @@ def test_each_slice_is_kept_and_the_last_one_ends_the_job(engine, work_off):
     job = engine.tasks.begin("count", "hall", {"to": 3})
     assert (job.kind, job.map, job.frame_id, job.progress) == ("count", "hall", None, None)
     claimed = engine.claim("w")
-    assert isinstance(claimed, Task)
+    assert isinstance(claimed, LongJob)
     assert (claimed.data, claimed.of_map.name) == ({"to": 3}, "hall")
     assert engine.run(claimed) == JobState.QUEUED
     between = engine.get_job(job.job_id)
@@ -88,7 +86,7 @@ def test_a_slice_of_a_worker_that_fell_silent_counts_once(engine, work_off):
 def test_what_cannot_be_done_fails_at_once_and_goes_on_when_retried(engine, work_off):
     able = False
 
-    def handle(task: Task, until: float) -> Outcome:
+    def handle(task: LongJob, until: float) -> SliceResult:
         if task.progress and not able:
             raise InvalidRequest("the second step is impossible")
         return count_to(engine, 3)(task, until)
@@ -104,12 +102,12 @@ def test_what_cannot_be_done_fails_at_once_and_goes_on_when_retried(engine, work
     assert engine.retry_job(job.job_id)[1] is False  # it waits already
     assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
     assert items(engine, job) == [0, 1, 2]
-    with pytest.raises(CannotRetry, match="nothing was given up"):
+    with pytest.raises(CannotRetry, match="there is nothing to retry"):
         engine.retry_job(job.job_id)
 
 
 def test_what_breaks_down_is_tried_again_until_it_is_dead(engine, work_off):
-    def handle(_task: Task, _until: float) -> Outcome:
+    def handle(_task: LongJob, _until: float) -> SliceResult:
         raise RuntimeError("no luck")
 
     engine.tasks.register("count", handle)
@@ -154,18 +152,19 @@ def test_a_map_takes_its_long_jobs_and_their_files_along(engine, work_off):
 
 
 def test_frames_that_wait_are_signed_between_two_slices(
-    engine: Engine, uploads: Any, work_off: Callable[[Engine], list[JobState]]
-) -> None:
+    engine: Engine, uploads: Any, work_off: Callable[[Engine], list[JobState]],
+    due_now: Callable[[Engine], None],
+) -> None:  # fmt: skip
     engine.tasks.register("count", count_to(engine, 3))
     engine.tasks.begin("count", "hall", {})
     first = engine.claim("w")
-    assert isinstance(first, Task)
+    assert isinstance(first, LongJob)
     assert engine.run(first) == JobState.QUEUED
-    time.sleep(0.01)  # so that the next slice is due for sure
+    due_now(engine)
     engine.add_frame("hall", uploads[0].data, uploads[0].meta)
     frame = engine.claim("w")
     assert frame is not None
-    assert not isinstance(frame, Task)
+    assert not isinstance(frame, LongJob)
     engine.put_back(frame)
     assert work_off(engine) == [JobState.SUCCEEDED, JobState.QUEUED, JobState.SUCCEEDED]
 
@@ -174,11 +173,11 @@ def test_tries_before_a_slice_that_came_through_count_no_more(engine: Engine) ->
     engine.tasks.register("count", count_to(engine, 30))
     job = engine.tasks.begin("count", "hall", {})
     for _ in range(12):  # a machine that is restarted within every other slice
-        assert isinstance(engine.claim("killed"), Task)
+        assert isinstance(engine.claim("killed"), LongJob)
         with engine.store.database.write() as connection:
             connection.execute(update(jobs).values(leased_until=1.0))
         again = engine.claim("w")
-        assert isinstance(again, Task)
+        assert isinstance(again, LongJob)
         assert engine.run(again) == JobState.QUEUED
     assert items(engine, job) == list(range(12))
 
@@ -186,7 +185,7 @@ def test_tries_before_a_slice_that_came_through_count_no_more(engine: Engine) ->
 def test_a_job_that_is_removed_while_a_slice_runs_is_no_fault_of_its_worker(
     engine: Engine,
 ) -> None:
-    def handle(task: Task, until: float) -> Outcome:
+    def handle(task: LongJob, until: float) -> SliceResult:
         with engine.store.database.write() as connection:
             remove_job(connection, find_job(connection, task.claim.job.id))
         return count_to(engine, 2)(task, until)
@@ -206,11 +205,11 @@ def test_a_file_that_a_deletion_swept_is_made_again(
 ) -> None:
     swept: list[str] = []
 
-    def handle(task: Task, until: float) -> Outcome:
+    def handle(task: LongJob, until: float) -> SliceResult:
         outcome = count_to(engine, 1)(task, until)
         if not swept:  # another job that had made the same is removed at this moment
             swept.append(outcome.files[0].blob)
-            sweep(engine.store, swept)
+            collect_blobs(engine.store, swept)
         return outcome
 
     engine.tasks.register("count", handle)

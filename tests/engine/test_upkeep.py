@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine, administration, readers, upkeep
+from sceneprint.engine import Engine
+from sceneprint.engine import engine as administration
+from sceneprint.engine.search import local_index
+from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import InvalidRequest, UnreadableModel
-from sceneprint.schemas import JobState, NewMap, Query
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import models
+from sceneprint_client.api import JobState, NewMap, Query
 
 Make = Callable[..., Engine]
 ALL = Query(stages=("retrieve",), k=50)
@@ -65,7 +68,9 @@ def test_an_index_that_cannot_be_written_costs_no_frame(
     engine.create_map(NewMap(name="hall", model="depth"))
     names = fill(engine, uploads, work_off, range(3))
     assert engine.publish_due() == 0
-    assert [r.message for r in caplog.records if r.levelname == "ERROR"] == ["no index published"]
+    assert [r.message for r in caplog.records if r.levelname == "ERROR"] == [
+        "index publication failed"
+    ]
     answer = engine.query_upload("hall", uploads[1].data, uploads[1].meta, ALL)
     assert (answer.matches[0].frame_id, answer.index_generation) == (names[1], 0)
 
@@ -104,7 +109,9 @@ def test_what_was_not_asked_for_long_is_not_held(
         return list(engine._readers._open)
 
     assert held() == ["other", "hall"]
-    monkeypatch.setattr(readers, "HELD_BYTES", 2 * 64 * 448 - 1)  # 64 rows are set aside at once
+    monkeypatch.setattr(
+        local_index, "HELD_BYTES", 2 * 64 * 448 - 1
+    )  # 64 rows are set aside at once
     assert held() == ["hall"]
 
 
@@ -134,7 +141,7 @@ def test_a_large_map_is_published_by_its_share(
     """Of 12 frames a fourth: what is written in all is proportional to the map."""
     shutil.copytree(signed_folder, tmp_path / "data")
     engine = make_engine(tmp_path / "data", tail_frames=1)
-    monkeypatch.setattr(upkeep, "SHARE", 0.25)
+    monkeypatch.setattr(index_upkeep, "SHARE", 0.25)
     assert engine.publish_due() == 1
     names = [one.frame_id for one in engine.list_frames("hall").items]
     due = []
@@ -158,7 +165,7 @@ def test_maps_of_whole_fisher_vectors_have_no_index(
     with pytest.raises(InvalidRequest, match="has no index to rebuild"):
         engine.rebuild_index("hall")
     with engine.store.database.read() as connection:
-        folder = readers.index_folder(engine.settings.indexes, find_map(connection, "hall"))
+        folder = local_index.index_folder(engine.settings.indexes, find_map(connection, "hall"))
 
     def left() -> None:
         """What version 0.1 had made of such a map."""

@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from sceneprint.engine import Engine
-from sceneprint.engine import uploads as uploading
+from sceneprint.engine.ingest import uploads as uploading
 from sceneprint.errors import FrameConflict, InvalidIntrinsics, UnknownFrame, UselessFrame
-from sceneprint.schemas import FrameMeta, FrameState, JobState, NewMap, Query
+from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
 
 Told = Callable[[Engine], list[str]]
 WorkOff = Callable[[Engine], list[JobState | None]]
@@ -72,7 +72,7 @@ def test_other_metadata_of_the_same_content_is_a_conflict_that_names_it(
     added, _ = empty.add_frame("hall", data, meta)
     with pytest.raises(FrameConflict) as caught:
         empty.add_frame("hall", packed(data, 1), with_(meta, **more))
-    said = f"Frame {added.frame_id} has the same content, but other {fields}. A frame is in a map"
+    said = f"Frame {added.frame_id} has the same content, but a different {fields}. A map stores"
     assert str(caught.value).startswith(said)
     assert len(blobs(empty)) == 1
     assert empty.counts() == ({"received": 1}, {"queued": 1})
@@ -87,7 +87,7 @@ def test_another_parent_frame_or_pose_is_a_conflict(empty: Engine, uploads: Any)
         moved = matrix.copy()
         moved[0, 3] += shift
         pose = {"parent_frame": parent, "matrix": moved.tolist()}
-        with pytest.raises(FrameConflict, match=f"but other {fields}\\. A frame"):
+        with pytest.raises(FrameConflict, match=f"but a different {fields}\\. A map"):
             empty.add_frame("hall", data, with_(meta, pose=pose))
 
 
@@ -181,7 +181,7 @@ def test_a_blob_swept_while_its_upload_comes_in_is_put_again(
         digest = put(data)
         puts.append(digest)
         if len(puts) == 1:
-            uploading.sweep(empty.store, [digest])
+            uploading.collect_blobs(empty.store, [digest])
         return digest
 
     monkeypatch.setattr(empty.store.blobs, "put", swept)

@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 
 from sceneprint.engine import Engine
-from sceneprint.engine import work as working
-from sceneprint.schemas import FrameMeta, FrameState, JobState, NewMap, Query
+from sceneprint.engine.jobs import signature_job as working
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import changes_since
+from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
 
 Told = Callable[[Engine], list[str]]
 WorkOff = Callable[[Engine], list[JobState | None]]

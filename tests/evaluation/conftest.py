@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.evaluation.records import Error, Outcome, Pair
-from sceneprint.geometry.validation import Validation
+from sceneprint.geometry.validation.validation import PairValidation
+from sceneprint.lab.evaluation.protocol import Error, QueryOutcome, ValidatedPair
 
 
 def error(cm: float, degrees: float = 0.0) -> Error:
@@ -27,10 +27,10 @@ def pair(
     mean: float = 0.5,
     least: float = 0.4,
     bound: Error | None = None,
-) -> Pair:
+) -> ValidatedPair:
     T = np.eye(4)
     known: Any = {"status": status, "strength": strength if status == "accepted" else None}
-    v = Validation(
+    v = PairValidation(
         **known,
         reason="as given",
         T_match_query=T,
@@ -46,21 +46,21 @@ def pair(
     )
     same = scene == "here"
     off = off if same and off is not None else Error()
-    return Pair(match, scene, v, same, off, bound, mean, least, 10.0)
+    return ValidatedPair(match, scene, v, same, off, bound, mean, least, 10.0)
 
 
 def outcome(
     ranking: list[int],
     selection: list[int],
-    pairs: list[Pair],
+    pairs: list[ValidatedPair],
     *,
     least: list[float] | None = None,
     present: bool = True,
     **rest: Any,
-) -> Outcome:
+) -> QueryOutcome:
     """A query at the origin of "here" with a database of as many frames as `least`."""
     overlap = np.array(least if least is not None else [0.4] * (max(ranking) + 1))
-    return Outcome(
+    return QueryOutcome(
         name="here/query",
         scene="here",
         pose=np.eye(4),
@@ -79,17 +79,17 @@ def outcome(
 
 
 @pytest.fixture
-def make_pair() -> Callable[..., Pair]:
+def make_pair() -> Callable[..., ValidatedPair]:
     return pair
 
 
 @pytest.fixture
-def make_outcome() -> Callable[..., Outcome]:
+def make_outcome() -> Callable[..., QueryOutcome]:
     return outcome
 
 
 @pytest.fixture
-def three() -> list[Outcome]:
+def three() -> list[QueryOutcome]:
     """One query found, one lost, one whose scene is not in the database.
 
     The first: rank 1 weak and 7 cm off, rank 2 strong and 2 cm off, rank 3 strong, 4 cm and 6

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.evaluation.answers import Place, answer_rows, judge_answers
-from sceneprint.schemas import Answer, Quaternion, Transform, Vector
+from sceneprint.lab.evaluation.report import FramePlace, answer_rows, judge_answers
+from sceneprint_client.api import Answer, Quaternion, Transform, Vector
 
 
 def at(x: float, y: float = 0.0) -> np.ndarray:
@@ -45,8 +45,12 @@ def answer(matches: list[dict[str, Any]], pose: Transform | None = None) -> Answ
     )  # fmt: skip
 
 
-KNOWN = {"a": Place("hall", at(1)), "b": Place("hall", at(3)), "c": Place("cellar", at(0))}
-TRUTH = Place("hall", at(0))
+KNOWN = {
+    "a": FramePlace("hall", at(1)),
+    "b": FramePlace("hall", at(3)),
+    "c": FramePlace("cellar", at(0)),
+}
+TRUTH = FramePlace("hall", at(0))
 
 
 def test_rows_take_the_nearest_the_first_accepted_and_the_average() -> None:

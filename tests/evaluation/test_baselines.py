@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from sceneprint.cli import main
-from sceneprint.datasets import find_sequences
-from sceneprint.evaluation.baselines.baseline import BASELINES
-from sceneprint.evaluation.baselines.fpfh import FpfhVlad, features, vlad
-from sceneprint.evaluation.baselines.rings import (
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.lab.evaluation.baselines.baseline import BASELINES
+from sceneprint.lab.evaluation.baselines.fpfh import FpfhVlad, features, vlad
+from sceneprint.lab.evaluation.baselines.rings import (
     Rings,
     ring_descriptor,
     ring_distance,
     ring_distances,
 )
-from sceneprint.evaluation.baselines.thumbnails import Thumbnails, thumbnail
-from sceneprint.evaluation.diversity import points_of
+from sceneprint.lab.evaluation.baselines.thumbnails import Thumbnails, thumbnail
+from sceneprint.lab.evaluation.diversity import points_of
 from sceneprint.models import Model, save_model
-from sceneprint.types import Cloud, Floats, Floats32, Frame
+from sceneprint.types import Cloud, DepthFrame, Floats, Floats32
 
 
 def turned(points: Floats, sectors: int) -> Floats:
@@ -136,6 +136,7 @@ def test_vlad_by_hand() -> None:
     assert not vlad(words.astype(np.float32), words).any()
 
 
+@pytest.mark.thorough
 def test_fpfh_knows_a_cloud_that_was_turned(with_open3d: None) -> None:
     rng = np.random.default_rng(6)
     flat = rng.uniform(0, 2, (6000, 2))
@@ -161,7 +162,7 @@ def test_fpfh_knows_a_cloud_that_was_turned(with_open3d: None) -> None:
     assert distances[0] < 0.5 * distances[1]
 
 
-def test_which_frames_each_is_made_for(room_frames: tuple[Frame, ...]) -> None:
+def test_which_frames_each_is_made_for(room_frames: tuple[DepthFrame, ...]) -> None:
     seen, fused = Cloud(np.ones((3, 3), np.float32)), Cloud(np.ones((3, 3), np.float32), False)
     made_for = {
         name: [make(9.0).takes(frame) for frame in (room_frames[0], seen, fused)]
@@ -225,6 +226,7 @@ def test_baselines_are_rows_of_the_same_table(
     assert again["baselines"]["thumbnail_l1"] == row
 
 
+@pytest.mark.thorough
 def test_frames_that_come_back(room: Path, model_file: Path, tmp_path: Path) -> None:
     """Every frame asks those before it by more than 20 cm of travel."""
     poses = [np.loadtxt(room / "seq-01" / f"frame-{i:06d}.pose.txt") for i in range(12)]
@@ -256,7 +258,7 @@ def test_frames_that_come_back(room: Path, model_file: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--baselines", "sift"], "There is no such baseline"),
+        (["--baselines", "sift"], "no such baseline"),
         (["--gap-m", "-1"], "--gap-m"),
         (["--within", "inf"], "--within"),
     ],
@@ -272,6 +274,7 @@ def test_wrong_options(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_clouds_are_evaluated_as_depth_images_are(
     room: Path, model_file: Path, tmp_path: Path
 ) -> None:

@@ -95,6 +95,7 @@ def test_pictures_show_something(figures: Any) -> None:
     assert len(body) == points * 27  # six floats and three bytes
 
 
+@pytest.mark.thorough
 def test_the_number_of_processes_changes_nothing(
     figures: Any, ranges: list[str], model_file: Path, tmp_path: Path
 ) -> None:
@@ -236,7 +237,7 @@ def test_what_cannot_be_written_is_said_before_the_work(
     def work(*_: object) -> None:
         raise AssertionError("hours of it")
 
-    monkeypatch.setattr("sceneprint.evaluation.run.evaluate", work)
+    monkeypatch.setattr("sceneprint.lab.evaluation.run.evaluate", work)
     (tmp_path / "file").touch()
     asked = [str(building / "room-000"), "--db", "0:4", "--queries", "5:6"]
     asked += ["--model", str(model_file), "--jobs", "1"]
@@ -275,7 +276,7 @@ def test_the_reason_is_of_the_frames_that_are_missing(
     ("arguments", "message"),
     [
         (["{room}"], "Give --db and --queries"),
-        (["{room}", "--db", "0:4"], "--db is given without --queries"),
+        (["{room}", "--db", "0:4"], "--db needs --queries"),
         (["{room}", "--db", "0-4", "--queries", "5:6"], "is no range of frames"),
         (["{room}", "--db", "0:4", "--queries", "5:99"], "outside its 12 frames"),
         (["{room}", "--db", "0:4", "--queries", "3:6"], "chosen twice"),

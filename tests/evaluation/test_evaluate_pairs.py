@@ -12,11 +12,10 @@ import pytest
 from PIL import Image
 
 from sceneprint.cli import main
-from sceneprint.clouds import write_ply
-from sceneprint.evaluation.pair_drawing import BINS
-from sceneprint.evaluation.protocol import every_frame
-from sceneprint.evaluation.registration_baselines import METHODS, points_of, register
-from sceneprint.geometry.rigid import difference
+from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.geometry.pose.rigid import difference
+from sceneprint.lab.evaluation.pairs.pair_run import BINS, METHODS, points_of, register
+from sceneprint.lab.evaluation.protocol import every_frame
 from sceneprint.libraries import open3d
 from sceneprint.models import Model, save_model
 from sceneprint.types import Floats
@@ -91,6 +90,7 @@ def test_the_number_of_processes_changes_nothing(
     assert several | {"milliseconds": None} == alone[0] | {"milliseconds": None}
 
 
+@pytest.mark.thorough
 def test_clouds_are_registered_as_well(building: Path, asked: list[str], tmp_path: Path) -> None:
     room = tmp_path / "scans"
     room.mkdir()
@@ -115,6 +115,7 @@ def test_clouds_are_registered_as_well(building: Path, asked: list[str], tmp_pat
 
 
 @pytest.mark.usefixtures("with_open3d")
+@pytest.mark.thorough
 def test_baselines_find_a_cloud_again() -> None:
     """Three walls and a box, turned and moved."""
     rng = np.random.default_rng(0)

@@ -11,27 +11,35 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.evaluation.diversity import diversity, voxels
-from sceneprint.evaluation.lost import PLACES, lost, place_of
-from sceneprint.evaluation.measures import (
+from sceneprint.lab.evaluation.diversity import diversity, voxels
+from sceneprint.lab.evaluation.judgement import views_to_average
+from sceneprint.lab.evaluation.measures import (
+    PLACES,
     absent,
     accuracy,
     bound,
+    lost,
     oracle_and_random,
+    place_of,
     rows,
     validation,
 )
-from sceneprint.evaluation.pairs import views_to_average
-from sceneprint.evaluation.records import Error, Outcome, Pair, pose_error
-from sceneprint.evaluation.report import average, measured, per_query, to_json, without_infinities
-from sceneprint.evaluation.table import table
-from sceneprint.types import Floats, Frame, Intrinsics
+from sceneprint.lab.evaluation.protocol import Error, QueryOutcome, ValidatedPair, pose_error
+from sceneprint.lab.evaluation.report import (
+    average,
+    measured,
+    per_query,
+    table,
+    to_json,
+    without_infinities,
+)
+from sceneprint.types import DepthFrame, Floats, Intrinsics
 
-MakePair = Callable[..., Pair]
-MakeOutcome = Callable[..., Outcome]
+MakePair = Callable[..., ValidatedPair]
+MakeOutcome = Callable[..., QueryOutcome]
 
 
-def test_rows_of_three_queries(three: list[Outcome]) -> None:
+def test_rows_of_three_queries(three: list[QueryOutcome]) -> None:
     found = rows(three)  # the third has no scene to be found in
     assert found["R"] == {
         "within_5cm_5deg": 0.0,
@@ -58,7 +66,7 @@ def test_rows_of_three_queries(three: list[Outcome]) -> None:
     assert bound(three)["pose_average"]["within_5cm_5deg"] == 0.5
 
 
-def test_acceptance_of_three_queries(three: list[Outcome]) -> None:
+def test_acceptance_of_three_queries(three: list[QueryOutcome]) -> None:
     found = validation(three)
     assert (found["pairs"], found["accepted"], found["accepted_strong"]) == (7, 5, 2)
     assert found["precision"] == pytest.approx(3 / 5)  # 15 cm, and another scene
@@ -78,7 +86,7 @@ def test_acceptance_of_three_queries(three: list[Outcome]) -> None:
     }
 
 
-def test_chance_of_three_queries(three: list[Outcome]) -> None:
+def test_chance_of_three_queries(three: list[QueryOutcome]) -> None:
     found = oracle_and_random(three)
     assert found["oracle"]["mean_overlap"] == pytest.approx(0.55)
     assert found["oracle"]["top1_overlap_50"] == 1.0
@@ -94,7 +102,7 @@ def test_random_five(make_outcome: MakeOutcome, make_pair: MakePair) -> None:
     assert found == pytest.approx(1 - 56 / 252)
 
 
-def test_where_three_queries_are_lost(three: list[Outcome]) -> None:
+def test_where_three_queries_are_lost(three: list[QueryOutcome]) -> None:
     counts = lost(three)
     assert list(counts) == list(PLACES)
     assert sum(counts.values()) == 3
@@ -161,13 +169,13 @@ def test_pose_error() -> None:
 CAMERA = Intrinsics(40, 4, 100.0, 100.0, 0.0, 0.0)
 
 
-def dots(*columns: int, shift: float = 0.0, depth: float = 1.01) -> Frame:
+def dots(*columns: int, shift: float = 0.0, depth: float = 1.01) -> DepthFrame:
     """Single samples in the first row: 10 columns are five voxels at 1 m."""
     image = np.zeros((4, 40), np.float32)
     image[0, list(columns)] = depth
     pose: Floats = np.eye(4)
     pose[0, 3] = shift
-    return Frame(image, CAMERA, "dots", pose)
+    return DepthFrame(image, CAMERA, "dots", pose)
 
 
 def test_voxels_by_hand() -> None:
@@ -218,7 +226,7 @@ def test_without_anything_to_count_there_is_null(
 ) -> None:
     away = make_outcome([0], [0], [make_pair(0, "rejected", scene="there")], present=False)
 
-    def nothing(match: int) -> Frame:
+    def nothing(match: int) -> DepthFrame:
         raise AssertionError("no depth is needed")
 
     found = measured([away], [np.eye(4)], nothing)
@@ -230,7 +238,7 @@ def test_without_anything_to_count_there_is_null(
     assert accuracy([])["median_translation_m"] is None
 
 
-def test_json_has_null_for_what_is_infinite(three: list[Outcome]) -> None:
+def test_json_has_null_for_what_is_infinite(three: list[QueryOutcome]) -> None:
     names = ["a", "b", "c", "d"]
     found = without_infinities({"per_query": [per_query(one, names) for one in three]})
     read = json.loads(to_json(found))
@@ -245,7 +253,7 @@ def test_json_has_null_for_what_is_infinite(three: list[Outcome]) -> None:
 def test_answers_of_a_query_by_hand(make_outcome: MakeOutcome, make_pair: MakePair) -> None:
     """Three of R count; C has a weak one, a rejected, a strong and an ambiguous one."""
 
-    def found(match: int, T: Floats | None, *how: str) -> Pair:
+    def found(match: int, T: Floats | None, *how: str) -> ValidatedPair:
         one = make_pair(match, *how)
         return replace(one, validation=replace(one.validation, T_match_query=T))
 
@@ -275,7 +283,7 @@ def test_answers_of_a_query_by_hand(make_outcome: MakeOutcome, make_pair: MakePa
     assert all(set(match) == set(keys) for match in said["matches"])
 
 
-def test_average_of_scenes(three: list[Outcome]) -> None:
+def test_average_of_scenes(three: list[QueryOutcome]) -> None:
     poses = [np.eye(4)] * 4
     first = measured(three[:1], poses, lambda match: dots(match))
     second = measured(three[1:2], poses, lambda match: dots(match))
@@ -285,7 +293,7 @@ def test_average_of_scenes(three: list[Outcome]) -> None:
     assert found["R"]["mean_overlap"] == pytest.approx(0.3)
 
 
-def test_table_reads_well(three: list[Outcome]) -> None:
+def test_table_reads_well(three: list[QueryOutcome]) -> None:
     found: dict[str, Any] = measured(three, [np.eye(4)] * 4, lambda match: dots(match))
     found["left_out"] = [{"name": "a\nb", "reason": "dark"}, {"name": "c", "reason": "dark"}]
     found["milliseconds"] = {"rank": 1.0, "validate": None}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.evaluation.overlap import (
+from sceneprint.lab.evaluation.protocol import (
     GRID,
     PAIR_TOLERANCE,
     RELATIVE_TOLERANCE,
@@ -14,16 +14,16 @@ from sceneprint.evaluation.overlap import (
     overlaps,
     view_of,
 )
-from sceneprint.types import Floats, Frame, Intrinsics
+from sceneprint.types import DepthFrame, Floats, Intrinsics
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
 
 
-def wall(shift: float = 0.0, distance: float = 2.0) -> Frame:
+def wall(shift: float = 0.0, distance: float = 2.0) -> DepthFrame:
     """A wall across the whole image, seen from `shift` metres to the right."""
     pose: Floats = np.eye(4)
     pose[0, 3] = shift
-    return Frame(np.full((60, 80), distance, np.float32), CAMERA, pose=pose)
+    return DepthFrame(np.full((60, 80), distance, np.float32), CAMERA, pose=pose)
 
 
 def test_by_hand() -> None:
@@ -52,10 +52,10 @@ def test_the_mean_and_the_smaller_direction() -> None:
 
 def test_a_frame_without_a_pose_has_no_overlap() -> None:
     with pytest.raises(ValueError, match="has no pose"):
-        view_of(Frame(wall().depth, CAMERA, "lost"))
+        view_of(DepthFrame(wall().depth, CAMERA, "lost"))
 
 
-def plain_shares(a: Frame, b: Frame) -> tuple[float, float]:
+def plain_shares(a: DepthFrame, b: DepthFrame) -> tuple[float, float]:
     """Of the samples of a, those that b sees where they are."""
     assert a.pose is not None
     assert b.pose is not None
@@ -79,8 +79,8 @@ def plain_shares(a: Frame, b: Frame) -> tuple[float, float]:
     return loose / seen, strict / seen
 
 
-def test_against_the_plain_loop(room_frames: tuple[Frame, ...]) -> None:
-    from sceneprint.synth import synthesise_room
+def test_against_the_plain_loop(room_frames: tuple[DepthFrame, ...]) -> None:
+    from sceneprint.lab.synth import synthesise_room
 
     frames = [*room_frames[:3], *synthesise_room(3, 0, 25, along_path=True).frames[::12]]
     views = [view_of(frame) for frame in frames]

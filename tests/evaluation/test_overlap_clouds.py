@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.evaluation.overlap import POINTS, SAMPLES, overlap, view_of
-from sceneprint.types import Cloud, Floats, Frame, Intrinsics
+from sceneprint.lab.evaluation.protocol import POINTS, SAMPLES, overlap, view_of
+from sceneprint.types import Cloud, DepthFrame, Floats, Intrinsics
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
 
@@ -54,7 +54,7 @@ def test_a_turned_cloud_in_its_place_is_the_same() -> None:
 
 def test_a_cloud_beside_a_depth_image() -> None:
     pose: Floats = np.eye(4)
-    image = Frame(np.full((60, 80), 2.0, np.float32), CAMERA, pose=pose)
+    image = DepthFrame(np.full((60, 80), 2.0, np.float32), CAMERA, pose=pose)
     # of 4 m of wall the image is 80 / 70 * 2 wide; of its three rows of samples the wall, half a
     # metre up and down, is within 11 cm of two
     mean, _ = overlap(view_of(wall(-2, 2)), view_of(image))

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.evaluation.overlap import Overlaps
-from sceneprint.evaluation.pair_drawing import BINS, Drawing, Drawn, Place, draw, inside
+from sceneprint.lab.evaluation.pairs.pair_run import BINS, Drawing, Drawn, FrameOrigin, draw, inside
+from sceneprint.lab.evaluation.protocol import Overlaps
 from sceneprint.types import Floats
 
 ALL = Drawing(pairs=1000, negatives=0, apart=1)
 NO_PLANES = np.zeros(100, bool)
 
 
-def places(scene: str, n: int, run: str = "run") -> list[Place]:
-    return [Place(scene, f"{scene}/{run}", i) for i in range(n)]
+def places(scene: str, n: int, run: str = "run") -> list[FrameOrigin]:
+    return [FrameOrigin(scene, f"{scene}/{run}", i) for i in range(n)]
 
 
 def of_matrix(least: Floats, mean: Floats | None = None) -> Overlaps:

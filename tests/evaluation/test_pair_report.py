@@ -11,40 +11,42 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.evaluation.pair_drawing import BINS, Drawn
-from sceneprint.evaluation.pair_report import pair_figures
-from sceneprint.evaluation.pair_run import PairEvaluation
-from sceneprint.evaluation.pair_statistics import curves, evidence, residual
-from sceneprint.evaluation.pair_table import pair_table
-from sceneprint.evaluation.pair_trying import Other, Tried
-from sceneprint.evaluation.records import RIGHT, Error, Member, Pair
-from sceneprint.evaluation.report import to_json
-from sceneprint.geometry.acceptance import AcceptanceParameters
+from sceneprint.geometry.validation.acceptance import AcceptanceParameters
+from sceneprint.lab.evaluation.pairs.pair_report import (
+    curves,
+    evidence,
+    pair_figures,
+    pair_table,
+    residual,
+)
+from sceneprint.lab.evaluation.pairs.pair_run import BINS, Drawn, Other, PairEvaluation, Tried
+from sceneprint.lab.evaluation.protocol import RIGHT, Error, SignedFrame, ValidatedPair
+from sceneprint.lab.evaluation.report import to_json
 
 ACCEPTANCE = AcceptanceParameters()
 CM3, CM7, CM15, AWAY = Error(0.03, 0.0), Error(0.07, 0.0), Error(0.15, 0.0), Error(2.0, 1.0)
 
 
-def member(number: int, scene: str) -> Member:
-    return Member(number, f"{scene}/{number}", scene, np.eye(4), np.empty(0, np.uint8))
+def member(number: int, scene: str) -> SignedFrame:
+    return SignedFrame(number, f"{scene}/{number}", scene, np.eye(4), np.empty(0, np.uint8))
 
 
 MEMBERS = [member(0, "here"), member(1, "here"), member(2, "there")]
 
 
-def overlapping(name: str, pair: Pair, bound: Error = CM3) -> Tried:
+def overlapping(name: str, pair: ValidatedPair, bound: Error = CM3) -> Tried:
     drawn = Drawn(1, 0, "overlapping", name, 0.4, int(name.split("-")[0]) / 100, planar=False)
     return Tried(drawn, replace(pair, overlap_least=drawn.overlap_least, bound=bound), None, None)
 
 
-def negative(pair: Pair, *, planar: bool = False, cross: bool = True) -> Tried:
+def negative(pair: ValidatedPair, *, planar: bool = False, cross: bool = True) -> Tried:
     kind = "cross_scene" if cross else "same_scene"
     drawn = Drawn(0, 2 if cross else 1, kind, None, 0.0, 0.0, planar)  # type: ignore[arg-type]
     return Tried(drawn, replace(pair, overlap_least=0.0), None, None)
 
 
 @pytest.fixture
-def tried(make_pair: Callable[..., Pair]) -> list[Tried]:
+def tried(make_pair: Callable[..., ValidatedPair]) -> list[Tried]:
     """Two pairs of the first bin and three of the second, five negatives, one of them accepted."""
     strange = {"scene": "there"}
     return [
@@ -126,7 +128,7 @@ def test_a_wider_limit_makes_more_right(tried: list[Tried]) -> None:
     assert [one["what"] for one in found["failures"]].count("not_believed") == 2
 
 
-def test_statistics(make_pair: Callable[..., Pair]) -> None:
+def test_statistics(make_pair: Callable[..., ValidatedPair]) -> None:
     v = make_pair(0).validation
     assert evidence(replace(v, overlap=0.5, violations=0.04), ACCEPTANCE) == pytest.approx(0.3)
     assert evidence(replace(v, overlap=0.5, violations=None), ACCEPTANCE) == 0.5
@@ -136,8 +138,8 @@ def test_statistics(make_pair: Callable[..., Pair]) -> None:
     ) == pytest.approx(2.0)
 
 
-def test_curves(make_pair: Callable[..., Pair]) -> None:
-    def one(right: bool, status: str, **told: Any) -> Pair:
+def test_curves(make_pair: Callable[..., ValidatedPair]) -> None:
+    def one(right: bool, status: str, **told: Any) -> ValidatedPair:
         pair = make_pair(0, status, off=CM3 if right else AWAY)
         return replace(pair, validation=replace(pair.validation, **told))
 

@@ -9,25 +9,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.evaluation.clouds import cloud_figure, merged
-from sceneprint.evaluation.contact import contact_sheet
-from sceneprint.evaluation.pair_pictures import some_of_each
-from sceneprint.evaluation.plots import save_figure
-from sceneprint.evaluation.records import Outcome, Pair
-from sceneprint.types import Frame, Intrinsics
+from sceneprint.lab.evaluation.pairs.pair_report import some_of_each
+from sceneprint.lab.evaluation.plots import cloud_figure, contact_sheet, merged, save_figure
+from sceneprint.lab.evaluation.protocol import QueryOutcome, ValidatedPair
+from sceneprint.types import DepthFrame, Intrinsics
 
 
-def wall(depth: float) -> Frame:
+def wall(depth: float) -> DepthFrame:
     k = Intrinsics(32, 24, 30.0, 30.0, 16.0, 12.0)
-    return Frame(np.full((24, 32), depth, np.float32), k, "wall", np.eye(4))
+    return DepthFrame(np.full((24, 32), depth, np.float32), k, "wall", np.eye(4))
 
 
 @pytest.mark.parametrize("name", [r"a$\frac$b", "one $ alone", "a_{b}^c"])
 def test_a_name_is_no_formula(
     name: str,
     tmp_path: Path,
-    make_outcome: Callable[..., Outcome],
-    make_pair: Callable[..., Pair],
+    make_outcome: Callable[..., QueryOutcome],
+    make_pair: Callable[..., ValidatedPair],
 ) -> None:
     pairs = [make_pair(0), make_pair(1)]
     one = replace(make_outcome([0, 1], [0, 1], pairs), name=name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.evaluation.planarity import OFF_PLANE, plane_share
+from sceneprint.lab.evaluation.run import OFF_PLANE, plane_share
 from sceneprint.types import Floats
 
 

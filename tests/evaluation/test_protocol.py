@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.datasets import Camera, write_depth_png, write_intrinsics, write_pose
 from sceneprint.errors import DatasetError
-from sceneprint.evaluation.protocol import (
-    Part,
-    Protocol,
+from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
+from sceneprint.lab.evaluation.protocol import (
+    EvaluationProtocol,
+    PathRanges,
     Range,
     choose,
     parse_part,
@@ -40,7 +40,7 @@ def split(folder: Path, train: list[int], test: list[int]) -> Path:
     return folder
 
 
-def names(protocol: Protocol, use: str) -> list[str]:
+def names(protocol: EvaluationProtocol, use: str) -> list[str]:
     return [f.name.replace("frame-00000", "") for f in protocol.frames if f.use == use]
 
 
@@ -66,11 +66,11 @@ def test_what_is_no_range(text: str) -> None:
 
 
 def test_parts() -> None:
-    assert parse_part("a/b@c") == Part(Path("a/b@c"))
-    assert parse_part("a@b@db=0:9,queries=9:") == Part(
+    assert parse_part("a/b@c") == PathRanges(Path("a/b@c"))
+    assert parse_part("a@b@db=0:9,queries=9:") == PathRanges(
         Path("a@b"), (Range(0, 9, None),), (Range(9, None, None),)
     )
-    assert parse_part("x@queries=:3") == Part(Path("x"), None, (Range(None, 3, None),))
+    assert parse_part("x@queries=:3") == PathRanges(Path("x"), None, (Range(None, 3, None),))
     for text in ("x@db=0:9,db=0:9", "x@db=0:9,q=3:4", "x@db="):
         with pytest.raises(DatasetError):
             parse_part(text)
@@ -79,7 +79,10 @@ def test_parts() -> None:
 def test_ranges_count_over_the_sequences_of_a_path(tmp_path: Path) -> None:
     path = scene(tmp_path / "kitchen", {1: 4, 2: 4})
     found = choose(
-        [Part(path)], database=parse_ranges("0:6"), queries=parse_ranges("6:8"), database_step=2
+        [PathRanges(path)],
+        database=parse_ranges("0:6"),
+        queries=parse_ranges("6:8"),
+        database_step=2,
     )
     assert names(found, "database") == ["kitchen/seq-01/0", "kitchen/seq-01/2", "kitchen/seq-02/0"]
     assert names(found, "query") == ["kitchen/seq-02/2", "kitchen/seq-02/3"]
@@ -93,7 +96,7 @@ def test_splits_and_distractors(tmp_path: Path) -> None:
     first = split(scene(tmp_path / "kitchen", {1: 2, 2: 2, 3: 1}), [1], [2])
     second = split(scene(tmp_path / "office", {1: 1, 2: 3}), [2], [1])
     other = scene(tmp_path / "far" / "hall", {1: 1})
-    found = choose([Part(tmp_path / "kitchen"), Part(second)], [other], query_step=2)
+    found = choose([PathRanges(tmp_path / "kitchen"), PathRanges(second)], [other], query_step=2)
     assert found.split
     assert names(found, "database") == [
         "kitchen/seq-01/0",
@@ -113,14 +116,14 @@ def test_what_cannot_be_measured(tmp_path: Path) -> None:
     twin = scene(tmp_path / "other" / "kitchen", {1: 4})
     some, rest = parse_ranges("0:2"), parse_ranges("2:4")
     with pytest.raises(DatasetError, match=r"Give --db and --queries"):
-        choose([Part(path)])
+        choose([PathRanges(path)])
     with pytest.raises(DatasetError, match=r"chosen twice, as database and as query"):
-        choose([Part(path)], database=some, queries=parse_ranges("1:4"))
+        choose([PathRanges(path)], database=some, queries=parse_ranges("1:4"))
     with pytest.raises(DatasetError, match=r"outside its 4 frames"):
-        choose([Part(path)], database=some, queries=parse_ranges("2:5"))
+        choose([PathRanges(path)], database=some, queries=parse_ranges("2:5"))
     with pytest.raises(DatasetError, match=r"Another scene is called kitchen"):
-        choose([Part(path)], [twin], database=some, queries=rest)
+        choose([PathRanges(path)], [twin], database=some, queries=rest)
     with pytest.raises(DatasetError, match=r"No frame is chosen as query"):
-        choose([Part(path, database=some)])
+        choose([PathRanges(path, database=some)])
     with pytest.raises(DatasetError, match=r"No frame is chosen as database"):
-        choose([Part(path, queries=some)])
+        choose([PathRanges(path, queries=some)])

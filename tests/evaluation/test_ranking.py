@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.evaluation import ranking
-from sceneprint.evaluation.ranking import rank
+from sceneprint.lab.evaluation import judgement
+from sceneprint.lab.evaluation.judgement import rank
 
 
 def test_by_hand() -> None:
@@ -32,14 +32,14 @@ def test_a_query_that_may_find_nothing() -> None:
 
 @pytest.mark.parametrize("metric", ["l1", "l2"])
 def test_both_ways_to_compare_give_the_same(
-    metric: ranking.Metric, monkeypatch: pytest.MonkeyPatch
+    metric: judgement.Metric, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(3)
     database = rng.integers(0, 255, (150, 64), dtype=np.uint8)
     queries = rng.integers(0, 255, (12, 64), dtype=np.uint8)
     allowed = rng.random((12, 150)) < 0.8
     whole = rank(queries, database, allowed, metric=metric)
-    monkeypatch.setattr(ranking, "TIMED", 99)
+    monkeypatch.setattr(judgement, "TIMED", 99)
     each = rank(queries, database, allowed, metric=metric)
     assert [one.selection for one in whole] == [one.selection for one in each]
     for i, one in enumerate(each):

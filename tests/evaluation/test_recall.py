@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from sceneprint.evaluation.recall import metres_apart, recall
-from sceneprint.evaluation.records import Member
-from sceneprint.evaluation.travel import travelled
+from sceneprint.lab.evaluation.measures import metres_apart, recall
+from sceneprint.lab.evaluation.protocol import SignedFrame, travelled
 
 
-def member(name: str, x: float, y: float = 0.0, scene: str = "hall") -> Member:
+def member(name: str, x: float, y: float = 0.0, scene: str = "hall") -> SignedFrame:
     pose = np.eye(4)
     pose[:2, 3] = x, y
-    return Member(0, name, scene, pose, np.zeros(4, np.uint8))
+    return SignedFrame(0, name, scene, pose, np.zeros(4, np.uint8))
 
 
 def test_recall_by_hand() -> None:

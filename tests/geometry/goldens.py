@@ -10,7 +10,7 @@ from types import ModuleType
 
 import numpy as np
 
-from sceneprint.geometry.mixture import Mixture
+from sceneprint.geometry.signature.mixture import Mixture
 from sceneprint.types import Floats, Patches
 
 

@@ -8,9 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.geometry.acceptance import AcceptanceParameters, Evidence, belief, objection
-from sceneprint.geometry.agreement import AgreementParameters, agreements
-from sceneprint.geometry.alignment import AlignmentParameters, _scores
+from sceneprint.geometry.validation.acceptance import (
+    AcceptanceParameters,
+    Evidence,
+    belief,
+    objection,
+)
+from sceneprint.geometry.validation.overlap import OverlapParameters, agreements
+from sceneprint.geometry.validation.validation import AlignmentParameters, _scores
 from sceneprint.types import Floats32, Intrinsics, Surface
 
 P = AcceptanceParameters()
@@ -90,7 +95,7 @@ def wall(z: float) -> Surface:
 
 
 def test_a_violation_costs_three_inliers() -> None:
-    p, seen = AgreementParameters(), wall(2.0)
+    p, seen = OverlapParameters(), wall(2.0)
     on, before = np.zeros((5, 6), np.float32), np.zeros((2, 6), np.float32)
     on[:, 2], before[:, 2] = 2.0, 1.0  # on the wall, and a metre before it
     source: Floats32 = np.concatenate([on, before])

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry import agreement as module
-from sceneprint.geometry.agreement import AgreementParameters, agreement, sampled
+from sceneprint.geometry.validation import overlap as module
+from sceneprint.geometry.validation.overlap import OverlapParameters, overlap_counts, sampled
 from sceneprint.types import Floats, Floats32, Surface
 
-P = AgreementParameters()
+P = OverlapParameters()
 
 
-def oracle(source: Floats32, target: Surface, T: Floats, p: AgreementParameters) -> tuple[int, int]:
+def oracle(source: Floats32, target: Surface, T: Floats, p: OverlapParameters) -> tuple[int, int]:
     """Inliers and violations, point after point."""
     k, inliers, violations = target.camera, 0, 0
     for row in source.astype(float):
@@ -61,7 +61,7 @@ def test_equals_the_oracle(scenes: ModuleType) -> None:
         T = np.eye(4)
         T[:3, :3] = Rotation.from_rotvec(rng.normal(0, 0.004 * k, 3)).as_matrix()
         T[:3, 3] = rng.normal(0, 0.01 * k, 3)
-        found = agreement(source, corner, T, P)
+        found = overlap_counts(source, corner, T, P)
         assert (found.inliers, found.violations) == oracle(source, corner, T, P)
         assert found.points == len(source)
         inliers, violations = inliers + found.inliers, violations + found.violations
@@ -71,7 +71,7 @@ def test_equals_the_oracle(scenes: ModuleType) -> None:
 
 def test_a_surface_agrees_with_itself(scenes: ModuleType) -> None:
     corner, _ = scenes.corner()
-    found = agreement(sampled(corner, 2), corner, np.eye(4), P)
+    found = overlap_counts(sampled(corner, 2), corner, np.eye(4), P)
     assert (found.inliers, found.violations) == (found.points, 0) == (1200, 0)
 
 
@@ -81,10 +81,10 @@ def test_moving_into_and_out_of_the_room(scenes: ModuleType) -> None:
     source = sampled(corner, 2)
     shift = np.eye(4)
     shift[2, 3] = 0.3
-    behind = agreement(source, corner, shift, P)
+    behind = overlap_counts(source, corner, shift, P)
     assert (behind.violations, behind.inliers) == (0, 0)
     shift[2, 3] = -0.3
-    before = agreement(source, corner, shift, P)
+    before = overlap_counts(source, corner, shift, P)
     # the rest has left the image, is within the margin of a wall seen at a slant, or near an edge
     assert before.violations > 0.6 * before.points  # measured: 0.63
     assert before.inliers == 0
@@ -102,9 +102,9 @@ def test_sampling_takes_the_middle_of_each_cell(scenes: ModuleType, stride: int)
 
 def test_nothing_to_compare(scenes: ModuleType) -> None:
     corner, _ = scenes.corner()
-    none = agreement(np.empty((0, 6), np.float32), corner, np.eye(4), P)
+    none = overlap_counts(np.empty((0, 6), np.float32), corner, np.eye(4), P)
     assert (none.points, none.inliers, none.violations) == (0, 0, 0)
     source = sampled(corner, 5)
     corner.points[:] = 0.0
-    unseen = agreement(source, corner, np.eye(4), P)
+    unseen = overlap_counts(source, corner, np.eye(4), P)
     assert (unseen.points, unseen.inliers, unseen.violations) == (192, 0, 0)

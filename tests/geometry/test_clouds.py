@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import UselessFrame
-from sceneprint.geometry.clouds import CloudParameters, principal_axes, within_range
+from sceneprint.geometry.surface.cloud import CloudParameters, principal_axes, within_range
 from sceneprint.types import Cloud
 
 P = CloudParameters(minimum_points=3)

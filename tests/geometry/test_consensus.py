@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry import consensus as module
-from sceneprint.geometry.consensus import ConsensusParameters, consensus
-from sceneprint.geometry.rigid import difference, inverse, moved
+from sceneprint.geometry.pose.rigid import difference, inverse, moved
+from sceneprint.geometry.validation import consensus as module
+from sceneprint.geometry.validation.consensus import ConsensusParameters, consensus
 from sceneprint.types import Floats, Ints32, Patches
 
 P = ConsensusParameters()

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.cycles import CycleParameters, Edges, verdicts
-from sceneprint.geometry.rigid import difference, inverse
-from sceneprint.geometry.runs import Run, run_of
+from sceneprint.geometry.pose.loops import CycleParameters, LoopEdges, RobotPath, run_of, verdicts
+from sceneprint.geometry.pose.rigid import difference, inverse
 from sceneprint.types import Floats
 
 
@@ -29,24 +28,24 @@ def walk(rng: np.random.Generator, n: int, metres: float = 0.05, degrees: float 
     return np.array(poses)
 
 
-def a_run(poses: Floats, parents: list[int] | None = None) -> Run:
+def a_run(poses: Floats, parents: list[int] | None = None) -> RobotPath:
     return run_of(poses, np.array(parents or [0] * len(poses), np.int64))
 
 
 def edges_between(
     rng: np.random.Generator, here: Floats, there: Floats, n: int, metres: float, degrees: float
-) -> Edges:
+) -> LoopEdges:
     """Edges of two walks through one world, each with an error."""
     source = np.sort(rng.integers(0, len(here), n))
     target = np.clip(source + rng.integers(-3, 4, n), 0, len(there) - 1)
     pairs = zip(source, target, strict=True)
     true = [inverse(there[j]) @ here[i] @ moved_by(rng, metres, degrees) for i, j in pairs]
     weights = rng.choice([0.5, 1.0], n)
-    return Edges(source, target, np.array(true), weights)
+    return LoopEdges(source, target, np.array(true), weights)
 
 
 def oracle(
-    edges: Edges, source: Run, target: Run, p: CycleParameters
+    edges: LoopEdges, source: RobotPath, target: RobotPath, p: CycleParameters
 ) -> dict[tuple[int, int], bool]:
     """Pairs of edges near each other, and which close: one after the other, in matrices."""
     found = {}
@@ -133,11 +132,11 @@ def test_odometry_that_drifts_does_no_harm() -> None:
     target = source - 150
     exact = np.array([inverse(true[j]) @ true[i] for i, j in zip(source, target, strict=True)])
     run = a_run(drifted)
-    found = verdicts(Edges(source, target, exact, np.ones(150)), run, run)
+    found = verdicts(LoopEdges(source, target, exact, np.ones(150)), run, run)
     assert found.kept.all()
     assert (found.loops > 0).all()
     blind = CycleParameters(reach_m=1e3, reach_rad=1e3, drift=0.0)
-    assert not verdicts(Edges(source, target, exact, np.ones(150)), run, run, blind).kept.all()
+    assert not verdicts(LoopEdges(source, target, exact, np.ones(150)), run, run, blind).kept.all()
 
 
 def test_by_hand() -> None:
@@ -147,14 +146,14 @@ def test_by_hand() -> None:
     transforms = np.tile(np.eye(4), (3, 1, 1))
     transforms[1, 1, 3] = 0.2
     every = np.arange(3)
-    found = verdicts(Edges(every, every, transforms, np.ones(3)), a_run(poses), a_run(poses))
+    found = verdicts(LoopEdges(every, every, transforms, np.ones(3)), a_run(poses), a_run(poses))
     assert found.kept.tolist() == [True, False, True]
     assert found.loops.tolist() == [1, 2, 1]
     assert found.closed.tolist() == [1, 0, 1]
     # 5 % of 0.2 m of way on either side is what a loop may be off besides
     transforms[1, 1, 3] = 0.0
     transforms[2, 1, 3] = 0.07 + 0.05 * 0.2 + 1e-6
-    edges = Edges(every, every, transforms, np.ones(3))
+    edges = LoopEdges(every, every, transforms, np.ones(3))
     assert verdicts(edges, a_run(poses), a_run(poses)).closed.tolist() == [2, 1, 1]
     transforms[2, 1, 3] = 0.07 + 0.05 * 0.4 + 1e-6
     assert verdicts(edges, a_run(poses), a_run(poses)).kept.tolist() == [True, True, False]
@@ -164,7 +163,7 @@ def test_nothing_checks_where_there_are_no_poses_or_odometry_is_broken() -> None
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 0, 3] = (0.0, 0.1, 0.2, 0.3)
     every, transforms = np.arange(4), np.tile(np.eye(4), (4, 1, 1))
-    edges = Edges(every, every, transforms, np.ones(4))
+    edges = LoopEdges(every, every, transforms, np.ones(4))
     lost = poses.copy()
     lost[1] = np.nan
     found = verdicts(edges, a_run(lost), a_run(poses))
@@ -177,7 +176,7 @@ def test_nothing_checks_where_there_are_no_poses_or_odometry_is_broken() -> None
 def test_no_edges() -> None:
     run = a_run(np.tile(np.eye(4), (2, 1, 1)))
     none = np.empty(0, np.int64)
-    found = verdicts(Edges(none, none, np.empty((0, 4, 4)), np.empty(0)), run, run)
+    found = verdicts(LoopEdges(none, none, np.empty((0, 4, 4)), np.empty(0)), run, run)
     assert len(found.kept) == len(found.loops) == len(found.closed) == 0
 
 

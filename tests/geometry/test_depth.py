@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import UselessFrame
-from sceneprint.geometry.depth import DepthParameters, halved, halvings, inverse_depth
-from sceneprint.types import Floats32, Frame, Intrinsics
+from sceneprint.geometry.surface.depth_image import DepthParameters, halved, halvings, inverse_depth
+from sceneprint.types import DepthFrame, Floats32, Intrinsics
 
 
 def parameters(
@@ -29,10 +29,10 @@ def parameters(
 KINECT = DepthParameters(focal_length_px=146.0, maximum_pixels=160 * 120 * 4)
 
 
-def frame(depth: Floats32, focal_length: float = 10.0) -> Frame:
+def frame(depth: Floats32, focal_length: float = 10.0) -> DepthFrame:
     height, width = depth.shape
     camera = Intrinsics(width, height, focal_length, focal_length, 0.0, 0.0)
-    return Frame(depth, camera, "kitchen/7")
+    return DepthFrame(depth, camera, "kitchen/7")
 
 
 def test_two_by_two_by_hand() -> None:
@@ -113,7 +113,7 @@ def test_map_is_bounded_whatever_the_sensor() -> None:
 def test_kinect_becomes_160_by_120() -> None:
     depth = np.full((480, 640), 2.0, np.float32)
     q, camera = inverse_depth(
-        Frame(depth, Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)), KINECT
+        DepthFrame(depth, Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)), KINECT
     )
     assert q.shape == (120, 160)
     assert q.dtype == np.float32
@@ -177,7 +177,7 @@ def test_wrong_shape_is_the_callers_mistake() -> None:
     camera = Intrinsics(8, 6, 10.0, 10.0, 0.0, 0.0)
     for shape in ((8, 6), (6, 8, 1), (48,)):
         with pytest.raises(ValueError, match=r"is not \(6, 8\)"):
-            inverse_depth(Frame(np.ones(shape, np.float32), camera), parameters())
+            inverse_depth(DepthFrame(np.ones(shape, np.float32), camera), parameters())
 
 
 @pytest.mark.parametrize("shape", [(1, 2), (7, 400), (400, 7)])

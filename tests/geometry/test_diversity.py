@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.geometry.diversity import (
+from sceneprint.geometry.retrieval.distance import Metric, distances, pairwise_distances, rank
+from sceneprint.geometry.retrieval.dpp import (
     DiversityParameters,
     diversify,
     kernel_matrix,
     remaining,
 )
-from sceneprint.geometry.retrieval import Metric, distances, pairwise_distances, rank
 from sceneprint.types import Floats
 
 

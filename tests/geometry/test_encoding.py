@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sceneprint.geometry import encoding as module
-from sceneprint.geometry.counting import PairCounts
-from sceneprint.geometry.encoding import (
-    Statistics,
+from sceneprint.geometry.signature import fisher_vector as module
+from sceneprint.geometry.signature.fisher_vector import (
+    LevelStatistics,
     fisher_vector,
     normalised,
     quantise,
@@ -22,8 +21,8 @@ from sceneprint.geometry.encoding import (
     statistics_of_counts,
     statistics_of_features,
 )
-from sceneprint.geometry.mixture import Mixture, posteriors
-from sceneprint.geometry.table import LEADING, PairTable, pack
+from sceneprint.geometry.signature.mixture import Mixture, posteriors
+from sceneprint.geometry.signature.pair_table import LEADING, PairCounts, PairTable, pack
 from sceneprint.types import Floats, Ints32
 
 
@@ -197,7 +196,7 @@ def test_one_pair_is_enough() -> None:
     f = mixture.means[:1]
     pi = posteriors(f, mixture)[0]
     phi = fisher_vector(
-        Statistics(pi, np.outer(pi, f[0]), np.outer(pi, f[0] ** 2), 1, 1.0), mixture
+        LevelStatistics(pi, np.outer(pi, f[0]), np.outer(pi, f[0] ** 2), 1, 1.0), mixture
     )
     np.testing.assert_allclose(phi, eq2(f, mixture), rtol=0, atol=1e-12)
     # at its own mean a component has no first-order term

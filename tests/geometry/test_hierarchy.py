@@ -7,8 +7,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sceneprint.geometry.hierarchy import HierarchyParameters, hierarchy
-from sceneprint.geometry.segmentation import SegmentationParameters, segment
+from sceneprint.geometry.signature.segmentation import (
+    HierarchyParameters,
+    SegmentationParameters,
+    hierarchy,
+    segment,
+)
 from sceneprint.types import Floats, Hierarchy, Ints32, Surface
 
 

@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from sceneprint.errors import TrainingError
-from sceneprint.geometry.mixture import (
+from sceneprint.geometry.signature.mixture import (
     Mixture,
     MixtureParameters,
     em_step,

@@ -7,7 +7,7 @@ from types import ModuleType
 
 import pytest
 
-from sceneprint.geometry import encoding, properties
+from sceneprint.geometry.signature import fisher_vector, pair_features
 
 EQ1 = [
     ("-a_w * m_v", "a_w * m_v"),
@@ -76,9 +76,10 @@ def mutated(module: ModuleType, line: str, wrong: str) -> ModuleType:
     return copy
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("line", "wrong"), EQ1)
 def test_goldens_catch_a_wrong_eq1(goldens: ModuleType, line: str, wrong: str) -> None:
-    module = mutated(properties, line, wrong)
+    module = mutated(pair_features, line, wrong)
 
     def check() -> None:
         goldens.check_eq1(module)
@@ -88,20 +89,21 @@ def test_goldens_catch_a_wrong_eq1(goldens: ModuleType, line: str, wrong: str) -
         check()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("line", "wrong"), EQ2)
 def test_goldens_catch_a_wrong_eq2(goldens: ModuleType, line: str, wrong: str) -> None:
-    module = mutated(encoding, line, wrong)
+    module = mutated(fisher_vector, line, wrong)
     with pytest.raises(AssertionError):
         goldens.check_eq2(module)
 
 
 def test_unchanged_copies_pass(goldens: ModuleType) -> None:
     # so that the cases above fail for their mutation, not for being copies
-    copy = mutated(properties, "np.cross(u, v)", "np.cross(u, v)")
+    copy = mutated(pair_features, "np.cross(u, v)", "np.cross(u, v)")
     goldens.check_eq1(copy)
     goldens.check_r1(copy)
-    copy = mutated(encoding, "s.first - nu * zeroth", "s.first - nu * zeroth")
+    copy = mutated(fisher_vector, "s.first - nu * zeroth", "s.first - nu * zeroth")
     goldens.check_eq2(copy)
     # the copies are live: their functions are not the originals
-    assert copy.fisher_vector is not encoding.fisher_vector
-    assert properties.DIMENSION == 13
+    assert copy.fisher_vector is not fisher_vector.fisher_vector
+    assert pair_features.PROPERTY_DIMENSION == 13

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.geometry.cells import mixed
-from sceneprint.geometry.fitting import least_axis, plane_facing, plane_seen
-from sceneprint.geometry.neighbours import Links, linked
+from sceneprint.geometry.surface.cloud import mixed
+from sceneprint.geometry.surface.planes import Links, least_axis, linked, plane_facing, plane_seen
 from sceneprint.types import Floats
 
 

@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.depth import DepthParameters, inverse_depth
-from sceneprint.geometry.normals import NormalParameters, surface
-from sceneprint.types import Floats, Floats32, Frame, Intrinsics, Surface
+from sceneprint.geometry.surface.depth_image import (
+    DepthParameters,
+    NormalParameters,
+    inverse_depth,
+    surface,
+)
+from sceneprint.types import DepthFrame, Floats, Floats32, Intrinsics, Surface
 
 PARAMETERS = NormalParameters(
     radius_px=3,
@@ -113,7 +117,7 @@ def test_noise_of_a_kinect_at_two_metres(scenes: ModuleType, tilt: float, bound:
         minimum_depth=0.3, maximum_depth=9.0, same_surface=0.03,
         focal_length_px=146.0, maximum_pixels=160 * 120 * 4, minimum_valid=64,
     )  # fmt: skip
-    q, reduced = inverse_depth(Frame(depth, camera), reduction)
+    q, reduced = inverse_depth(DepthFrame(depth, camera), reduction)
     seen = fit(q, reduced)
     near = seen.valid & (np.abs(seen.points[..., 2] - 2) < 0.3)
     assert near.sum() > 2000

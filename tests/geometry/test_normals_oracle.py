@@ -6,7 +6,7 @@ from types import ModuleType
 
 import numpy as np
 
-from sceneprint.geometry.normals import NormalParameters, surface
+from sceneprint.geometry.surface.depth_image import NormalParameters, surface
 from sceneprint.types import Floats, Intrinsics
 
 CAMERA = Intrinsics(26, 18, 40.0, 37.0, 12.0, 9.5)

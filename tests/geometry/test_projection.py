@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import TrainingError
-from sceneprint.geometry.projection import Projection, fit_projection, project
+from sceneprint.geometry.signature.pair_features import Projection, fit_projection, project
 from sceneprint.types import Floats
 
 RNG_SEED = 11

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry import properties as module
-from sceneprint.geometry.properties import (
+from sceneprint.geometry.signature import pair_features as module
+from sceneprint.geometry.signature.pair_features import (
     PropertyParameters,
     invariants,
     neighbour_pairs,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.quaternions import quaternion_of, rotation_of
+from sceneprint.geometry.pose.rigid import quaternion_of, rotation_of
 from sceneprint.types import Floats
 
 AXES = [np.array(a, float) for a in itertools.product((-1, 0, 1), repeat=3) if any(a)]

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from sceneprint.geometry import rectification
-from sceneprint.geometry.rectification import ray_to_axis, undistort
+from sceneprint.geometry.surface import rectification
+from sceneprint.geometry.surface.rectification import ray_to_axis, undistort
 from sceneprint.types import Intrinsics
 
 LENS = (-0.28, 0.09, 0.0015, -0.0022, -0.012)  # every term of the model is at work
@@ -184,7 +184,7 @@ length = st.one_of(st.floats(1.0, 100.0), st.floats(1e-3, 1e7))
 centre = st.one_of(st.floats(-10, 20), st.floats(-1e7, 1e7))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(length, length, centre, centre, st.lists(coefficient, min_size=5, max_size=5))
 def test_any_camera_gives_samples_or_nothing(
     fx: float, fy: float, cx: float, cy: float, k: list[float]

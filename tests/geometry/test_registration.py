@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry import registration as module
-from sceneprint.geometry.agreement import sampled
-from sceneprint.geometry.registration import COARSE, FINE, RefinementParameters, refine
-from sceneprint.geometry.rigid import difference
+from sceneprint.geometry.pose.rigid import difference
+from sceneprint.geometry.validation import icp as module
+from sceneprint.geometry.validation.icp import COARSE, FINE, RefinementParameters, refine
+from sceneprint.geometry.validation.overlap import sampled
+from sceneprint.lab.synth import KINECT, render, trajectory
+from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.models import Model
 from sceneprint.signing import see
-from sceneprint.synth import KINECT, render, trajectory
-from sceneprint.synth.synthesis import room_and_rng
-from sceneprint.types import Floats, Floats32, Frame, Surface
+from sceneprint.types import DepthFrame, Floats, Floats32, Surface
 
 NEAR = replace(COARSE, stride=2)
 
@@ -65,7 +65,7 @@ def room_surface(small_model: Model) -> Surface:
     """A furnished room, without noise."""
     room, rng = room_and_rng(11, 0)
     pose = trajectory(room, 20, rng)[10]
-    return see(Frame(render(room, pose, KINECT), KINECT), small_model.parameters)
+    return see(DepthFrame(render(room, pose, KINECT), KINECT), small_model.parameters)
 
 
 def test_by_hand(validation_goldens: ModuleType) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.planes import plane_view, plane_weights
-from sceneprint.geometry.rigid import difference, inverse, inverses, moved
-from sceneprint.geometry.rivals import RivalParameters, far_from, symmetries
+from sceneprint.geometry.pose.rigid import difference, inverse, inverses, moved
+from sceneprint.geometry.validation.ambiguity import AmbiguityParameters, far_from, symmetries
+from sceneprint.geometry.validation.overlap import plane_view, plane_weights
 from sceneprint.types import Floats, Geometry, Intrinsics, Patches, Surface
 
-P = RivalParameters()
+P = AmbiguityParameters()
 
 
 def on_planes(*planes: tuple[list[float], float, int, float]) -> Patches:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.geometry.clouds import CloudParameters
-from sceneprint.geometry.scaling import POWERS, scaled
+from sceneprint.geometry.scale import POWERS, scaled
+from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.models import ModelParameters
 from sceneprint.pipeline import Signer, prepare, validate
 from sceneprint.types import Cloud

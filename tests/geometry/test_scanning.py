@@ -14,8 +14,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.geometry.psadbw import QUERIES, SCANNERS, Ints64, widths, widths_of
-from sceneprint.geometry.scanning import frozen, scan
+from sceneprint.geometry.retrieval.distance import (
+    QUERIES,
+    SCANNERS,
+    Ints64,
+    frozen,
+    scan,
+    widths,
+    widths_of,
+)
 from sceneprint.types import Bytes
 
 WIDTHS = (64, 32, 16, 0)
@@ -137,8 +144,8 @@ def test_what_a_processor_can_do() -> None:
 #: Run by a process that compiles for another processor than that it runs on.
 FOREIGN = """
 import numpy as np
-from sceneprint.geometry.psadbw import widths
-from sceneprint.geometry.scanning import scan
+from sceneprint.geometry.retrieval.distance import widths
+from sceneprint.geometry.retrieval.distance import scan
 x = np.arange(7000, dtype=np.uint64).reshape(7, 1000).astype(np.uint8)
 right = np.abs(x.astype(int)[:, None] - x.astype(int)).sum(axis=2)
 assert all((scan(x, x, np.arange(7), width=w) == right).all() for w in widths())
@@ -146,6 +153,7 @@ print(*widths())
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(16 not in widths(), reason="not an x86")
 def test_code_for_an_old_processor_uses_nothing_that_it_lacks(tmp_path: Path) -> None:
     """The compiler aborts at what its target lacks; and no code is taken from another's cache."""

@@ -7,7 +7,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sceneprint.geometry.segmentation import SegmentationParameters, kept, patches_of, segment
+from sceneprint.geometry.signature.segmentation import (
+    SegmentationParameters,
+    compact_labels,
+    patches_of,
+    segment,
+)
 from sceneprint.types import Surface
 
 
@@ -109,11 +114,11 @@ def test_patches_respect_depth_edges(scenes: ModuleType) -> None:
 
 def test_kept_by_hand() -> None:
     labels = np.array([[0, 1, -1, 2], [3, 3, 1, 0]], np.int32)
-    result = kept(labels, np.array([True, False, True, True]))
+    result = compact_labels(labels, np.array([True, False, True, True]))
     assert result.tolist() == [[0, -1, -1, 1], [2, 2, -1, 0]]
     assert result.dtype == np.int32
-    assert kept(labels, np.zeros(4, bool)).tolist() == [[-1] * 4] * 2
-    assert kept(labels, np.ones(4, bool)).tolist() == labels.tolist()
+    assert compact_labels(labels, np.zeros(4, bool)).tolist() == [[-1] * 4] * 2
+    assert compact_labels(labels, np.ones(4, bool)).tolist() == labels.tolist()
     assert labels.tolist() == [[0, 1, -1, 2], [3, 3, 1, 0]]
 
 

@@ -9,22 +9,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.geometry.alignment import AlignmentParameters
-from sceneprint.geometry.rigid import difference, inverse, moved
-from sceneprint.geometry.sequences import (
+from sceneprint.geometry.pose.rigid import difference, inverse, moved
+from sceneprint.geometry.validation.sequence_alignment import (
     SequenceParameters,
-    alignment_cost,
+    _cyclic,
     coarse,
     neighbour_sequences,
     sequence_correspondences,
 )
-from sceneprint.geometry.validation import ValidationParameters, validate
+from sceneprint.geometry.validation.validation import (
+    AlignmentParameters,
+    ValidationParameters,
+    validate,
+)
+from sceneprint.lab.synth import KINECT, take, trajectory
+from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
-from sceneprint.synth import KINECT, take, trajectory
-from sceneprint.synth.synthesis import room_and_rng
-from sceneprint.types import Floats, Frame, Patches
+from sceneprint.types import DepthFrame, Floats, Patches
 
 P = SequenceParameters()
 
@@ -57,6 +60,17 @@ def motion(seed: int) -> Floats:
     T[:3, :3] = R * np.linalg.det(R)
     T[:3, 3] = rng.uniform(-3, 3, 3)
     return T
+
+
+def alignment_cost(a: Floats, b: Floats, p: SequenceParameters) -> float:
+    """Share of the cost of leaving all of one out and inserting all of the other: 0 alike."""
+    m, n = len(a), len(b)
+    costs, rows = np.empty((max(m, 1), max(n, 1))), np.empty((3, n + 1))
+    cost = _cyclic(
+        np.ascontiguousarray(a, float), m, np.ascontiguousarray(b, float), n,
+        p.length_scale, p.angle_scale, p.gap_cost, p.swap_cost, 1.0, costs, rows,
+    )  # fmt: skip
+    return float(cost)
 
 
 def oracle(a: Floats, b: Floats) -> float:
@@ -229,7 +243,7 @@ def test_two_views_are_aligned_by_sequences() -> None:
     room, rng = room_and_rng(11, 0)
     poses = trajectory(room, 61, rng)[12:36:12]
     query, match = (
-        geometry_of(see(Frame(take(room, T, KINECT, rng), KINECT), model.parameters), model)
+        geometry_of(see(DepthFrame(take(room, T, KINECT, rng), KINECT), model.parameters), model)
         for T in poses
     )
     alignment = AlignmentParameters(sequence=replace(P, n_sources=40, n_coarse=40))

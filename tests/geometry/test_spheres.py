@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import UselessFrame
-from sceneprint.geometry.clouds import CloudParameters
-from sceneprint.geometry.framing import directions, framed, to_angles
-from sceneprint.geometry.spheres import _averaged as averaged
-from sceneprint.geometry.spheres import range_image
-from sceneprint.types import Cloud, Floats, Frame, Sphere
+from sceneprint.geometry.surface.cloud import CloudParameters
+from sceneprint.geometry.surface.range_image import _averaged as averaged
+from sceneprint.geometry.surface.range_image import directions, framed, range_image, to_angles
+from sceneprint.types import Cloud, DepthFrame, Floats, Sphere
 
 P = CloudParameters(image_angle=0.02)
 
@@ -175,7 +174,7 @@ def test_points_in_one_direction_show_no_surface() -> None:
         range_image(Cloud(ray.astype(np.float32)), P)
 
 
-def test_agrees_with_the_depth_image_it_is_of(room_frames: tuple[Frame, ...]) -> None:
+def test_agrees_with_the_depth_image_it_is_of(room_frames: tuple[DepthFrame, ...]) -> None:
     from sceneprint.models import ModelParameters
     from sceneprint.signing import see
 

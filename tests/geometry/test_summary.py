@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sceneprint.geometry.diversity import diversify
-from sceneprint.geometry.summary import novel, summarise
+from sceneprint.geometry.retrieval.dpp import diversify, novel, summarise
 from sceneprint.types import Floats
 
 

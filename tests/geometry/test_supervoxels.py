@@ -9,10 +9,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sceneprint.geometry.clouds import CloudParameters
-from sceneprint.geometry.segmentation import SegmentationParameters, patches_of
-from sceneprint.geometry.supervoxels import supervoxels
-from sceneprint.geometry.voxels import Voxels, voxels
+from sceneprint.geometry.signature.segmentation import SegmentationParameters, patches_of
+from sceneprint.geometry.signature.supervoxels import supervoxels
+from sceneprint.geometry.surface.cloud import CloudParameters
+from sceneprint.geometry.surface.voxels import Voxels, voxels
 from sceneprint.types import Cloud, Ints32
 
 P = CloudParameters(voxel_angle=0.03, voxel_size=0.06)

@@ -10,18 +10,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
-from sceneprint.geometry.surroundings import (
+from sceneprint.geometry.validation.patch_descriptors import (
     ANGLES,
     RANGE,
     Compression,
-    SurroundingsParameters,
+    PatchDescriptorParameters,
     compress,
     fit_compression,
-    surroundings,
+    patch_descriptors,
 )
 from sceneprint.types import Floats, Floats32, Patches
 
-P = SurroundingsParameters()
+P = PatchDescriptorParameters()
 
 
 def bin_of(scale: int, distance: int, height: int, cosine: int, radial: int) -> int:
@@ -42,7 +42,7 @@ def two(normal: list[float], place: list[float], area: float = 0.7) -> Patches:
     )
 
 
-def oracle(patches: Patches, p: SurroundingsParameters) -> Floats:
+def oracle(patches: Patches, p: PatchDescriptorParameters) -> Floats:
     """The same histograms by hat functions on clipped coordinates, pair after pair."""
 
     def hats(at: float, count: int) -> Floats:
@@ -78,14 +78,14 @@ def test_sizes() -> None:
     none = Patches(
         np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0, np.int32), np.empty(0)
     )
-    found = surroundings(none, P)
+    found = patch_descriptors(none, P)
     assert (found.shape, found.dtype) == ((0, P.dimension), np.float32)
 
 
 def test_two_patches_by_hand() -> None:
     # 25 cm off in the plane, level, at right angles, and across the way there: (2, 2, 1, 1) of
     # the nearest scale, whose bins are 10 cm and 16 cm; one unit of it all in one bin
-    row = surroundings(two([0, 1, 0], [0.25, 0, 0]), P)[0]
+    row = patch_descriptors(two([0, 1, 0], [0.25, 0, 0]), P)[0]
     expected = np.zeros(P.dimension)
     expected[bin_of(0, 2, 2, 1, 1)] = 1.0
     # bins of 16 cm, 25 cm is 1.0625 of them past the middle of the first; 7 heights
@@ -101,12 +101,12 @@ def test_two_patches_by_hand() -> None:
 def test_angles_by_hand() -> None:
     # straight above, facing the same way: no direction in the plane, so radial 0, the middle bin;
     # cosine 1 is the middle of no bin: all of it in the last
-    row = surroundings(two([0, 0, 1], [0, 0, 0.16]), P)[0]
+    row = patch_descriptors(two([0, 0, 1], [0, 0, 0.16]), P)[0]
     near = row[: bin_of(1, 0, 0, 0, 0)]
     assert np.flatnonzero(near).tolist() == [bin_of(0, 0, 3, 2, 1)]
     # towards the first patch and 60 degrees up: cosine 1/2, 3/4 of the way from bin 1 to 2;
     # radial -sqrt(3)/2, beyond the middle of bin 0
-    row = surroundings(two([-(3**0.5) / 2, 0, 0.5], [0.25, 0, 0]), P)[0]
+    row = patch_descriptors(two([-(3**0.5) / 2, 0, 0.5], [0.25, 0, 0]), P)[0]
     near = row[: bin_of(1, 0, 0, 0, 0)]
     assert np.flatnonzero(near).tolist() == [bin_of(0, 2, 2, 1, 0), bin_of(0, 2, 2, 2, 0)]
     np.testing.assert_allclose(near[near > 0], np.sqrt(np.array([0.25, 0.75]) / 3), atol=1e-6)
@@ -115,13 +115,13 @@ def test_angles_by_hand() -> None:
 def test_equals_the_oracle(scenes: ModuleType) -> None:
     rng = np.random.default_rng(0)
     for patches in (scenes.random_patches(rng, 40, 0.8), scenes.room(rng, 60)):
-        np.testing.assert_allclose(surroundings(patches, P), oracle(patches, P), atol=2e-6)
+        np.testing.assert_allclose(patch_descriptors(patches, P), oracle(patches, P), atol=2e-6)
 
 
 def test_other_parameters_equal_the_oracle(scenes: ModuleType) -> None:
-    p = SurroundingsParameters(0.5, 3, 2, 0.9, 1, 4, 1.1, 2, 1)
+    p = PatchDescriptorParameters(0.5, 3, 2, 0.9, 1, 4, 1.1, 2, 1)
     patches = scenes.random_patches(np.random.default_rng(1), 40, 0.8)
-    np.testing.assert_allclose(surroundings(patches, p), oracle(patches, p), atol=2e-6)
+    np.testing.assert_allclose(patch_descriptors(patches, p), oracle(patches, p), atol=2e-6)
 
 
 def test_rigid_motions_change_nothing(scenes: ModuleType) -> None:
@@ -130,7 +130,7 @@ def test_rigid_motions_change_nothing(scenes: ModuleType) -> None:
         patches = scenes.room(rng)
         turned = scenes.moved(patches, Rotation.random(rng=rng), rng.normal(0, 5, 3))
         # roots make little of much: of 1e-8 in a bin 1e-4
-        before, after = surroundings(patches, P) ** 2, surroundings(turned, P) ** 2
+        before, after = patch_descriptors(patches, P) ** 2, patch_descriptors(turned, P) ** 2
         np.testing.assert_allclose(after, before, atol=1e-6)
 
 
@@ -140,7 +140,7 @@ def test_a_mirror_image_has_the_same_surroundings(scenes: ModuleType) -> None:
     mirror = np.array([-1.0, 1.0, 1.0])
     other = replace(patches, means=patches.means * mirror, normals=patches.normals * mirror)
     np.testing.assert_allclose(
-        surroundings(other, P) ** 2, surroundings(patches, P) ** 2, atol=1e-6
+        patch_descriptors(other, P) ** 2, patch_descriptors(patches, P) ** 2, atol=1e-6
     )
 
 
@@ -156,14 +156,14 @@ def test_order_and_size_of_patches_do_not_matter(scenes: ModuleType) -> None:
         patches.coherences[order],
     )
     np.testing.assert_allclose(
-        surroundings(shuffled, P), surroundings(patches, P)[order], atol=1e-6
+        patch_descriptors(shuffled, P), patch_descriptors(patches, P)[order], atol=1e-6
     )
 
 
 def test_every_scale_reached_weighs_the_same() -> None:
     # 30 cm: all three; 60 cm: two; 1.2 m: one; 2 m: none
     for distance, scales in ((0.3, 3), (0.6, 2), (1.2, 1), (2.0, 0)):
-        rows = surroundings(two([0, 0, 1], [distance, 0, 0]), P)
+        rows = patch_descriptors(two([0, 0, 1], [distance, 0, 0]), P)
         np.testing.assert_allclose(np.linalg.norm(rows, axis=1) ** 2, scales / 3, atol=1e-6)
 
 
@@ -199,7 +199,7 @@ def test_compression_by_hand() -> None:
 
 
 def learnt(scenes: ModuleType, rng: np.random.Generator) -> Floats32:
-    rooms = [surroundings(scenes.room(rng), P) for _ in range(12)]
+    rooms = [patch_descriptors(scenes.room(rng), P) for _ in range(12)]
     return np.concatenate(rooms)
 
 

@@ -10,17 +10,23 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.bins import TableLayout, bin_centres
-from sceneprint.geometry.counting import count_pairs
-from sceneprint.geometry.mixture import Mixture, posteriors
-from sceneprint.geometry.projection import Projection, project
-from sceneprint.geometry.properties import (
+from sceneprint.geometry.signature.mixture import Mixture, posteriors
+from sceneprint.geometry.signature.pair_features import (
+    Projection,
     PropertyParameters,
     invariants,
     neighbour_pairs,
+    project,
     properties,
 )
-from sceneprint.geometry.table import LEADING, LEAST, part
+from sceneprint.geometry.signature.pair_table import (
+    LEADING,
+    LEAST,
+    TableLayout,
+    bin_centres,
+    count_pairs,
+    part,
+)
 from sceneprint.types import Floats, Ints32, Patches
 
 LAYOUT = TableLayout(distance_bins=36, angle_bins=25, dihedral_bins=36, distance_exponent=1.3)

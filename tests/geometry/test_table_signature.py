@@ -11,22 +11,22 @@ import pytest
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.bins import TableLayout
-from sceneprint.geometry.counting import count_pairs
-from sceneprint.geometry.encoding import (
+from sceneprint.geometry.signature.fisher_vector import (
     fisher_vector,
     normalised,
     statistics_of_counts,
     statistics_of_features,
 )
-from sceneprint.geometry.mixture import Mixture, MixtureParameters, fit_mixture
-from sceneprint.geometry.projection import Projection, fit_projection, project
-from sceneprint.geometry.properties import (
+from sceneprint.geometry.signature.mixture import Mixture, MixtureParameters, fit_mixture
+from sceneprint.geometry.signature.pair_features import (
+    Projection,
     PropertyParameters,
+    fit_projection,
     neighbour_pairs,
     pair_properties,
+    project,
 )
-from sceneprint.geometry.table import PairTable, part
+from sceneprint.geometry.signature.pair_table import PairTable, TableLayout, count_pairs, part
 from sceneprint.types import Floats, Patches
 
 LAYOUT = TableLayout(distance_bins=36, angle_bins=25, dihedral_bins=36, distance_exponent=1.3)

@@ -8,23 +8,26 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sceneprint.geometry.agreement import AgreementParameters, agreement, sampled
-from sceneprint.geometry.overlays import SOURCE, STEP_COLOURS, TARGET, overlay
-from sceneprint.geometry.rigid import inverse
-from sceneprint.geometry.traces import (
+from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.validation.inspection import (
     AGREES,
     NEITHER,
     OUTSIDE,
+    SOURCE,
+    STEP_COLOURS,
+    TARGET,
     TOLERANCE,
     VIOLATES,
     VIOLATION,
     judged,
+    overlay,
     residuals,
     trace,
 )
+from sceneprint.geometry.validation.overlap import OverlapParameters, overlap_counts, sampled
 from sceneprint.types import Floats, Geometry, Patches, Surface
 
-P = AgreementParameters(stride=3)
+P = OverlapParameters(stride=3)
 
 
 def shifted(x: float = 0.0, z: float = 0.0) -> Floats:
@@ -56,11 +59,11 @@ def framed(surface: Surface, of: Patches) -> Geometry:
 def test_every_point_is_judged_as_it_is_counted(scenes: ModuleType, T: Floats) -> None:
     seen, _ = scenes.corner()
     points = sampled(seen, P.stride)
-    counts, verdicts = agreement(points, seen, T, P), judged(points, seen, T, P)
+    counts, verdicts = overlap_counts(points, seen, T, P), judged(points, seen, T, P)
     assert (verdicts == AGREES).sum() == counts.inliers
     assert (verdicts == VIOLATES).sum() == counts.violations
     for i in range(0, len(points), 41):
-        alone = agreement(points[i : i + 1], seen, T, P)
+        alone = overlap_counts(points[i : i + 1], seen, T, P)
         assert verdicts[i] == (AGREES if alone.inliers else VIOLATES if alone.violations else 0)
 
 
@@ -72,7 +75,7 @@ def test_a_wall_before_a_wall(scenes: ModuleType) -> None:
 
 @pytest.mark.parametrize("tolerance", [0.05, 0.12])
 def test_residuals_by_hand(scenes: ModuleType, tolerance: float) -> None:
-    seen, p = wall(scenes, 2.0), AgreementParameters(stride=3, surface_tolerance=tolerance)
+    seen, p = wall(scenes, 2.0), OverlapParameters(stride=3, surface_tolerance=tolerance)
     points = sampled(seen, 3)
     ahead = int(np.hypot(points[:, 0], points[:, 1]).argmin())
     # half a step off a whole one, as a share of the tolerance, and where nothing agrees
@@ -135,9 +138,9 @@ def test_overlays_are_coloured(scenes: ModuleType) -> None:
 
 def test_an_overlays_steps_are_of_the_models_tolerance(scenes: ModuleType) -> None:
     seen = wall(scenes, 2.0)
-    wide = AgreementParameters(surface_tolerance=0.12)
+    wide = OverlapParameters(surface_tolerance=0.12)
     for share, step in ((0.19, 0), (0.21, 1), (0.39, 1), (0.41, 2), (0.99, 2), (1.01, 3)):
-        for p in (AgreementParameters(), wide):
+        for p in (OverlapParameters(), wide):
             T = shifted(z=share * p.surface_tolerance)
             _, _, colours = overlay(seen, seen, T, "residual", p)
             middle = colours[: len(colours) // 2].tolist()

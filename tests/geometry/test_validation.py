@@ -13,29 +13,28 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint import pipeline
-from sceneprint.artifacts import read_geometry, write_geometry
 from sceneprint.errors import ModelMismatch
-from sceneprint.geometry.acceptance import AcceptanceParameters, Mode
-from sceneprint.geometry.agreement import agreement, sampled
-from sceneprint.geometry.alignment import align
-from sceneprint.geometry.rigid import difference, inverse
-from sceneprint.geometry.validation import (
-    Validation,
+from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.geometry.pose.rigid import difference, inverse
+from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
+from sceneprint.geometry.validation.overlap import overlap_counts, sampled
+from sceneprint.geometry.validation.validation import (
+    PairValidation,
     ValidationParameters,
+    align,
     middle,
     refined_at,
     validate,
 )
+from sceneprint.lab.synth import KINECT, symmetric_box, take, trajectory
+from sceneprint.lab.synth.dataset import room_and_rng
+from sceneprint.lab.synth.mesh import box, join
+from sceneprint.lab.synth.rooms import Room
+from sceneprint.lab.synth.walls import Ceiling, shell, walls_of
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
-from sceneprint.synth import KINECT, symmetric_box, take, trajectory
-from sceneprint.synth.mesh import join
-from sceneprint.synth.rooms import Room
-from sceneprint.synth.shell import Ceiling, shell, walls_of
-from sceneprint.synth.solids import box
-from sceneprint.synth.synthesis import room_and_rng
-from sceneprint.types import Floats, Floats32, Frame, Geometry, Patches, Surface
+from sceneprint.types import DepthFrame, Floats, Floats32, Geometry, Patches, Surface
 
 #: Views of a room, each with its pose, two or three decimetres and some twenty degrees apart.
 Views = list[tuple[Floats, Geometry]]
@@ -47,7 +46,7 @@ def model() -> Model:
 
 
 def geometry(model: Model, depth: Floats32) -> Geometry:
-    return geometry_of(see(Frame(depth, KINECT), model.parameters), model)
+    return geometry_of(see(DepthFrame(depth, KINECT), model.parameters), model)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +70,7 @@ def pairs(rooms: list[Views]) -> list[tuple[Geometry, Geometry, Floats]]:
     ]
 
 
-def sane(v: Validation) -> Validation:
+def sane(v: PairValidation) -> PairValidation:
     """The answer, once everything in it is seen to be a number that makes sense."""
     assert v.status in ("accepted", "ambiguous", "rejected")
     assert (v.strength is None) == (v.status != "accepted")
@@ -95,11 +94,11 @@ def sane(v: Validation) -> Validation:
     return v
 
 
-def content(v: Validation) -> tuple[object, ...]:
+def content(v: PairValidation) -> tuple[object, ...]:
     return tuple(x.tobytes() if isinstance(x, np.ndarray) else x for x in astuple(v))
 
 
-def off(v: Validation, T: Floats) -> tuple[float, float]:
+def off(v: PairValidation, T: Floats) -> tuple[float, float]:
     """Metres and degrees from a transform."""
     assert v.T_match_query is not None
     metres, radians = difference(v.T_match_query, T)
@@ -311,7 +310,7 @@ def test_the_papers_test_is_the_residual_alone(
     query, match, _ = pairs[0]
     hard = AcceptanceParameters(evidence=2.0)
 
-    def judged(p: AcceptanceParameters, mode: Mode) -> Validation:
+    def judged(p: AcceptanceParameters, mode: Mode) -> PairValidation:
         return sane(validate(query, match, 0, ValidationParameters(acceptance=p), mode))
 
     full, paper = judged(hard, "full"), judged(hard, "paper")
@@ -340,9 +339,9 @@ def test_what_is_told_is_counted_under_the_transform_told(
         v = sane(validate(query, match))
         if v.T_match_query is None:
             continue
-        a = agreement(sampled(query.surface, 5), match.surface, v.T_match_query, p.agreement)
+        a = overlap_counts(sampled(query.surface, 5), match.surface, v.T_match_query, p.agreement)
         back = inverse(v.T_match_query)
-        b = agreement(sampled(match.surface, 5), query.surface, back, p.agreement)
+        b = overlap_counts(sampled(match.surface, 5), query.surface, back, p.agreement)
         inliers, violations = a.inliers + b.inliers, a.violations + b.violations
         assert v.inliers == inliers
         assert v.overlap == inliers / (a.points + b.points)
@@ -374,8 +373,8 @@ def test_where_the_directions_disagree_the_better_one_is_told(rooms: list[Views]
         assert sum(same) == 1
         totals = []
         for T in told:
-            of_query = agreement(there.points, match.surface, T, p.agreement)
-            of_match = agreement(back.points, query.surface, inverse(T), p.agreement)
+            of_query = overlap_counts(there.points, match.surface, T, p.agreement)
+            of_match = overlap_counts(back.points, query.surface, inverse(T), p.agreement)
             inliers = of_query.inliers + of_match.inliers
             violations = (of_query.violations or 0) + (of_match.violations or 0)
             overlap = inliers / (of_query.points + of_match.points)

@@ -11,23 +11,28 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.artifacts import read_geometry, write_geometry
-from sceneprint.geometry.acceptance import AcceptanceParameters, Evidence, belief, objection
-from sceneprint.geometry.agreement import AgreementParameters, agreements, looked_up, sampled
-from sceneprint.geometry.registration import FINE, refine
-from sceneprint.geometry.rigid import difference, inverse, moved
-from sceneprint.geometry.scaling import scaled
-from sceneprint.geometry.validation import Validation, ValidationParameters, validate
+from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.geometry.pose.rigid import difference, inverse, moved
+from sceneprint.geometry.scale import scaled
+from sceneprint.geometry.validation.acceptance import (
+    AcceptanceParameters,
+    Evidence,
+    belief,
+    objection,
+)
+from sceneprint.geometry.validation.icp import FINE, refine
+from sceneprint.geometry.validation.overlap import OverlapParameters, agreements, looked_up, sampled
+from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters, validate
+from sceneprint.lab.synth import KINECT, take
+from sceneprint.lab.synth.dataset import room_and_rng
+from sceneprint.lab.synth.rooms import Room
+from sceneprint.lab.synth.trajectories import pose as looking
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
-from sceneprint.synth import KINECT, take
-from sceneprint.synth.poses import pose as looking
-from sceneprint.synth.rooms import Room
-from sceneprint.synth.synthesis import room_and_rng
-from sceneprint.types import Cloud, Floats, Floats32, Frame, Geometry, Sphere
+from sceneprint.types import Cloud, DepthFrame, Floats, Floats32, Geometry, Sphere
 
-Make = Callable[[Cloud | Frame], Geometry]
+Make = Callable[[Cloud | DepthFrame], Geometry]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +51,7 @@ def model() -> Model:
 
 @pytest.fixture(scope="module")
 def made(model: Model) -> Make:
-    def make(frame: Cloud | Frame) -> Geometry:
+    def make(frame: Cloud | DepthFrame) -> Geometry:
         return read_geometry(write_geometry(geometry_of(see(frame, model.parameters), model)))
 
     return make
@@ -100,7 +105,7 @@ def fused(rooms: list[tuple[Room, list[View]]], made: Make) -> list[list[Geometr
     ]
 
 
-def off(v: Validation, T: Floats) -> tuple[float, float]:
+def off(v: PairValidation, T: Floats) -> tuple[float, float]:
     """Metres and degrees from a transform."""
     assert v.T_match_query is not None, v.reason
     metres, radians = difference(v.T_match_query, T)
@@ -160,7 +165,7 @@ def test_a_depth_image_beside_the_cloud_of_the_same_view(
     y, x = np.nonzero((depth > 0.4) & (depth < 6))
     z = depth[y, x].astype(float)
     points = np.stack([(x - KINECT.cx) / KINECT.fx * z, (y - KINECT.cy) / KINECT.fy * z, z], axis=1)
-    image, cloud = made(Frame(depth, KINECT)), made(Cloud(points.astype(np.float32)))
+    image, cloud = made(DepthFrame(depth, KINECT)), made(Cloud(points.astype(np.float32)))
     assert isinstance(cloud.surface.camera, Sphere)
     for v in (validate(image, cloud), validate(cloud, image), validate(cloud, cloud)):
         assert not v.around  # a cloud may see no more than a camera does
@@ -214,7 +219,7 @@ def test_what_is_found_by_place_does_not_depend_on_a_secret(
     points, made = sampled(query.surface, 5), []
     for secret in (0, 2**51 + 12345):
         monkeypatch.setattr("secrets.randbits", lambda _, secret=secret: secret)
-        p = AgreementParameters()
+        p = OverlapParameters()
         target = looked_up(match.surface, p)
         refined = refine(points, match.surface, np.eye(4), FINE)
         assert refined is not None

@@ -8,15 +8,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sceneprint.geometry import (
-    agreement,
-    averaging,
-    consensus,
-    projecting,
-    registration,
-    rigid,
-    targets,
-)
+from sceneprint.geometry.pose import average, rigid
+from sceneprint.geometry.surface import camera
+from sceneprint.geometry.validation import consensus, icp, overlap
 
 RIGID = [
     ("-T[:3, :3].T @ T[:3, 3]", "T[:3, :3].T @ T[:3, 3]"),
@@ -183,23 +177,21 @@ AVERAGING = [
 
 CHECKS = {
     rigid: ("check_rigid",),
-    projecting: ("check_projecting",),
-    targets: ("check_targets",),
-    agreement: ("check_agreement", "check_sampling", "check_agreement_of_clouds"),
-    registration: ("check_registration", "check_registration_of_clouds"),
+    camera: ("check_projecting",),
+    overlap: ("check_targets", "check_agreement", "check_sampling", "check_agreement_of_clouds"),
+    icp: ("check_registration", "check_registration_of_clouds"),
     consensus: ("check_consensus",),
-    averaging: ("check_averaging",),
+    average: ("check_averaging",),
 }
 CASES = [
     (module, line, wrong)
     for module, mutations in (
         (rigid, RIGID),
-        (projecting, PROJECTING),
-        (targets, TARGETS),
-        (agreement, AGREEMENT),
-        (registration, REGISTRATION),
+        (camera, PROJECTING),
+        (overlap, TARGETS + AGREEMENT),
+        (icp, REGISTRATION),
         (consensus, CONSENSUS),
-        (averaging, AVERAGING),
+        (average, AVERAGING),
     )
     for line, wrong in mutations
 ]
@@ -225,6 +217,7 @@ def check(goldens: ModuleType, module: ModuleType, copy: ModuleType) -> None:
             getattr(goldens, name)(copy)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("module", "line", "wrong"),
     CASES,

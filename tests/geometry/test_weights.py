@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sceneprint.geometry.segmentation import patches_of
-from sceneprint.geometry.weights import WeightParameters, patch_weights
+from sceneprint.geometry.signature.segmentation import WeightParameters, patch_weights, patches_of
 from sceneprint.types import Intrinsics, Patches, Surface
 
 ONES = np.ones((2, 3))

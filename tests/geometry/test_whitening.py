@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.geometry.retrieval import distances
-from sceneprint.geometry.whitening import (
+from sceneprint.geometry.retrieval.distance import distances
+from sceneprint.geometry.signature.whitening import (
     UNITS,
     Whitening,
     WhiteningParameters,
@@ -86,16 +86,6 @@ def test_partial_whitening_keeps_some_spread(psi: Floats, exponent: float, sprea
     np.testing.assert_allclose(deviation, np.sqrt(len(psi)), rtol=0.02)
     slope = np.polyfit(np.log(1 / full.scales), np.log(left), 1)[0]
     assert slope == pytest.approx(spread, abs=0.05)
-
-
-def test_shrinkage_raises_what_is_narrow(psi: Floats) -> None:
-    plain, shrunk = (
-        fit_whitening(psi_units(psi), (1,), WhiteningParameters(32, shrinkage=share))
-        for share in (0.0, 0.5)
-    )
-    ratio = shrunk.scales / plain.scales
-    assert ratio[0] > 1 > ratio[-1]  # the widest axis counts more, the narrowest less
-    assert (np.diff(ratio) <= 1e-12).all()
 
 
 def test_squared_distance_is_that_of_unit_vectors(psi: Floats, fit: Whitening) -> None:

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index import Generation, files, newest, newest_number, scrub
+from sceneprint.index import Generation, mapped_files, newest, newest_number, scrub
 from sceneprint.index.flat import map_index
 from sceneprint.index.lists import map_lists
-from sceneprint.index.manifests import Manifest, manifests, read_manifest
+from sceneprint.index.manifest import GenerationManifest, manifests, read_manifest
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -62,7 +62,7 @@ def test_a_changed_file_is_passed_over(
         data[at] ^= 1 << at % 8
     path.write_bytes(data)
     assert number_of(folder) == 2
-    assert caplog.record_tuples[0][:2] == ("sceneprint.index.generations", logging.WARNING)
+    assert caplog.record_tuples[0][:2] == ("sceneprint.index.generation", logging.WARNING)
     assert path.name in caplog.text
 
 
@@ -100,7 +100,7 @@ def test_files_removed_while_they_are_opened_are_not_damaged(
     """A builder that publishes twice between the listing of a folder and the opening."""
     passed = False
 
-    def late(path: Path) -> Manifest:
+    def late(path: Path) -> GenerationManifest:
         nonlocal passed
         if not passed:
             passed = True
@@ -109,7 +109,7 @@ def test_files_removed_while_they_are_opened_are_not_damaged(
             assert not path.exists() or int(path.name[:10]) > 2
         return read_manifest(path)
 
-    monkeypatch.setattr("sceneprint.index.generations.read_manifest", late)
+    monkeypatch.setattr("sceneprint.index.generation.read_manifest", late)
     assert number_of(folder) == 4
     assert caplog.record_tuples == []
 
@@ -208,7 +208,7 @@ def test_scrubbing_names_what_is_damaged(folder: Path, kind: str) -> None:
 
 
 def test_scrubbing_stops_between_blocks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "BLOCK_BYTES", 100)
+    monkeypatch.setattr(mapped_files, "BLOCK_BYTES", 100)
     steps = list(scrub(folder))
     sizes = [size for _, size in read_manifest(manifests(folder)[0][1]).files]
     assert len(steps) == sum(-(-size // 100) for size in sizes)

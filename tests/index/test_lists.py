@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sceneprint.index import Generation, Tail, lists, newest, search
-from sceneprint.index.keys import draw
 from sceneprint.index.lists import Lists, centre_lists, grouped, train_lists
+from sceneprint.index.mapped_files import draw
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from sceneprint.index import Generation, clear, newest, newest_number, publication, publish
-from sceneprint.index.files import building
-from sceneprint.index.keys import Block
+from sceneprint.index.mapped_files import Block, building
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -175,7 +174,7 @@ def test_what_is_open_is_taken_from_there(
     second = published(np.arange(100, 150), signatures[100:], first)
     read: list[str] = []
     monkeypatch.setattr(
-        "sceneprint.index.generations.check", lambda _, name, __: read.append(name) or iter(())
+        "sceneprint.index.generation.check", lambda _, name, __: read.append(name) or iter(())
     )
     found = newest(folder, "model", LENGTH, known=first)
     assert found is not None
@@ -207,7 +206,7 @@ vectors = found.vectors
 hits = search(rows[777], found, Tail.empty(256), 3, metric="l2")
 assert hits.keys[0] == 777 and hits.distances[0] == 0
 assert (found.vectors == rows).all()
-assert found.distances(rows[5])[5] == 0
+assert (found.vectors[5] == rows[5]).all()
 where = next(line for line in open("/proc/self/smaps") if ".faiss" in line)
 del found, hits
 assert (vectors == rows).all()  # keeps the mapping alive by itself

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.geometry import retrieval
-from sceneprint.index import Generation, Hits, Tail, publish, search, signatures_of
+from sceneprint.geometry.retrieval import distance
+from sceneprint.index import Generation, SearchHits, Tail, publish, search, signatures_of
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -22,7 +22,7 @@ LENGTH = 256
 search_l2 = partial(search, metric="l2")
 
 
-def answer(hits: Hits) -> tuple[list[int], list[int]]:
+def answer(hits: SearchHits) -> tuple[list[int], list[int]]:
     return hits.keys.tolist(), hits.distances.tolist()
 
 
@@ -140,7 +140,7 @@ def test_rows_that_may_not_be_found_are_not_read(
 
     def counted(query: Bytes, stored: Bytes, metric: Any, rows: np.ndarray) -> np.ndarray:
         read.append(len(rows))
-        return retrieval.distances(query, stored, metric, rows=rows)
+        return distance.distances(query, stored, metric, rows=rows)
 
     names = search.__globals__
     monkeypatch.setitem(names, "distances", counted)
@@ -192,7 +192,8 @@ def test_distances_that_floats_cannot_hold_are_exact(published: Publish, nearest
         assert hits.distances[0] > 1 << 24
         assert answer(hits) == nearest(query, frames_of(keys, signatures), size)
     np.testing.assert_array_equal(
-        generation.distances(query), (signatures.astype(np.int64) ** 2).sum(axis=1)
+        distance.distances(query, generation.vectors, "l2"),
+        (signatures.astype(np.int64) ** 2).sum(axis=1),
     )
 
 

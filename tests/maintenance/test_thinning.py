@@ -12,17 +12,17 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest, UnknownMap
-from sceneprint.geometry.diversity import diversify
-from sceneprint.geometry.retrieval import pairwise_distances
-from sceneprint.maintenance import thinning
-from sceneprint.maintenance.thinning import carry_out, propose
-from sceneprint.schemas import NewMap
+from sceneprint.geometry.retrieval.distance import pairwise_distances
+from sceneprint.geometry.retrieval.dpp import diversify
+from sceneprint.maintenance import thin
+from sceneprint.maintenance.thin import carry_out, propose
 from sceneprint.settings import Settings
 from sceneprint.store import queue
 from sceneprint.store.frames import add_frame
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import StoredSignature, index_frame
 from sceneprint.types import Bytes
+from sceneprint_client.api import NewMap
 
 N = 60
 
@@ -124,8 +124,8 @@ def test_nothing_changes_before_it_is_carried_out(
 def test_novelty_is_what_its_sentence_says(
     make: Callable[..., Engine], vectors: Bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(thinning, "BLOCK", 7)
-    monkeypatch.setattr(thinning, "KEPT_BLOCK", 4)
+    monkeypatch.setattr(thin, "BLOCK", 7)
+    monkeypatch.setattr(thin, "KEPT_BLOCK", 4)
     engine = make()
     names = ids(engine)
     d0 = engine.view("hall")[1].unrelated_distance
@@ -178,15 +178,15 @@ def test_the_most_telling_are_those_of_the_determinant(
 def test_the_scale_is_that_of_a_sample_by_its_seed(
     make: Callable[..., Engine], vectors: Bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(thinning, "SAMPLE", 4)
+    monkeypatch.setattr(thin, "SAMPLE", 4)
     scales: list[float] = []
 
     def spied(distances_of: Any, n: int, k: int, sigma: float) -> Any:
         scales.append(sigma)
         return summarise(distances_of, n, k, sigma)
 
-    summarise = thinning.summarise
-    monkeypatch.setattr(thinning, "summarise", spied)
+    summarise = thin.summarise
+    monkeypatch.setattr(thin, "summarise", spied)
     engine = make()
     one, same, other = (propose(engine, "hall", keep=20, seed=seed) for seed in (1, 1, 2))
     assert one == same
@@ -221,7 +221,7 @@ def test_what_cannot_be_asked_for(
     for how in ({}, {"keep": 3, "novelty": 0.1}):
         with pytest.raises(InvalidRequest, match="not both"):
             propose(engine, "hall", **how)
-    monkeypatch.setattr(thinning, "CHOICE_BYTES", 8 * N * 7 - 1)
+    monkeypatch.setattr(thin, "CHOICE_BYTES", 8 * N * 7 - 1)
     assert len(propose(engine, "hall", keep=6).losses) == N - 6
     with pytest.raises(InvalidRequest, match=r"Choosing 7 of 60 frames would take .* --novelty"):
         propose(engine, "hall", keep=7)

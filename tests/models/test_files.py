@@ -12,9 +12,9 @@ import pytest
 from safetensors.numpy import load, save
 
 from sceneprint.errors import UnreadableModel
-from sceneprint.geometry.depth import DepthParameters
-from sceneprint.geometry.segmentation import SegmentationParameters
-from sceneprint.geometry.surroundings import SurroundingsParameters
+from sceneprint.geometry.signature.segmentation import SegmentationParameters
+from sceneprint.geometry.surface.depth_image import DepthParameters
+from sceneprint.geometry.validation.patch_descriptors import PatchDescriptorParameters
 from sceneprint.models import PRESETS, Model, parse_model, read_model, save_model
 
 
@@ -42,7 +42,7 @@ def test_id_is_the_content_not_the_name(small_model: Model) -> None:
     depth = replace(small_model.parameters, depth=DepthParameters(maximum_depth=8.99))
     bent = replace(small_model.mixture, means=small_model.mixture.means + 1e-12)
     reach = replace(
-        small_model.parameters, surroundings=replace(SurroundingsParameters(), far_radius=1.5)
+        small_model.parameters, surroundings=replace(PatchDescriptorParameters(), far_radius=1.5)
     )
     own = replace(
         small_model.parameters, validation_segmentation=SegmentationParameters(n_patches=399)

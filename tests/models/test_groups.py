@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from sceneprint.errors import UnreadableModel
-from sceneprint.geometry.clouds import CloudParameters
-from sceneprint.geometry.validation import ValidationParameters
+from sceneprint.geometry.surface.cloud import CloudParameters
+from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.models import Model, ModelParameters, parse_model, read_model, write_model
 from sceneprint.models.model import parameters_of, to_mapping
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.schemas import NewMap
 from sceneprint.settings import Settings
+from sceneprint_client.api import NewMap
 
 pytestmark = pytest.mark.skipif(
     os.environ.get("SCENEPRINT_TEST_DATABASE") != "postgresql", reason="make test-postgres"

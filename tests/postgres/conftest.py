@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from sceneprint.datasets import write_depth_png
-from sceneprint.schemas import CameraIntrinsics, FrameMeta
+from sceneprint.formats.dataset import write_depth_png
 from sceneprint.store import Store, open_store
-from sceneprint.types import Frame
+from sceneprint.types import DepthFrame
+from sceneprint_client.api import CameraIntrinsics, FrameMeta
 
 #: Seconds that anything may take on the slowest machine.
 PATIENCE_S = 90.0
@@ -42,7 +42,9 @@ class Small(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def small(room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory) -> list[Small]:
+def small(
+    room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory
+) -> list[Small]:
     """Frames of their own content: every fourth sample from another corner each."""
     path, found = tmp_path_factory.mktemp("png") / "a.png", []
     for number in range(12):

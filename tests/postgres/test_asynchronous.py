@@ -13,11 +13,11 @@ import pytest
 from benchmarks.fleet.postgres import Server
 from sceneprint.engine import Engine
 from sceneprint.errors import StoreAway, UnknownFrame
-from sceneprint.schemas import JobState, NewMap, Query
 from sceneprint.settings import Settings
 from sceneprint.store import Database
 from sceneprint.store.events import EventRow, Wanted
-from service.feed import Feed
+from sceneprint_client.api import JobState, NewMap, Query
+from service.events import Feed
 
 ASKED = Query(k=5, candidates=5, keep=False)
 

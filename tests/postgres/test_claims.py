@@ -12,12 +12,11 @@ import pytest
 from sqlalchemy import Connection, text, update
 
 from sceneprint.errors import LostLease
-from sceneprint.schemas import JobState
-from sceneprint.store import Store, cancelling, clock, deaths, listing, queue
+from sceneprint.store import Store, queue
 from sceneprint.store.maps import add_map, keep_model
 from sceneprint.store.queue import Claim
-from sceneprint.store.records import JobRow
-from sceneprint.store.tables import jobs
+from sceneprint.store.tables import JobRow, jobs
+from sceneprint_client.api import JobState
 
 BLOCKED = text(
     "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database() "
@@ -49,7 +48,7 @@ def claimed(store: Store, worker: str = "w", lease_s: float = 60.0) -> Claim:
 
 def now_is(store: Store, job: JobRow) -> JobRow:
     with store.database.read() as connection:
-        return listing.find_job(connection, job.id)
+        return queue.find_job(connection, job.id)
 
 
 def turned(store: Store, job: JobRow, **values: object) -> None:
@@ -121,11 +120,11 @@ def test_what_fell_silent_is_locked_only_by_who_takes_it(store: Store) -> None:
 @pytest.mark.parametrize("first", ["claim", "cancel"])
 def test_a_claim_beside_a_cancellation(store: Store, until: Any, first: str) -> None:
     with store.database.read() as connection:
-        job = listing.find_job(connection, _id_of(connection, 1))
+        job = queue.find_job(connection, _id_of(connection, 1))
 
     def cancel() -> None:
         with store.database.write() as connection:
-            cancelling.cancel(connection, job)
+            queue.cancel(connection, job)
 
     if first == "claim":
         with uncommitted(store) as (connection, commit):
@@ -138,7 +137,7 @@ def test_a_claim_beside_a_cancellation(store: Store, until: Any, first: str) -> 
             queue.finish(connection, held, JobState.SUCCEEDED)
     else:
         with store.database.write() as connection:
-            cancelling.cancel(connection, job)
+            queue.cancel(connection, job)
             assert claimed(store).job.number == 2  # passed over, though not committed
     assert now_is(store, job).state == JobState.CANCELLED
 
@@ -191,7 +190,7 @@ def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(
 
     def tell() -> JobRow | None:
         with store.database.write() as connection:
-            return deaths.fail_of_dead(
+            return queue.fail_of_dead(
                 connection, dead.job.id, dead.token, "died", "trace", counts=False
             )
 
@@ -210,7 +209,7 @@ def test_a_renewal_beside_the_burial_of_its_job(store: Store, until: Any) -> Non
 
     def bury() -> list[JobRow]:
         with store.database.write() as connection:
-            return deaths.bury(connection)
+            return queue.dead_letter(connection)
 
     with uncommitted(store) as (connection, commit):
         queue.renew(connection, held, 60.0)
@@ -241,9 +240,9 @@ def test_the_clock_of_a_host_decides_nothing(
     with store.database.read() as connection:
         assert not queue.has_due(connection)
         assert 0 < (queue.due_in_s(connection) or 0) <= 60
-        assert clock.read_clock(connection) == pytest.approx(real(), abs=30)
+        assert queue.read_clock(connection) == pytest.approx(real(), abs=30)
     with store.database.write() as connection:
         queue.give_back(connection, held)
     assert claimed(store).job.number == held.job.number  # at once
     with store.database.write() as connection:
-        assert deaths.bury(connection) == []
+        assert queue.dead_letter(connection) == []

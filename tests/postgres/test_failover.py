@@ -68,7 +68,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, until: Callable[..., Any]) -
         )  # fmt: skip
     made = Fleet(primary, standby, process, errors)
     try:
-        until(lambda: made.log("the database is waited for"))
+        until(lambda: made.log("waiting for the database"))
         primary.start()
         assert process.stdout is not None
         told = re.match(r"sceneprint: serving (\S+)", process.stdout.readline())
@@ -119,7 +119,7 @@ def test_nothing_acknowledged_is_lost_and_all_goes_on_by_itself(
         assert refused.json()["type"] == "/problems/store-away"
         assert "127.0.0.1" not in refused.json()["detail"]
     assert fleet.ask("GET", "/healthz").status_code == 200
-    until(lambda: fleet.log("the store does not answer"))
+    until(lambda: fleet.log("store unreachable"))
     fleet.standby.promote()
     promoted = time.monotonic()
     found = until(lambda: (answer := query(views[0])).status_code == 200 and answer)

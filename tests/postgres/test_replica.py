@@ -12,11 +12,18 @@ from sqlalchemy import text
 
 from benchmarks.fleet.postgres import Server
 from sceneprint.errors import UnknownMap, UnusableStore, UselessFrame
-from sceneprint.store import Database, Store, open_store, replica
+from sceneprint.store import Database, Store, open_store
 from sceneprint.store.database import open_database
-from sceneprint.store.events import tell
+from sceneprint.store.events import record_event
 from sceneprint.store.maps import add_map, find_map, keep_model
-from sceneprint.store.replica import Behind, Replica, asked, behind_s, require_primary
+from sceneprint.store.postgres import replica
+from sceneprint.store.postgres.replica import (
+    Behind,
+    Replica,
+    behind_s,
+    read_through,
+    require_primary,
+)
 
 MODEL = "ab" * 32
 NAMES = text("SELECT name FROM maps ORDER BY name")
@@ -81,13 +88,13 @@ def test_within_a_query_the_replica_is_read_and_elsewhere_the_primary(store: Sto
             recovers = connection.execute(text("SELECT pg_is_in_recovery()")).scalar_one()
         return recovers, maps_of(store.queried), behind_s()
 
-    recovers, names, behind = asked(store.replica, ask)
+    recovers, names, behind = read_through(store.replica, ask)
     assert (recovers, names) == (True, ["hall"])
     assert behind is not None
     assert 0 <= behind <= 30.0
     assert store.queried is store.database
-    assert asked(None, ask) == (False, ["hall"], None)
-    assert asked(store.replica, lambda: asked(store.replica, ask))[0] is True
+    assert read_through(None, ask) == (False, ["hall"], None)
+    assert read_through(store.replica, lambda: read_through(store.replica, ask))[0] is True
 
 
 def test_what_the_replica_does_not_know_yet_the_primary_is_asked(
@@ -104,10 +111,10 @@ def test_what_the_replica_does_not_know_yet_the_primary_is_asked(
             with store.queried.read() as connection:
                 return find_map(connection, "new").name
 
-        assert asked(store.replica, ask) == "new"
+        assert read_through(store.replica, ask) == "new"
         assert tried == [False, True]
         with pytest.raises(UnknownMap, match="no map 'none'"):
-            asked(store.replica, lambda: _find(store, "none"))
+            read_through(store.replica, lambda: _find(store, "none"))
     finally:
         held(pair, False)
 
@@ -125,7 +132,7 @@ def test_errors_of_the_frame_itself_are_raised_once(store: Store) -> None:
         raise UselessFrame("a: nothing in it")
 
     with pytest.raises(UselessFrame):
-        asked(store.replica, ask)
+        read_through(store.replica, ask)
     assert tried == [1]
 
 
@@ -137,7 +144,7 @@ def test_what_is_held_of_the_primary_is_not_mixed_with_an_older_state(store: Sto
         require_primary("what is held")
         return "answered"
 
-    assert asked(store.replica, ask) == "answered"
+    assert read_through(store.replica, ask) == "answered"
     assert tried == [False, True]
     require_primary("it is")
     assert issubclass(Behind, Exception)
@@ -155,7 +162,7 @@ def test_it_is_asked_only_while_it_is_near_by_the_log_and_not_by_a_clock(
     held(pair, True)
     try:
         with primary.write() as connection:
-            tell(connection, "map.created", "one")
+            record_event(connection, "map.created", "one")
         until(lambda: (ours.standing().behind_s or 0) > 1.5)  # though it is measured all the while
         assert ours.near() is None
         told = ours.standing()
@@ -185,7 +192,7 @@ def test_what_is_no_replica_or_is_away_costs_no_query(
     given = url.format(primary=postgres_url, other=postgres.url("postgres"))
     primary = open_database(postgres_url)
     ours = Replica(primary, given, 30.0)
-    assert asked(ours, lambda: behind_s()) is None
+    assert read_through(ours, lambda: behind_s()) is None
     until(lambda: ours.standing().reason not in (None, "it was not asked yet"))
     told = ours.standing()
     assert (told.used, told.behind_s) == (False, None)
@@ -207,11 +214,11 @@ def test_one_that_falls_is_left_at_once_and_comes_back(
 ) -> None:
     pair[1].kill()
     for _ in range(3):
-        assert asked(store.replica, lambda: maps_of(store.queried)) == ["hall"]
+        assert read_through(store.replica, lambda: maps_of(store.queried)) == ["hall"]
     until(lambda: store.replica and not store.replica.standing().used)
     pair[1].start()
     until(lambda: store.replica and store.replica.standing().used)
-    assert asked(store.replica, lambda: store.queried is not store.database)
+    assert read_through(store.replica, lambda: store.queried is not store.database)
 
 
 def test_a_replica_is_of_postgresql(postgres_url: str, tmp_path: Path) -> None:
@@ -239,9 +246,9 @@ def test_a_conflict_with_recovery_is_asked_of_the_primary(
                 until(lambda: connection.execute(NAMES).all() == [])  # it is ended there
         return names
 
-    assert asked(store.replica, ask) == ["hall"]
+    assert read_through(store.replica, ask) == ["hall"]
     assert tried == [True, False]
     follower.execute("ALTER SYSTEM RESET max_standby_streaming_delay")
     follower.execute("SELECT pg_reload_conf()")
     caught_up(store, until)
-    assert asked(store.replica, lambda: maps_of(store.queried)) == ["hall"]
+    assert read_through(store.replica, lambda: maps_of(store.queried)) == ["hall"]

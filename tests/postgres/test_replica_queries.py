@@ -13,10 +13,10 @@ import pytest
 from benchmarks.fleet.postgres import Server
 from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest
-from sceneprint.schemas import Answer, JobState, NewMap, Query
-from sceneprint.schemas.operations import ReplicaSeen
 from sceneprint.settings import Settings
-from sceneprint.store.replica import Replica
+from sceneprint.store.postgres.replica import Replica
+from sceneprint_client.api import Answer, JobState, NewMap, Query
+from sceneprint_client.api.admin import ReplicaSeen
 from service.metrics import Metrics
 
 Until = Callable[[Callable[[], Any]], Any]

@@ -12,7 +12,7 @@ from sqlalchemy import text
 from benchmarks.fleet.postgres import Server
 from sceneprint.errors import StoreAway
 from sceneprint.store import Store
-from sceneprint.store.events import Wanted, list_events, tell
+from sceneprint.store.events import Wanted, list_events, record_event
 
 WAITING = "FROM pg_stat_activity WHERE wait_event = 'SyncRep'"
 
@@ -38,7 +38,7 @@ def test_a_commit_whose_wait_is_ended_by_hand_is_not_acknowledged(
             with database.write() as connection:
                 limit = connection.execute(text("SHOW statement_timeout")).scalar_one()
                 assert limit == "0"  # else the server would end the wait itself
-                tell(connection, "map.created", "hall")
+                record_event(connection, "map.created", "hall")
         except Exception as error:
             raised.append(error)
 
@@ -56,7 +56,7 @@ def test_a_commit_whose_wait_is_ended_by_hand_is_not_acknowledged(
 def test_other_warnings_are_no_doubt(server_store: Store) -> None:
     with server_store.database.write() as connection:
         connection.execute(text("DO $$ BEGIN RAISE WARNING 'of something else'; END $$"))
-        tell(connection, "map.created", "hall")
+        record_event(connection, "map.created", "hall")
     with server_store.database.read() as connection:
         assert len(list_events(connection, Wanted(), after=0, limit=9)) == 1
         assert connection.execute(text("SHOW statement_timeout")).scalar_one() == "1min"

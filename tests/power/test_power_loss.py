@@ -16,14 +16,14 @@ import pytest
 from numpy.typing import NDArray
 from sqlalchemy import Connection, event
 
-from sceneprint import writing
+from sceneprint import atomic_files
 from sceneprint.engine import Engine
 from sceneprint.index import Generation, newest, publication, publish
-from sceneprint.index.manifests import Manifest
-from sceneprint.schemas import CameraIntrinsics, FrameMeta, JobState, NewMap
+from sceneprint.index.manifest import GenerationManifest
 from sceneprint.settings import Settings
 from sceneprint.store import FolderBlobs
 from sceneprint.types import Bytes
+from sceneprint_client.api import CameraIntrinsics, FrameMeta, JobState, NewMap
 
 LENGTH = 64
 Recorded = Callable[..., Any]
@@ -45,9 +45,9 @@ def test_what_a_disk_may_drop(tmp_path: Path, recorded: Recorded) -> None:
         (root / "sub" / "part").replace(root / "sub" / "whole")
         (root / "old").unlink()
         disk.mark("renamed")
-        writing.sync_folder(root / "sub")
+        atomic_files.sync_folder(root / "sub")
         disk.mark("sub synced")
-        writing.sync_folder(root)
+        atomic_files.sync_folder(root)
     left: dict[str, list[dict[str, bytes | None]]] = {}
     for _, what, tree in disk.crashes(seeds=20):
         left.setdefault(what.partition(":")[0], []).append(tree)
@@ -278,7 +278,7 @@ def test_old_generations_removed_too_early_are_found_out(
 ) -> None:
     write = publication.write_manifest
 
-    def remove_first(folder: Path, manifest: Manifest) -> Path:
+    def remove_first(folder: Path, manifest: GenerationManifest) -> Path:
         for path in folder.glob("*.json"):
             path.unlink()
         return write(folder, manifest)
@@ -289,7 +289,7 @@ def test_old_generations_removed_too_early_are_found_out(
 
 @pytest.fixture(scope="module")
 def small_upload(room_frames: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    from sceneprint.datasets import write_depth_png
+    from sceneprint.formats.dataset import write_depth_png
 
     path = tmp_path_factory.mktemp("png") / "a.png"
     frame = room_frames[0]

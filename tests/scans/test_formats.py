@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import UnreadableCloud
-from sceneprint.scans import decode_cloud, decode_scan, format_of
+from sceneprint.formats.points import decode_cloud, decode_scan, format_of
 
 Write = Callable[..., bytes]
 

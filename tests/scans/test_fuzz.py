@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import FrameError
-from sceneprint.scans import CloudFormat, decode_scan
+from sceneprint.formats.points import decode_scan
+from sceneprint_client.api.frames import CloudFormat
 
 Write = Callable[..., bytes]
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneprint.errors import FrameError, UnreadableCloud
-from sceneprint.scans import decode_cloud, decode_scan
-from sceneprint.scans.lzf import inflate
+from sceneprint.formats.points import decode_cloud, decode_scan
+from sceneprint.formats.points.pcd import inflate
 
 Write = Callable[..., bytes]
 

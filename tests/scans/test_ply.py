@@ -6,9 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sceneprint.clouds import write_ply
 from sceneprint.errors import UnreadableCloud
-from sceneprint.scans import decode_cloud, decode_scan
+from sceneprint.formats.points import decode_cloud, decode_scan
+from sceneprint.formats.points.ply_export import write_ply
 
 Write = Callable[..., bytes]
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import InvalidPose, UnreadableCloud, UselessFrame
-from sceneprint.scans import decode_cloud, decode_scan, reading
-from sceneprint.scans.thinning import thinned
+from sceneprint.formats.points import cloud as reading
+from sceneprint.formats.points import decode_cloud, decode_scan
+from sceneprint.formats.points.cloud import thinned
 
 Write = Callable[..., bytes]
 

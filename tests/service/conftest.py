@@ -21,11 +21,11 @@ import numpy as np
 import pytest
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 
-from sceneprint.datasets import write_depth_png
 from sceneprint.engine import Engine
-from sceneprint.schemas.keys import Scope
+from sceneprint.formats.dataset import write_depth_png
 from sceneprint.settings import Settings
-from sceneprint.types import Floats32, Frame, Intrinsics
+from sceneprint.types import DepthFrame, Floats32, Intrinsics
+from sceneprint_client.api.admin import Scope
 from service.app import create_app
 
 BIN = Path(sys.executable).parent
@@ -204,7 +204,7 @@ def shoot(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Shot]:
 
 
 @pytest.fixture(scope="session")
-def shots(room_frames: tuple[Frame, ...], shoot: Callable[..., Shot]) -> list[Shot]:
+def shots(room_frames: tuple[DepthFrame, ...], shoot: Callable[..., Shot]) -> list[Shot]:
     """Three views of each of two rooms, with their poses."""
     return [
         shoot(one.depth, one.intrinsics, None if one.pose is None else one.pose.tolist())
@@ -213,7 +213,7 @@ def shots(room_frames: tuple[Frame, ...], shoot: Callable[..., Shot]) -> list[Sh
 
 
 @pytest.fixture(scope="session")
-def small_shots(room_frames: tuple[Frame, ...], shoot: Callable[..., Shot]) -> list[Shot]:
+def small_shots(room_frames: tuple[DepthFrame, ...], shoot: Callable[..., Shot]) -> list[Shot]:
     """96 small frames: every fourth sample from each of 16 corners of each of six views."""
     found = []
     for frame in room_frames:

@@ -104,7 +104,7 @@ def test_another_frame_of_the_same_id_is_not_asked_in_its_place(served, make_map
         put(i)
         reply = served.client.post(f"/v1/queries/{query_id}/again", json={})
         assert reply.status_code == status, reply.text
-    refused(reply, 404, "unknown-frame", "another has its id")
+    refused(reply, 404, "unknown-frame", "a new frame has its id")
 
 
 def test_the_query_is_drawn_as_the_frame_is(served, asked):
@@ -125,7 +125,7 @@ def test_the_query_is_drawn_as_the_frame_is(served, asked):
 def test_what_cannot_be_asked_again(served, asked, shots, refused):
     path = f"/v1/queries/{asked['query_id']}"
     reply = served.client.get(f"{path}/preview.png?view=patches")
-    refused(reply, 422, "invalid-request", "not kept")
+    refused(reply, 422, "invalid-request", "not stored")
     for wrong in ({"kk": 2}, {"k": 0}, {"frame": {"map": "again", "frame_id": "x"}}, {"maps": []}):
         refused(served.client.post(f"{path}/again", json=wrong), 422, "invalid-request", "")
     refused(served.client.post(f"{path}/again", json=[1]), 400, "malformed-body", "object")
@@ -136,7 +136,7 @@ def test_what_cannot_be_asked_again(served, asked, shots, refused):
     reply = served.client.post(f"{path}/again", json={"maps": ["nowhere"]})
     refused(reply, 404, "unknown-map", "nowhere")
     reply = served.client.post(f"/v1/queries/{'0' * 32}/again", json={})
-    refused(reply, 404, "unknown-query", "no longer")
+    refused(reply, 404, "unknown-query", "expired")
     # without validation no points were made: they cannot be validated, or drawn
     form = shots[0].form()
     form["data"]["stages"] = "retrieve"

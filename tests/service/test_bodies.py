@@ -95,7 +95,7 @@ FORMS = {
     "meta as file": (X, part("meta", META, "m") + part("frame", b"a") + END, 422,
                      "invalid-request", "`frame`"),
     "unknown part": (X, FRAME + KNOWN + part("colour", b"1") + END, 422, "invalid-request",
-                     "a part 'colour' that is not known"),
+                     "an unknown part 'colour'"),
     "meta is no JSON": (X, FRAME + part("meta", b"{") + END, 400, "malformed-body", "`meta`"),
     "meta is no object": (X, FRAME + part("meta", b"[]") + END, 422, "invalid-request", "`meta`"),
     "meta is empty": (X, FRAME + part("meta", b"") + END, 400, "malformed-body", "`meta`"),
@@ -126,7 +126,7 @@ def test_the_length_is_believed_before_a_byte_is_read(wire):
     assert headers["content-type"] == "application/problem+json"
     problem = json.loads(body)
     assert (problem["status"], problem["type"]) == (413, "/problems/too-large")
-    assert "more than 100000 bytes" in problem["detail"]
+    assert "the limit of 100000 bytes" in problem["detail"]
     assert problem["instance"] == f"/requests/{headers['x-request-id']}"
 
 

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprint.clouds import write_ply
-from sceneprint.types import Floats, Frame
+from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.types import DepthFrame, Floats
 
 WAIT = {"Prefer": "wait=60"}
 #: Where the second of three clouds says that it was seen from, metres in its own coordinates.
 VIEWPOINT = (2.0, -1.0, 0.5)
 
 
-def points_of(frame: Frame, every: int = 2) -> Floats:
+def points_of(frame: DepthFrame, every: int = 2) -> Floats:
     """What a depth image sees, in its optical frame."""
     depth, k = frame.depth[::every, ::every].astype(float), frame.intrinsics
     y, x = np.nonzero(depth)
@@ -155,7 +155,7 @@ def test_a_cloud_is_who_its_points_are(served, hall, clouds, refused):
     same = form(repacked, viewpoint=dict(zip("xyz", VIEWPOINT, strict=True)))
     assert (post(same).status_code, post(same).json()["frame_id"]) == (200, ids[2])
     robot = form(repacked, robot="r", viewpoint=dict(zip("xyz", VIEWPOINT, strict=True)))
-    refused(post(robot), 409, "frame-conflict", "other robot")
+    refused(post(robot), 409, "frame-conflict", "different robot")
     millimetres = raw(npy(1000.0 * (clouds[2] + VIEWPOINT)), viewpoint="2,-1,0.5")
     millimetres["params"]["units_per_metre"] = 1000
     refused(post(millimetres), 409, "frame-conflict", "other units_per_metre")
@@ -205,7 +205,9 @@ def read_points(ply: bytes) -> Floats:
 def test_a_viewpoint_is_content_and_a_base_can_be_edited(served, hall, refused):
     path, ids = hall
     http, frame = served.client, f"{path}/frames/{ids[2]}"
-    refused(http.patch(frame, json={"viewpoint": None}), 422, "invalid-request", "what the frame")
+    refused(
+        http.patch(frame, json={"viewpoint": None}), 422, "invalid-request", "identity of the frame"
+    )
     matrix = np.diag([-1.0, -1.0, 1.0, 1.0]).tolist()
     told = http.patch(frame, json={"T_base_sensor": {"base_frame": "spot", "matrix": matrix}})
     assert told.json()["base_frame"] == "spot"

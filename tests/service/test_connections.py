@@ -19,11 +19,12 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from sceneprint.settings import Settings
-from service import connections, slowness
-from service.connections import Connection
-from service.cors import Origins
+from service import guards
+from service import server as connections
+from service.guards import Origins
 from service.metrics import Metrics
-from service.middleware import Around
+from service.middleware import RequestMiddleware
+from service.server import Connection
 
 LARGE = 8 << 20
 PATIENCE_S = 30
@@ -60,10 +61,10 @@ def opened(monkeypatch) -> Iterator[Callable[..., socket.socket]]:
     """Connections to a service that is soon tired of waiting."""
     monkeypatch.setattr(connections, "HEAD_S", 0.8)
     monkeypatch.setattr(connections, "READING_S", 1.0)
-    monkeypatch.setattr(slowness, "IDLE_S", 0.8)
+    monkeypatch.setattr(guards, "IDLE_S", 0.8)
     settings = Settings(body_s=1, upload_bytes=1 << 20, cors_origins=())
     made: list[socket.socket] = []
-    with running(Around(app, settings, Origins(()), Metrics())) as address:
+    with running(RequestMiddleware(app, settings, Origins(()), Metrics())) as address:
 
         def connect(said: bytes = b"") -> socket.socket:
             made.append(socket.create_connection(address, timeout=PATIENCE_S))
@@ -214,7 +215,7 @@ def test_a_body_that_stops_is_refused(opened, sent):
     wire = opened(ask("/", "Content-Length: 9", method="POST") + sent)
     status, problem = refusal(rest(wire))
     assert (status, problem["type"]) == (408, "/problems/slow-body")
-    assert f"nothing came, after {len(sent)} bytes" in problem["detail"]
+    assert f" s, after {len(sent)} bytes" in problem["detail"]
 
 
 def test_a_body_that_drips_is_refused_in_the_end(opened):
@@ -222,13 +223,13 @@ def test_a_body_that_drips_is_refused_in_the_end(opened):
     with dripping(wire, b"1\r\na\r\n"):
         status, problem = refusal(rest(wire))
     assert (status, problem["type"]) == (408, "/problems/slow-body")
-    assert "it took too long" in problem["detail"]
+    assert "the transfer took too long" in problem["detail"]
 
 
 def test_each_mebibyte_that_came_gives_more_time(monkeypatch):
     """By hand: 2 s, and 4 s for each MiB; each part took 3 s of waiting."""
     now = [0.0]
-    monkeypatch.setattr(slowness.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(guards.time, "monotonic", lambda: now[0])
     left = []
 
     class Timeout:
@@ -239,14 +240,14 @@ def test_each_mebibyte_that_came_gives_more_time(monkeypatch):
 
         async def __aexit__(self, *_: object) -> None: ...
 
-    monkeypatch.setattr(slowness.asyncio, "timeout", Timeout)
+    monkeypatch.setattr(guards.asyncio, "timeout", Timeout)
 
     async def receive() -> dict[str, Any]:
         now[0] += 3
         return {"type": "http.request", "body": bytes(1 << 20), "more_body": True}
 
     async def read() -> None:
-        body = slowness.Incoming(receive, 1 << 30, 2.0)
+        body = guards.RequestBody(receive, 1 << 30, 2.0)
         for _ in range(4):
             await body.next()
 

@@ -27,7 +27,7 @@ def test_a_database_that_vanishes_is_told_of_and_comes_back(shaken, small_shots,
         shaken.client.get(path),
         shaken.client.post(path, **small_shots[2].form()),
     ):
-        refused(answer, 503, "unusable-store", "Its log says why")
+        refused(answer, 503, "unusable-store", "See its log")
         assert answer.headers["retry-after"] == "1"
         own = answer.headers["x-request-id"]
         noted = [line for line in shaken.log("request failed") if line["request_id"] == own]
@@ -49,7 +49,7 @@ def test_a_disk_that_takes_no_blobs_takes_no_frames(shaken, small_shots, refused
     blobs.write_text("a file where the folder was")
     before = shaken.client.get("/readyz").json()["frames"]
     answer = shaken.client.post("/v1/maps/hall/frames", **small_shots[3].form())
-    refused(answer, 503, "unusable-store", "nothing was taken")
+    refused(answer, 503, "unusable-store", "nothing was stored")
     assert shaken.client.get("/readyz").json()["frames"] == before
     blobs.unlink()
     away.rename(blobs)

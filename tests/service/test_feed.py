@@ -10,10 +10,10 @@ import pytest
 
 from sceneprint.errors import Busy
 from sceneprint.store import Database, open_store
-from sceneprint.store.events import EventRow, Wanted, tell
+from sceneprint.store.events import EventRow, Wanted, record_event
 from sceneprint.store.retention import remove_events
-from service import feed as feeds
-from service.feed import Feed
+from service import events as feeds
+from service.events import Feed
 
 Batch = tuple[list[EventRow], int]
 
@@ -31,7 +31,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
 def write(database: Database, *names: str) -> None:
     for name in names:
         with database.write() as connection:
-            tell(connection, "frame.received", name, name)
+            record_event(connection, "frame.received", name, name)
 
 
 def ids(batch: Batch) -> list[int]:
@@ -69,7 +69,7 @@ def test_streams_far_behind_and_near_are_told_all_once(database, monkeypatch):
         assert await gather(begun[0], 40) == list(range(21, 61))
         assert await gather(begun[2], 20) == list(range(21, 61, 2))
         looks: list[int] = []
-        monkeypatch.setattr(feeds, "read_on", lambda *_: looks.append(1))
+        monkeypatch.setattr(feeds, "next_events", lambda *_: looks.append(1))
         write(database, "shop", "hall")  # all are near: memory has it
         for stream in begun[:2]:
             assert await gather(stream, 2) == [61, 62]
@@ -172,7 +172,7 @@ def test_there_are_so_many_places_and_all_end_together(database):
         feed = Feed(database, most=2, kept=9)
         for _ in range(2):
             feed.join()
-        with pytest.raises(Busy, match="As many streams of events are open"):
+        with pytest.raises(Busy, match="limit of open event streams"):
             feed.join()
         streams = [feed.batches(Wanted(), None, always) for _ in range(2)]
         waiting = []

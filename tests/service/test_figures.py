@@ -14,14 +14,14 @@ from typing import Any
 
 import pytest
 
-from sceneprint import descriptors
+from sceneprint import process_limits
 from sceneprint.engine import Engine
 from sceneprint.logs import JsonFormatter, name_request, of_request, request_id
-from sceneprint.schemas import Answer
 from sceneprint.settings import Settings
 from sceneprint.store import database
-from sceneprint.store.samples import samples_since
-from service.sampling import Sampler
+from sceneprint.store.metrics import samples_since
+from sceneprint_client.api import Answer
+from service.metrics import Sampler
 
 
 def test_what_was_done_is_told(served, make_map, shots, until):
@@ -188,9 +188,9 @@ def test_lines_name_the_request_that_is_worked_on():
 
 CHILD = """
 import resource
-from sceneprint import descriptors
+from sceneprint.process_limits import raise_descriptors
 resource.setrlimit(resource.RLIMIT_NOFILE, (64, 256))
-told = descriptors.raise_descriptors()
+told = raise_descriptors()
 files = [open("/dev/null") for _ in range(200)]
 print(told, resource.getrlimit(resource.RLIMIT_NOFILE))
 """
@@ -200,7 +200,9 @@ def test_as_many_files_may_be_open_as_the_system_lets(served):
     done = subprocess.run([sys.executable, "-c", CHILD], capture_output=True, text=True, check=True)
     assert done.stdout == "256 (256, 256)\n"
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    wanted = descriptors.MOST if hard == resource.RLIM_INFINITY else min(hard, descriptors.MOST)
+    wanted = (
+        process_limits.MOST if hard == resource.RLIM_INFINITY else min(hard, process_limits.MOST)
+    )
     for pid in (served.process.pid, *served.workers):
         text = Path(f"/proc/{pid}/limits").read_text()
         (line,) = [one for one in text.splitlines() if one.startswith("Max open files")]

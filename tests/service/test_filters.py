@@ -151,7 +151,7 @@ def test_a_frame_is_kept_only_where_the_map_lacks_its_place(
     told = second.json()
     assert (second.status_code, told["state"]) == (201, "redundant")
     assert first.json()["frame_id"] in told["reason"]
-    assert "the map has this place" in told["reason"]
+    assert "the map already has this place" in told["reason"]
     frame = served.client.get(f"{path}/frames/{told['frame_id']}").json()
     assert (frame["state"], frame["reason"]) == ("redundant", told["reason"])
     listed = served.client.get(f"{path}/frames?state=redundant").json()["items"]

@@ -27,7 +27,7 @@ def test_who_waits_too_long_is_sent_away_and_nothing_of_it_is_begun():
             await asyncio.sleep(0.01)
         waiting = [asyncio.create_task(gate.run(lambda: work("late"))) for _ in range(2)]
         for one in waiting:
-            with pytest.raises(Busy, match=r"in 0\.2 s\. Nothing was begun"):
+            with pytest.raises(Busy, match=r"in 0\.2 s\. Nothing was stored"):
                 await one
         done.set()
         assert await first == "first"
@@ -60,7 +60,7 @@ def test_as_many_have_a_place_as_may():
     async def test() -> None:
         gate = Gate(1, 1, longest_s=1)
         async with gate.place(), gate.place():
-            with pytest.raises(Busy, match="as it lets wait"):
+            with pytest.raises(Busy, match="queue of uploads and queries is full"):
                 async with gate.place():
                     pass
         async with gate.place():

@@ -12,7 +12,7 @@ import pytest
 
 from sceneprint.errors import InvalidRequest
 from sceneprint.settings import Settings
-from service.cors import origins_of
+from service.guards import origins_of
 
 FLEET = "https://fleet.example"
 NOTHING = "default-src 'none'; frame-ancestors 'none'"
@@ -131,7 +131,7 @@ def test_all_pages_are_not_let_in_where_no_key_is_asked_for(tmp_path):
 
 @pytest.mark.parametrize("given", ["fleet.example", "https://fleet.example/", "ftp://a", "a b"])
 def test_an_origin_is_written_as_browsers_write_it(given):
-    with pytest.raises(ValueError, match="is no origin"):
+    with pytest.raises(ValueError, match="is not an origin"):
         Settings(cors_origins=given)
 
 
@@ -205,7 +205,7 @@ def test_one_key_does_not_take_every_place(walled, refused, until):
             wire.sendall(head)
         until(lambda: walled.ask("reader", "GET", "/v1/keys/me").status_code == 429)
         answer = walled.ask("reader", "GET", "/v1/keys/me", headers={"X-Request-Id": "late"})
-        refused(answer, 429, "rate-limited", f"{most} requests with this key are in hand")
+        refused(answer, 429, "rate-limited", f"{most} requests with this key are in progress")
         other = walled.ask("keeper", "POST", "/v1/maps/bravo/queries", json={"frame_id": "none"})
         assert other.status_code == 404
     until(lambda: walled.ask("reader", "GET", "/v1/keys/me").status_code == 200)

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from sceneprint.cli import checks
+from sceneprint.cli import doctor
 from sceneprint.engine import Engine
-from sceneprint.schemas import FrameMeta, NewMap
 from sceneprint.settings import Settings
-from sceneprint.store.postgres import allow
+from sceneprint.store.postgres.connection import allow
+from sceneprint_client.api import FrameMeta, NewMap
 
 BIN = Path(sys.executable).parent
 #: Largest file that a process may write from now on, where no disk can be mounted: less than the
@@ -40,7 +40,7 @@ def members(server) -> list[int]:
 class Mounted:
     """A service whose data folder is a disk of its own, of 24 MB."""
 
-    kinds = (507, "store-full", "30", "The service's disk is full, and nothing was taken")
+    kinds = (507, "store-full", "30", "The service's disk is full, so nothing was stored")
 
     def __init__(self, server) -> None:
         self.server = server
@@ -66,7 +66,7 @@ class Mounted:
 class Limited:
     """A service whose processes may write no large file; no privilege is needed for that."""
 
-    kinds = (503, "unusable-store", "1", "nothing was taken")
+    kinds = (503, "unusable-store", "1", "nothing was stored")
 
     def __init__(self, server) -> None:
         self.server, self.folder = server, server.folder
@@ -140,13 +140,13 @@ def test_a_full_disk_takes_nothing_and_costs_nothing(
     asked = server.client.post(f"{path}/queries", **shots[0].form())
     assert (asked.status_code, asked.json()["status"]) == (200, "found")
     os.kill(worker, signal.SIGCONT)
-    until(lambda: len(server.log("the store does not answer")) >= 2)
+    until(lambda: len(server.log("store unreachable")) >= 2)
     assert server.client.get("/healthz").status_code == 200
     job = server.client.get(f"/v1/jobs/{waiting.json()['job_id']}").json()
     assert job["state"] in ("queued", "running")
     assert tree(narrow.folder / "blobs") == blobs
     if isinstance(narrow, Mounted):
-        look = checks.machine(Settings(data_dir=narrow.folder, database_url=None))
+        look = doctor.machine(Settings(data_dir=narrow.folder, database_url=None))
         told = {one.subject: one for one in look}
         assert told["data folder"].verdict == told["disk"].verdict == "WRONG"
         assert "is on a full disk. Free some space" in told["data folder"].text
@@ -197,7 +197,7 @@ def test_another_process_that_keeps_writing_stops_uploads_alone(kept, small_shot
                 assert (answer.status_code, answer.headers["retry-after"]) == (503, "1")
             kinds = [answer.json()["type"].rpartition("/")[2] for answer in answers]
             assert kinds == ["store-locked"] * 4
-        refused(upload(11), 503, "store-locked", "nothing was taken")
+        refused(upload(11), 503, "store-locked", "nothing was stored")
         deleted = kept.client.delete(f"{path}/frames/none")
         refused(deleted, 503, "store-locked")
     assert kept.client.get("/readyz").json()["frames"] == {"indexed": 3}
@@ -286,8 +286,8 @@ def test_a_read_only_folder_is_served_as_it_is(sealed, stored, begin, small_shot
     path = "/v1/maps/hall"
     ready = server.client.get("/readyz").json()
     assert (ready["status"], ready["read_only"], ready["frames"]) == ("ready", True, {"indexed": 4})
-    assert len(server.log("the store is read-only: queries are answered, and nothing is taken or "
-                          "signed")) == 1  # fmt: skip
+    said = "the store is read-only: queries work, but nothing is stored or signed"
+    assert len(server.log(said)) == 1
     asked = server.client.post(f"{path}/queries", **small_shots[1].form())
     assert (asked.status_code, asked.json()["status"]) == (200, "found")
     frames = server.client.get(f"{path}/frames").json()["items"]
@@ -322,5 +322,5 @@ def test_workers_and_doctor_say_that_a_folder_is_read_only(sealed, stored):
     assert done.returncode == 2
     (line,) = [one for one in done.stdout.splitlines() if one.startswith("WRONG")]
     assert "is read-only" in line
-    assert "`sceneprint serve` answers queries of it, and takes nothing" in line
+    assert "`sceneprint serve` can answer queries from it but cannot accept uploads" in line
     assert contents(stored) == before

@@ -11,11 +11,12 @@ from typing import Any
 
 import pytest
 
-from sceneprint.client import Client
-from sceneprint.engine import Engine, endings
+from sceneprint.engine import Engine
+from sceneprint.engine.jobs import lifecycle
 from sceneprint.errors import NewerSchema, UnusableStore
-from sceneprint.schemas import FrameMeta, FrameState, JobState, NewMap, Query
 from sceneprint.settings import Settings
+from sceneprint_client import Client
+from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
 
 BIN = Path(sys.executable).parent
 HALL = "/v1/maps/hall"
@@ -129,7 +130,7 @@ def test_blobs_that_are_missing_cost_what_needs_them(folder, begin, small_shots,
     assert {match["validation"]["status"] for match in answer.json()["matches"]} == {"skipped"}
     assert server.client.get(f"{HALL}/frames/{frames[2]}").json()["state"] == "indexed"
     sent = server.client.post(f"{HALL}/frames", **small_shots[20].form())
-    refused(sent, 503, "unusable-store", "nothing was taken")
+    refused(sent, 503, "unusable-store", "nothing was stored")
     assert not (folder / "blobs").exists()  # a disk that was unmounted comes back, with its blobs
     (folder / "away").rename(folder / "blobs")
     assert server.client.post(f"{HALL}/frames", **small_shots[20].form()).status_code == 202
@@ -183,7 +184,7 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
             place.rename(folder / "away")
         place.write_bytes(b"a file where the folder should be")
         with monkeypatch.context() as patch:
-            patch.setattr(endings, "LEFT_S", 600.0)
+            patch.setattr(lifecycle, "LEFT_S", 600.0)
             with pytest.raises(UnusableStore):
                 engine.run(engine.claim("w"))
             assert engine.claim("w") is None  # it lets others go first
@@ -193,7 +194,7 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
             assert work.frame.id == other.frame_id
             assert engine.run(work) == JobState.SUCCEEDED
         due(truth, folder)
-        monkeypatch.setattr(endings, "LEFT_S", 0.0)
+        monkeypatch.setattr(lifecycle, "LEFT_S", 0.0)
         for _ in range(4):  # more often than a frame may break down
             work = engine.claim("w")
             assert work is not None

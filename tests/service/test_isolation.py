@@ -16,8 +16,8 @@ import httpx
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.schemas import NewMap
 from sceneprint.settings import Settings
+from sceneprint_client.api import NewMap
 
 #: The key's own map, one that it may not see, and one that is not there: names of one length.
 OWN, THEIRS, NONE = "alpha", "bravo", "zulus"

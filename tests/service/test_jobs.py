@@ -26,7 +26,9 @@ def test_a_job_is_cancelled_and_tried_again(idle, make_map, small_shots, refused
     path, client = make_map(idle, "given-up"), idle.client
     first = sent(idle, path, small_shots[0])
     place = f"/v1/jobs/{first['job_id']}"
-    refused(client.post(f"{place}/retry"), 409, "cannot-retry", "is queued and its frame received")
+    refused(
+        client.post(f"{place}/retry"), 409, "cannot-retry", "is queued and its frame is received"
+    )
     for _ in range(2):
         cancelled = client.post(f"{place}/cancel")
         assert (cancelled.status_code, cancelled.json()["state"]) == (200, "cancelled")
@@ -92,7 +94,7 @@ def test_a_priority_is_a_small_whole_number(idle, make_map, small_shots, refused
     problem = refused(idle.client.post(f"{path}/frames", **form), 422, "invalid-request")
     assert [one["field"] for one in problem["errors"]] == ["priority"]
     query = idle.client.post(f"{path}/queries", **form)
-    refused(query, 422, "invalid-request", "a part 'priority' that is not known")
+    refused(query, 422, "invalid-request", "an unknown part 'priority'")
 
 
 def test_a_frame_says_its_priority(idle, make_map, small_shots):

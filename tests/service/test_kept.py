@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.engine.kept import Kept
-from sceneprint.schemas import Answer, Counts, NewMap, Query
-from sceneprint.schemas.options import FrameName
+from sceneprint.engine.results.stored_results import StoredResult
 from sceneprint.settings import Settings
 from sceneprint.store.frames import add_frame
 from sceneprint.store.maps import find_map
+from sceneprint_client.api import Answer, Counts, NewMap, Query
+from sceneprint_client.api.options import FrameName
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_what_is_not_there(served, asked, refused):
             reply = served.client.get(f"/v1/queries/{query_id}{tail}")
             assert reply.status_code == 404
             if "%" not in query_id:
-                refused(reply, 404, "unknown-query", "no longer")
+                refused(reply, 404, "unknown-query", "expired")
     refused(served.client.get(f"{path}/matches/nobody"), 404, "unknown-frame", "has no match")
     reply = served.client.get(f"{path}/matches/{best}?map=elsewhere")
     refused(reply, 404, "unknown-frame", "in map 'elsewhere'")
@@ -113,7 +113,9 @@ def test_an_answer_is_seen_by_who_may_read_all_of_it(begin):
             model="m", index_generation=0, exact=True, counts=counts, milliseconds={}, maps=maps,
             frame=None if home is None else FrameName(map=home, frame_id="f"),
         )  # fmt: skip
-        assert engine.kept.keep(Kept(answer, Query(), "a" * 64, np.zeros(4, np.uint8), None))
+        assert engine.kept.keep(
+            StoredResult(answer, Query(), "a" * 64, np.zeros(4, np.uint8), None)
+        )
         return answer.query_id
 
     known = {

@@ -34,7 +34,7 @@ def secret(wide) -> str:
     assert done.returncode == 0
     assert done.stdout.startswith("sp_")
     assert len(done.stdout.split()) == 1
-    assert done.stderr == "keep it: it is not stored, and cannot be shown again\n"
+    assert done.stderr == "save this secret now: it is not stored and cannot be shown again\n"
     return done.stdout.strip()
 
 
@@ -110,4 +110,4 @@ def test_a_key_has_a_name_that_can_be_printed(name: str, tmp_path: Path) -> None
     )
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1
-    assert "is no name for a key" in done.stderr
+    assert "is not a valid key name" in done.stderr

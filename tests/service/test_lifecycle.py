@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import subprocess
 import sys
 from datetime import datetime
 
@@ -136,7 +137,7 @@ def test_a_file_that_is_no_database_is_refused_in_one_line(begin, tmp_path):
     [
         (("--port", "99999"), "The setting port is 99999"),
         (("--workers", "257"), "The setting workers is 257"),
-        (("--host", "no.such.host.invalid"), "no.such.host.invalid:0 cannot be listened on"),
+        (("--host", "no.such.host.invalid"), "no.such.host.invalid:0 is not available"),
     ],
 )
 def test_what_cannot_be_set_is_refused_in_one_line(begin, arguments, text):
@@ -147,8 +148,8 @@ def test_a_port_that_is_taken_is_refused_in_one_line(begin, served):
     port = served.url.rpartition(":")[2]
     line = refusal(begin, "--port", port)
     assert line == (
-        f"sceneprint serve: 127.0.0.1:{port} cannot be listened on (Address already in use). "
-        "Choose another --port, 0 for a free one, or stop what holds it."
+        f"sceneprint serve: 127.0.0.1:{port} is not available (Address already in use). "
+        "Choose another --port, 0 for a free one, or stop the process that uses it."
     )
     with socket.create_connection(("127.0.0.1", int(port))):
         assert served.client.get("/healthz").status_code == 200
@@ -176,3 +177,27 @@ def test_service_and_worker_alone_do_the_job_together(begin, make_map, small_sho
     interrupted = begin(command=(sys.executable, "-m", "service"), **given)
     assert interrupted.end(signal.SIGINT) == 0
     assert {line["level"] for line in interrupted.log()} == {"info"}
+
+
+UNPREPARED = """
+import sys
+from sceneprint import cli
+from sceneprint.cli import options
+from sceneprint.errors import UnusableStore
+
+def fail(*_):
+    raise UnusableStore("no room for tables")
+
+options.prepare_presets = fail
+sys.exit(cli.main(["serve", "--port", "0", "--data", sys.argv[1]]))
+"""
+
+
+def test_a_service_whose_workers_cannot_start_ends_with_the_reason(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", UNPREPARED, str(tmp_path)],
+        capture_output=True, text=True, timeout=90,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stdout.startswith("sceneprint: serving http://")
+    assert done.stderr.splitlines()[-1] == "sceneprint serve: no room for tables"

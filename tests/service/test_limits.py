@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.limits import Limit, Standing, place_of
+from service.limits import Limit, RateState, place_of
 
 
 class Clock:
@@ -21,7 +21,7 @@ def test_a_rested_caller_may_ask_at_once_and_then_at_the_rate():
     told = [limit.take("a") for _ in range(4)]
     assert [one.allowed for one in told] == [True, True, True, False]
     assert [one.left for one in told] == [2, 1, 0, 0]
-    assert told[3] == Standing("key", quota=3, window_s=2, left=0, wait_s=1, allowed=False)
+    assert told[3] == RateState("key", quota=3, window_s=2, left=0, wait_s=1, allowed=False)
     clock.now += 0.5  # one token more
     assert [limit.take("a").allowed for _ in range(2)] == [True, False]
     clock.now += 100  # never more than full

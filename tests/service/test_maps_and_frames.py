@@ -23,7 +23,7 @@ def test_a_map_is_made_once_and_stays_as_it_was_made(served, refused):
     assert datetime.fromisoformat(made["created_at"]).utcoffset() is not None
     for other in ({"title": "Another"}, {}, {"title": "The hall", "model": "paper"}):
         answer = served.client.post("/v1/maps", json={"name": "hall", **other})
-        refused(answer, 409, "map-exists", "'hall' with another title or model")
+        refused(answer, 409, "map-exists", "'hall' already exists with a different title, model")
     assert served.client.get("/v1/maps/hall").json()["title"] == "The hall"
     names = [one["name"] for one in served.client.get("/v1/maps").json()["items"]]
     assert "hall" in names
@@ -79,7 +79,7 @@ def test_an_upload_is_safe_then_signed_and_the_same_one_is_there_already(
         ({**meta, "captured_at": "2024-05-01T12:00:00.251+02:00"}, "captured_at"),
     ):
         answer = served.client.post(f"{path}/frames", **shot.form(**other))
-        text = f"Frame {added['frame_id']} has the same content, but other {names}."
+        text = f"Frame {added['frame_id']} has the same content, but a different {names}."
         refused(answer, 409, "frame-conflict", text)
 
     frame = served.client.get(f"{path}/frames/{added['frame_id']}").json()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from sceneprint.schemas.base import Given
-from service.access import Caller
-from service.once import guarded
+from sceneprint_client.api.base import Given
+from service.auth import Caller
+from service.bodies import guarded
 
 
 class Before(Given):

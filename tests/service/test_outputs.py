@@ -244,12 +244,12 @@ def test_sessions_and_a_trajectory(served, shown, refused):
     thin = served.client.get(f"{path}/trajectory?session=monday&most=2")
     lines = [line for line in thin.text.splitlines() if not line.startswith("#")]
     assert [float(line.split()[0]) - start for line in lines] == [0, 2]
-    assert "# poses: 2 of 3, evenly taken; frames left out: 1" in thin.text
+    assert "# poses: 2 of 3, evenly spaced; frames left out: 1" in thin.text
     refused(served.client.get(f"{path}/trajectory"), 422, "invalid-request", "session: ")
     for most in (1, 10_001):
         bad = served.client.get(f"{path}/trajectory?session=monday&most={most}")
         refused(bad, 422, "invalid-request", "most: ")
-    refused(served.client.get(f"{path}/sessions?cursor=x"), 422, "invalid-request", "given out")
+    refused(served.client.get(f"{path}/sessions?cursor=x"), 422, "invalid-request", "is not valid")
 
 
 def test_an_edit_does_not_overwrite_another(served, shown, refused):
@@ -268,10 +268,10 @@ def test_an_edit_does_not_overwrite_another(served, shown, refused):
     assert done.json() == served.client.get(url).json()
     for given in (tag, f"W/{done.headers['etag']}", '"a", "b"'):
         late = served.client.patch(url, json={"tags": []}, headers={"If-Match": given})
-        refused(late, 412, "precondition-failed", "has been edited since it was read")
+        refused(late, 412, "precondition-failed", "was edited after you read it")
     refused(
         served.client.patch(url, json={}, headers={"If-Match": "5"}),
-        422, "invalid-request", "with its quotes",
+        422, "invalid-request", "including its quotes",
     )  # fmt: skip
     for given in ({}, {"If-Match": "*"}, {"If-Match": f'"x", {done.headers["etag"]}'}):
         assert served.client.patch(url, json={"robot": None}, headers=given).status_code == 200

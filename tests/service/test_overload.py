@@ -36,7 +36,7 @@ def test_who_comes_too_many_is_sent_away_and_may_come_back(busy, shots, refused)
     assert kinds.count(200) >= 2  # one at work, one that waited
     for answer in answers:
         if answer.status_code == 503:
-            refused(answer, 503, "busy", "Come back in a second")
+            refused(answer, 503, "busy", "Retry in a second")
             assert answer.headers["retry-after"] == "1"
         else:
             assert answer.json()["counts"]["map"] == 2

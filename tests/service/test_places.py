@@ -19,10 +19,10 @@ import pytest
 import starlette.formparsers
 from fastapi import FastAPI
 
-from sceneprint.schemas import Added
 from sceneprint.settings import Settings
+from sceneprint_client.api import Added
 from service.app import UPLOADS, create_app
-from service.routes import uploads
+from service.routes import frames
 
 JSON, FORM = "application/json", "multipart/form-data; boundary=x"
 #: The beginning of a form whose file is larger than is kept in memory, and its end.
@@ -216,13 +216,13 @@ def test_a_wait_looks_less_and_less_often_and_ends_with_its_caller(
     async def is_disconnected() -> bool:
         return len(pauses) >= hung_up_after
 
-    monkeypatch.setattr(uploads, "time", clock)
-    monkeypatch.setattr(uploads.anyio, "sleep", sleep)
+    monkeypatch.setattr(frames, "time", clock)
+    monkeypatch.setattr(frames.anyio, "sleep", sleep)
     frame = SimpleNamespace(state="received", reason=None)
     here: Any = SimpleNamespace(engine=SimpleNamespace(get_frame=lambda *_: frame))
     request: Any = SimpleNamespace(is_disconnected=is_disconnected)
     added = Added(frame_id="f", job_id="j", state="received", reason=None)
-    settled = asyncio.run(uploads._settled(request, here, "m", added, 10.0))
+    settled = asyncio.run(frames._settled(request, here, "m", added, 10.0))
     assert settled.state == "received"
     if looks is not None:
         assert pauses == pytest.approx(looks)

@@ -59,7 +59,7 @@ def test_refusals_of_points(served, drawn, refused):
     refused(served.client.get(f"{match}?transform=best"), 422, "invalid-request", "transform")
     refused(served.client.get(f"{match}?map=elsewhere"), 404, "unknown-frame", "in map")
     refused(served.client.get(f"{drawn['path']}/frames/x/points"), 404, "unknown-frame", "'x'")
-    refused(served.client.get(f"/v1/queries/{'0' * 32}/points"), 404, "unknown-query", "no longer")
+    refused(served.client.get(f"/v1/queries/{'0' * 32}/points"), 404, "unknown-query", "expired")
     bare = {"frame_id": drawn["ids"][0], "stages": "retrieve"}
     quick = served.client.post(f"{drawn['path']}/queries", json=bare).json()["query_id"]
     for tail in ("points", f"matches/{drawn['ids'][1]}/points"):

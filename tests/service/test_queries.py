@@ -146,7 +146,7 @@ def test_stages_and_k_are_as_asked(served, rooms, moved):
     assert [match["rank"] for match in plain["matches"]] == [1, 2]
     for match in plain["matches"]:
         assert match["validation"] == {
-            "status": "skipped", "strength": None, "reason": "not asked for", "residual": None,
+            "status": "skipped", "strength": None, "reason": "not requested", "residual": None,
             "overlap": None, "plane_overlap": None, "free_space_violations": None,
             "inliers": None, "ambiguity": None,
         }  # fmt: skip
@@ -169,7 +169,9 @@ def test_stages_and_k_are_as_asked(served, rooms, moved):
     assert checked["counts"]["accepted"] == 1
     assert checked["counts"]["selected"] == 0
     skipped = [m for m in checked["matches"] if m["validation"]["status"] == "skipped"]
-    assert {m["validation"]["reason"] for m in skipped} <= {"enough were accepted before it"}
+    assert {m["validation"]["reason"] for m in skipped} <= {
+        "enough matches were accepted before it"
+    }
     assert len(skipped) == 4 - checked["counts"]["validated"]
 
 

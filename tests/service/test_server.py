@@ -22,5 +22,5 @@ def test_accepted_connections_do_not_wait_for_acknowledgements(tmp_path):
             accepted, _ = listening.accept()
             with accepted:
                 assert accepted.proto == socket.IPPROTO_TCP
-        with pytest.raises(UnusableStore, match=f"127.0.0.1:{port} cannot be listened on"):
+        with pytest.raises(UnusableStore, match=f"127.0.0.1:{port} is not available"):
             listen(Settings(data_dir=tmp_path, port=port))

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from sceneprint.schemas.keys import Scope
+from sceneprint_client.api.admin import Scope
 
 KEYS: dict[str, dict[str, Scope]] = {
     "boss": {"*": "admin"}, "tenant": {"alpha": "admin", "later": "admin"},

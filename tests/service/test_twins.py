@@ -15,13 +15,13 @@ from typing import Any
 
 import pytest
 
-from sceneprint.schemas.keys import Scope
+from sceneprint_client.api.admin import Scope
 
 KEYS: dict[str, dict[str, Scope]] = {
     "boss": {"*": "admin"}, "admin": {"alpha": "admin"}, "reader": {"alpha": "read"},
 }  # fmt: skip
 #: Ids and seals; times; how long something took, and in which minutes it was.
-CHANCE = re.compile(r"\b[0-9a-f]{32}\b")
+CHANCE = re.compile(r"\b[0-9a-f]{32}(?:[0-9a-f]{16})?\b")
 TIMES = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|\+00:00)")
 TOOK = re.compile(
     r'"milliseconds":{[^}]*}|"oldest_waiting_s":[\d.e-]+|"(minutes|buckets)":\[[^]]*\]'

@@ -40,7 +40,7 @@ def test_a_frame_has_the_id_it_was_put_under(served, hall, small_shots, refused)
     found = http.get(path).json()
     assert (found["frame_id"], found["session"]) == ("Robot-1_0.png", "a")
     problem = refused(http.put(path, **shot.form(session="b")), 409, "frame-conflict")
-    assert "other session." in problem["detail"]
+    assert "a different session." in problem["detail"]
     other = refused(http.put(path, **small_shots[1].form(session="a")), 409, "frame-conflict")
     assert "other content" in other["detail"]
     # the same content under another id is a frame of its own, and shares the blob
@@ -124,7 +124,7 @@ def test_a_query_may_be_a_body_too(served, hall, small_shots) -> None:
         ({"fxx": "1"}, "fxx"),
         ({"fx": "wide", "fy": "1", "cx": "1", "cy": "1"}, "fx"),
         ({"fx": "1", "fy": "1", "cx": "1"}, "cy"),
-        ({"meta": "{}", "fx": "1"}, "Say all in `meta`"),
+        ({"meta": "{}", "fx": "1"}, "Put everything into `meta`"),
         ({"fx": "40", "fy": "40", "cx": "1", "cy": "1", "pose": "1,2,3"}, "has 3 numbers"),
         ({"fx": "40", "fy": "40", "cx": "1", "cy": "1", "base_frame": "b"}, "Send both"),
         ({"fx": "40", "fy": "40", "cx": "1", "cy": "1", "base": "0,0,0,0,0,0,9"}, "T_base_sensor"),

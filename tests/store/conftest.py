@@ -14,12 +14,11 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, event, update
 
-from sceneprint.schemas import JobState
-from sceneprint.store import Store, listing, open_database, open_store, queue
+from sceneprint.store import Store, open_database, open_store, queue
 from sceneprint.store.frames import add_frame
 from sceneprint.store.maps import add_map, keep_model
-from sceneprint.store.records import FrameRow, JobRow, MapRow
-from sceneprint.store.tables import jobs
+from sceneprint.store.tables import FrameRow, JobRow, MapRow, jobs
+from sceneprint_client.api import JobState
 
 MODEL = "ab" * 32
 
@@ -28,7 +27,7 @@ MODEL = "ab" * 32
 NURSERY = """
 import json, sys
 from multiprocessing import get_context
-import sceneprint.engine.happenings
+import sceneprint.engine.admin.operations
 
 fork = get_context("fork")
 
@@ -183,7 +182,7 @@ class Hand:
 
     def row(self, job: JobRow) -> JobRow:
         with self.database.read() as connection:
-            return listing.find_job(connection, job.id)
+            return queue.find_job(connection, job.id)
 
     def fail(self, held: queue.Claim, error: str = "broke", trace: str = "Trace") -> JobState:
         with self.database.write() as connection:

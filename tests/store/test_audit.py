@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from sceneprint.store import Store
-from sceneprint.store.audit import Change, list_changes, note
+from sceneprint.store.keys import KeyChange, list_changes, note
 
 
 def test_the_newest_lines_are_kept(store: Store) -> None:
     with store.database.write() as connection:
         for number in range(9):
-            note(connection, Change(f"a{number}", "boss", at=float(number)), kept=4)
+            note(connection, KeyChange(f"a{number}", "boss", at=float(number)), kept=4)
     with store.database.read() as connection:
         found = list_changes(connection, None, 99, None, None)
     assert [(one.action, one.at) for one in found] == [
@@ -19,9 +19,9 @@ def test_the_newest_lines_are_kept(store: Store) -> None:
 
 def test_lines_are_found_by_actor_and_map(store: Store) -> None:
     with store.database.write() as connection:
-        note(connection, Change("make", "boss", map="hall", data={"n": 1}))
-        note(connection, Change("make", "robot", map="yard", target="t" * 200))
-        note(connection, Change("edit", "robot", map="hall"))
+        note(connection, KeyChange("make", "boss", map="hall", data={"n": 1}))
+        note(connection, KeyChange("make", "robot", map="yard", target="t" * 200))
+        note(connection, KeyChange("edit", "robot", map="hall"))
 
     def found(*asked: object) -> list[tuple[str, str, str | None]]:
         with store.database.read() as connection:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from sceneprint.store import bell
-from sceneprint.store.bell import Bell
+from sceneprint.store import wakeup
+from sceneprint.store.wakeup import Wakeup
 
 #: Seconds after which nothing rings any more, on the slowest machine.
 FOREVER = 60.0
@@ -22,11 +22,11 @@ def fifos(folder: Path) -> list[Path]:
 
 
 @pytest.fixture
-def ours(tmp_path: Path) -> Bell:
-    return Bell(tmp_path / "bells")
+def ours(tmp_path: Path) -> Wakeup:
+    return Wakeup(tmp_path / "bells")
 
 
-def test_all_who_wait_are_woken(ours: Bell) -> None:
+def test_all_who_wait_are_woken(ours: Wakeup) -> None:
     with ours.listen() as first, ours.listen() as second:
         rung: list[bool] = []
         threads = [
@@ -41,7 +41,7 @@ def test_all_who_wait_are_woken(ours: Bell) -> None:
         assert rung == [True, True]
 
 
-def test_what_is_rung_before_the_wait_ends_it_once(ours: Bell) -> None:
+def test_what_is_rung_before_the_wait_ends_it_once(ours: Wakeup) -> None:
     ours.ring()  # nobody has ever listened
     with ours.listen() as listener:
         assert not listener.wait(0)
@@ -52,7 +52,7 @@ def test_what_is_rung_before_the_wait_ends_it_once(ours: Bell) -> None:
         assert not listener.wait(0)
 
 
-def test_another_descriptor_ends_the_wait_too(ours: Bell) -> None:
+def test_another_descriptor_ends_the_wait_too(ours: Wakeup) -> None:
     told, tell = os.pipe()
     with ours.listen() as listener:
         os.write(tell, b"!")
@@ -61,7 +61,7 @@ def test_another_descriptor_ends_the_wait_too(ours: Bell) -> None:
     os.close(tell)
 
 
-def test_who_listens_no_more_leaves_nothing(ours: Bell, tmp_path: Path) -> None:
+def test_who_listens_no_more_leaves_nothing(ours: Wakeup, tmp_path: Path) -> None:
     with ours.listen():
         (fifo,) = fifos(tmp_path)
         assert fifo.is_fifo()
@@ -69,14 +69,14 @@ def test_who_listens_no_more_leaves_nothing(ours: Bell, tmp_path: Path) -> None:
     assert fifos(tmp_path) == []
 
 
-def test_what_the_dead_left_is_removed_when_it_is_old(ours: Bell, tmp_path: Path) -> None:
+def test_what_the_dead_left_is_removed_when_it_is_old(ours: Wakeup, tmp_path: Path) -> None:
     with ours.listen() as listener:
         (own,) = fifos(tmp_path)
         old, new, file = (tmp_path / "bells" / name for name in ("old", "new", "file"))
         os.mkfifo(old)
         os.mkfifo(new)
         file.write_bytes(b"other")
-        ago = time.time() - 2 * bell.STALE_S
+        ago = time.time() - 2 * wakeup.STALE_S
         for path in (own, old, file):
             os.utime(path, (ago, ago))
         ours.ring()
@@ -86,9 +86,9 @@ def test_what_the_dead_left_is_removed_when_it_is_old(ours: Bell, tmp_path: Path
 
 
 def test_a_listener_shows_that_it_lives_and_mends_its_fifo(
-    ours: Bell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ours: Wakeup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bell, "ALIVE_S", 0.0)
+    monkeypatch.setattr(wakeup, "ALIVE_S", 0.0)
     with ours.listen() as listener:
         (own,) = fifos(tmp_path)
         os.utime(own, (1.0, 1.0))
@@ -103,7 +103,7 @@ def test_a_listener_shows_that_it_lives_and_mends_its_fifo(
 
 def test_where_there_can_be_no_bell_nobody_is_harmed(tmp_path: Path) -> None:
     (tmp_path / "bells").write_bytes(b"a file")
-    ours = Bell(tmp_path / "bells")
+    ours = Wakeup(tmp_path / "bells")
     with ours.listen() as listener:
         ours.ring()
         looking = threading.Thread(target=listener.wait, args=(1e6,), daemon=True)

@@ -16,10 +16,9 @@ import pytest
 
 from sceneprint.errors import DamagedBlob, ReadOnlyStore, StoreFull, UnusableStore
 from sceneprint.store import Blobs, FolderBlobs
-from sceneprint.store.locks import FileLocks
-from sceneprint.store.marks import MARK
-from sceneprint.store.object_blobs import ObjectBlobs
-from sceneprint.store.object_urls import open_objects
+from sceneprint.store.blobs.folder import FileLocks
+from sceneprint.store.blobs.object_client import open_objects
+from sceneprint.store.blobs.object_store import MARK, ObjectBlobs
 
 DIGEST = hashlib.sha256(b"depth").hexdigest()
 KEY = f"blobs/{DIGEST[:2]}/{DIGEST}"
@@ -29,9 +28,9 @@ import resource, sys
 from pathlib import Path
 from sceneprint.errors import UnusableStore
 from sceneprint.store import FolderBlobs
-from sceneprint.store.locks import FileLocks
-from sceneprint.store.object_blobs import ObjectBlobs
-from sceneprint.store.object_urls import open_objects
+from sceneprint.store.blobs.folder import FileLocks
+from sceneprint.store.blobs.object_store import ObjectBlobs
+from sceneprint.store.blobs.object_client import open_objects
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536))
 blobs = FolderBlobs(Path(sys.argv[1]))

@@ -13,15 +13,13 @@ import numpy as np
 import pytest
 from sqlalchemy import Connection, update
 
-from sceneprint.schemas import FrameState
-from sceneprint.schemas.browsing import FrameListing, Run
 from sceneprint.store import Store
-from sceneprint.store.browsing import list_frames
-from sceneprint.store.editing import write_frame
+from sceneprint.store.frame_queries import count_run, list_frames, list_runs, poses_of_run
+from sceneprint.store.frames import write_frame
 from sceneprint.store.maps import add_map
-from sceneprint.store.records import FrameRow, MapRow
-from sceneprint.store.sessions import count_run, list_runs, poses_of_run
-from sceneprint.store.tables import frames
+from sceneprint.store.tables import FrameRow, MapRow, frames
+from sceneprint_client.api import FrameState
+from sceneprint_client.api.listing import FrameListing, Run
 
 Received = Callable[..., FrameRow]
 Plans = Callable[[Connection], AbstractContextManager[list[str]]]

@@ -22,9 +22,8 @@ from sqlalchemy import create_engine
 from sceneprint.errors import NewerSchema, UnusableStore
 from sceneprint.store import Store, open_database
 from sceneprint.store.maps import find_map
-from sceneprint.store.records import MapRow
-from sceneprint.store.revisions import known_revisions, migration_config, revision_of
-from sceneprint.store.tables import metadata
+from sceneprint.store.schema import known_revisions, migration_config, revision_of
+from sceneprint.store.tables import MapRow, metadata
 
 TABLES = [
     "audit", "doomed", "events", "former_maps", "frame_tags", "frames", "idempotency", "job_files",
@@ -63,13 +62,19 @@ def described(path: Path) -> set[tuple[str, ...]]:
 
 
 @pytest.mark.sqlite_only("what its file says of itself")
-def test_the_migrations_make_the_tables_that_the_code_knows(store: Store, tmp_path: Path) -> None:
-    with store.database.read() as connection:
+def test_the_migrations_make_the_tables_that_the_code_knows(
+    store: Store, tmp_path: Path, bring_to: Callable[[str, str], None]
+) -> None:
+    url = f"sqlite:///{tmp_path / 'other.db'}"
+    bring_to(url, "head")
+    engine = create_engine(url)
+    with engine.begin() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         assert compare_metadata(context, metadata) == []
-    engine = create_engine(f"sqlite:///{tmp_path / 'other.db'}")
-    metadata.create_all(engine)
+        assert revision_of(connection) == known_revisions()[0]
     engine.dispose()
+    with store.database.read() as connection:  # which has never seen a migration
+        assert revision_of(connection) == known_revisions()[0]
     assert described(tmp_path / "truth.db") == described(tmp_path / "other.db")
     assert sorted(name for kind, name, *_ in described(tmp_path / "truth.db") if kind == "table") \
         == [*TABLES[:-1], "signatures", "sqlite_sequence"]  # fmt: skip

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from sceneprint.errors import LostLease
-from sceneprint.schemas import JobState
-from sceneprint.store import Store, cancelling, deaths, queue
-from sceneprint.store.records import JobRow
+from sceneprint.store import Store, queue
+from sceneprint.store.tables import JobRow
+from sceneprint_client.api import JobState
 
 Queued = Callable[..., JobRow]
 Turned = Callable[..., None]
@@ -85,16 +85,16 @@ def test_a_job_whose_workers_all_fell_silent_is_buried(
         held = hand.taken()
         assert (held.job.number, held.job.attempts) == (silent.number, attempt)
         with store.database.write() as connection:  # its last lease still runs
-            assert deaths.bury(connection) == []
+            assert queue.dead_letter(connection) == []
         turned(silent, leased_until=time.time() - 1)
         if attempt < 10:
             with store.database.write() as connection:  # another may try
-                assert deaths.bury(connection) == []
+                assert queue.dead_letter(connection) == []
     lively = queued("b")
     assert hand.taken().job.number == lively.number  # and the other not an eleventh time
     assert hand.due()  # to be buried
     with store.database.write() as connection:
-        (buried,) = deaths.bury(connection)
+        (buried,) = queue.dead_letter(connection)
     assert buried == hand.row(silent)
     assert (buried.state, buried.leased_until) == (JobState.DEAD, None)
     assert buried.error == "its worker fell silent, and 10 tries are over"
@@ -132,14 +132,14 @@ def test_cancelling_takes_a_job_from_whoever_has_it(
     running, waiting, over, other = (queued(name) for name in "abcd")
     held = hand.taken()
     with store.database.write() as connection:
-        cancelling.cancel_of(connection, waiting.frame_number)
+        queue.cancel_of(connection, waiting.frame_number)
     assert hand.row(waiting).state == JobState.CANCELLED
     done = hand.taken()
     assert done.job.number == over.number  # not the cancelled one
     with store.database.write() as connection:
         queue.finish(connection, done, JobState.SUCCEEDED)
-        cancelling.cancel_of(connection, over.frame_number)
-        cancelling.cancel_of(connection, running.frame_number)
+        queue.cancel_of(connection, over.frame_number)
+        queue.cancel_of(connection, running.frame_number)
     assert hand.row(over).state == JobState.SUCCEEDED
     with pytest.raises(LostLease), store.database.write() as connection:
         queue.finish(connection, held, JobState.SUCCEEDED)

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from sqlalchemy import insert, select
 
-from sceneprint.schemas.events import KINDS
 from sceneprint.store import Store
 from sceneprint.store.events import Wanted, list_events, newest_seen
-from sceneprint.store.figures import count_events
 from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.metrics import count_events
 from sceneprint.store.tables import events
+from sceneprint_client.api.admin import KINDS
 
 ROOT = Path(__file__).resolve().parents[2]
 KEPT = ("frame.received", "frame.indexed", "map.created", "key.created")
@@ -22,7 +22,7 @@ KEPT = ("frame.received", "frame.indexed", "map.created", "key.created")
 #: Each process commits events one by one, some transactions of several and some given up.
 WRITE = """
 from sceneprint.store import open_store
-from sceneprint.store.events import tell
+from sceneprint.store.events import record_event
 from pathlib import Path
 
 def work(i):
@@ -31,7 +31,7 @@ def work(i):
         try:
             with store.database.write() as connection:
                 for part in range(1 + n % 3):
-                    tell(connection, "frame.received", "hall", f"{i}-{n}-{part}")
+                    record_event(connection, "frame.received", "hall", f"{i}-{n}-{part}")
                 if n % 7 == 3:
                     raise KeyError
         except KeyError:
@@ -39,13 +39,13 @@ def work(i):
 """
 READ = """
 from sceneprint.store.events import Wanted
-from sceneprint.engine.happenings import read_on
+from sceneprint.engine.admin.operations import next_events
 import time
 
 def read(store):
     seen, place, until = [], 0, time.monotonic() + 60
     while len(seen) < int(ARGS[2]) and time.monotonic() < until:
-        found, place, _ = read_on(store.database, Wanted(), place, 5)
+        found, place, _ = next_events(store.database, Wanted(), place, 5)
         seen += [(one.number, one.frame_id) for one in found]
     return seen
 
@@ -122,7 +122,8 @@ def test_events_are_counted_by_interval(empty):
 
 
 def test_every_kind_that_is_told_is_declared():
-    told, pattern = set(), re.compile(r"\b(?:tell|tell_of)\(\s*connection,\s*\"([\w.]+)\"")
+    told: set[str] = set()
+    pattern = re.compile(r"\brecord_(?:job_)?event\(\s*connection,\s*\"([\w.]+)\"")
     declared_event = re.compile(r"\bevent=\"([\w.]+)\"")
     for folder in ("sceneprint", "service", "worker"):
         for path in (ROOT / folder).rglob("*.py"):

@@ -9,20 +9,19 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, update
 
-from sceneprint.schemas import Filter, FrameState
 from sceneprint.store import Store
-from sceneprint.store.filters import Taken, passing
+from sceneprint.store.frame_queries import QueryOrigin, passing
 from sceneprint.store.frames import delete_frame, set_state
 from sceneprint.store.maps import add_map
-from sceneprint.store.records import FrameRow, MapRow
-from sceneprint.store.tables import frames
+from sceneprint.store.tables import FrameRow, MapRow, frames
+from sceneprint_client.api import Filter, FrameState
 
 Received = Callable[..., FrameRow]
 Plans = Callable[[Connection], AbstractContextManager[list[str]]]
-NOBODY = Taken(None, None, None)
+NOBODY = QueryOrigin(None, None, None)
 
 
-def found(store: Store, row: MapRow, taken: Taken = NOBODY, **wanted: Any) -> list[int]:
+def found(store: Store, row: MapRow, taken: QueryOrigin = NOBODY, **wanted: Any) -> list[int]:
     with store.database.read() as connection:
         return sorted(passing(connection, row.number, Filter(**wanted), taken).tolist())
 
@@ -79,10 +78,10 @@ def test_own_session_is_that_of_the_robot(store: Store, hall: MapRow, indexed: R
     away = [("r1", "s", 89.9), ("r1", "s", 110.1), ("r1", "t", 100.0), ("r1", None, 100.0),
             (None, "s", 200.0)]  # fmt: skip
     of_r2 = [("r2", "s", 100.0), ("r2", "s", None)]
-    asked = Taken("r1", "s", 100.0)
+    asked = QueryOrigin("r1", "s", 100.0)
     assert found(store, hall, asked, not_within_s=10) == sorted(made[o] for o in away + of_r2)
     # a query that names no robot may be any robot's
-    asked = Taken(None, "s", 100.0)
+    asked = QueryOrigin(None, "s", 100.0)
     assert found(store, hall, asked, not_within_s=10) == sorted(made[o] for o in away)
     with pytest.raises(ValueError, match="no session"):
         found(store, hall, NOBODY, not_within_s=10)
@@ -107,7 +106,7 @@ def test_no_filter_reads_other_maps(
     store: Store, hall: MapRow, plans: Plans, wanted: dict[str, Any]
 ) -> None:
     with store.database.read() as connection, plans(connection) as told:
-        passing(connection, hall.number, Filter.model_validate(wanted), Taken("r1", "s", 1.0))
+        passing(connection, hall.number, Filter.model_validate(wanted), QueryOrigin("r1", "s", 1.0))
     assert told
     assert all("SEARCH" in step or "LIST SUBQUERY" in step for step in told), told
     assert not any("TEMP B-TREE" in step for step in told), told

@@ -10,15 +10,14 @@ from sqlalchemy import select, update
 from sqlalchemy.exc import IntegrityError
 
 from sceneprint.errors import Conflict, UnknownFrame, UnknownKey, UnknownMap
-from sceneprint.schemas import FrameState
-from sceneprint.schemas.browsing import FrameListing
-from sceneprint.store import Store, browsing, listing, queue
+from sceneprint.store import Store, frame_queries, queue
 from sceneprint.store import frames as stored
 from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import signatures as signed
-from sceneprint.store.records import FrameRow, MapRow
-from sceneprint.store.tables import events, keys, signatures
+from sceneprint.store.tables import FrameRow, MapRow, events, keys, signatures
+from sceneprint_client.api import FrameState
+from sceneprint_client.api.listing import FrameListing
 
 Received = Callable[..., FrameRow]
 Indexed = Callable[[FrameRow], int]
@@ -44,7 +43,9 @@ def delete(store: Store, row: MapRow, frame: FrameRow) -> list[str]:
         return stored.delete_frame(connection, row, now)
 
 
-def changes(store: Store, row: MapRow, since: int, limit: int = 256) -> list[list[signed.Change]]:
+def changes(
+    store: Store, row: MapRow, since: int, limit: int = 256
+) -> list[list[signed.SignatureChange]]:
     with store.database.read() as connection:
         return list(signed.changes_since(connection, row, since, limit))
 
@@ -58,9 +59,9 @@ def test_a_row_comes_back_as_it_was_given(store: Store, hall: MapRow, received: 
     )  # fmt: skip
     with store.database.read() as connection:
         assert stored.find_frame(connection, hall, frame.id) == frame
-        assert stored.find_content(connection, hall.number, "a") == frame
-        assert stored.find_content(connection, hall.number, "b") is None
-        assert stored.find_content(connection, hall.number + 1, "a") is None
+        assert stored.frames_of_content(connection, hall.number, "a")[:1] == [frame]
+        assert stored.frames_of_content(connection, hall.number, "b") == []
+        assert stored.frames_of_content(connection, hall.number + 1, "a") == []
         with pytest.raises(UnknownFrame, match="no frame 'x' in map 'hall'"):
             stored.find_frame(connection, hall, "x")
         with pytest.raises(UnknownMap, match="no map 'x'"):
@@ -81,11 +82,11 @@ def test_an_id_is_in_a_map_once_and_given_up_by_what_is_deleted(
     assert received("a", other, frame_id="gate.1").map_number == other.number
     second = received("a")  # the same content under an id of its own
     with store.database.read() as connection:
-        assert stored.find_content(connection, hall.number, "a") == first
+        assert stored.frames_of_content(connection, hall.number, "a")[:1] == [first]
     delete(store, hall, first)
     again = received("b", frame_id="gate.1")
     with store.database.read() as connection:
-        assert stored.find_content(connection, hall.number, "a") == second
+        assert stored.frames_of_content(connection, hall.number, "a")[:1] == [second]
         assert stored.find_frame(connection, hall, "gate.1") == again
         gone = stored.frame_of(connection, first.number)
     assert (gone.state, gone.id != "gate.1") == (FrameState.DELETED, True)
@@ -101,7 +102,7 @@ def test_changes_come_in_order_whatever_the_block(
     delete(store, hall, frames[0])
     delete(store, hall, frames[2])
     wanted = [
-        signed.Change(
+        signed.SignatureChange(
             frames[i].number,
             frames[i].id,
             revision,
@@ -157,9 +158,11 @@ def test_a_deleted_frame_leaves_a_row_and_nothing_else(
             FrameListing(state=FrameState.DELETED),
         )
         assert (now.state, now.content_id, now.revision) == (FrameState.DELETED, None, 2)
-        assert stored.find_content(connection, hall.number, "a") is None
-        assert browsing.list_frames(connection, hall.number, None, 9, FrameListing()) == [other]
-        assert browsing.list_frames(connection, hall.number, None, 9, gone) == [now]
+        assert stored.frames_of_content(connection, hall.number, "a") == []
+        assert frame_queries.list_frames(connection, hall.number, None, 9, FrameListing()) == [
+            other
+        ]
+        assert frame_queries.list_frames(connection, hall.number, None, 9, gone) == [now]
         assert stored.frames_of(connection, [frame.number, other.number]) == {other.number: other}
         assert signed.stored_vector(connection, frame.number, hall.model_id) is None
         assert signed.geometry_blobs(connection, [frame.number], hall.model_id) == {}
@@ -182,9 +185,11 @@ def test_pages_follow_the_order_of_arrival(
     indexed(frames[3])
     done = FrameListing(state=FrameState.INDEXED)
     with store.database.read() as connection:
-        first = browsing.list_frames(connection, hall.number, None, 2, FrameListing())
-        rest = browsing.list_frames(connection, hall.number, first[-1].number, 9, FrameListing())
-        found = browsing.list_frames(connection, hall.number, None, 9, done)
+        first = frame_queries.list_frames(connection, hall.number, None, 2, FrameListing())
+        rest = frame_queries.list_frames(
+            connection, hall.number, first[-1].number, 9, FrameListing()
+        )
+        found = frame_queries.list_frames(connection, hall.number, None, 9, done)
         assert stored_maps.count_frames(connection, hall.number) == {"indexed": 1, "received": 4}
         assert stored.count_states(connection) == {"indexed": 1, "received": 4}
     assert [frame.number for frame in first + rest] == [frame.number for frame in frames]
@@ -207,7 +212,7 @@ def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(
     with store.database.read() as connection:
         assert [row.name for row in stored_maps.list_maps(connection)] == ["other"]
         assert stored.frames_of(connection, [mine.number, theirs.number]).keys() == {theirs.number}
-        assert listing.jobs_of(connection, [mine.number, theirs.number]) == {theirs.number: kept}
+        assert queue.jobs_of(connection, [mine.number, theirs.number]) == {theirs.number: kept}
         assert job.number != kept.number
         assert stored.refers_to(connection, "11" * 32)
         assert signed.stored_vector(connection, mine.number, hall.model_id) is None

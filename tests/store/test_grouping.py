@@ -13,8 +13,8 @@ from sqlalchemy import Connection, event, func, select
 from sceneprint.errors import FrameConflict, LostLease, StoreFull
 from sceneprint.logs import of_request, request_id
 from sceneprint.store import Database, Store
-from sceneprint.store.events import tell
-from sceneprint.store.grouping import MOST, Grouping, _Waiting
+from sceneprint.store.batching import MOST_TOGETHER, Grouping, _Waiting
+from sceneprint.store.events import record_event
 from sceneprint.store.tables import events
 
 
@@ -60,16 +60,16 @@ def count(database: Database, kind: str) -> int:
 
 def noting(kind: str, result: object) -> Callable[[Connection], Any]:
     def work(connection: Connection) -> object:
-        tell(connection, kind, None, None)
+        record_event(connection, kind, None, None)
         return result
 
     return work
 
 
 def test_who_waits_together_is_committed_together(database: Database) -> None:
-    found, commits = together(database, [noting("a", i) for i in range(MOST + 3)])
-    assert found == list(range(MOST + 3))
-    assert count(database, "a") == MOST + 3
+    found, commits = together(database, [noting("a", i) for i in range(MOST_TOGETHER + 3)])
+    assert found == list(range(MOST_TOGETHER + 3))
+    assert count(database, "a") == MOST_TOGETHER + 3
     assert commits == 2  # at most MOST in one
 
 
@@ -104,7 +104,7 @@ def test_what_breaks_a_transaction_leaves_no_trace_and_the_others_their_own(
     database: Database,
 ) -> None:
     def break_down(connection: Connection) -> None:
-        tell(connection, "broken", None, None)
+        record_event(connection, "broken", None, None)
         raise ValueError("a mistake")
 
     found, _ = together(database, [noting("a", 0), break_down, noting("a", 2)])
@@ -115,7 +115,7 @@ def test_what_breaks_a_transaction_leaves_no_trace_and_the_others_their_own(
 
 def test_a_full_disk_is_told_to_all(database: Database) -> None:
     def full(connection: Connection) -> None:
-        tell(connection, "full", None, None)
+        record_event(connection, "full", None, None)
         raise StoreFull("no room")
 
     found, _ = together(database, [noting("a", 0), full])

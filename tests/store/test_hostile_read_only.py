@@ -17,7 +17,7 @@ from sqlalchemy import create_engine, text
 from sceneprint.errors import UnusableStore
 from sceneprint.store import open_database, open_store
 from sceneprint.store.database import Database
-from sceneprint.store.sealed import Sealed
+from sceneprint.store.sqlite import ReadOnlyFile
 
 #: A reader without the right to write, that does what it reads on standard input; permissions
 #: hold for root as well: PR_CAPBSET_DROP, CAP_DAC_OVERRIDE.
@@ -130,7 +130,7 @@ def test_a_log_that_was_left_is_read_or_refused(folder: Path, reader: Reader) ->
 def test_a_file_that_changes_while_it_is_read_is_not_believed(folder: Path) -> None:
     """It is read without locks, as unchanging; somebody writes it after all."""
     folder.chmod(0o755)
-    sealed = Sealed(folder / "a.db")
+    sealed = ReadOnlyFile(folder / "a.db")
     engine = create_engine(f"sqlite:///{folder}/a.db", creator=sealed.connect)
     database = Database(engine, sealed)
 

@@ -12,16 +12,14 @@ import pytest
 from sqlalchemy import text
 
 from benchmarks.fleet.postgres import Server
-from sceneprint.schemas import FrameState
 from sceneprint.store import open_database
-from sceneprint.store.deleting import doomed_blobs
-from sceneprint.store.former import last_event
+from sceneprint.store.deletion import doomed_blobs
 from sceneprint.store.frames import add_frame, frame_of
 from sceneprint.store.keys import list_keys
-from sceneprint.store.listing import find_job
-from sceneprint.store.queue import enqueue
-from sceneprint.store.quotas import Use, counted_anew, use_of
+from sceneprint.store.queue import enqueue, find_job
+from sceneprint.store.quotas import MapUsage, counted_usage, last_event, use_of
 from sceneprint.store.tables import frame_tags
+from sceneprint_client.api import FrameState
 
 #: What version 0001 stored of three frames: with tags and pose, with neither, with a tag twice.
 POSE = [[1.0, 0.0, 0.0, 1.5], [0.0, 1.0, 0.0, -2.5], [0.0, 0.0, 1.0, 3.25], [0.0, 0.0, 0.0, 1.0]]
@@ -128,7 +126,7 @@ def test_what_a_map_held_before_there_were_quotas_is_counted(
         connection.execute("INSERT INTO events (at, kind, map, data) VALUES (1, 'z', 'gone', '{}')")
     database = open_database(f"sqlite:///{old}")
     with database.read() as connection:
-        assert use_of(connection, 1) == counted_anew(connection, 1) == Use(1, 10)
+        assert use_of(connection, 1) == counted_usage(connection, 1) == MapUsage(1, 10)
         assert doomed_blobs(connection, 10) == ["blob-2"]
         assert (last_event(connection, "gone"), last_event(connection, "never")) == (3, 0)
     database.close()

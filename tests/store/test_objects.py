@@ -16,17 +16,16 @@ import pytest
 
 from benchmarks.fleet.s3 import ObjectServer
 from sceneprint.errors import DamagedBlob, StoreAway, UnusableStore
-from sceneprint.store import object_urls, recent
-from sceneprint.store import objects as module
-from sceneprint.store.locks import FileLocks
-from sceneprint.store.object_blobs import ObjectBlobs
-from sceneprint.store.object_urls import check_objects, open_objects
-from sceneprint.store.objects import PART
+from sceneprint.store.blobs import object_client, object_store
+from sceneprint.store.blobs import object_client as module
+from sceneprint.store.blobs.folder import FileLocks
+from sceneprint.store.blobs.object_client import PART, check_objects, open_objects
+from sceneprint.store.blobs.object_store import ObjectBlobs
 
 HALF_WAY = """
 import sys, time
-from sceneprint.store.object_urls import open_objects
-from sceneprint.store.objects import PART
+from sceneprint.store.blobs.object_client import open_objects
+from sceneprint.store.blobs.object_client import PART
 
 class Slow:
     place = 0
@@ -123,8 +122,8 @@ def test_who_is_killed_half_way_leaves_nothing_to_be_read(bucket: str) -> None:
 @pytest.fixture
 def brittle(monkeypatch: pytest.MonkeyPatch) -> Iterator[ObjectServer]:
     """A server of this test alone, and little patience with it."""
-    monkeypatch.setattr(object_urls, "TRIED_S", 1)
-    monkeypatch.setattr(object_urls, "SMALL_S", 1)
+    monkeypatch.setattr(object_client, "TRIED_S", 1)
+    monkeypatch.setattr(object_client, "SMALL_S", 1)
     monkeypatch.setattr(module, "AWAY_S", 0.2)
     with ObjectServer() as server:
         for name, value in server.env.items():
@@ -135,7 +134,7 @@ def brittle(monkeypatch: pytest.MonkeyPatch) -> Iterator[ObjectServer]:
 def test_a_server_that_falls_acknowledges_nothing(
     brittle: ObjectServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(object_urls, "TRIED_S", 0.2)
+    monkeypatch.setattr(object_client, "TRIED_S", 0.2)
     objects = open_objects(brittle.bucket("fragile"))
 
     class Fatal(io.BytesIO):
@@ -163,8 +162,8 @@ def test_a_server_that_falls_acknowledges_nothing(
 def test_a_server_that_never_answers_is_given_up(
     monkeypatch: pytest.MonkeyPatch, bucket: str
 ) -> None:
-    monkeypatch.setattr(object_urls, "SMALL_S", 0.3)
-    monkeypatch.setattr(object_urls, "TRIED_S", 0.1)
+    monkeypatch.setattr(object_client, "SMALL_S", 0.3)
+    monkeypatch.setattr(object_client, "TRIED_S", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         place = f"http://127.0.0.1:{silent.getsockname()[1]}"
         monkeypatch.setenv("AWS_ENDPOINT_URL", place)
@@ -174,15 +173,15 @@ def test_a_server_that_never_answers_is_given_up(
 
 
 def test_what_was_read_lately_is_held_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recent, "MOST", 100)
-    held = recent.Recent(3600.0)
+    monkeypatch.setattr(object_store, "MOST", 100)
+    held = object_store.Recent(3600.0)
     for number in range(12):
         held.put(f"{number}", bytes([number]) * 10)
     assert [held.get(f"{number}") for number in range(3)] == [None, None, b"\2" * 10]
     held.put("2", b"x" * 10)  # read anew: the newest again
     held.put("12", b"y" * 5)
     assert (held.get("2"), held.get("3")) == (b"x" * 10, None)
-    held.put("large", bytes(recent.LARGEST + 1))
+    held.put("large", bytes(object_store.LARGEST + 1))
     assert held.get("large") is None
     held.remove("2")
     assert held.get("2") is None
@@ -191,7 +190,7 @@ def test_what_was_read_lately_is_held_within_bounds(monkeypatch: pytest.MonkeyPa
 
 
 def test_what_was_read_lately_goes_by_itself() -> None:
-    held = recent.Recent(0.05)
+    held = object_store.Recent(0.05)
     held.put("a", b"x")
     _until_empty(held)  # nobody asks for it
     assert held._bytes == 0
@@ -199,7 +198,7 @@ def test_what_was_read_lately_goes_by_itself() -> None:
     _until_empty(held)
 
 
-def _until_empty(held: recent.Recent) -> None:
+def _until_empty(held: object_store.Recent) -> None:
     end = time.monotonic() + 60
     while held._held:
         assert time.monotonic() < end

@@ -10,11 +10,10 @@ import pytest
 from sqlalchemy import event, select
 
 from sceneprint.errors import LostLease, UnknownJob
-from sceneprint.schemas import JobState
-from sceneprint.store import Store, listing, queue
-from sceneprint.store.records import FrameRow, JobRow, MapRow
+from sceneprint.store import Store, queue
 from sceneprint.store.signatures import StoredSignature, index_frame
-from sceneprint.store.tables import signatures
+from sceneprint.store.tables import FrameRow, JobRow, MapRow, signatures
+from sceneprint_client.api import JobState
 
 Queued = Callable[..., JobRow]
 Turned = Callable[..., None]
@@ -31,10 +30,10 @@ def test_a_job_is_queued_as_it_should_be(store: Store, hand: Any, queued: Queued
     assert (job.started_at, job.finished_at) == (None, None)
     assert hand.row(job) == job
     with store.database.read() as connection:
-        assert listing.jobs_of(connection, [job.frame_number]) == {job.frame_number: job}
-        assert listing.count_jobs(connection) == {"queued": 1}
+        assert queue.jobs_of(connection, [job.frame_number]) == {job.frame_number: job}
+        assert queue.count_jobs(connection) == {"queued": 1}
         with pytest.raises(UnknownJob, match="no job 'nobody'"):
-            listing.find_job(connection, "nobody")
+            queue.find_job(connection, "nobody")
 
 
 def test_what_matters_more_comes_first_and_of_equals_what_came_first(

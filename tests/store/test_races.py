@@ -6,15 +6,15 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from sceneprint.schemas import JobState
-from sceneprint.store import Store, deaths, listing, queue
+from sceneprint.store import Store, queue
 from sceneprint.store.maps import find_map, next_revision
-from sceneprint.store.records import JobRow, MapRow
+from sceneprint.store.tables import JobRow, MapRow
+from sceneprint_client.api import JobState
 
 Queued = Callable[..., JobRow]
 
 WORKS = """
-from sceneprint.schemas import JobState
+from sceneprint_client.api import JobState
 from sceneprint.store import open_database, queue
 from sceneprint.store.maps import next_revision
 
@@ -59,7 +59,7 @@ def test_threads_at_one_queue_get_each_job_once(store: Store, hall: MapRow, queu
     assert raised == []
     assert sorted(done) == wanted
     with store.database.read() as connection:
-        assert listing.count_jobs(connection) == {"succeeded": 30}
+        assert queue.count_jobs(connection) == {"succeeded": 30}
         assert find_map(connection, "hall").revision == 30
 
 
@@ -71,7 +71,7 @@ def test_processes_at_one_queue_get_each_job_once(
     assert all(isinstance(each, list) for each in found), found  # else what was raised
     assert sorted(number for each in found for number in each) == wanted
     with store.database.read() as connection:
-        assert listing.count_jobs(connection) == {"succeeded": 30}
+        assert queue.count_jobs(connection) == {"succeeded": 30}
         assert find_map(connection, "hall").revision == 30
 
 
@@ -108,6 +108,6 @@ def test_threads_that_outlive_their_leases_take_effect_once(
     assert raised == []
     assert sorted(effects) == sorted(set(effects))
     with store.database.write() as connection:
-        dead = [job.number for job in deaths.bury(connection)]
+        dead = [job.number for job in queue.dead_letter(connection)]
         assert sorted(effects + dead) == [job.number for job in jobs]
         assert find_map(connection, "hall").revision == len(effects)

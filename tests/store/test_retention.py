@@ -7,8 +7,8 @@ from collections.abc import Collection
 import pytest
 from sqlalchemy import Connection
 
-from sceneprint.store import Store, former
-from sceneprint.store.events import Wanted, anchor_of, holds_anchor, list_events, tell
+from sceneprint.store import Store, quotas
+from sceneprint.store.events import Wanted, anchor_of, holds_anchor, list_events, record_event
 from sceneprint.store.maps import add_map, find_map, keep_model, remove_map
 from sceneprint.store.retention import floor_of, floors, remove_events, spent_numbers
 
@@ -26,7 +26,7 @@ def filled(empty: Store) -> Store:
         for name in ("hall", "shop"):
             add_map(connection, name, None, "m" * 64)
         for i in range(60):
-            tell(connection, "frame.received", ("hall", "shop", None)[i % 3])
+            record_event(connection, "frame.received", ("hall", "shop", None)[i % 3])
     return empty
 
 
@@ -64,8 +64,8 @@ def test_what_happens_elsewhere_moves_nothing(filled):
         assert own == numbers_of(connection, "shop")[-11]
         assert {after for after, floor in before.items() if floor > after} == set(range(own))
         for _ in range(150):
-            tell(connection, "frame.received", "hall")
-            tell(connection, "key.created")
+            record_event(connection, "frame.received", "hall")
+            record_event(connection, "key.created")
         assert floors(connection, 10)["shop"] == own
         for after in before:  # the same is missed
             assert (floor_of(connection, shop, 10, after) > after) == (after < own)
@@ -99,7 +99,7 @@ def test_of_a_map_that_is_gone_nothing_is_missed_after_its_last_event(filled):
         remove_map(connection, find_map(connection, "hall"))
         last = numbers_of(connection, "hall")[-1]
         for _ in range(100):  # in others that are gone, and in none
-            tell(connection, "key.created")
+            record_event(connection, "key.created")
         remove_events(connection, spent_numbers(connection, 10, (), 999))
         assert numbers_of(connection, "hall") == []
         assert floor_of(connection, hall, 10, last - 1) > last - 1
@@ -109,17 +109,17 @@ def test_of_a_map_that_is_gone_nothing_is_missed_after_its_last_event(filled):
 
 
 def test_names_of_maps_that_are_gone_are_bounded(filled, monkeypatch):
-    monkeypatch.setattr(former, "MOST", 3)
+    monkeypatch.setattr(quotas, "MOST", 3)
     with filled.database.write() as connection:
         lasts = {}
         for name in ("limited", "a", "b", "c", "d"):
             limits = {"quota_frames": 7} if name == "limited" else None
             remove_map(connection, add_map(connection, name, None, "m" * 64, limits))
             lasts[name] = numbers_of(connection, name)[-1]
-        known = {name: former.last_event(connection, name) for name in lasts}
+        known = {name: quotas.last_event(connection, name) for name in lasts}
         # of the one that is forgotten it is known that it went before the oldest that is not
         assert known == lasts | {"a": lasts["b"]}
         for name, quota in (("limited", 7), ("b", None), ("a", None)):
             made = add_map(connection, name, None, "m" * 64)
             assert (made.quota_frames, made.quota_bytes) == (quota, None)
-        assert former.last_event(connection, "b") == 0  # fewer than can be remembered: none is
+        assert quotas.last_event(connection, "b") == 0  # fewer than can be remembered: none is

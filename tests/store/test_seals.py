@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sceneprint.store import Store, open_store
-from sceneprint.store.seals import START
+from sceneprint.store.opaque_ids import START
 
 
 def opened(folder: Path) -> Store:
@@ -34,17 +34,17 @@ def test_a_seal_is_read_by_its_store_in_every_process(tmp_path):
 def test_what_was_not_given_out_is_none(tmp_path):
     seals = opened(tmp_path).seals
     seal = seals.seal("frame", 7)
-    for place in range(32):  # whichever digit is another
+    for place in range(48):  # whichever digit is another
         altered = f"{seal[:place]}{'0' if seal[place] != '0' else '1'}{seal[place + 1 :]}"
         assert seals.open("frame", altered) is None
-    for wrong in ("", "7", "00", "x" * 32, seal.upper() + "a", seal + "0", seal[:-1], "0" * 32):
+    for wrong in ("", "7", "00", "x" * 32, seal.upper() + "a", seal + "0", seal[:-1], "0" * 48):
         assert seals.open("frame", wrong) is None
 
 
-@pytest.mark.parametrize("half", [slice(16), slice(16, 32)])
-def test_neighbours_have_nothing_in_common(tmp_path, half):
+@pytest.mark.parametrize("part", [slice(16), slice(16, 32), slice(32, 48)])
+def test_neighbours_have_nothing_in_common(tmp_path, part):
     """Half of 64 bits differ, six deviations of the mean of 500 allowed: else gaps would show."""
     seals = opened(tmp_path).seals
-    found = [int(seals.seal("event", number)[half], 16) for number in range(1, 502)]
+    found = [int(seals.seal("event", number)[part], 16) for number in range(1, 502)]
     differing = [(a ^ b).bit_count() for a, b in pairwise(found)]
     assert abs(sum(differing) / 500 - 32) < 6 * 4 / 500**0.5

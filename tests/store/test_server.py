@@ -19,16 +19,15 @@ from sqlalchemy import create_engine, insert, select, text
 
 from benchmarks.fleet.postgres import Server
 from sceneprint.errors import StoreAway, StoreLocked, UnusableStore
-from sceneprint.store import Database, Store, database, open_database, open_store, postgres
-from sceneprint.store.audit import Change, list_changes, note
+from sceneprint.store import Database, Store, database, open_database, open_store
 from sceneprint.store.database import is_there, reach_database
-from sceneprint.store.events import tell
+from sceneprint.store.events import record_event
 from sceneprint.store.frames import add_frame, frames_of
-from sceneprint.store.keys import create_key, list_keys
+from sceneprint.store.keys import KeyChange, create_key, list_changes, list_keys, note
 from sceneprint.store.maps import add_map, find_map, keep_model, list_maps, map_of
-from sceneprint.store.records import MapRow
-from sceneprint.store.revisions import known_revisions, migration_config
-from sceneprint.store.tables import events, maps, metadata
+from sceneprint.store.postgres import connection as postgres
+from sceneprint.store.schema import known_revisions, migration_config
+from sceneprint.store.tables import MapRow, events, maps, metadata
 
 Race = Callable[..., list[Any]]
 
@@ -120,7 +119,7 @@ def test_what_an_earlier_version_stored_is_brought_along(empty_url: str) -> None
         assert connection.execute(text("SELECT value FROM secrets")).scalar_one() == secret
         # as after billions of events
         connection.execute(text("SELECT setval('events_number_seq', 3000000000)"))
-        tell(connection, "key.created")
+        record_event(connection, "key.created")
         assert connection.execute(text("SELECT max(number) FROM events")).scalar() == 3_000_000_001
     opened.close()
 
@@ -252,7 +251,7 @@ def test_a_text_with_nul_is_found_nowhere_and_noted_all_the_same(store: Store) -
         assert [row.name for row in list_maps(connection)] == ["hall"]
         found = connection.execute(select(maps.c.number).where(maps.c.name == "hall\0"))
         assert found.all() == []
-        note(connection, Change("a" * 99, "boss\0", map="m" * 99, target="hall\0"))
+        note(connection, KeyChange("a" * 99, "boss\0", map="m" * 99, target="hall\0"))
         (line,) = list_changes(connection, None, 9, None, None)
     assert (len(line.action), line.actor[:4], line.map) == (64, "boss", "m" * 63)
 
@@ -294,6 +293,6 @@ def test_what_was_stored_is_json(store: Store, hall: MapRow) -> None:
     """Not of PostgreSQL's other kind, which sorts keys and knows no escaped NUL."""
     data = {"b": 1, "a": ["\0", "\ud800", 1e300, None]}
     with store.database.write() as connection:
-        tell(connection, "map.edited", "hall", **data)
+        record_event(connection, "map.edited", "hall", **data)
         (found,) = connection.execute(select(events.c.data).where(events.c.kind == "map.edited"))
     assert json.dumps(found[0]) == json.dumps(data)

@@ -12,7 +12,7 @@ from benchmarks.fleet.postgres import Server
 from sceneprint import errors
 from sceneprint.store import Database, open_database
 from sceneprint.store.database import is_there, reach_database
-from sceneprint.store.looking import look_at
+from sceneprint.store.read_only import look_at
 from sceneprint.store.tables import maps
 
 

@@ -12,9 +12,8 @@ from sqlalchemy import text
 
 from sceneprint.errors import UnusableStore
 from sceneprint.store import Store, open_blobs, open_database, open_store
-from sceneprint.store.marks import MARK
-from sceneprint.store.object_blobs import ObjectBlobs
-from sceneprint.store.object_urls import open_objects
+from sceneprint.store.blobs.object_client import open_objects
+from sceneprint.store.blobs.object_store import MARK, ObjectBlobs
 
 HOLDS = """
 import sys, time
@@ -60,8 +59,8 @@ def test_who_only_looks_marks_nothing(store_url: str, bucket: str) -> None:
 def test_a_store_that_is_away_is_opened_and_claimed_later(
     tmp_path: Path, bucket: str, monkeypatch: pytest.MonkeyPatch, object_server: Any
 ) -> None:
-    monkeypatch.setattr("sceneprint.store.object_urls.TRIED_S", 0.1)
-    monkeypatch.setattr("sceneprint.store.objects.AWAY_S", 0.0)
+    monkeypatch.setattr("sceneprint.store.blobs.object_client.TRIED_S", 0.1)
+    monkeypatch.setattr("sceneprint.store.blobs.object_client.AWAY_S", 0.0)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     store = open_store(f"sqlite:///{tmp_path / 'new' / 'a.db'}", bucket)
     with pytest.raises(UnusableStore, match="cannot be read"):
@@ -76,7 +75,7 @@ def test_a_store_that_is_away_is_opened_and_claimed_later(
     store.blobs.put(b"depth")
     store.blobs.check()
     open_objects(bucket).delete(MARK)
-    monkeypatch.setattr("sceneprint.store.object_blobs.CHECK_S", 0.0)
+    monkeypatch.setattr("sceneprint.store.blobs.object_store.CHECK_S", 0.0)
     with pytest.raises(UnusableStore, match="emptied or replaced"):
         store.blobs.check()
     store.close()

@@ -14,8 +14,7 @@ from sqlalchemy.exc import IntegrityError
 from sceneprint.errors import StoreFull
 from sceneprint.store import Store
 from sceneprint.store.maps import find_map, next_revision
-from sceneprint.store.records import MapRow
-from sceneprint.store.tables import events, frames, maps
+from sceneprint.store.tables import MapRow, events, frames, maps
 
 COUNTS = """
 from sceneprint.store import open_database

@@ -1,20 +1,21 @@
 import numpy as np
 import pytest
 
-from sceneprint.synth import clutter, seats, storage, tables
-from sceneprint.synth.fittings import curtain, radiator
-from sceneprint.synth.mesh import Mesh, area, face_normals, volume
-from sceneprint.synth.piece import Surface, scatter
+from sceneprint.lab.synth import furniture
+from sceneprint.lab.synth.furniture import Shelf, curtain, radiator, scatter
+from sceneprint.lab.synth.mesh import SyntheticMesh, area, face_normals, volume
 
 PIECES = [
-    tables.table, tables.round_table, tables.desk, seats.chair, seats.swivel_chair, seats.stool,
-    seats.sofa, seats.bed, storage.cupboard, storage.shelf, storage.kitchen_row, storage.fridge,
-    storage.counter, storage.floor_thing, storage.stairs,
+    furniture.table, furniture.round_table, furniture.desk, furniture.chair,
+furniture.swivel_chair, furniture.stool,
+    furniture.sofa, furniture.bed, furniture.cupboard, furniture.shelf, furniture.kitchen_row,
+furniture.fridge,
+    furniture.counter, furniture.floor_thing, furniture.stairs,
 ]  # fmt: skip
-THINGS = [builder for builder, _ in clutter.SMALL]
+THINGS = [builder for builder, _ in furniture.SMALL]
 
 
-def assert_solid(mesh: Mesh) -> None:
+def assert_solid(mesh: SyntheticMesh) -> None:
     assert np.isfinite(mesh.vertices).all()
     np.testing.assert_allclose(face_normals(mesh).sum(axis=0), 0, atol=1e-9)
     assert volume(mesh) > 0
@@ -44,7 +45,7 @@ def test_a_thing_is_solid_and_small(builder):
 
 
 def test_scattered_things_stay_on_their_surface():
-    surface = Surface(1.0, 2.0, 1.5, 0.8, 0.7, 0.5, 15)
+    surface = Shelf(1.0, 2.0, 1.5, 0.8, 0.7, 0.5, 15)
     mesh = scatter(surface, np.random.default_rng(1))
     assert len(mesh.faces) > 100
     assert mesh.vertices[:, 2].min() > 0.7 - 0.15

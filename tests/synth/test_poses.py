@@ -1,19 +1,17 @@
 import numpy as np
 import pytest
 
-from sceneprint.synth import make_room, scattered_poses, trajectory
-from sceneprint.synth.layout import inside
-from sceneprint.synth.mesh import Mesh
-from sceneprint.synth.poses import CLEARANCE, HEIGHTS, clear, pose
-from sceneprint.synth.rooms import Room
-from sceneprint.synth.shell import Ceiling
-from sceneprint.synth.solids import box
+from sceneprint.lab.synth import make_room, scattered_poses, trajectory
+from sceneprint.lab.synth.mesh import SyntheticMesh, box
+from sceneprint.lab.synth.rooms import Room, inside
+from sceneprint.lab.synth.trajectories import CLEARANCE, HEIGHTS, clear, pose
+from sceneprint.lab.synth.walls import Ceiling
 from sceneprint.types import Floats
 
 SEEDS = (0, 1, 2)
 
 
-def winding(mesh: Mesh, point: Floats) -> float:
+def winding(mesh: SyntheticMesh, point: Floats) -> float:
     """How often the mesh encloses a point: its solid angle over 4 pi."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] - point for k in range(3))
     la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
@@ -37,9 +35,9 @@ def test_pose_by_hand():
 def test_clear_knows_outside_inside_and_near():
     outline = np.array([(-3, -3), (3, -3), (3, 3), (-3, 3)], float)
     hall = box(6, 6, 3)
-    hall = Mesh(hall.vertices, hall.faces[:, ::-1], hall.loss)
+    hall = SyntheticMesh(hall.vertices, hall.faces[:, ::-1], hall.loss)
     solid = box(1, 1, 1)
-    both = Mesh(
+    both = SyntheticMesh(
         np.concatenate([hall.vertices, solid.vertices]),
         np.concatenate([hall.faces, solid.faces + 8]).astype(np.int32),
         np.zeros(24, np.float32),

@@ -4,17 +4,16 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import MissingDependency
-from sceneprint.synth import Caster, cast_depth, corridor, make_room, render, symmetric_box
-from sceneprint.synth.mesh import Mesh, face_normals, mesh_of
-from sceneprint.synth.poses import pose
-from sceneprint.synth.rays import cast_faces, pixel_rays
-from sceneprint.synth.solids import ellipsoid
+from sceneprint.lab.synth import Caster, cast_depth, corridor, make_room, render, symmetric_box
+from sceneprint.lab.synth.mesh import SyntheticMesh, ellipsoid, face_normals, mesh_of
+from sceneprint.lab.synth.sensors import cast_faces, pixel_rays
+from sceneprint.lab.synth.trajectories import pose
 from sceneprint.types import Floats, Intrinsics
 
 SMALL = Intrinsics(24, 18, 20.0, 21.0, 11.3, 8.9)
 
 
-def oracle(mesh: Mesh, T: Floats, camera: Intrinsics) -> tuple[Floats, Floats]:
+def oracle(mesh: SyntheticMesh, T: Floats, camera: Intrinsics) -> tuple[Floats, Floats]:
     """Depth and cosine by Moeller and Trumbore against every triangle."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     normals = face_normals(mesh)

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from sceneprint.synth import corridor, make_room, symmetric_box
-from sceneprint.synth.layout import CELL, Floor, Place, inside
-from sceneprint.synth.mesh import area, face_normals, volume
-from sceneprint.synth.shell import Ceiling, Opening, Wall, ceiling, floor_plan, shell, walls_of
+from sceneprint.lab.synth import corridor, make_room, symmetric_box
+from sceneprint.lab.synth.mesh import area, face_normals, volume
+from sceneprint.lab.synth.rooms import CELL, Floor, PiecePose, inside
+from sceneprint.lab.synth.walls import Ceiling, Opening, Wall, ceiling, floor_plan, shell, walls_of
 
 L_PLAN = np.array([(0, 0), (4, 0), (4, 2), (2, 2), (2, 3), (0, 3)], float)
 
@@ -50,13 +50,13 @@ def test_inside_by_hand():
 def test_floor_is_claimed_once_and_only_inside():
     floor = Floor(L_PLAN)
     assert np.count_nonzero(floor.inside) * CELL**2 == pytest.approx(10.0)
-    assert floor.claim(Place(1, 1, 0.5), 0.8, 0.6)
+    assert floor.claim(PiecePose(1, 1, 0.5), 0.8, 0.6)
     assert np.count_nonzero(floor.claimed & floor.inside) * CELL**2 == pytest.approx(0.48, abs=0.05)
     before = floor.claimed.copy()
-    assert not floor.claim(Place(1.3, 1, 0), 0.8, 0.6)
-    assert not floor.claim(Place(3.5, 2.5, 0), 0.4, 0.4)
+    assert not floor.claim(PiecePose(1.3, 1, 0), 0.8, 0.6)
+    assert not floor.claim(PiecePose(3.5, 2.5, 0), 0.4, 0.4)
     np.testing.assert_array_equal(floor.claimed, before)
-    assert floor.claim(Place(1.5, 1, 0), 0.6, 0.6, overlap=0.6)
+    assert floor.claim(PiecePose(1.5, 1, 0), 0.6, 0.6, overlap=0.6)
 
 
 def test_rooms_are_furnished():

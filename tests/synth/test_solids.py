@@ -3,19 +3,23 @@ import math
 import numpy as np
 import pytest
 
-from sceneprint.synth.mesh import Mesh, area, face_normals, join, volume
-from sceneprint.synth.solids import (
+from sceneprint.lab.synth.mesh import (
+    SyntheticMesh,
+    area,
     blob,
     box,
     cone,
     cylinder,
     ellipsoid,
     extrude,
+    face_normals,
+    join,
     revolve,
     ribbon,
     tapered_box,
     triangulate,
     tube,
+    volume,
 )
 
 RNG = np.random.default_rng(0)
@@ -43,7 +47,7 @@ def test_box_by_hand():
         (tube([(0, 0, 0), (0, 0, 1), (0, 0, 2)], 1.0, 64), NGON * 2.0),
     ],
 )
-def test_volume_by_the_divergence_theorem(mesh: Mesh, expected: float):
+def test_volume_by_the_divergence_theorem(mesh: SyntheticMesh, expected: float):
     assert volume(mesh) == pytest.approx(expected)
 
 

@@ -6,10 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.synth.mesh import Mesh
-from sceneprint.synth.rays import Caster
-from sceneprint.synth.solids import box
-from sceneprint.synth.spinning import Spinning, scan
+from sceneprint.lab.synth.mesh import SyntheticMesh, box
+from sceneprint.lab.synth.sensors import Caster, Spinning, scan
 from sceneprint.types import Floats, Floats32
 
 HALF = np.array([6.0, 4.0, 2.0])  #: of the box scanned from within, metres
@@ -22,7 +20,7 @@ SENSOR = Spinning(
 )
 
 
-def inside_out(mesh: Mesh) -> Mesh:
+def inside_out(mesh: SyntheticMesh) -> SyntheticMesh:
     return replace(mesh, faces=mesh.faces[:, ::-1].copy())
 
 

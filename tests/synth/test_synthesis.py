@@ -5,8 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from sceneprint.synth import KINECT, SynthRoom, render, synthesise_room
-from sceneprint.synth.synthesis import room_and_rng
+from sceneprint.lab.synth import KINECT, SynthRoom, render, synthesise_room
+from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.types import Intrinsics
 
 SMALL = Intrinsics(160, 120, 146.25, 146.25, 80.0, 60.0)

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.datasets import write_depth_png
 from sceneprint.engine import Engine
-from sceneprint.schemas import Added, CameraIntrinsics, FrameMeta, NewMap
+from sceneprint.formats.dataset import write_depth_png
 from sceneprint.settings import Settings
+from sceneprint_client.api import Added, CameraIntrinsics, FrameMeta, NewMap
 
 LEASE_S = 1.5  # a busy machine renews one late at times
 

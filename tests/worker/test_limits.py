@@ -24,7 +24,7 @@ def run(code: str, *arguments: str) -> str:
 MEMORY = """
 import sys
 import numpy as np
-from worker.limits import limit_memory
+from sceneprint.process_limits import limit_memory
 limit_memory(int(sys.argv[1]))
 small = np.ones(16 << 20, np.uint8)
 mapped = np.memmap(sys.argv[2], np.uint8, mode="r")
@@ -33,11 +33,11 @@ try:
     np.ones(256 << 20, np.uint8)
     print("had it")
 except MemoryError:
-    print("no memory")
+    print("not enough memory")
 """
 
 
-@pytest.mark.parametrize(("limit", "said"), [(128 << 20, "no memory"), (0, "had it")])
+@pytest.mark.parametrize(("limit", "said"), [(128 << 20, "not enough memory"), (0, "had it")])
 def test_what_is_written_is_limited_and_what_is_mapped_is_not(
     tmp_path: Path, limit: int, said: str
 ) -> None:
@@ -48,8 +48,8 @@ def test_what_is_written_is_limited_and_what_is_mapped_is_not(
 
 STOP = """
 import os, signal, sys
-from worker.limits import Stop
-stop = Stop()
+from sceneprint.process_limits import StopSignal
+stop = StopSignal()
 print(stop.asked)
 os.kill(os.getpid(), int(sys.argv[1]))
 stop.wait(1e6)

@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.schemas import FrameMeta, NewMap
+from sceneprint_client.api import FrameMeta, NewMap
 
 #: The workers as they are, but for what they do with frames of some focal lengths. Nothing but
 #: the bell, and the time of the next try, wakes those that wait.
 SCRIPT = """
 import ctypes, logging, sys
 import numpy as np
-import sceneprint.engine.work as work
+import sceneprint.engine.jobs.signature_job as work
 import sceneprint.store.queue as queue
 import worker.loop, worker.supervisor
 
@@ -83,7 +83,7 @@ def test_a_frame_that_ends_its_worker_is_given_up_and_costs_no_other(crew, frame
         assert "spoilt.py" in job.traceback
         assert crew.engine.get_frame("hall", job.frame_id).reason == job.error
     assert jobs["crashing"].error == "its worker was killed by signal 11 (Segmentation fault)"
-    assert jobs["hanging"].error == "its worker ran longer than 6 s, and was ended"
+    assert jobs["hanging"].error == "its worker ran longer than 6 s and was stopped"
     assert jobs["hungry"].error.startswith("MemoryError: Unable to allocate 1.00 GiB")
     assert jobs["broken"].error == "ZeroDivisionError: a bug"
     # the others did not notice: none was tried twice, and nobody died but of the frames at fault

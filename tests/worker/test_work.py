@@ -7,7 +7,7 @@ import re
 import signal
 import time
 
-from sceneprint.schemas import NewMap
+from sceneprint_client.api import NewMap
 
 
 def test_two_workers_sign_each_frame_once(crew, frames):
@@ -40,12 +40,12 @@ def test_frames_of_a_greater_priority_are_signed_first(crew, frames):
 def test_a_database_that_vanishes_for_a_moment_is_waited_for(crew, frames):
     crew.engine.create_map(NewMap(name="shaken", model="depth"))
     crew.change("ALTER TABLE jobs RENAME TO away")
-    crew.until(lambda: len(crew.log("the store does not answer")) >= 2)
+    crew.until(lambda: len(crew.log("store unreachable")) >= 2)
     crew.change("ALTER TABLE away RENAME TO jobs")
     for one in frames[32:36]:
         crew.engine.add_frame("shaken", *one)
     crew.settled("shaken", 4)
-    said = crew.log("the store does not answer")[0]["error"]  # in the words of either database
+    said = crew.log("store unreachable")[0]["error"]  # in the words of either database
     assert re.search('no such table: jobs|relation "jobs" does not', said)
     assert len(crew.log("worker ready")) == 2  # the same two
 

@@ -12,12 +12,13 @@ const LATE_MS = 2500;
 const AGES_MS = 20_000; // "just now" is not true for long
 const main = document.getElementById("main");
 const sheets = new Map(); // address -> <link> of styles
-let turn = null; // aborts what the page that is shown began
+let turn = new AbortController(); // aborts what the page that is shown began
+/** @type {any} */
 let shownPath = null;
 
 /** Render the page of the address. */
 async function show() {
-  turn?.abort();
+  turn.abort();
   turn = new AbortController();
   const { signal } = turn;
   const { route, params, search, path } = parse(location.hash);
@@ -40,7 +41,7 @@ async function show() {
   try {
     if (route === null) {
       const home = h("a", { class: "button", href: "#/" }, "To the maps");
-      put(root, empty({ title: "There is no such page", text: "The address leads nowhere.", actions: home }));
+      put(root, empty({ title: "Page not found", text: "There is no page at this address.", actions: home }));
       return;
     }
     const [page] = await Promise.all([import(new URL(route.page, PAGES).href).catch(unloaded), identify(get)]);
@@ -89,7 +90,7 @@ function uncaught(event) {
   if (error?.name === "AbortError") { event.preventDefault(); return; }
   if (error?.status === undefined && !isUnfetched(error)) return; // a fault of ours: the console has it
   event.preventDefault();
-  if (error.status === 401) { doubt(); show(); } else toast(isUnfetched(error) ? "A part of this page could not be loaded. Load the page again." : error.message, { kind: "bad" });
+  if (error.status === 401) { doubt(); show(); } else toast(isUnfetched(error) ? "A part of this page could not be loaded. Reload the page." : error.message, { kind: "bad" });
 }
 
 async function styled(name) {
@@ -98,8 +99,8 @@ async function styled(name) {
   if (!link) {
     link = h("link", { rel: "stylesheet", href });
     link.came = new Promise((resolve) => {
-      link.onload = () => { link.sheet.disabled = true; resolve(); }; // until a page wears it
-      link.onerror = () => { sheets.delete(href); resolve(); };
+      link.onload = () => { link.sheet.disabled = true; resolve(null); }; // until a page wears it
+      link.onerror = () => { sheets.delete(href); resolve(null); };
     });
     sheets.set(href, link);
     document.head.append(link);
@@ -119,6 +120,7 @@ async function unloaded(error) {
 }
 
 const banner = document.getElementById("banner");
+/** @type {Timer} */
 let late = null; // a stream that is back at once is not worth a word
 
 function lost(isLost) {
@@ -131,7 +133,7 @@ function lost(isLost) {
 
 function tellLost() {
   banner.hidden = false;
-  put(banner, "The service does not answer. What is shown may be old; trying again…");
+  put(banner, "The service does not answer. The data shown may be out of date; retrying…");
 }
 
 window.addEventListener("sceneprint:live", (event) => lost(event.detail === "waiting"));

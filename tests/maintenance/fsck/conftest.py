@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from sqlalchemy import NullPool, create_engine, make_url
 
-from sceneprint.datasets import write_depth_png
 from sceneprint.engine import Engine
-from sceneprint.maintenance.fsck import Outcome, fsck
+from sceneprint.formats.dataset import write_depth_png
+from sceneprint.maintenance.fsck.check import FindingOutcome, fsck
 from sceneprint.models import Model, open_table, write_model
-from sceneprint.schemas import CameraIntrinsics, FrameMeta, GivenPose, JobState, Query
 from sceneprint.settings import Settings
 from sceneprint.store.maps import add_map, keep_model
-from sceneprint.types import Frame
+from sceneprint.types import DepthFrame
+from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, JobState, Query
 
 #: Frames of `hall`, all signed; the first index holds half of them, the second all.
 HALL = 12
@@ -46,9 +46,8 @@ class House:
             tail_frames=HALL // 2 - 1,
         )  # fmt: skip
 
-    def look(self, **how: Any) -> list[Outcome]:
-        found = fsck(self.settings, **how)
-        return [one for one in found if one.finding.kind != "unchecked-pages"]  # PostgreSQL's
+    def look(self, **how: Any) -> list[FindingOutcome]:
+        return list(fsck(self.settings, **how))
 
     def files(self) -> dict[str, int | None]:
         """Checksum of every file, and every folder."""
@@ -99,7 +98,7 @@ class House:
 
 @pytest.fixture(scope="session")
 def uploads(
-    room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory
+    room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory
 ) -> list[Upload]:
     """24 small frames with poses: every fourth sample from each of four corners of six views."""
     path, found = tmp_path_factory.mktemp("png") / "frame.png", []

@@ -15,8 +15,8 @@ import pytest
 from PIL import Image
 
 from sceneprint.cli import main
-from sceneprint.cli.served import serving
-from sceneprint.client import Client
+from sceneprint.cli.demo import serving
+from sceneprint_client import Client
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_it_says_what_it_would_do_and_what_it_did(
 ) -> None:
     assert fsck(expect=0).splitlines() == [
         "checked 1 models, 15 frames, 13 signatures, 27 blobs, 27 files, 2 generations, 1 tables",
-        "all is well",
+        "no problems found",
     ]
     house.sql("INSERT INTO frame_tags VALUES (1, 'other')")
     (house.data / "blobs" / "notes.txt").write_text("mine")
@@ -56,7 +56,7 @@ def test_it_says_what_it_would_do_and_what_it_did(
     )
     assert lines[1].startswith("note      foreign-file  ")
     assert lines[-1] == (
-        "1 damaged, 0 left over; nothing was changed: `sceneprint fsck --repair` can mend 1"
+        "1 damaged, 0 left over; nothing was changed: `sceneprint fsck --repair` can repair 1"
     )
     told = json.loads(record.read_text())
     assert told["checked"]["frames"] == 15
@@ -66,8 +66,8 @@ def test_it_says_what_it_would_do_and_what_it_did(
     ]
     lines = fsck("--repair", expect=0).splitlines()
     assert lines[0].endswith("; done: 2 written")
-    assert lines[-1].startswith("1 damaged, 0 left over: 1 repaired, 0 not. Look again")
-    assert fsck("--map", "hall", expect=0).splitlines()[-1] == "all is well"
+    assert lines[-1].startswith("1 damaged, 0 left over: 1 repaired, 0 not. Run it again")
+    assert fsck("--map", "hall", expect=0).splitlines()[-1] == "no problems found"
 
 
 def test_what_cannot_be_checked_or_repaired_has_its_own_code(

@@ -13,8 +13,8 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.errors import NewerSchema, UnknownMap, UnusableStore
-from sceneprint.maintenance.fsck import FATAL
-from sceneprint.schemas import NewMap
+from sceneprint.maintenance.fsck.check import FATAL
+from sceneprint_client.api import NewMap
 
 FLIPS = 30
 #: Rows of which every byte that matters is checked.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.maintenance.findings import Finding
+from sceneprint.maintenance.fsck.findings import Finding
 
 HALL = 12
 #: Flips of each kind.
@@ -98,7 +98,7 @@ def test_a_damaged_index_is_removed_and_made_again(
 
 
 def ask() -> Any:
-    from sceneprint.schemas import Query
+    from sceneprint_client.api import Query
 
     return Query(stages=("retrieve",))
 

@@ -13,7 +13,7 @@ import pytest
 from sceneprint.cli import main
 from sceneprint.engine import Engine
 from sceneprint.errors import UnusableStore
-from sceneprint.schemas import JobState
+from sceneprint_client.api import JobState
 
 
 def blobs(house: Any) -> set[str]:
@@ -170,5 +170,5 @@ def test_odd_arguments_are_refused_in_a_line(
     house: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad = os.fsdecode(b"caf\xe9")
-    assert "is not text in UTF-8" in refused(capsys, "fsck", "--data", house.data, "--map", bad)
+    assert "is not valid UTF-8" in refused(capsys, "fsck", "--data", house.data, "--map", bad)
     assert main(["fsck", "--data", str(house.data), "--grace", "1" + "0" * 400]) in (0, 1)

@@ -7,14 +7,13 @@ from pathlib import Path
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.maintenance.fsck import fsck
-from sceneprint.maintenance.restoring import restore_snapshot
-from sceneprint.maintenance.snapshots import take_snapshot
-from sceneprint.schemas import NewMap
+from sceneprint.maintenance.fsck.check import fsck
+from sceneprint.maintenance.snapshot.creation import take_snapshot
+from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 from sceneprint.settings import Settings
 from sceneprint.store import Store
-from sceneprint.store.listing import find_job
-from sceneprint.store.parts import JobFile, add_files, files_of
+from sceneprint.store.queue import JobFile, add_files, files_of, find_job
+from sceneprint_client.api import NewMap
 
 
 @pytest.fixture

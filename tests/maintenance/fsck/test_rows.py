@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.schemas import Query
 from sceneprint.store.tables import frames
+from sceneprint_client.api import Query
 
 FIRST = "(SELECT MIN(number) FROM frames WHERE state = 'indexed')"
 WAITING = "(SELECT number FROM frames WHERE state = 'received')"

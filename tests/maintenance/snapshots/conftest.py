@@ -15,10 +15,12 @@ import numpy as np
 import pytest
 
 from sceneprint.cli import main
-from sceneprint.datasets import write_depth_png
 from sceneprint.engine import Engine
-from sceneprint.maintenance.snapshots import take_snapshot
-from sceneprint.schemas import (
+from sceneprint.formats.dataset import write_depth_png
+from sceneprint.maintenance.snapshot.creation import take_snapshot
+from sceneprint.settings import Settings
+from sceneprint.types import DepthFrame
+from sceneprint_client.api import (
     Answer,
     CameraIntrinsics,
     FrameMeta,
@@ -27,8 +29,6 @@ from sceneprint.schemas import (
     NewMap,
     Query,
 )
-from sceneprint.settings import Settings
-from sceneprint.types import Frame
 
 SIGNED = 4
 
@@ -53,7 +53,7 @@ class Upload:
 
 @pytest.fixture(scope="session")
 def uploads(
-    room_frames: tuple[Frame, ...], tmp_path_factory: pytest.TempPathFactory
+    room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory
 ) -> list[Upload]:
     """24 small frames with poses: every fourth sample from each of four corners of six views."""
     path, found = tmp_path_factory.mktemp("png") / "frame.png", []

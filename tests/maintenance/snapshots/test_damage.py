@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from sceneprint.errors import DamagedSnapshot, NewerSchema, SnapshotError, UnusableStore
-from sceneprint.maintenance.restoring import restore_snapshot, verify_snapshot
+from sceneprint.maintenance.snapshot.restoration import restore_snapshot, verify_snapshot
 
 Members = list[tuple[tarfile.TarInfo, bytes]]
 

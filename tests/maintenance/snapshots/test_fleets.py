@@ -19,21 +19,21 @@ import pytest
 from pydantic import SecretStr
 from sqlalchemy import insert
 
-from sceneprint.cli.served import serving
+from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
 from sceneprint.errors import DamagedSnapshot, SnapshotError, UnknownSnapshot, UnusableStore
-from sceneprint.maintenance.exporting import copy_server
-from sceneprint.maintenance.fleets import restore_to_fleet
-from sceneprint.maintenance.fsck import fsck
-from sceneprint.maintenance.restoring import restore_snapshot
-from sceneprint.maintenance.shelf import Shelf
-from sceneprint.maintenance.snapshots import take_snapshot
-from sceneprint.schemas import Query
+from sceneprint.maintenance.fsck.check import fsck
+from sceneprint.maintenance.snapshot.catalog import SnapshotCatalog
+from sceneprint.maintenance.snapshot.creation import take_snapshot
+from sceneprint.maintenance.snapshot.database_copy import copy_server
+from sceneprint.maintenance.snapshot.postgres import restore_to_fleet
+from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
-from sceneprint.store.marks import Mark
-from sceneprint.store.object_urls import open_objects
+from sceneprint.store.blobs.object_client import open_objects
+from sceneprint.store.blobs.object_store import BucketOwner
 from sceneprint.store.tables import keys, metadata
+from sceneprint_client.api import Query
 
 pytestmark = pytest.mark.sqlite_only("these have servers of their own")
 
@@ -252,7 +252,7 @@ def test_commands(archive, postgres, tmp_path, sceneprint, monkeypatch):
     monkeypatch.setenv("SCENEPRINT_DATABASE_URL", secret)
     out = tmp_path / "a.tar"
     assert "1 maps, 5 frames" in sceneprint("snapshot", "--data", data, "--out", out).stdout
-    assert "is whole" in sceneprint("restore", "--verify-only", out).stdout
+    assert "is complete" in sceneprint("restore", "--verify-only", out).stdout
 
 
 def test_blobs_and_snapshots_in_an_object_store(
@@ -268,11 +268,11 @@ def test_blobs_and_snapshots_in_an_object_store(
         blobs = {*engine.store.blobs.digests()}
         engine.store.blobs.remove(first := min(blobs))
     assert len(blobs) == told.manifest.blobs.count
-    shelf = Shelf(fleet)
+    shelf = SnapshotCatalog(fleet)
     ids = [f"{datetime.now(UTC):%Y%m%d}T00000{n}Z-0123abcd" for n in range(3)]
     for one in ids:
         assert shelf.take(one).damaged == 1  # the one that was removed
-    other = Shelf(fleet_of(tmp_path / "other", postgres_url, **kept))  # another host
+    other = SnapshotCatalog(fleet_of(tmp_path / "other", postgres_url, **kept))  # another host
     assert [one.snapshot_id for one in other.list()] == ids[:0:-1]
     with other.open(ids[2]) as file:
         assert file.read(13) == b"manifest.json"
@@ -291,6 +291,7 @@ def test_blobs_and_snapshots_in_an_object_store(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["home", "node"]
 
 
+@pytest.mark.thorough
 def test_taken_over_the_service(
     archive, postgres, postgres_url, tmp_path, sceneprint, monkeypatch, rows
 ):
@@ -327,7 +328,7 @@ def test_a_prefix_is_not_shared_with_the_store_that_was_copied(archive, postgres
     assert rows_in(second.database) == rows_in(first.database)
     assert json.loads(marks.get("sceneprint.json")) == mark
     with pytest.raises(UnusableStore, match="of another database"):
-        Mark(marks).begin("0" * 32, "1" * 32)
+        BucketOwner(marks).begin("0" * 32, "1" * 32)
 
 
 def test_an_archive_that_is_another_when_it_is_read_again(

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from sceneprint.maintenance.restoring import restore_snapshot, verify_snapshot
-from sceneprint.maintenance.snapshots import take_snapshot
+from sceneprint.maintenance.snapshot.creation import take_snapshot
+from sceneprint.maintenance.snapshot.restoration import restore_snapshot, verify_snapshot
 
 KILLS = 12
 
@@ -22,8 +22,8 @@ KILLS = 12
 NURSERY = """
 import itertools, os, signal, sys
 from pathlib import Path
-from sceneprint.maintenance.restoring import restore_snapshot
-from sceneprint.maintenance.snapshots import take_snapshot
+from sceneprint.maintenance.snapshot.restoration import restore_snapshot
+from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.settings import Settings
 
 what, source, folder = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])

@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from sceneprint.cli.served import serving
-from sceneprint.client import Client
+from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
-from sceneprint.maintenance.restoring import restore_snapshot
-from sceneprint.maintenance.snapshots import take_snapshot
+from sceneprint.maintenance.snapshot.creation import take_snapshot
+from sceneprint.maintenance.snapshot.restoration import restore_snapshot
+from sceneprint_client import Client
 
 
 @dataclass(eq=False)

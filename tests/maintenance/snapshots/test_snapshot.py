@@ -23,9 +23,9 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.errors import SnapshotError, UnusableStore
-from sceneprint.maintenance import taking
-from sceneprint.maintenance.restoring import restore_snapshot, verify_snapshot
-from sceneprint.maintenance.snapshots import take_snapshot
+from sceneprint.maintenance.snapshot import creation
+from sceneprint.maintenance.snapshot.creation import take_snapshot
+from sceneprint.maintenance.snapshot.restoration import restore_snapshot, verify_snapshot
 from sceneprint.store import FolderBlobs
 from sceneprint.store.frames import refers_to
 
@@ -139,7 +139,7 @@ def test_the_commands(master, tmp_path, sceneprint, monkeypatch):
     )
     assert (tmp_path / name).read_bytes() == before
     said = sceneprint("restore", "--verify-only", name)
-    assert re.fullmatch(rf"{name} is whole: {held} of \S{{20}} in \d+\.\d s\n", said.stdout)
+    assert re.fullmatch(rf"{name} is complete: {held} of \S{{20}} in \d+\.\d s\n", said.stdout)
     said = sceneprint("restore", name, "--data", "new")
     assert said.stdout.startswith(f"{name} is restored to new: {held} of ")
     assert names_in(tmp_path) == sorted([name, "folder", "new"])
@@ -179,7 +179,10 @@ def test_damaged_blobs_are_left_out_and_named(data, tmp_path, sceneprint, rows, 
     )
     told = said.stderr.splitlines()
     assert told[:-1] == lines
-    assert told[-1] == "All else is in it. Run `sceneprint fsck` to see what can be done."
+    assert (
+        told[-1]
+        == "Everything else is included. Run `sceneprint fsck` to see what can be repaired."
+    )
     with tarfile.open(out) as tar:
         names = tar.getnames()
         listed = [json.loads(line) for line in tar.extractfile("damaged.jsonl")]
@@ -254,7 +257,7 @@ def test_a_database_of_an_earlier_schema_is_taken_as_it_is(tmp_path, settings, b
 AS_NOBODY = """
 import os, sys
 from pathlib import Path
-from sceneprint.maintenance.snapshots import take_snapshot
+from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.settings import Settings
 os.setgroups([]), os.setgid(65534), os.setuid(65534)
 folder = Path(sys.argv[1])
@@ -295,7 +298,7 @@ def test_large_blobs_go_in_parts(data, tmp_path, settings, rows, monkeypatch):
     monkeypatch.setattr(FolderBlobs, "open", _told(FolderBlobs.open, asked))
     small = take_snapshot(settings(data), tmp_path / "small.tar")
     assert asked == []
-    monkeypatch.setattr(taking, "_LARGE", 20)
+    monkeypatch.setattr(creation, "_LARGE", 20)
     large = take_snapshot(settings(data), tmp_path / "large.tar")
     assert len(asked) == large.manifest.blobs.count == small.manifest.blobs.count > 0
     assert large.damaged == small.damaged

@@ -6,8 +6,8 @@ import threading
 import time
 
 from sceneprint.engine import Engine
-from sceneprint.maintenance.restoring import verify_snapshot
-from sceneprint.maintenance.snapshots import take_snapshot
+from sceneprint.maintenance.snapshot.creation import take_snapshot
+from sceneprint.maintenance.snapshot.restoration import verify_snapshot
 
 
 def test_what_is_deleted_meanwhile_is_in_it(data, tmp_path, settings, rows):

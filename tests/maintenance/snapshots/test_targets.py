@@ -11,8 +11,7 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.errors import SnapshotError
-from sceneprint.maintenance.restoring import restore_snapshot
-from sceneprint.maintenance.targets import Target
+from sceneprint.maintenance.snapshot.restoration import RestoreTarget, restore_snapshot
 
 #: Holds the database as an idle service does, and as any other reader.
 ENGINE = """
@@ -37,8 +36,8 @@ MOUNTED = """
 import os, subprocess, sys
 from pathlib import Path
 from sceneprint.errors import SnapshotError
-from sceneprint.maintenance.restoring import restore_snapshot
-from sceneprint.maintenance.snapshots import take_snapshot
+from sceneprint.maintenance.snapshot.restoration import restore_snapshot
+from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.settings import Settings
 
 archive, folder = map(Path, sys.argv[1:])
@@ -109,7 +108,7 @@ def test_replaced_it_is_moved_aside(archive, data, tmp_path, content, sceneprint
     said = sceneprint("restore", archive, "--data", data, "--replace")
     (aside,) = set(names_in(tmp_path)) - {"data"}
     assert aside.startswith("data.before-2")
-    assert said.stderr == f"what was there before is kept in {tmp_path / aside}\n"
+    assert said.stderr == f"the previous contents are now in {tmp_path / aside}\n"
     assert content(tmp_path / aside) == before
     assert (tmp_path / aside / "note").read_text() == "mine"
     assert names_in(data) == ["blobs", "sceneprint.db"]
@@ -202,7 +201,9 @@ def test_what_was_moved_aside_comes_back(data, tmp_path, content):
     """What should take its place goes with it, and is then not where it was."""
     before = content(data)
     with pytest.raises(SnapshotError, match="Nothing was changed"):
-        Target(data, replace=True).put(data / "blobs", blobs="blobs", database="sceneprint.db")
+        RestoreTarget(data, replace=True).put(
+            data / "blobs", blobs="blobs", database="sceneprint.db"
+        )
     assert names_in(tmp_path) == ["data"]
     assert content(data) == before
 

@@ -26,14 +26,14 @@ export function about(frame, job, { edit }) {
       ["Job", jobOf(frame, job)],
       job?.error && job.error !== frame.reason && ["Error", job.error],
     ])),
-    card("Who took it", edit && h("button", { class: "button", type: "button", id: "edit", onClick: edit }, "Edit"), list(who)),
+    card("Source", edit && h("button", { class: "button", type: "button", id: "edit", onClick: edit }, "Edit"), list(who)),
     card("Sensor", null, list(frame.kind === "cloud" ? ofCloud(frame) : ofDepth(frame))),
-    card("Pose", null, frame.pose ? transform(frame.pose) : h("p", { class: "muted" }, "None was sent: answers cannot say where in the map it is."),
-      frame.T_base_sensor && [h("h3", {}, "On the robot"), transform(frame.T_base_sensor)]),
+    card("Pose", null, frame.pose ? transform(frame.pose) : h("p", { class: "muted" }, "No pose was sent, so answers cannot place this frame in the map."),
+      frame.T_base_sensor && [h("h3", {}, "Mounting"), transform(frame.T_base_sensor)]),
     card("Identity", null, list([
       ["Frame", mono(frame.frame_id)], ["Content", frame.content_id && mono(frame.content_id)],
       ["Upload", bytes(frame.bytes)], ["Note", frame.note],
-    ]), h("details", {}, h("summary", {}, "As the API tells it"), h("pre", { class: "mono raw", tabindex: "0" }, JSON.stringify(frame, null, 2)))),
+    ]), h("details", {}, h("summary", {}, "JSON of the API"), h("pre", { class: "mono raw", tabindex: "0" }, JSON.stringify(frame, null, 2)))),
   ];
 }
 
@@ -62,6 +62,7 @@ function jobOf(frame, job) {
     h("span", { class: "muted" }, took !== null && ` in ${seconds(took)}`, job.attempts > 1 && `, ${count(job.attempts)} tries`));
 }
 
+/** @param {Object<string, any>} frame */
 function ofDepth({ intrinsics: lens, depth_scale: scale, depth_along_ray: ray }) {
   return [
     ["Kind", "Depth image"],

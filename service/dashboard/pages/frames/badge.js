@@ -7,13 +7,13 @@ const KINDS = {
   queued: "neutral", running: "neutral", succeeded: "good", cancelled: "warn", dead: "bad",
 };
 const SENTENCES = {
-  received: "Stored, and waiting for a worker.",
+  received: "Stored and waiting for a worker.",
   signing: "A worker is signing it.",
-  indexed: "Signed: queries find it.",
-  rejected: "Nothing in it can be signed.",
-  failed: "Signing it was given up.",
-  redundant: "Not kept, as asked: the map has this place.",
-  deleted: "Removed; no query finds it.",
+  indexed: "Signed and searchable.",
+  rejected: "It cannot be signed.",
+  failed: "Signing failed.",
+  redundant: "Not stored, as requested: the map already has this place.",
+  deleted: "Deleted; not searchable.",
 };
 
 /** States a frame can be in, in the order in which they are met. */

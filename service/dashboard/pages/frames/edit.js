@@ -21,7 +21,7 @@ export function editFrame(frame, edited) {
   const save = h("button", { class: "button primary", type: "submit" }, "Save");
   const dialog = sheet({
     title: "Edit the frame",
-    children: [field("robot", "none"), field("session", "none"), field("tags", "with commas between"), said],
+    children: [field("robot", "none"), field("session", "none"), field("tags", "comma-separated"), said],
     buttons: [save],
   });
   let base = frame;
@@ -64,14 +64,14 @@ export function editFrame(frame, edited) {
     const theirs = () => {
       frame = base;
       for (const [name, input] of Object.entries(inputs)) input.value = textOf(base, name);
-      put(said, h("p", { class: "muted" }, "These are the values of now."));
+      put(said, h("p", { class: "muted" }, "These are the current values."));
       put(save, "Save");
     };
     put(said,
-      h("p", { class: "field-error" }, "Somebody edited this frame after you opened it. Nothing of yours was saved."),
-      h("ul", {}, other.map((name) => h("li", {}, `${NAMES[name]} is now `, h("strong", {}, textOf(base, name) || "none"))), !other.length && h("li", {}, "What they changed is none of these fields.")),
-      h("button", { class: "button", type: "button", onClick: theirs }, "Take what is there now"));
-    put(save, "Save mine over it");
+      h("p", { class: "field-error" }, "Somebody edited this frame after you opened it. Your changes were not saved."),
+      h("ul", {}, other.map((name) => h("li", {}, `${NAMES[name]} is now `, h("strong", {}, textOf(base, name) || "none"))), !other.length && h("li", {}, "They changed none of these fields.")),
+      h("button", { class: "button", type: "button", onClick: theirs }, "Use the current values"));
+    put(save, "Overwrite with mine");
   }
 }
 

@@ -62,7 +62,7 @@ export function filterBar(search, runs, choose) {
   const element = h("div", { class: "filters", role: "group", "aria-label": "Filters" },
     listed("robot", "Robot", names("robot"), "All robots"),
     listed("session", "Session", names("session"), "All sessions"),
-    listed("state", "State", STATES, "All but deleted"),
+    listed("state", "State", STATES, "All except deleted"),
     field("tag", "Tag", typed("tag", [], tag)),
     moment("captured_after", "Taken from"),
     moment("captured_before", "Taken until"));
@@ -75,7 +75,7 @@ export function filterBar(search, runs, choose) {
 function local(iso) {
   const at = new Date(iso);
   if (iso === "" || Number.isNaN(at.getTime())) return "";
-  return new Date(at - 60_000 * at.getTimezoneOffset()).toISOString().slice(0, 16);
+  return new Date(at.getTime() - 60_000 * at.getTimezoneOffset()).toISOString().slice(0, 16);
 }
 
 /**

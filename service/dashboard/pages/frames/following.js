@@ -1,6 +1,5 @@
 // What happens to frames while a page shows them: events say which, the API says what they are now.
 import { at, get, watch } from "../lib/api.js";
-import { isPending } from "./badge.js";
 
 const PAUSE_MS = 150;
 const AGAIN_MS = 3000; // where nothing answers, or too much is asked
@@ -24,6 +23,7 @@ const MOST_UNKNOWN = 2000;
 export function follow({ map, signal, shown, pending, changed, missed, arrived, begins }) {
   const waiting = new Set();
   const unknown = new Set(); // frames of which was heard before the page knew them
+  /** @type {Timer} */
   let timer = null;
   let begun = false;
 

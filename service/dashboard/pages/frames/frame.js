@@ -24,18 +24,19 @@ export async function render(root, { params, search, signal, go, title, actions 
   const canWrite = may("write", params.map);
   const side = h("div", { class: "frame-side" });
   const main = h("div", { class: "frame-main" });
+  /** @type {string | null} */
   let drawn = null; // the state that the main part shows
   title(`Frame ${shortId(frame.frame_id)}`);
   put(root, h("div", { class: "frame-page" }, main, side));
 
   async function draw() {
     const isEdit = document.activeElement?.id === "edit";
-    put(side, about(frame, job, { edit: canWrite && frame.state !== "deleted" ? () => editFrame(frame, take) : null }));
+    put(side, about(frame, job, { edit: canWrite && frame.state !== "deleted" ? () => editFrame(frame, take) : undefined }));
     if (isEdit) document.getElementById("edit")?.focus();
     if (drawn === frame.state) return;
     drawn = frame.state;
     actions(
-      frame.state === "indexed" && h("a", { class: "button primary", href: link("maps", params.map, "query", { frame: frame.frame_id }) }, "Ask where this is"),
+      frame.state === "indexed" && h("a", { class: "button primary", href: link("maps", params.map, "query", { frame: frame.frame_id }) }, "Locate this frame"),
       canWrite && frame.state !== "deleted" && h("button", { class: "button danger", type: "button", onClick: remove }, "Delete"));
     if (frame.state !== "indexed") { put(main, look()); return; }
     const { scene } = await import("./scene.js");
@@ -51,7 +52,7 @@ export async function render(root, { params, search, signal, go, title, actions 
       const shown = preview(frame, { view, width: WIDTH, signal });
       put(place, shown);
       put(meaning);
-      if (frame.state !== "indexed" || !(await shown.querySelector("canvas").ready)) return;
+      if (frame.state !== "indexed" || !(await shown.querySelector("canvas")?.ready)) return;
       const png = await bytes(`${path}/preview.png`, { params: { view, width: WIDTH }, signal, accept: "image/png" });
       if (shown.isConnected) put(meaning, textOf(png, "Description")); // else another view was chosen meanwhile
     };
@@ -62,7 +63,7 @@ export async function render(root, { params, search, signal, go, title, actions 
     });
     show(first);
     return h("section", { class: "card", "aria-labelledby": "look-title" },
-      h("div", { class: "card-head" }, h("h2", { id: "look-title" }, "What the sensor saw"), frame.state === "indexed" && views),
+      h("div", { class: "card-head" }, h("h2", { id: "look-title" }, "Sensor view"), frame.state === "indexed" && views),
       place, meaning, files());
   }
 
@@ -78,7 +79,7 @@ export async function render(root, { params, search, signal, go, title, actions 
   async function remove() {
     const sure = await confirm({
       title: "Delete this frame?", word: shortId(frame.frame_id), action: "Delete",
-      text: "No query finds it from then on, and its upload is removed from disk. This cannot be undone.",
+      text: "Queries no longer find it, and its upload is removed from disk. This cannot be undone.",
     });
     if (!sure) return;
     await send("DELETE", path);

@@ -26,9 +26,13 @@ export async function render(root, { params, search, signal, go, title, actions 
   actions(canWrite && h("a", { class: "button primary", href: link("maps", params.map, "upload") }, "Upload frames"));
 
   let wanted = search;
+  /** @type {any} null until they have come */
   let runs = null; // of the map's sessions: 100,000 frames are counted for them, and the list need not wait
+  /** @type {AbortController | null} */
   let list = null;
+  /** @type {Object<string, any> | null} */
   let last = null; // the page that is shown
+  /** @type {string | null} */
   let offered = null; // robots and sessions that the filters offer
   const tiles = new Map(); // by frame
   const come = new Set(); // frames that came since the list was asked for
@@ -54,7 +58,7 @@ export async function render(root, { params, search, signal, go, title, actions 
     wanted = next;
     go(link("maps", params.map, wanted), { quiet: true });
     show();
-    if (!sameList) return fetchList().catch(shownFault);
+    if (!sameList) { fetchList().catch(shownFault); return; }
     for (const one of tiles.values()) one.show(one.frame, viewOf(wanted));
   }
 
@@ -101,7 +105,7 @@ export async function render(root, { params, search, signal, go, title, actions 
     // what is being typed or chosen in it stays; only other choices are worth another bar
     const names = JSON.stringify(runs.items.map((one) => [one.robot, one.session]));
     const at = document.activeElement;
-    if (!bar.contains(at)) { offer(names); return; }
+    if (at === null || !bar.contains(at)) { offer(names); return; }
     at.addEventListener("focusout", () => setTimeout(() => { if (!signal.aborted) offer(names); }), { once: true });
   }
 
@@ -109,18 +113,18 @@ export async function render(root, { params, search, signal, go, title, actions 
     if (names === offered) return;
     offered = names;
     const before = bar;
-    const focused = before.contains(document.activeElement) ? document.activeElement.id : null;
+    const focused = before.contains(document.activeElement) ? document.activeElement?.id : null;
     bar = filterBar(wanted, runs.items, turn);
     before.replaceWith(bar);
     if (focused) document.getElementById(focused)?.focus();
   }
 
   function nothing() {
-    if (wanted.has("cursor")) return empty({ title: "No more frames", text: "This page is behind the last one.", actions: first("First page") });
-    if (!clear.hidden) return empty({ title: "No frame passes", text: "No frame of this map has all that the filters ask for.", actions: h("button", { class: "button", type: "button", onClick: () => clear.click() }, "Clear filters") });
+    if (wanted.has("cursor")) return empty({ title: "No more frames", text: "There is no such page.", actions: first("First page") });
+    if (!clear.hidden) return empty({ title: "No frame matches", text: "No frame of this map matches all filters.", actions: h("button", { class: "button", type: "button", onClick: () => clear.click() }, "Clear filters") });
     return empty({
       title: "No frames yet",
-      text: "What is uploaded here can be found a moment later, and its state changes before your eyes.",
+      text: "Uploaded frames become searchable within moments. This page shows their state live.",
       actions: canWrite && h("a", { class: "button primary", href: link("maps", params.map, "upload") }, "Upload frames"),
     });
   }
@@ -165,6 +169,7 @@ export async function render(root, { params, search, signal, go, title, actions 
   })]);
   counted.catch((error) => { if (error.name !== "AbortError") toast(error.message, { kind: "bad" }); });
   const isFirst = () => !wanted.has("cursor") && wanted.get("order") !== "asc";
+  /** @type {Timer} */
   let filling = null;
   signal.addEventListener("abort", () => clearTimeout(filling), { once: true });
   const look = () => {

@@ -9,7 +9,7 @@ const PARENTS = 4; // folders above a frame that are looked into, as `sceneprint
 
 /** @typedef {{file: File | null, path: string}} Dropped path: with the folders that were dropped; file:
  *   null where it cannot be read */
-/** @typedef {{file: File, path: string, source: import("./kinds.js").Source, said: object,
+/** @typedef {{file: File, path: string, source: import("./kinds.js").Source, said: Object<string, any>,
  *   pose: File | null}} Found said: fields of the nearest intrinsics.json or clouds.json */
 
 /**
@@ -49,14 +49,17 @@ async function* walk(entries) {
  * Sort what came: frames and archives, what they lack and what belongs to none of them.
  * @param {AsyncIterable<Dropped>} files
  * @param {AbortSignal} signal
- * @returns {Promise<{found: Found[], fields: object[], left: string[], faults: string[]}>}
+ * @returns {Promise<{found: Found[], fields: Object<string, any>[], left: string[], faults: string[]}>}
  *   fields: of files that were dropped without a folder, for the form; left: paths of what is not
  *   sent; faults: files that should say something and do not
  */
 export async function taken(files, signal) {
   const frames = [];
   const [beside, poses] = [new Map(), new Map()];
-  const [fields, left, faults] = [[], [], []];
+  /** @type {Object<string, any>[]} */
+  const fields = [];
+  /** @type {string[][]} */
+  const [left, faults] = [[], []];
   let since = performance.now();
   for await (const { file, path } of files) {
     if (signal.aborted) break;

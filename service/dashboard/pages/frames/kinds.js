@@ -74,11 +74,11 @@ export function stemOf(name) {
 /**
  * The fields of an intrinsics.json or a clouds.json, as `settings` of source.js has them.
  * @param {File} file
- * @returns {Promise<object>}
+ * @returns {Promise<Object<string, any>>}
  * @throws {Error} it is no JSON object, or too large to be one of them
  */
 export async function fieldsOf(file) {
-  if (file.size > MOST_TEXT) throw new Error(`${file.name} is too large: it has a few numbers.`);
+  if (file.size > MOST_TEXT) throw new Error(`${file.name} is too large: it should contain only a few numbers.`);
   let said;
   try {
     said = JSON.parse(await file.text());
@@ -86,7 +86,7 @@ export async function fieldsOf(file) {
     throw new Error(`${file.name} is not JSON.`);
   }
   if (said === null || typeof said !== "object" || Array.isArray(said)) {
-    throw new Error(`${file.name} is no JSON object.`);
+    throw new Error(`${file.name} is not a JSON object.`);
   }
   const known = ["fx", "fy", "cx", "cy", "width", "height", "distortion", "depth_scale",
     "depth_along_ray", "viewpoint", "units_per_metre", "format"];
@@ -100,10 +100,10 @@ export async function fieldsOf(file) {
  * @throws {Error} it holds anything else
  */
 export async function poseOf(file) {
-  if (file.size > MOST_TEXT) throw new Error(`${file.name} is too large: a pose is 16 numbers.`);
+  if (file.size > MOST_TEXT) throw new Error(`${file.name} is too large: a pose has 16 numbers.`);
   const numbers = (await file.text()).trim().split(/\s+/).map(Number);
   if (numbers.length !== 16 || !numbers.every(Number.isFinite)) {
-    throw new Error(`${file.name} holds no pose. Write 4 rows of 4 numbers, sensor to parent.`);
+    throw new Error(`${file.name} contains no pose. Write 4 rows of 4 numbers, sensor to parent.`);
   }
   return [0, 4, 8, 12].map((row) => numbers.slice(row, row + 4));
 }

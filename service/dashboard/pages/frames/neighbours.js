@@ -15,10 +15,10 @@ const K = 8;
  * @returns {HTMLElement} it fills itself
  */
 export function neighbours(frame, signal) {
-  const place = h("div", {}, loading("Looking for its neighbours"));
+  const place = h("div", {}, loading("Loading neighbours"));
   const card = h("section", { class: "card", "aria-labelledby": "neighbours-title" },
     h("h2", { id: "neighbours-title" }, "Neighbours"),
-    h("p", { class: "muted" }, "The nearest signatures of this map. Nothing is validated yet: that is what a query does."), place);
+    h("p", { class: "muted" }, "The nearest signatures in this map. They are not validated: run a query for that."), place);
   async function ask() {
     try {
       const { data } = await send("POST", `${at("maps", frame.map)}/queries`, {
@@ -26,7 +26,7 @@ export function neighbours(frame, signal) {
       });
       put(place, data.matches.length
         ? h("ol", { class: "neighbours" }, data.matches.map((one) => tileOf(one, signal)))
-        : h("p", { class: "muted" }, "This is the only frame of the map that can be found."));
+        : h("p", { class: "muted" }, "This is the only searchable frame of the map."));
     } catch (error) {
       if (error.name === "AbortError") return;
       if (error.status === 401) throw error;

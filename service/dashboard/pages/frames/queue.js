@@ -14,7 +14,7 @@ const REST_S = 5;
 const ENDS_ALL = new Set([401, 403, 404, 507]);
 
 /** @typedef {import("./intake.js").Found & {id: number, state: string, share: number,
- *   frame_id: string | null, job: object | null, reason: string | null, problem: Error | null,
+ *   frame_id: string | null, job: Object<string, any> | null, reason: string | null, problem: Error | null,
  *   isThere: boolean, tries: number, until: number, stop: AbortController | null}} Item
  *   state: ready, waiting, sending, sent, importing, imported, refused, cancelled, or a frame's */
 
@@ -32,7 +32,7 @@ window.addEventListener("beforeunload", (event) => {
   if ([...queues.values()].some((one) => one.isBusy())) event.preventDefault();
 });
 
-class Queue {
+export class Queue {
   constructor(map) {
     this.map = map;
     this.items = [];
@@ -123,7 +123,7 @@ class Queue {
     this.change(item, { state: "sending", share: 0, problem: null });
     try {
       // else the network would be blamed for it, and it asked again and again
-      await item.file.slice(0, 1).arrayBuffer().catch(() => { throw new Error("It cannot be read any more: it was changed, moved or removed since it was chosen. Choose it again."); });
+      await item.file.slice(0, 1).arrayBuffer().catch(() => { throw new Error("The file can no longer be read: it was changed, moved or removed. Choose it again."); });
       if (item.source.kind === "archive") await this.sendArchive(item);
       else await this.sendFrame(item);
     } catch (error) {
@@ -135,7 +135,7 @@ class Queue {
   async sendFrame(item) {
     if (item.file.size === 0) throw new Error("The file is empty.");
     // the service would speak of the size of an image that this is not
-    if (item.source.kind === "depth" && !item.source.format) throw new Error("It is named as an image, and holds none: its bytes are no PNG and no NPY.");
+    if (item.source.kind === "depth" && !item.source.format) throw new Error("It is named like an image, but it is neither a PNG nor an NPY file.");
     const pose = item.pose ? await poseOf(item.pose) : null;
     const form = await formOf(item.file, this.saidOf(item), { source: item.source, pose });
     const answer = await send("POST", at("maps", this.map, "frames"), {

@@ -5,7 +5,7 @@ import { link } from "../lib/router.js";
 import { badge, isPending } from "./badge.js";
 import { viewSwitch } from "./views.js";
 
-const GROUPS = [["all", "All"], ["ready", "Ready"], ["way", "Under way"], ["done", "Done"], ["refused", "Refused"]];
+const GROUPS = [["all", "All"], ["ready", "Ready"], ["way", "In progress"], ["done", "Done"], ["refused", "Refused"]];
 const IN_GROUP = {
   ready: "ready", waiting: "way", sending: "way", received: "way", signing: "way", importing: "way",
   queued: "way", running: "way", indexed: "done", redundant: "done", imported: "done",
@@ -23,11 +23,12 @@ export function groupOf(state) {
  * The list of a queue; `update(item)` after one has changed, `update(null)` after many have.
  * @param {import("./queue.js").Queue} queue
  * @param {AbortSignal} signal
- * @returns {HTMLElement & {update: (item: object | null) => void}}
+ * @returns {HTMLElement & {update: (item: Object<string, any> | null) => void}}
  */
 export function rowsOf(queue, signal) {
   let group = "all";
   let most = STEP;
+  /** @type {Timer} */
   let timer = null;
   let all = false; // many have changed
   const rows = new Map();
@@ -35,7 +36,7 @@ export function rowsOf(queue, signal) {
   const list = h("ul", { class: "rows" });
   const more = h("button", { class: "button", type: "button", onClick: () => { most += STEP; draw(); } });
   const choose = viewSwitch(group, (one) => { group = one; most = STEP; draw(); }, GROUPS, "Show");
-  const element = h("section", { class: "rows-place", "aria-label": "Files" }, choose, list, more);
+  const element = Object.assign(h("section", { class: "rows-place", "aria-label": "Files" }, choose, list, more), { update });
 
   function draw() {
     timer = null;
@@ -43,8 +44,9 @@ export function rowsOf(queue, signal) {
     counts.all = queue.items.length;
     for (const item of queue.items) counts[groupOf(item.state)] += 1;
     for (const button of choose.querySelectorAll("button")) {
-      const [, text] = GROUPS.find(([name]) => name === button.dataset.value);
-      put(button, text, h("span", { class: "number muted" }, ` ${count(counts[button.dataset.value])}`));
+      const value = button.dataset.value ?? "";
+      const text = GROUPS.find(([name]) => name === value)?.[1];
+      put(button, text, h("span", { class: "number muted" }, ` ${count(counts[value])}`));
     }
     const wanted = queue.items.filter((one) => group === "all" || groupOf(one.state) === group);
     const shown = wanted.slice(0, most);
@@ -61,14 +63,14 @@ export function rowsOf(queue, signal) {
     more.hidden = wanted.length <= most;
     put(more, `Show ${count(Math.min(STEP, wanted.length - most))} more of ${count(wanted.length - most)}`);
     element.hidden = queue.items.length === 0;
-    if (had && !list.contains(document.activeElement)) (list.querySelector(".row-action button") ?? choose.firstElementChild).focus({ preventScroll: true });
+    if (had && !list.contains(document.activeElement)) /** @type {HTMLElement} */ (list.querySelector(".row-action button") ?? choose.firstElementChild).focus({ preventScroll: true });
   }
 
   // a transfer tells of itself many times a second, and several are under way
-  element.update = (item) => {
+  function update(item) {
     if (item) dirty.add(item); else all = true;
     timer ??= setTimeout(draw, 80);
-  };
+  }
   signal.addEventListener("abort", () => clearTimeout(timer), { once: true });
   draw();
   return element;
@@ -78,28 +80,29 @@ function rowOf(queue, item) {
   const state = h("div", { class: "row-state" });
   const more = h("div", { class: "row-more" });
   const action = h("div", { class: "row-action" });
-  const about = h("div", { class: "row-about muted" }, aboutOf(queue, item));
-  const row = h("li", { class: "row", dataset: { name: item.file.name } },
-    h("div", { class: "row-name" }, h("span", { title: item.path }, item.file.name), about), state, action, more);
+  const about = h("div", { class: "row-about muted" }, aboutOf(item));
+  const row = Object.assign(h("li", { class: "row", dataset: { name: item.file.name } },
+    h("div", { class: "row-name" }, h("span", { title: item.path }, item.file.name), about), state, action, more), { show });
+  /** @type {string | null} */
   let drawn = null;
-  row.show = () => {
-    if (item.state === "sending" && drawn === "sending") { row.querySelector("progress").value = item.share; return; }
+  function show() {
+    if (item.state === "sending" && drawn === "sending") { /** @type {HTMLProgressElement} */ (row.querySelector("progress")).value = item.share; return; }
     if (item.state === drawn && item.state !== "importing" && item.state !== "waiting") return;
     drawn = item.state;
     row.dataset.state = item.state;
-    put(about, aboutOf(queue, item));
+    put(about, aboutOf(item));
     put(state, stateOf(item));
     const had = action.contains(document.activeElement);
     put(action, actionOf(queue, item));
-    if (had) action.querySelector("button, a")?.focus();
+    if (had) /** @type {HTMLElement | null} */ (action.querySelector("button, a"))?.focus();
     put(more, reasonOf(item));
     if (item.state === "waiting" && item.until) setTimeout(() => { if (item.state === "waiting") put(more, reasonOf(item)); }, 1000);
-  };
-  row.show();
+  }
+  show();
   return row;
 }
 
-function aboutOf(queue, item) {
+function aboutOf(item) {
   const said = [KIND[item.source.kind], bytes(item.file.size)];
   if (item.source.width) said.push(`${item.source.width} × ${item.source.height}`);
   if (Object.keys(item.said).length) said.push(item.source.kind === "cloud" ? "clouds.json" : "intrinsics.json");
@@ -145,18 +148,18 @@ function reasonOf(item) {
       (problem.errors ?? []).length > 0 && h("ul", {}, problem.errors.map((one) => h("li", {}, one.field ? `${one.field}: ${one.reason}` : one.reason))),
     ];
   }
-  if (item.isThere && !isPending(state)) return h("p", {}, "The map has this frame already.", item.reason && ` ${item.reason}`);
+  if (item.isThere && !isPending(state)) return h("p", {}, "The map already has this frame.", item.reason && ` ${item.reason}`);
   return item.reason && h("p", {}, item.reason);
 }
 
 function importOf(item) {
   const { received = 0, there = 0, refused = 0, ignored = 0 } = item.job.result ?? {};
-  const parts = [`${count(received)} taken`, there && `${count(there)} there already`, refused && `${count(refused)} refused`,
-    ignored && `${count(ignored)} files left out`].filter(Boolean);
+  const parts = [`${count(received)} imported`, there && `${count(there)} already there`, refused && `${count(refused)} refused`,
+    ignored && `${count(ignored)} files skipped`].filter(Boolean);
   const faults = item.refused ?? [];
   return [
     h("p", {}, `Frames: ${parts.join(", ")}.`),
-    faults.length > 0 && h("details", {}, h("summary", {}, `What was refused${faults.length < refused ? ", the first of them" : ""}`),
+    faults.length > 0 && h("details", {}, h("summary", {}, `Rejected files${faults.length < refused ? ", the first of them" : ""}`),
       h("ul", {}, faults.slice(0, STEP).map((one) => h("li", {}, h("strong", {}, one.name), ` ${one.problem.detail}`)))),
   ];
 }

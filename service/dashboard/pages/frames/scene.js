@@ -25,6 +25,7 @@ export async function scene(frame, signal) {
   const canvas = h("canvas", { class: "scene-canvas" });
   const told = h("p", { class: "muted", role: "status" }, "Loading the points…");
   const patchesPlace = h("div", { class: "patches" }, loading("Loading the patches"));
+  /** @type {{colour: string, level: number, points: any, levels: any}} */
   const state = { colour: "height", level: 0, points: null, levels: null };
   const colours = viewSwitch(state.colour, (one) => { state.colour = one; draw(); }, COLOURS, "Colour of the points");
   const cards = [
@@ -34,6 +35,7 @@ export async function scene(frame, signal) {
     h("section", { class: "card", "aria-labelledby": "patches-title" },
       h("h2", { id: "patches-title" }, "Patches"), patchesPlace),
   ];
+  /** @type {any} the viewer, once the points have come */
   let viewer = null;
 
   async function begin() {

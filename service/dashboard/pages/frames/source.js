@@ -11,7 +11,7 @@ const EMPTY = {
   robot: "", session: "", parent_frame: "", tags: "",
 };
 const PRESETS = {
-  "": { label: "Own values" },
+  "": { label: "Custom" },
   kinect: {
     label: "Kinect, 640 × 480, f 585", fx: "585", fy: "585", cx: "320", cy: "240",
     width: "640", height: "480", distortion: "", depth_scale: "1000", depth_along_ray: false,
@@ -37,10 +37,10 @@ export function remember(given) {
 
 /**
  * What the API is told of a file as `meta`.
- * @param {object} given settings, with what intrinsics.json or clouds.json say in place of theirs
+ * @param {Object<string, any>} given settings, with what intrinsics.json or clouds.json say in place of theirs
  * @param {import("./kinds.js").Source} source of the file
  * @param {number[][] | null} [pose] T_parent_sensor
- * @returns {object}
+ * @returns {Object<string, any>}
  */
 export function metaOf(given, source, pose = null) {
   const meta = {};
@@ -89,7 +89,7 @@ function ofCloud(given, source) {
 /**
  * The form that uploads and queries send: parts `frame` and `meta`.
  * @param {File} file
- * @param {object} given as of `metaOf`
+ * @param {Object<string, any>} given as of `metaOf`
  * @param {{source?: import("./kinds.js").Source, pose?: number[][] | null}} [more]
  * @returns {Promise<FormData>}
  */
@@ -100,7 +100,7 @@ export async function formOf(file, given, { source, pose = null } = {}) {
   return form;
 }
 
-/** Whether a depth image could be sent with these settings. @param {object} given */
+/** Whether a depth image could be sent with these settings. @param {Object<string, any>} given */
 export function hasCamera(given) {
   return ["fx", "fy", "cx", "cy"].every((name) => said(given[name]));
 }
@@ -123,7 +123,7 @@ function numberOf(value) {
 /**
  * Fields for the camera of depth images, and, folded, for how clouds are read. What is typed goes
  * into `given` and is remembered; `element.refill()` shows `given` after others changed it.
- * @param {object} given settings()
+ * @param {typeof EMPTY} given settings()
  * @param {{onchange?: () => void}} [heard]
  * @returns {HTMLElement & {refill: () => void}}
  */
@@ -139,6 +139,7 @@ export function cameraFields(given, { onchange = () => {} } = {}) {
   }, Object.entries(PRESETS).map(([value, { label }]) => h("option", { value }, label)));
   const changed = () => { remember(given); onchange(); };
 
+  /** @param {string} name @param {string} label @param {Object<string, any>} [props] of the field; hint: beside the label */
   function input(name, label, { type = "text", hint = "", ...props } = {}) {
     const box = type === "checkbox";
     const field = h("input", {
@@ -171,13 +172,13 @@ export function cameraFields(given, { onchange = () => {} } = {}) {
 
   const element = h("div", { class: "source-fields" },
     h("fieldset", null,
-      h("legend", null, "Camera of depth images"),
+      h("legend", null, "Camera settings"),
       h("label", { class: "field source-preset" }, h("span", null, "Preset"), preset),
       h("div", { class: "source-row" },
         input("fx", "fx", { hint: "px" }), input("fy", "fy", { hint: "px" }),
         input("cx", "cx", { hint: "px" }), input("cy", "cy", { hint: "px" }),
-        input("width", "Width", { hint: "px", placeholder: "of the image" }),
-        input("height", "Height", { hint: "px", placeholder: "of the image" }),
+        input("width", "Width", { hint: "px", placeholder: "from the image" }),
+        input("height", "Height", { hint: "px", placeholder: "from the image" }),
         input("depth_scale", "Depth scale", { hint: "per metre", placeholder: "1000" }),
         input("distortion", "Distortion", { placeholder: "k1,k2,p1,p2" })),
       input("depth_along_ray", "Samples are ranges along the pixel’s ray", { type: "checkbox" })),

@@ -25,7 +25,7 @@ export function preview(frame, { view = "depth", width = PREVIEW, signal }) {
     return h("div", { class: "frame-picture" }, shown);
   }
   return h("div", { class: "frame-picture frame-why", dataset: { state: frame.state } },
-    h("strong", {}, isPending(frame.state) ? "No picture yet" : `Not found by queries`),
+    h("strong", {}, isPending(frame.state) ? "No picture yet" : `Not searchable`),
     h("p", {}, frame.reason ?? sentence(frame.state)));
 }
 
@@ -38,9 +38,10 @@ export function preview(frame, { view = "depth", width = PREVIEW, signal }) {
 export function tile(frame, { view, signal }) {
   const shown = h("div", { class: "tile-top" });
   const words = h("div", { class: "tile-words" });
-  const element = h("li", { class: "tile", dataset: { frame: frame.frame_id } }, shown, words);
+  const element = Object.assign(h("li", { class: "tile", dataset: { frame: frame.frame_id } }, shown, words), { show, frame });
+  /** @type {string | null} */
   let drawn = null;
-  element.show = (given, wanted) => {
+  function show(given, wanted) {
     element.frame = given;
     const looks = `${given.state} ${given.reason} ${wanted}`;
     if (looks !== drawn) put(shown, preview(given, { view: wanted, signal }));
@@ -51,8 +52,8 @@ export function tile(frame, { view, signal }) {
         h("a", { href, class: "mono", title: given.frame_id }, shortId(given.frame_id)), badge(given.state)),
       h("div", { class: "tile-who" }, who(given)),
       h("div", { class: "tile-when muted" }, when(given), given.kind === "cloud" && " · cloud"));
-  };
-  element.show(frame, view);
+  }
+  show(frame, view);
   return element;
 }
 

@@ -21,7 +21,7 @@ export async function render(root, { params, signal, title, actions }) {
   const map = await get(at("maps", params.map), { signal });
   title(`Upload to ${map.title ?? map.name}`);
   if (!may("write", params.map)) {
-    put(root, empty({ title: "Your key may not upload here", text: `“${me()?.name}” may look at this map. To upload, a key needs the scope “write” for it.` }));
+    put(root, empty({ title: "Your key may not upload here", text: `“${me()?.name}” can only read this map. To upload, a key needs the scope “write” for it.` }));
     return;
   }
   const queue = queueOf(params.map);
@@ -35,28 +35,28 @@ export async function render(root, { params, signal, title, actions }) {
   const fields = cameraFields(queue.given);
   const start = h("button", { class: "button primary", type: "button", onClick: begin });
   const cancel = h("button", { class: "button", type: "button", onClick: () => queue.cancelAll() }, "Cancel all");
-  const tidy = h("button", { class: "button quiet", type: "button", onClick: () => queue.remove(queue.items.filter((one) => groupOf(one.state) === "done")) }, "Clear what is done");
+  const tidy = h("button", { class: "button quiet", type: "button", onClick: () => queue.remove(queue.items.filter((one) => groupOf(one.state) === "done")) }, "Clear finished");
   const retry = h("button", { class: "button", type: "button", onClick: () => queue.again(queue.untaken()) });
   const bar = h("div", { class: "upload-bar" }, summary, h("div", { class: "toolbar" }, tidy, retry, cancel, start));
   const place = dropZone((files) => take(files));
   put(root, h("div", { class: "upload" },
     h("div", { class: "upload-main" }, place, note, bar, aloud, said, rows),
-    h("aside", { class: "card upload-said", "aria-label": "What is said of the files" }, whoFields(queue.given), fields)));
+    h("aside", { class: "card upload-said", "aria-label": "Metadata of the files" }, whoFields(queue.given), fields)));
   actions(h("a", { class: "button", href: link("maps", params.map) }, "To the frames"));
 
   async function take(files) {
-    put(note, "Reading what was dropped…");
+    put(note, "Reading the dropped files…");
     const { found, fields: told, left, faults } = await taken(files, signal);
     if (signal.aborted) return;
     for (const one of told) Object.assign(queue.given, one);
     if (told.length) { remember(queue.given); fields.refill(); }
     queue.add(found);
     const words = [...faults];
-    if (told.length) words.push("The camera was read from what came along.");
+    if (told.length) words.push("The camera settings were read from the dropped files.");
     const beside = found.filter((one) => Object.keys(one.said).length).length;
-    if (beside) words.push(`${count(beside)} of ${count(found.length)} are read as the intrinsics.json or clouds.json in their folder says.`);
-    if (left.length) words.push(`${count(left.length)} ${left.length === 1 ? "file is" : "files are"} no frame, and left out: ${left.slice(0, 3).join(", ")}${left.length > 3 ? ", …" : ""}`);
-    if (!found.length && !told.length && !left.length && !faults.length) words.push("Nothing in it can be read.");
+    if (beside) words.push(`${count(beside)} of ${count(found.length)} use the intrinsics.json or clouds.json in their folder.`);
+    if (left.length) words.push(`${count(left.length)} ${left.length === 1 ? "file was" : "files were"} skipped, not a frame: ${left.slice(0, 3).join(", ")}${left.length > 3 ? ", …" : ""}`);
+    if (!found.length && !told.length && !left.length && !faults.length) words.push("It contains nothing readable.");
     put(note, words.join(" "));
     put(said);
   }
@@ -65,8 +65,8 @@ export async function render(root, { params, signal, title, actions }) {
     const ready = queue.items.filter((one) => one.state === "ready");
     const blind = ready.find((one) => one.source.kind === "depth" && !hasCamera({ ...queue.given, ...one.said }));
     const lost = ready.find((one) => one.pose && ![queue.given.session, queue.given.parent_frame].some((text) => text.trim()) && !one.path.includes("/"));
-    if (blind) return missing("fx", `${blind.file.name} is a depth image: give its camera (fx, fy, cx, cy), or drop an intrinsics.json along.`);
-    if (lost) return missing("session", `${lost.file.name} has a pose: name its session, or the parent frame that the pose leads to.`);
+    if (blind) return missing("fx", `${blind.file.name} is a depth image: enter its camera (fx, fy, cx, cy), or drop an intrinsics.json with it.`);
+    if (lost) return missing("session", `${lost.file.name} has a pose: enter its session, or the parent frame of the pose.`);
     put(said);
     queue.start();
     return show(null);
@@ -76,6 +76,8 @@ export async function render(root, { params, signal, title, actions }) {
     put(said, text);
     root.querySelector(`.upload-said [name="${name}"]`).focus();
   }
+
+  /** @type {Timer} */
 
   let timer = null;
   function show(item) {
@@ -104,8 +106,8 @@ export async function render(root, { params, signal, title, actions }) {
     put(retry, `Retry ${count(untaken)}`);
     cancel.hidden = !(queue.running && busy);
     tidy.hidden = !queue.items.some((one) => groupOf(one.state) === "done");
-    const words = { indexed: "indexed", redundant: "not needed", imported: "archives taken", received: "waiting for a worker", signing: "being signed",
-      importing: "archives being taken", sending: "being sent", waiting: "in the queue", ready: "ready", refused: "refused", cancelled: "cancelled" };
+    const words = { indexed: "indexed", redundant: "not needed", imported: "archives imported", received: "waiting for a worker", signing: "being signed",
+      importing: "archives being imported", sending: "being sent", waiting: "in the queue", ready: "ready", refused: "refused", cancelled: "cancelled" };
     const parts = Object.keys(words).filter((one) => states[one]).map((one) => `${count(states[one])} ${words[one]}`);
     const sending = busy > 0 && queue.running;
     if (status.textContent !== parts.join(" · ")) put(status, parts.join(" · "));
@@ -115,11 +117,13 @@ export async function render(root, { params, signal, title, actions }) {
       sending && h("progress", { max: size || 1, value: sent, "aria-label": "All files, sent" }),
       stop,
     ]);
-    const why = queue.stopped?.status === 401 ? "It was stopped: the service asks for another key. With one, upload the rest."
-      : queue.stopped ? `It was stopped, as all others would be refused as well: ${queue.stopped.message}` : "";
+    const why = queue.stopped?.status === 401 ? "Upload stopped: the service requires another key. Enter one, then upload the rest."
+      : queue.stopped ? `Upload stopped, as all other files would be rejected too: ${queue.stopped.message}` : "";
     if (stop.textContent !== why) put(stop, why);
     tell(parts.join(" · "));
   }
+
+  /** @type {Timer} */
 
   let telling = null;
   let toTell = "";
@@ -135,7 +139,7 @@ export async function render(root, { params, signal, title, actions }) {
   document.addEventListener("drop", (event) => {
     if (!isFiles(event) || event.defaultPrevented) return;
     event.preventDefault();
-    take(dropped(event.dataTransfer));
+    take(dropped(/** @type {DataTransfer} */ (event.dataTransfer)));
   }, { signal });
   queue.listeners.add(show);
   signal.addEventListener("abort", () => { queue.listeners.delete(show); clearTimeout(timer); clearTimeout(telling); }, { once: true });
@@ -168,15 +172,15 @@ function dropZone(take) {
   zone.addEventListener("dragenter", over(1));
   zone.addEventListener("dragleave", over(-1));
   zone.addEventListener("dragover", (event) => event.preventDefault());
-  zone.addEventListener("drop", (event) => { depth = 0; over(0)(event); take(dropped(event.dataTransfer)); });
+  zone.addEventListener("drop", (event) => { depth = 0; over(0)(event); take(dropped(/** @type {DataTransfer} */ (event.dataTransfer))); });
   return zone;
 }
 
 function whoFields(given) {
   const field = (name, label, placeholder) => h("label", { class: "field" }, h("span", {}, label),
     h("input", { type: "text", name, autocomplete: "off", placeholder, value: given[name], onInput: (event) => { given[name] = event.target.value; remember(given); } }));
-  return h("fieldset", {}, h("legend", {}, "Who took them"),
+  return h("fieldset", {}, h("legend", {}, "Source"),
     h("div", { class: "source-row" },
-      field("robot", "Robot", "none"), field("session", "Session", "as the folder"),
-      field("tags", "Tags", "door, north"), field("parent_frame", "Parent frame of poses", "as the session")));
+      field("robot", "Robot", "none"), field("session", "Session", "folder name"),
+      field("tags", "Tags", "door, north"), field("parent_frame", "Parent frame of poses", "same as the session")));
 }

@@ -81,7 +81,7 @@ export async function bytes(path, { params, signal, accept = "*/*" } = {}) {
  */
 export async function save(path, { params, name } = {}) {
   const link = document.createElement("a");
-  link.download = name ?? path.split("/").pop();
+  link.download = name ?? path.split("/").pop() ?? "";
   link.href = address(path, params);
   if (key() === null) { link.click(); return; } // straight to the disk, however large
   const answer = await ask(path, params, { headers: { Accept: "*/*" } });
@@ -108,18 +108,20 @@ function upload(method, url, { headers, body, signal, onprogress }) {
     for (const [name, value] of Object.entries(headers)) request.setRequestHeader(name, value);
     request.upload.onprogress = (event) => { if (event.lengthComputable) onprogress(event.loaded / event.total); };
     request.onerror = () => reject(unreachable());
-    request.onabort = () => reject(new DOMException("It was given up.", "AbortError"));
+    const givenUp = () => reject(new DOMException("It was cancelled.", "AbortError"));
+    request.onabort = givenUp;
     request.onload = () => {
-      let data = request.responseText || null;
-      if (data && /[/+]json/.test(request.getResponseHeader("Content-Type") ?? "")) data = JSON.parse(data);
+      const isJson = /[/+]json/.test(request.getResponseHeader("Content-Type") ?? "");
+      const text = request.responseText;
+      const data = text && isJson ? JSON.parse(text) : text || null;
       if (request.status >= 400) {
-        reject(new Problem(request.status, data ?? {}, request.getResponseHeader("Retry-After")));
+        reject(new Problem(request.status, (isJson && data) || {}, request.getResponseHeader("Retry-After")));
         return;
       }
       const lines = request.getAllResponseHeaders().trim().split(/\r?\n/).map((line) => line.split(/:\s*(.*)/, 2));
-      resolve({ status: request.status, data, headers: new Headers(lines) });
+      resolve({ status: request.status, data, headers: new Headers(/** @type {any} */ (lines)) });
     };
-    if (signal?.aborted) { request.onabort(); return; }
+    if (signal?.aborted) { givenUp(); return; }
     signal?.addEventListener("abort", () => request.abort(), { once: true });
     request.send(body ?? null);
   });

@@ -27,6 +27,7 @@ const KEYS = { ArrowLeft: -1, ArrowRight: 1, PageUp: -10, PageDown: 10, Home: -I
  *   times: rising and even; values: of each series, as many as times
  */
 export function chart({ title, kind = "lines", series, format, axis = format, least = 0, nothing = "" }) {
+  /** @type {{times: Date[], values: (number | null)[][], at: number | null, width: number}} */
   const state = { times: [], values: series.map(() => []), at: null, width: 480 };
   const drawing = svg("svg", { "aria-hidden": "true", height: HEIGHT });
   const plot = h("div", { class: "chart-plot", tabindex: "0", role: "slider", "aria-label": title,
@@ -35,7 +36,7 @@ export function chart({ title, kind = "lines", series, format, axis = format, le
   const moment = h("span", { class: "muted number" });
   const table = h("table", { class: "table compact" });
   const more = h("details", { class: "chart-table", onToggle: () => fill() },
-    h("summary", {}, "As a table"), h("div", { class: "chart-scroll", tabindex: "0", role: "region", "aria-label": `${title}, table` }, table));
+    h("summary", {}, "Show as table"), h("div", { class: "chart-scroll", tabindex: "0", role: "region", "aria-label": `${title}, table` }, table));
   const note = h("p", { class: "chart-nothing muted", hidden: true }, nothing);
   const element = h("figure", { class: "chart" },
     h("figcaption", {}, h("span", { class: "chart-title" }, title), moment,
@@ -51,7 +52,7 @@ export function chart({ title, kind = "lines", series, format, axis = format, le
     const at = state.at ?? Math.max(last - 1, 0);
     const time = state.times[at];
     put(moment, time ? clock(time) : "");
-    told.forEach((one, i) => put(one, value(i, at)));
+    told.forEach((one, i) => { put(one, value(i, at)); });
     plot.setAttribute("aria-valuemin", "0");
     plot.setAttribute("aria-valuemax", String(Math.max(last, 0)));
     plot.setAttribute("aria-valuenow", String(at));
@@ -108,7 +109,7 @@ export function chart({ title, kind = "lines", series, format, axis = format, le
       Object.assign(state, { times, values });
       if (looked !== null) {
         const again = times.findIndex((time) => time.getTime() === looked);
-        state.at = again >= 0 ? again : 0;
+        state.at = Math.max(again, 0);
       }
       note.hidden = values.some((one) => one.some((found) => found !== null && found !== 0));
       redraw();
@@ -117,20 +118,22 @@ export function chart({ title, kind = "lines", series, format, axis = format, le
   };
 }
 
-/** Where things are: the left edge, the width of a minute, and the heights. */
-function frame({ state, series, kind, least }) {
+/** Where things are: the left edge, the width of a minute, and the heights.
+ * @param {Object<string, any>} parts of `chart` */
+function frame(parts) {
+  const { state, series, least } = parts;
   const left = EDGE.left;
   const step = (state.width - left - EDGE.right) / Math.max(state.times.length, 1);
-  const [piles, lines] = parted({ state, series, kind });
+  const [piles, lines] = parted(parts);
   const piled = [...stacked(piles.map((i) => state.values[i])).flat().map(([, to]) => to), ...lines.flatMap((i) => state.values[i])];
   const axisSteps = steps(Math.max(0, ...piled.filter((one) => one !== null)), 3, least);
   const bottom = HEIGHT - EDGE.bottom;
-  const y = (value) => bottom - (value / axisSteps.at(-1)) * (bottom - EDGE.top);
+  const y = (value) => bottom - (value / axisSteps[axisSteps.length - 1]) * (bottom - EDGE.top);
   return { left, step, bottom, y, axisSteps, x: (i) => left + (i + 0.5) * step, count: series.length };
 }
 
 function draw(parts) {
-  const { drawing, state, series, kind, axis } = parts;
+  const { drawing, state, series, axis } = parts;
   const { left, step, bottom, x, y, axisSteps } = frame(parts);
   drawing.setAttribute("width", state.width);
   drawing.setAttribute("viewBox", `0 0 ${state.width} ${HEIGHT}`);
@@ -157,7 +160,7 @@ function bars({ state, series }, piles, step, x, y) {
     && svg("rect", { x: x(i) - width / 2, width, y: y(to), height: Math.max(y(from) - y(to), 1), style: { fill: `var(${series[piles[s]].colour})` } })));
 }
 
-/** Places of the series that are piled up, and of those that are lines. */
+/** Places of the series that are piled up, and of those that are lines. @param {Object<string, any>} parts */
 function parted({ series, kind }) {
   const isPiled = (one) => kind === "bars" && !one.over;
   const places = series.map((_, i) => i);
@@ -174,6 +177,7 @@ function mark(parts) {
   cursor.style.setProperty("visibility", state.at === null ? "hidden" : "visible");
 }
 
+/** @param {{colour: string, dash?: string}} series @param {boolean} isBar */
 function swatch({ colour, dash }, isBar) {
   const paint = isBar ? { fill: `var(${colour})` } : { stroke: `var(${colour})` };
   return svg("svg", { class: "chart-swatch", viewBox: "0 0 14 10", width: 14, height: 10, "aria-hidden": "true" },

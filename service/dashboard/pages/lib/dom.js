@@ -7,10 +7,11 @@ const LIVE = new Set(["value", "checked", "indeterminate", "selected"]);
 /**
  * An element. `props`: class, dataset, style (an object, set through CSSOM: the policy forbids
  * style attributes), on<Event> handlers, attributes; null and false are left out.
- * @param {string} tag
- * @param {Object<string, any>} [props]
+ * @template {keyof HTMLElementTagNameMap} T
+ * @param {T} tag
+ * @param {?Object<string, any>} [props]
  * @param {...any} children nodes, strings, numbers, arrays of them; null and false are left out
- * @returns {HTMLElement}
+ * @returns {HTMLElementTagNameMap[T]}
  */
 export function h(tag, props, ...children) {
   return made(document.createElement(tag), props, children);
@@ -19,7 +20,7 @@ export function h(tag, props, ...children) {
 /**
  * The same in the namespace of SVG.
  * @param {string} tag
- * @param {Object<string, any>} [props]
+ * @param {?Object<string, any>} [props]
  * @param {...any} children
  * @returns {SVGElement}
  */
@@ -31,7 +32,7 @@ export function svg(tag, props, ...children) {
  * Replace what is in an element.
  * @param {Element} parent
  * @param {...any} children as of `h`
- * @returns {Element} the parent
+ * @returns {any} the parent
  */
 export function put(parent, ...children) {
   parent.replaceChildren(...nodes(children));
@@ -44,6 +45,7 @@ export function put(parent, ...children) {
  * @returns {() => Promise<any>}
  */
 export function once(act) {
+  /** @type {Promise<any> | null} */
   let turn = null;
   return () => (turn ??= act().finally(() => { turn = null; }));
 }

@@ -72,7 +72,7 @@ export function ago(iso) {
 /** When, as an element that tells the exact time on demand. @param {string | null | undefined} iso */
 export function time(iso) {
   if (!Number.isFinite(Date.parse(iso ?? ""))) return h("span", {}, NONE);
-  const exact = new Date(iso).toISOString().replace("T", " ").replace(/(\.\d+)?Z$/, " UTC");
+  const exact = new Date(iso ?? "").toISOString().replace("T", " ").replace(/(\.\d+)?Z$/, " UTC");
   return h("time", { datetime: iso, title: exact }, ago(iso));
 }
 
@@ -95,6 +95,7 @@ function two(a, unitA, b, unitB) {
   return b === 0 ? `${a} ${unitA}` : `${a} ${unitA} ${b} ${unitB}`;
 }
 
+/** @param {any} n @returns {n is number} */
 function isNumber(n) {
   return typeof n === "number" && Number.isFinite(n);
 }

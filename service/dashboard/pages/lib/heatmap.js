@@ -25,7 +25,9 @@ export function heatmap({ values, names, ticks, label, marked = new Set(), forma
     onpointermove: (event) => move(cellAt(event)), onpointerleave: () => move(null), onblur: () => move(null),
     onfocus: () => move(at ?? [0, Math.min(1, n - 1)]), onkeydown: walk });
   const cells = painted(values); // once: 200 x 200 of them take longer than a pointer waits
+  /** @type {[number, number] | null} */
   let at = null; // the cell that is looked at
+  /** @type {number | null} */
   let row = null; // a row that someone else points at
 
   function cellAt(event) {
@@ -37,7 +39,7 @@ export function heatmap({ values, names, ticks, label, marked = new Set(), forma
   function move(to) {
     if (to?.[0] === at?.[0] && to?.[1] === at?.[1]) return;
     at = to;
-    put(told, at === null ? "Point at a cell, or walk with the arrow keys."
+    put(told, at === null ? "Hover over a cell, or use the arrow keys."
       : [names[at[0]], " and ", names[at[1]], ": ", h("strong", { class: "number" }, format(values[at[0]][at[1]]))]);
     draw();
     onmove(at);
@@ -47,6 +49,7 @@ export function heatmap({ values, names, ticks, label, marked = new Set(), forma
     const step = STEPS[event.key];
     const [i, j] = at ?? [0, 0];
     const clip = (x) => Math.min(n - 1, Math.max(0, x));
+    /** @type {[number, number] | null} */
     let to = null;
     if (step) to = [clip(i + step[0]), clip(j + step[1])];
     else if (event.key === "Home") to = [i, 0];
@@ -59,7 +62,7 @@ export function heatmap({ values, names, ticks, label, marked = new Set(), forma
   function draw() {
     const scale = window.devicePixelRatio || 1;
     if (canvas.width !== Math.round(side * scale)) canvas.width = canvas.height = Math.round(side * scale);
-    const pen = canvas.getContext("2d");
+    const pen = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
     pen.setTransform(scale, 0, 0, scale, 0, 0);
     pen.clearRect(0, 0, side, side);
     const theme = getComputedStyle(canvas);
@@ -105,10 +108,10 @@ export function heatmap({ values, names, ticks, label, marked = new Set(), forma
   }
 
   const table = h("details", { class: "heatmap-table", ontoggle: () => { if (table.open && table.childElementCount === 1) table.append(asTable(values, ticks, names, format, label)); } },
-    h("summary", {}, "The same as a table"));
+    h("summary", {}, "Show as table"));
   canvas.style.setProperty("width", `${side}px`);
   window.addEventListener("sceneprint:theme", draw, { signal });
-  put(told, "Point at a cell, or walk with the arrow keys.");
+  put(told, "Hover over a cell, or use the arrow keys.");
   requestAnimationFrame(draw); // colours are known when it is in the page
   const element = h("div", { class: "heatmap-block" }, h("div", { class: "heatmap-scroll" }, canvas),
     h("div", { class: "heatmap-foot" }, told, legend()), table);
@@ -119,16 +122,16 @@ export function heatmap({ values, names, ticks, label, marked = new Set(), forma
 function painted(values) {
   const n = values.length;
   const cells = h("canvas", { width: n, height: n });
-  const pen = cells.getContext("2d");
+  const pen = /** @type {CanvasRenderingContext2D} */ (cells.getContext("2d"));
   const image = pen.createImageData(n, n);
-  values.flat().forEach((value, i) => image.data.set([...rgbOf(value), 255], 4 * i));
+  values.flat().forEach((value, i) => { image.data.set([...rgbOf(value), 255], 4 * i); });
   pen.putImageData(image, 0, 0);
   return cells;
 }
 
 function legend() {
   const strip = h("canvas", { class: "heatmap-legend", width: 120, height: 10, "aria-hidden": "true" });
-  const pen = strip.getContext("2d");
+  const pen = /** @type {CanvasRenderingContext2D} */ (strip.getContext("2d"));
   for (let x = 0; x < 120; x += 1) { pen.fillStyle = `rgb(${rgbOf(x / 119).join(",")})`; pen.fillRect(x, 0, 1, 10); }
   return h("span", { class: "heatmap-key" }, "unrelated 0 ", strip, " 1 the same");
 }

@@ -27,7 +27,7 @@ export class Problem extends Error {
 /** A path of the API from its segments, which may hold any character. @param {...string} segments */
 export function at(...segments) {
   // nothing is called so, and a URL would take it for a step to elsewhere
-  if (segments.some((one) => /^\.{0,2}$/.test(one))) throw new Problem(404, { title: "Not found", detail: "The address leads nowhere." });
+  if (segments.some((one) => /^\.{0,2}$/.test(one))) throw new Problem(404, { title: "Not found", detail: "There is no page at this address." });
   return segments.map((one) => encodeURIComponent(one)).join("/");
 }
 
@@ -67,7 +67,7 @@ export function keyed(headers = {}) {
 
 /** The Problem of no answer. */
 export function unreachable() {
-  const detail = "The service does not answer. It may be restarting, or the network is gone.";
+  const detail = "The service does not answer. It may be restarting, or the network is down.";
   return new Problem(0, { type: "unreachable", title: "No answer", detail });
 }
 

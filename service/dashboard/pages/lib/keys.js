@@ -3,11 +3,11 @@ import { get } from "./api.js";
 import { h, put } from "./dom.js";
 import { forgetKey, identify, key, me, setKey } from "./session.js";
 
-const MAY = { read: "look and query", write: "upload and edit frames", admin: "change the map itself" };
+const MAY = { read: "view and query", write: "upload and edit frames", admin: "change the map itself" };
 
 /**
  * A field for a key, and why it is there.
- * @param {Error} problem of status 401 or 403
+ * @param {Fault} problem of status 401 or 403
  * @param {() => void} taken what to do with a key that is good
  * @returns {HTMLElement}
  */
@@ -17,7 +17,7 @@ export function keyPage(problem, taken) {
     id: "key", class: "mono", type: "password", autocomplete: "off", spellcheck: "false",
     placeholder: "sp_…", "aria-describedby": "key-why key-note",
   });
-  const why = h("p", { id: "key-why", class: "field-error", role: "alert" }, !refused && key() !== null && told(problem));
+  const why = h("p", { id: "key-why", class: "field-error", role: "alert" }, !refused && key() !== null && told(problem.message));
   const button = h("button", { class: "button primary", type: "submit" }, "Use this key");
   const show = h("button", { class: "button", type: "button", "aria-pressed": false, onClick: () => {
     const hidden = input.type === "password";
@@ -33,7 +33,7 @@ export function keyPage(problem, taken) {
     const before = key();
     const given = input.value.trim();
     // a header can hold no other characters, and fetch would break down over them
-    if (!/^[\x21-\x7e]+$/.test(given)) { tell(given ? "That is no key: it has characters that no key has." : "Paste a key first."); return; }
+    if (!/^[\x21-\x7e]+$/.test(given)) { tell(given ? "This is not a key: it contains characters that keys do not have." : "Paste a key first."); return; }
     setKey(given);
     button.disabled = true;
     try {
@@ -41,7 +41,7 @@ export function keyPage(problem, taken) {
       taken();
     } catch (error) {
       if (before === null) forgetKey(); else setKey(before);
-      tell(error.status === 401 ? told(error) : error.message);
+      tell(error.status === 401 ? told(error.message) : error.message);
     } finally {
       button.disabled = false;
     }
@@ -56,21 +56,21 @@ export function keyPage(problem, taken) {
 
   return h("section", { class: "card key-page" },
     h("h2", {}, heading(problem.status)),
-    refused ? h("p", {}, problem.detail)
-      : h("p", {}, "Whoever runs it makes one with ", h("code", {}, "sceneprint keys --create NAME"), "."),
+    refused ? h("p", {}, problem.message)
+      : h("p", {}, "Its operator can create one with ", h("code", {}, "sceneprint keys --create NAME"), "."),
     refused && grants(),
     form,
-    h("p", { id: "key-note", class: "muted" }, "It is kept in this tab until the tab is closed, and sent to this service alone."));
+    h("p", { id: "key-note", class: "muted" }, "The key stays in this tab until you close it, and is sent only to this service."));
 }
 
 function heading(status) {
-  if (status === 401) return "This service asks for a key";
-  return status === 403 ? "Your key may not do this" : "It is not there, or your key may not see it";
+  if (status === 401) return "This service requires a key";
+  return status === 403 ? "Your key does not allow this" : "It does not exist, or your key may not see it";
 }
 
 // what the API says is for who writes requests by hand
-function told({ detail }) {
-  return detail.includes("has expired") ? detail : "This service does not know this key. See that all of it was copied, or ask for another.";
+function told(detail) {
+  return detail.includes("has expired") ? detail : "This service does not know this key. Check that you copied all of it, or ask for another.";
 }
 
 /** What the key of this tab may do. */

@@ -12,6 +12,7 @@ const LONGEST_S = 15;
  * @returns {Promise<void>} rejected with a Problem where the API refuses for good
  */
 export async function watch({ map, kinds, onevent, onstate = () => {}, signal }) {
+  /** @type {any} */
   const state = { last: null };
   let wait = FIRST_S;
   while (!signal.aborted) {
@@ -63,9 +64,10 @@ async function messages(body, state, onevent) {
     const { done, value } = await whole(reader.read());
     if (done) return;
     const parts = (rest + value).split("\n\n");
-    rest = parts.pop();
+    rest = parts.pop() ?? "";
     for (const part of parts) {
       let data = "";
+      /** @type {any} */
       let id = null;
       for (const line of part.split("\n")) {
         if (line.startsWith("id: ")) id = line.slice(4);
@@ -79,12 +81,12 @@ async function messages(body, state, onevent) {
 }
 
 function shown(signal) {
-  if (!document.hidden || signal.aborted) return Promise.resolve();
+  if (!document.hidden || signal.aborted) return Promise.resolve(null);
   return new Promise((resolve) => {
     const look = () => {
       if (document.hidden && !signal.aborted) return;
       document.removeEventListener("visibilitychange", look);
-      resolve();
+      resolve(null);
     };
     document.addEventListener("visibilitychange", look);
     signal.addEventListener("abort", look, { once: true });
@@ -95,6 +97,6 @@ function shown(signal) {
 export function pause(s, signal) {
   return new Promise((resolve) => {
     const timer = setTimeout(resolve, 1000 * s);
-    signal.addEventListener("abort", () => { clearTimeout(timer); resolve(); }, { once: true });
+    signal.addEventListener("abort", () => { clearTimeout(timer); resolve(null); }, { once: true });
   });
 }

@@ -8,12 +8,11 @@ import { h } from "./dom.js";
  * @param {Object<string, any>} params
  * @param {{alt: string, width: number, height: number, signal?: AbortSignal}} how size: in CSS
  *   pixels, kept free until the picture is there
- * @returns {HTMLCanvasElement} its property `ready` is a promise: whether it was drawn
+ * @returns {HTMLCanvasElement & {ready: Promise<boolean>}} its property `ready` is a promise: whether it was drawn
  */
 export function picture(path, params, { alt, width, height, signal }) {
   const canvas = h("canvas", { role: "img", "aria-label": alt, width, height, class: "picture" });
-  canvas.ready = draw(canvas, path, params, alt, signal);
-  return canvas;
+  return Object.assign(canvas, { ready: draw(canvas, path, params, alt, signal) });
 }
 
 async function draw(canvas, path, params, alt, signal) {
@@ -27,7 +26,7 @@ async function draw(canvas, path, params, alt, signal) {
     return true;
   } catch (error) {
     if (error.name === "AbortError") return false;
-    const why = error.status === 409 ? "Nothing to see yet" : error.status === 0 ? "No answer" : "Cannot be shown";
+    const why = error.status === 409 ? "No preview yet" : error.status === 0 ? "No answer" : "Not available";
     canvas.setAttribute("aria-label", `${alt}. ${why}: ${error.message}`);
     canvas.title = error.message;
     write(canvas, why);

@@ -45,8 +45,9 @@ export function parse(hash) {
  */
 export function link(...parts) {
   const last = parts.at(-1);
-  const search = typeof last === "object" ? parts.pop() : null;
-  const path = `#/${parts.map((one) => encodeURIComponent(one)).join("/")}`;
+  const search = typeof last === "object" ? last : null;
+  if (search) parts.pop();
+  const path = `#/${parts.map((one) => encodeURIComponent(String(one))).join("/")}`;
   if (search === null) return path;
   const query = new URLSearchParams();
   const entries = search instanceof URLSearchParams ? [...search] : Object.entries(search);

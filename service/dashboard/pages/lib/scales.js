@@ -12,7 +12,7 @@ export function steps(most, count = 3, least = 0) {
   const top = most > 0 ? most : least || 1;
   const rough = Math.max(top / count, least);
   const power = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].map((one) => one * power).find((one) => one >= rough * (1 - 1e-9));
+  const step = [1, 2, 5, 10].map((one) => one * power).find((one) => one >= rough * (1 - 1e-9)) ?? 10 * power;
   const last = Math.ceil(top / step - 1e-9);
   // a power below 1 has no exact sums: digits beyond those of the step are noise
   return Array.from({ length: last + 1 }, (_, i) => Number((i * step).toPrecision(12)));
@@ -27,7 +27,7 @@ export function steps(most, count = 3, least = 0) {
  */
 export function linePath(values, x, y) {
   return runs(values).filter(([from, to]) => to - from > 1).map(([from, to]) => {
-    const points = values.slice(from, to).map((value, i) => `${fixed(x(from + i))} ${fixed(y(value))}`);
+    const points = values.slice(from, to).map((value, i) => `${fixed(x(from + i))} ${fixed(y(/** @type {number} */ (value)))}`);
     return `M${points.join("L")}`;
   }).join("");
 }
@@ -41,7 +41,7 @@ export function linePath(values, x, y) {
  */
 export function dotPath(values, x, y) {
   return runs(values).filter(([from, to]) => to - from === 1)
-    .map(([from]) => `M${fixed(x(from))} ${fixed(y(values[from]))}h0`).join("");
+    .map(([from]) => `M${fixed(x(from))} ${fixed(y(/** @type {number} */ (values[from])))}h0`).join("");
 }
 
 /**
@@ -53,7 +53,7 @@ export function dotPath(values, x, y) {
  */
 export function areaPath(values, x, y) {
   return runs(values).filter(([from, to]) => to - from > 1).map(([from, to]) => {
-    const points = values.slice(from, to).map((value, i) => `${fixed(x(from + i))} ${fixed(y(value))}`);
+    const points = values.slice(from, to).map((value, i) => `${fixed(x(from + i))} ${fixed(y(/** @type {number} */ (value)))}`);
     return `M${fixed(x(from))} ${fixed(y(0))}L${points.join("L")}L${fixed(x(to - 1))} ${fixed(y(0))}Z`;
   }).join("");
 }
@@ -98,6 +98,7 @@ export function clock(time) {
 /** From and to (excluded) of stretches without a null. */
 function runs(values) {
   const found = [];
+  /** @type {number | null} */
   let from = null;
   [...values, null].forEach((value, i) => {
     if (value !== null && from === null) from = i;

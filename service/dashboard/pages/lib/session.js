@@ -3,7 +3,9 @@
 const KEY = "sceneprint.key";
 const THEME = "sceneprint.theme";
 const SCOPES = ["read", "write", "admin"];
+/** @type {any} */
 let kept = null; // where storage is forbidden the key lasts until the page is left
+/** @type {any} */
 let known = { key: undefined, me: null };
 
 /** The key of this tab; null where none was given. @returns {string | null} */
@@ -13,8 +15,8 @@ export function key() {
 
 /** Keep a key until the tab is closed. @param {string} text */
 export function setKey(text) {
-  kept = text.trim();
-  try { sessionStorage.setItem(KEY, kept); } catch { /* it is in `kept` */ }
+  const given = kept = text.trim();
+  try { sessionStorage.setItem(KEY, given); } catch { /* it is in `kept` */ }
 }
 
 /** Know no key any more. */
@@ -63,7 +65,7 @@ export function may(scope, map) {
 
 /** The theme that was chosen. @returns {"auto" | "light" | "dark"} */
 export function theme() {
-  return document.documentElement.dataset.theme ?? "auto";
+  return /** @type {any} */ (document.documentElement.dataset.theme) ?? "auto";
 }
 
 /** Choose a theme; pages that draw hear of it by the event `sceneprint:theme` of window.

@@ -8,7 +8,7 @@ const AREAS = [
   ["operations", "Operations", "#/operations", "M3 12h4l3-8 4 16 3-8h4"],
 ];
 const THEMES = [
-  ["auto", "As the system", "M12 3a9 9 0 100 18zM12 3a9 9 0 010 18"],
+  ["auto", "System", "M12 3a9 9 0 100 18zM12 3a9 9 0 010 18"],
   ["light", "Light", "M12 8a4 4 0 100 8 4 4 0 000-8zM12 2v2M12 20v2M2 12h2M20 12h2M5 5l1.400 1.400M17.600 17.600L19 19M5 19l1.400-1.400M17.600 6.400L19 5"],
   ["dark", "Dark", "M20 14.500A8.500 8.500 0 019.500 4a8.500 8.500 0 1010.500 10.500z"],
 ];
@@ -45,7 +45,7 @@ export function drawHead(route, params) {
 export function drawRail(route, again) {
   put(document.getElementById("nav"), AREAS.map(([area, text, href, path]) =>
     h("a", { href, "aria-current": route?.area === area && "page" }, icon(path), h("span", {}, text))));
-  const choose = (name) => { setTheme(name); drawRail(route, again); document.getElementById(`theme-${name}`).focus(); };
+  const choose = (name) => { setTheme(name); drawRail(route, again); document.getElementById(`theme-${name}`)?.focus(); };
   const themes = THEMES.map(([name, text, path]) => h("button", {
     type: "button", id: `theme-${name}`, title: text, "aria-label": `Theme: ${text}`,
     "aria-pressed": theme() === name, onClick: () => choose(name),
@@ -53,7 +53,7 @@ export function drawRail(route, again) {
   const forget = () => { forgetKey(); again(); };
   put(document.getElementById("rail-foot"),
     key() !== null && h("div", { class: "whose" },
-      h("span", { class: "muted" }, "Key "), h("strong", {}, me()?.name ?? "not asked for"),
+      h("span", { class: "muted" }, "Key "), h("strong", {}, me()?.name ?? "not required"),
       h("button", { class: "button quiet", type: "button", onClick: forget }, "Forget")),
     h("div", { class: "themes", role: "group", "aria-label": "Theme" }, themes));
 }

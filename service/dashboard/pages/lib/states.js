@@ -28,7 +28,7 @@ export function empty({ title, text, actions }) {
 
 /**
  * What the API refused, in its own words.
- * @param {Error} problem a Problem, or a fault of ours
+ * @param {Fault} problem a Problem, or a fault of ours
  * @param {() => void} [retry]
  * @returns {HTMLElement}
  */
@@ -36,9 +36,9 @@ export function failed(problem, retry) {
   const known = problem.status !== undefined;
   const fields = (problem.errors ?? []).map((one) => h("li", {}, one.field ? `${one.field}: ${one.reason}` : one.reason));
   const text = [
-    h("p", {}, known ? problem.detail : `The page broke down: ${problem.message}`),
+    h("p", {}, known ? problem.detail : `The page failed: ${problem.message}`),
     fields.length > 0 && h("ul", {}, fields),
-    problem.instance && h("p", { class: "muted" }, "In the log as ", h("span", { class: "mono" }, problem.instance.split("/").pop())),
+    problem.instance && h("p", { class: "muted" }, "Request id in the log: ", h("span", { class: "mono" }, problem.instance.split("/").pop())),
   ];
   const title = known ? problem.title : "This page cannot be shown";
   return state("bad", title, text, retry && h("button", { class: "button", type: "button", onClick: retry }, "Try again"));
@@ -57,7 +57,7 @@ export function gone(back, signal) {
     back();
   }, 1000 * AGAIN_S);
   signal.addEventListener("abort", () => clearInterval(timer), { once: true });
-  const text = "It may be restarting. This page comes back by itself as soon as it answers.";
+  const text = "It may be restarting. This page reloads as soon as the service answers.";
   return state("wait", "The service does not answer", text, h("span", { class: "muted" }, `Trying every ${AGAIN_S} seconds…`));
 }
 
@@ -71,7 +71,7 @@ export function toast(text, { kind = "good" } = {}) {
   const close = h("button", { class: "button quiet", type: "button", "aria-label": "Dismiss", onClick: () => one.remove() }, "×");
   const one = h("div", { class: "toast", dataset: { kind } }, shape(kind), h("span", {}, text), close);
   region.append(one);
-  while (region.children.length > 4) region.firstChild.remove();
+  while (region.children.length > 4) region.firstChild?.remove();
   // what went wrong stays until it was seen
   if (kind === "good") setTimeout(() => one.remove(), 1000 * TOAST_S);
 }
@@ -107,7 +107,7 @@ export function sheet({ title, children, buttons }) {
   const cancel = h("button", { class: "button", type: "button", onClick: () => dialog.close() }, "Cancel");
   const dialog = h("dialog", { class: "dialog", "aria-label": title },
     h("form", { novalidate: true }, h("h2", {}, title), children, h("div", { class: "dialog-foot" }, cancel, buttons)));
-  const before = document.activeElement;
+  const before = /** @type {HTMLElement | null} */ (document.activeElement);
   dialog.addEventListener("close", () => {
     dialog.remove();
     // what was pressed may have been drawn anew
@@ -132,7 +132,7 @@ function shape(kind) {
 }
 
 /** Show a skeleton in an element if what comes takes longer than a blink. @param {Element} root
- * @returns {() => void} to be called when it has come */
+ * @param {string} [text] @returns {() => void} to be called when it has come */
 export function soon(root, text) {
   const timer = setTimeout(() => { if (!root.hasChildNodes()) put(root, loading(text)); }, 150);
   return () => {

@@ -36,7 +36,7 @@ export function mapCard(map, { signal, changed }) {
     index: h("dd", {}, "…"), disk: h("dd", { class: "number" }, "…"),
   };
   const tools = may("admin", map.name) && h("div", { class: "map-tools" },
-    tool(PENCIL, `Retitle ${map.name}`, async () => (await edit()).retitleMap(card.map, changed)),
+    tool(PENCIL, `Rename ${map.name}`, async () => (await edit()).retitleMap(card.map, changed)),
     tool(BIN, `Delete ${map.name}`, async () => (await edit()).deleteMap(card.map, changed)));
   const element = h("article", { class: "card map", "aria-labelledby": id, dataset: { map: map.name } },
     h("div", { class: "map-head" }, h("div", {}, parts.heading, parts.name), tools),
@@ -47,7 +47,9 @@ export function mapCard(map, { signal, changed }) {
       h("div", {}, h("dt", {}, "Model"), parts.model),
       h("div", {}, h("dt", {}, "Index"), parts.index),
       h("div", {}, h("dt", {}, "Disk"), parts.disk)));
+  /** @type {number | null} */
   let filled = null; // when the figures were asked for; null: never
+  /** @type {Timer} */
   let timer = null;
   let looks = 0;
   const card = { element, map, update, fill };
@@ -94,7 +96,7 @@ export function mapCard(map, { signal, changed }) {
       const { database, blobs, index } = stats.bytes;
       put(parts.disk, h("span", { title: `${bytes(database ?? 0)} signatures, ${bytes(blobs)} uploads and geometry, ${bytes(index)} index` },
         bytes((database ?? 0) + blobs + index)));
-      put(parts.growth, growth.indexed === 0 ? first(name) : grown(growth, young ? "since it was made" : `in ${DAYS} days`));
+      put(parts.growth, growth.indexed === 0 ? first(name) : grown(growth, young ? "since its creation" : `in ${DAYS} days`));
     } catch (error) {
       if (error.name === "AbortError" || error.status === 404) return; // left, or removed meanwhile
       if (error.status === 401) throw error;
@@ -112,13 +114,13 @@ function badge(map, kind, n, text, state) {
 }
 
 function healthy(indexed) {
-  return indexed ? h("span", { class: "badge", dataset: { kind: "good" } }, "nothing waits") : h("span", { class: "badge" }, "empty");
+  return indexed ? h("span", { class: "badge", dataset: { kind: "good" } }, "Up to date") : h("span", { class: "badge" }, "empty");
 }
 
 function progress({ model, done, left, failed, dead }) {
   const all = done + left + failed + dead;
   const text = `to ${model}: ${count(done)} of ${count(all)}`;
-  return h("span", { class: "reencoding" }, text, dead > 0 && h("span", { class: "badge", dataset: { kind: "bad" } }, `${count(dead)} stuck`),
+  return h("span", { class: "reencoding" }, text, dead > 0 && h("span", { class: "badge", dataset: { kind: "bad" } }, `${count(dead)} failed`),
     h("progress", { max: Math.max(all, 1), value: done, "aria-label": `Signing again ${text}` }));
 }
 

@@ -8,12 +8,12 @@ import { confirm, sheet, toast } from "../lib/states.js";
 // what the models that ship are for; their size comes from the API
 const FOR = {
   depth: ["Rooms", "For depth cameras indoors."],
-  lidar: ["LiDAR", "For scans that reach far: halls, storeys, city blocks."],
-  paper: ["Paper", "For research: the long signatures of the paper, all of them compared."],
+  lidar: ["LiDAR", "For long-range scans: halls, storeys, city blocks."],
+  paper: ["Paper", "For research: the long signatures of the paper, with exact search."],
 };
 
 // what the API's regular expression means
-const PATTERN = "Lower-case letters, digits, - and _ only, and a letter or a digit first.";
+const PATTERN = "Use only lower-case letters, digits, - and _, and start with a letter or digit.";
 
 /** Ask for a name, a title and a model, and make a map of them. @param {(hash: string) => void} go
  * @param {AbortSignal} signal */
@@ -25,8 +25,8 @@ export async function createMap(go, signal) {
   await form({
     title: "New map", action: "Create map",
     children: [
-      field("Name", name, "Lower-case letters, digits, - and _. It is in every address, and never changes."),
-      field("Title", title, "For people; optional, and can be changed."),
+      field("Name", name, "Lower-case letters, digits, - and _. It is part of every address and cannot be changed."),
+      field("Title", title, "Optional display name; you can change it later."),
       h("fieldset", { class: "models" }, h("legend", {}, "Model"), models,
         h("p", { class: "field-error", id: "new-model-error", role: "alert" })),
     ],
@@ -34,7 +34,7 @@ export async function createMap(go, signal) {
       const model = dialog.querySelector("input[name=model]:checked")?.value;
       const json = { name: name.value.trim(), title: title.value.trim() || null, model };
       const { status, data } = await send("POST", "maps", { json });
-      toast(status === 201 ? `${data.name} was made.` : `${data.name} was there already, as wanted.`);
+      toast(status === 201 ? `${data.name} was created.` : `${data.name} already exists with these settings.`);
       if (dialog.open) go(link("maps", data.name)); // else it was left meanwhile
     },
     place: (problem) => (problem.type === "map-exists" ? "name" : null),
@@ -50,20 +50,20 @@ export async function retitleMap(map, changed) {
   let { etag } = map;
   const title = h("input", { id: "new-title", name: "title", autocomplete: "off", maxlength: 200, value: map.title ?? "" });
   await form({
-    title: `Retitle ${map.name}`, action: "Save title",
-    children: [field("Title", title, "Empty: it is called by its name.")],
+    title: `Rename ${map.name}`, action: "Save title",
+    children: [field("Title", title, "If empty, the name is shown.")],
     async save() {
       await send("PATCH", at("maps", map.name), {
         json: { title: title.value.trim() || null }, type: "application/merge-patch+json", headers: { "If-Match": `"${etag}"` },
       });
-      toast(`${map.name} was retitled.`);
+      toast(`The title of ${map.name} was changed.`);
       await changed();
     },
     async place(problem) {
       if (problem.type !== "precondition-failed") return null;
       const now = await get(at("maps", map.name));
       etag = now.etag;
-      problem.detail = `Somebody else has called it “${now.title ?? now.name}” meanwhile. Save again to call it as you wrote.`;
+      problem.detail = `Somebody else changed the title to “${now.title ?? now.name}” in the meantime. Save again to use yours.`;
       return "title";
     },
   });
@@ -72,7 +72,7 @@ export async function retitleMap(map, changed) {
 /** Ask for the name of a map to be typed, and remove it. */
 export async function deleteMap(map, changed) {
   const frames = Object.entries(map.frames).reduce((n, [state, one]) => n + (state === "deleted" ? 0 : one), 0);
-  const text = `Its ${count(frames)} ${frames === 1 ? "frame" : "frames"} with their uploads, signatures and index are removed for good. There is no way back but a snapshot.`;
+  const text = `Its ${count(frames)} ${frames === 1 ? "frame" : "frames"} with their uploads, signatures and index are permanently deleted. Only a snapshot can restore them.`;
   if (!(await confirm({ title: `Delete ${map.title ?? map.name}?`, text, word: map.name, action: "Delete map" }))) return;
   await send("DELETE", at("maps", map.name));
   toast(`${map.name} was deleted.`);

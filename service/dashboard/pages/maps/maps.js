@@ -24,6 +24,7 @@ export async function render(root, { signal, go, title, actions }) {
   const wanted = h("input", { id: "find", type: "search", placeholder: "Find a map", "aria-label": "Find a map", onInput: narrow });
   const grid = h("div", { class: "grid maps" });
   const nothing = h("p", { class: "muted", role: "status" });
+  /** @type {Timer} */
   let timer = null;
 
   function draw(items) {
@@ -64,7 +65,7 @@ export async function render(root, { signal, go, title, actions }) {
       element.hidden = !`${map.name} ${map.title ?? ""}`.toLowerCase().includes(text);
       left += element.hidden ? 0 : 1;
     }
-    put(nothing, left === 0 && `No map is called like “${wanted.value}”.`);
+    put(nothing, left === 0 && `No map matches “${wanted.value}”.`);
   }
 
   async function reload() {
@@ -101,6 +102,7 @@ export async function render(root, { signal, go, title, actions }) {
     sum();
   }
 
+  /** @param {any} event */
   function heard({ kind, map }) {
     if (signal.aborted) return;
     // of no map, of another set of maps, or of what was missed: look at all
@@ -119,8 +121,8 @@ export async function render(root, { signal, go, title, actions }) {
   const begin = () => empty({
     title: "No maps yet",
     text: mayMake
-      ? "A map holds the frames of one place, signed with one model. Make one, then upload depth images or point clouds: workers sign them, and any frame can be looked up among them."
-      : "There is no map that your key may read, and it may make none. Ask whoever runs this service for another key.",
+      ? "A map holds the frames of one place, signed with one model. Create one, then upload depth images or point clouds. Workers sign them, and you can query the map with any frame."
+      : "Your key cannot read any map and cannot create one. Ask the operator of this service for another key.",
     actions: mayMake ? button("first-map") : null,
   });
 

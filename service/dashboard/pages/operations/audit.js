@@ -11,9 +11,9 @@ export async function renderTab(root, { search, signal }) {
   const asked = { actor: search.get("actor"), map: search.get("map") };
   const to = (change) => link("operations", { tab: "audit", ...asked, ...change });
   const body = h("tbody", {});
-  const table = h("table", { class: "table" }, h("thead", {}, h("tr", {}, ["When", "Who", "What", "Map", "Of it", "From", "More"].map((text) => h("th", { scope: "col" }, text)))), body);
+  const table = h("table", { class: "table" }, h("thead", {}, h("tr", {}, ["When", "Who", "What", "Map", "Target", "From", "More"].map((text) => h("th", { scope: "col" }, text)))), body);
   const card = h("div", { class: "card scroll" }, table);
-  const none = h("div", { hidden: true }, empty({ title: "No such change", text: "Changes appear here with who made them." }));
+  const none = h("div", { hidden: true }, empty({ title: "No changes", text: "Changes appear here with their author." }));
   const more = h("button", { class: "button", type: "button", hidden: true, onClick: () => older() }, "Show older changes");
   const actor = h("input", { type: "search", value: asked.actor ?? "", placeholder: "Key", "aria-label": "Name of the key" });
   let cursor = null;
@@ -38,7 +38,7 @@ export async function renderTab(root, { search, signal }) {
 function changeRow(one) {
   const data = Object.keys(one.data).length > 0 && JSON.stringify(one.data);
   return h("tr", {}, h("td", {}, time(one.at)),
-    h("th", { scope: "row" }, one.actor ?? h("span", { class: "muted" }, "no key asked for")),
+    h("th", { scope: "row" }, one.actor ?? h("span", { class: "muted" }, "no key required")),
     h("td", {}, one.action.replaceAll("_", " ")), h("td", {}, one.map ?? "–"),
     h("td", { class: "mono cut", title: one.target }, one.target ?? "–"), h("td", { class: "mono" }, one.address ?? "–"),
     h("td", { class: "mono cut", title: data || null }, data || "–"));

@@ -40,7 +40,7 @@ export async function renderTab(root, { search, signal }) {
  */
 export async function events({ map, kind, limit, older = false, signal, onstate, onevent = () => {} }) {
   const list = h("ul", { class: "list events" });
-  const none = h("p", { class: "muted" }, "Nothing has happened yet.");
+  const none = h("p", { class: "muted" }, "No events yet.");
   const more = h("button", { class: "button", type: "button", hidden: true, onClick: () => before() }, "Show older events");
   const show = rows(list, (one) => one.id, eventRow);
   const most = older ? MOST : limit;

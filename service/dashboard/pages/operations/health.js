@@ -26,7 +26,7 @@ export function health() {
     async look(signal) {
       try {
         const told = await get("../readyz", { signal });
-        tell(told.read_only ? "warn" : "good", told.read_only ? "read-only: it answers, and takes nothing" : "ready");
+        tell(told.read_only ? "warn" : "good", told.read_only ? "read-only: it answers queries but accepts no uploads" : "ready");
         put(version, `version ${told.version}`);
       } catch (error) {
         if (error.name === "AbortError") throw error;
@@ -35,7 +35,7 @@ export function health() {
     },
     live(state) {
       live.dataset.kind = state === "live" ? "good" : "warn";
-      live.title = state === "live" ? "Events come as they happen" : "The stream of events broke off; trying again";
+      live.title = state === "live" ? "Live events" : "The event stream was interrupted; reconnecting";
       put(live, state);
     },
   };

@@ -5,30 +5,34 @@ import { count, ms } from "../lib/format.js";
 
 const time = (value) => (value === 0 ? "0" : ms(1000 * value));
 
+/** @type {Parameters<typeof chart>[0]} */
 const FRAMES = {
-  title: "Frames a minute", kind: "bars", format: count, least: 1, nothing: "No frame came in the last hour",
+  title: "Frames a minute", kind: "bars", format: count, least: 1, nothing: "No frames in the last hour",
   series: [
     { name: "indexed", colour: "--good" }, { name: "redundant", colour: "--match" },
     { name: "rejected", colour: "--warn" }, { name: "failed", colour: "--bad" },
     { name: "received", colour: "--muted", over: true },
   ],
 };
+/** @type {Parameters<typeof chart>[0]} */
 const LATENCY = {
-  title: "Time of queries", format: time, nothing: "No query was answered in the last hour",
+  title: "Query time", format: time, nothing: "No queries in the last hour",
   series: [
     { name: "p50", colour: "--accent", area: true }, { name: "p95", colour: "--match", dash: "6 3" },
     { name: "p99", colour: "--rival", dash: "1.5 3.5" },
   ],
 };
+/** @type {Parameters<typeof chart>[0]} */
 const QUERIES = {
-  title: "Queries a minute", kind: "bars", format: count, least: 1, nothing: "No query came in the last hour",
+  title: "Queries a minute", kind: "bars", format: count, least: 1, nothing: "No queries in the last hour",
   series: [
     { name: "found", colour: "--good" }, { name: "ambiguous", colour: "--warn" },
     { name: "not_found", colour: "--edge" }, { name: "unvalidated", colour: "--match" },
   ],
 };
+/** @type {Parameters<typeof chart>[0]} */
 const REQUESTS = {
-  title: "Requests a minute", kind: "bars", format: count, least: 1, nothing: "No request in the last hour",
+  title: "Requests a minute", kind: "bars", format: count, least: 1, nothing: "No requests in the last hour",
   series: [
     { name: "answered", colour: "--accent" }, { name: "refused", colour: "--warn" },
     { name: "busy", colour: "--rival" }, { name: "broken", colour: "--bad" },
@@ -41,7 +45,9 @@ const REQUESTS = {
  * @returns {{element: HTMLElement, update: (stats: Object<string, any>) => void}}
  */
 export function history(whole) {
+  /** @type {[ReturnType<typeof chart>, (minute: Object<string, any>) => (number | null)[]]} */
   const frames = [chart(FRAMES), (one) => FRAMES.series.map(({ name }) => one[name])];
+  /** @type {(typeof frames)[]} */
   const others = [
     [chart(LATENCY), (one) => LATENCY.series.map(({ name }) => one.latency?.[name] ?? null)],
     [chart(named(QUERIES)), (one) => QUERIES.series.map(({ name }) => one.queries[name] ?? 0)],

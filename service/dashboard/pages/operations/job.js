@@ -10,12 +10,12 @@ export const styles = ["operations/operations.css"];
 
 const POLL_S = 2;
 const SENTENCES = {
-  queued: "Waiting for a worker, for the first time or for another try.",
-  running: "A worker is at it.",
-  succeeded: "Done, and what it made is stored.",
+  queued: "Waiting for a worker, for the first attempt or a retry.",
+  running: "A worker is running it.",
+  succeeded: "Done, and its result is stored.",
   failed: "Its input cannot be used.",
-  cancelled: "Given up on request, such as by deleting its frame.",
-  dead: "Given up after too many tries.",
+  cancelled: "Cancelled on request, for example by deleting its frame.",
+  dead: "Failed too many times.",
 };
 
 /** See lib/router.js. */
@@ -23,7 +23,9 @@ export async function render(root, { params, signal, title, actions: head }) {
   const said = h("span", { class: "visually-hidden", role: "status" });
   const body = h("div", { class: "page" });
   const place = at("jobs", params.job);
+  /** @type {string | null} */
   let shown = null;
+  /** @type {string | null} */
   let state = null;
   let ask = () => {};
 
@@ -51,19 +53,19 @@ function describe(job, open) {
     ["Frame", job.frame_id && h("a", { class: "mono", href: link("maps", job.map, "frames", job.frame_id) }, job.frame_id)],
     ["Id", h("span", { class: "mono" }, job.job_id)],
     ["Priority", String(job.priority)],
-    ["Tries", count(job.attempts)],
-    ["Came", time(job.created_at)],
-    ["Latest try", job.started_at && time(job.started_at)],
+    ["Attempts", count(job.attempts)],
+    ["Created", time(job.created_at)],
+    ["Latest attempt", job.started_at && time(job.started_at)],
     ["Ended", job.finished_at && time(job.finished_at)],
-    ["Took", job.finished_at && took(job) !== null && span(took(job))],
-    ["Tried again by", job.followed_by && h("a", { class: "mono", href: link("operations", "jobs", job.followed_by) }, job.followed_by)],
+    ["Duration", job.finished_at && took(job) !== null && span(took(job) ?? 0)],
+    ["Retried by", job.followed_by && h("a", { class: "mono", href: link("operations", "jobs", job.followed_by) }, job.followed_by)],
   ];
   return [
     h("section", { class: "card", "aria-label": "State" },
       h("p", { class: "job-state" }, stateBadge(job.state), " ", SENTENCES[job.state] ?? ""),
       job.progress && progress(job.progress),
       h("dl", { class: "facts" }, facts.filter(([, value]) => value).map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))))),
-    job.error && h("section", { class: "card", "aria-labelledby": "job-error" }, h("h2", { id: "job-error" }, "What went wrong"),
+    job.error && h("section", { class: "card", "aria-labelledby": "job-error" }, h("h2", { id: "job-error" }, "Error"),
       h("p", { class: "job-error" }, job.error), traceback(job, open)),
     job.result && h("section", { class: "card", "aria-labelledby": "job-result" }, h("h2", { id: "job-result" }, "Result"), result(job.result)),
   ];

@@ -47,10 +47,10 @@ export function jobRow(job, changed) {
     job.frame_id && [" / ", h("a", { class: "mono", href: link("maps", job.map, "frames", job.frame_id), title: job.frame_id, dataset: { part: "frame" } }, shortId(job.frame_id))],
   ];
   const facts = [
-    job.attempts > 1 && `${count(job.attempts)} tries`,
+    job.attempts > 1 && `${count(job.attempts)} attempts`,
     job.finished_at && ["ended ", time(job.finished_at)],
     !job.finished_at && ["came ", time(job.created_at)],
-    job.finished_at && took(job) !== null && `took ${span(took(job))}`,
+    job.finished_at && took(job) !== null && `took ${span(took(job) ?? 0)}`,
   ].filter(Boolean).flatMap((one, i) => (i ? [" · ", one] : one));
   return h("li", { class: "job", dataset: { job: job.job_id } },
     h("div", { class: "job-line" }, stateBadge(job.state),
@@ -65,7 +65,7 @@ export function jobRow(job, changed) {
 
 /** The traceback, folded. @param {Object<string, any>} job @param {boolean} [open] */
 export function traceback(job, open = false) {
-  return job.traceback && h("details", { open }, h("summary", { dataset: { part: "traceback" } }, "Traceback of the last try"),
+  return job.traceback && h("details", { open }, h("summary", { dataset: { part: "traceback" } }, "Traceback of the last attempt"),
     h("pre", { class: "traceback", tabindex: "0", role: "region", "aria-label": "Traceback" }, job.traceback));
 }
 
@@ -82,7 +82,7 @@ export function progress({ done, total }) {
  * @param {(job: Object<string, any>) => void} changed
  */
 export function actions(job, changed) {
-  if (job.followed_by) return h("a", { href: link("operations", "jobs", job.followed_by), dataset: { part: "next" } }, "tried again");
+  if (job.followed_by) return h("a", { href: link("operations", "jobs", job.followed_by), dataset: { part: "next" } }, "retried");
   const press = (what, told) => async (event) => {
     event.target.disabled = true;
     try {
@@ -94,7 +94,7 @@ export function actions(job, changed) {
       throw error;
     }
   };
-  if (canRetry(job)) return h("button", { class: "button", type: "button", dataset: { part: "act" }, onClick: press("retry", "Queued once more") }, "Retry");
+  if (canRetry(job)) return h("button", { class: "button", type: "button", dataset: { part: "act" }, onClick: press("retry", "Queued again") }, "Retry");
   const over = job.state !== "queued" && job.state !== "running";
   if (over || !may("write", job.map ?? undefined)) return null;
   return h("button", { class: "button quiet", type: "button", dataset: { part: "act" }, onClick: press("cancel", "Cancelled") }, "Cancel");
@@ -108,15 +108,16 @@ export function actions(job, changed) {
  */
 export async function retryAll(map, signal, tell) {
   const dead = [];
+  /** @type {string | null} */
   let cursor = null;
   do {
     const page = await get("jobs", { params: { state: "dead", map, cursor, limit: 1000 }, signal });
     dead.push(...page.items.filter(canRetry).map((job) => job.job_id)); // a traceback of each is much
     cursor = page.next_cursor;
   } while (cursor);
-  if (dead.length === 0) { tell("No dead job is left to be tried again."); return; }
+  if (dead.length === 0) { tell("No dead job is left to be retried."); return; }
   const many = dead.length === 1 ? "1 dead job" : `${count(dead.length)} dead jobs`;
-  const text = h("p", {}, `${many}${map ? ` of map ${map}` : ""} will be queued once more, each with its tries anew. What broke them may break them again.`);
+  const text = h("p", {}, `${many}${map ? ` of map ${map}` : ""} will be queued again with a fresh number of attempts. They may fail again for the same reason.`);
   if (!(await confirm({ title: "Retry all dead jobs", text, action: `Retry ${many}` }))) return;
   const left = dead.toReversed(); // taken from its end
   let done = 0;
@@ -133,7 +134,7 @@ export async function retryAll(map, signal, tell) {
       tell(`Queued ${count(done)} of ${count(dead.length)}…`);
     }
   }));
-  tell(`${count(done)} queued once more${refused ? `, ${count(refused)} could not be` : ""}.`);
+  tell(`${count(done)} queued again${refused ? `, ${count(refused)} could not be` : ""}.`);
 }
 
 /** A status line that tells what `retryAll` does, and its button. */

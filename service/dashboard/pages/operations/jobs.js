@@ -20,7 +20,7 @@ export async function renderTab(root, { search, signal }) {
   const to = (change) => link("operations", { tab: "jobs", ...asked, ...change });
   const list = h("ul", { class: "list jobs" });
   const more = h("button", { class: "button", type: "button", hidden: true, onClick: () => { pages += 1; again(); } }, "Show older jobs");
-  const nothing = h("div", { hidden: true }, empty({ title: "No such job", text: "Jobs appear here as soon as frames come in." }));
+  const nothing = h("div", { hidden: true }, empty({ title: "No jobs", text: "Jobs appear here as soon as frames are uploaded." }));
   const show = rows(list, (job) => job.job_id, (job) => jobRow(job, () => again()));
   const { element: states, tell } = filters(asked.state, to);
   const kind = h("select", { id: "jobs-kind", onChange: () => go(to({ kind: kind.value })) },
@@ -31,6 +31,7 @@ export async function renderTab(root, { search, signal }) {
 
   async function look() {
     const items = [];
+    /** @type {string | null} */
     let cursor = null;
     for (let page = 0; page < pages; page += 1) {
       const found = await get("jobs", { params: { ...asked, cursor, limit: AT_ONCE }, signal });
@@ -55,7 +56,7 @@ export async function renderTab(root, { search, signal }) {
 }
 
 /** Whether the key may do that with any map. */
-const mayAny = (scope) => may(scope) || Object.keys(me().grants).some((map) => may(scope, map));
+const mayAny = (scope) => may(scope) || Object.keys(me()?.grants ?? {}).some((map) => may(scope, map));
 
 /** How many jobs are in each state; null for who may not have them counted. */
 async function counts(map, signal) {

@@ -10,9 +10,9 @@ import { rows } from "./poll.js";
 /** See operations.js. */
 export async function renderTab(root, { signal, actions }) {
   const body = h("tbody", {});
-  const table = h("table", { class: "table" }, h("thead", {}, h("tr", {}, ["Name", "May", "Made", "Expires", ""].map((text) => h("th", { scope: "col" }, text || h("span", { class: "visually-hidden" }, "Actions"))))), body);
+  const table = h("table", { class: "table" }, h("thead", {}, h("tr", {}, ["Name", "Permissions", "Created", "Expires", ""].map((text) => h("th", { scope: "col" }, text || h("span", { class: "visually-hidden" }, "Actions"))))), body);
   const card = h("div", { class: "card scroll" }, table);
-  const none = h("div", { hidden: true }, empty({ title: "No key yet", text: "Without one the service answers on its own machine alone. The first key should be admin of all maps: it makes the others." }));
+  const none = h("div", { hidden: true }, empty({ title: "No key yet", text: "Without a key, the service answers only on its own machine. Give the first key admin access to all maps, so that it can create the others." }));
   const more = h("button", { class: "button", type: "button", hidden: true, onClick: () => older() }, "Show more keys");
   const show = rows(body, (one) => one.name, (one) => keyRow(one, () => first()));
   let found = [];
@@ -34,7 +34,7 @@ export async function renderTab(root, { signal, actions }) {
   }
 
   await first();
-  actions(h("button", { class: "button primary", type: "button", onClick: () => newKey(signal, first) }, "Make a key"));
+  actions(h("button", { class: "button primary", type: "button", onClick: () => newKey(signal, first) }, "Create a key"));
   put(root, card, none, more);
 }
 
@@ -42,11 +42,11 @@ function keyRow(key, changed) {
   const grants = Object.entries(key.grants).map(([map, scope]) => h("span", { class: "chip" }, map === "*" ? "all maps" : map, ": ", scope));
   const own = me()?.name === key.name;
   const withdraw = async () => {
-    const text = [h("p", {}, "Whoever has it is refused from the next request on. This cannot be undone."),
-      own && h("p", {}, h("strong", {}, "It is the key that you show now."))];
-    if (!(await confirm({ title: `Withdraw key ${key.name}`, text, word: key.name, action: "Withdraw" }))) return;
+    const text = [h("p", {}, "Requests with this key are rejected from now on. This cannot be undone."),
+      own && h("p", {}, h("strong", {}, "This is the key that you are using now."))];
+    if (!(await confirm({ title: `Revoke key ${key.name}`, text, word: key.name, action: "Revoke" }))) return;
     await send("DELETE", at("keys", key.name));
-    toast(`Key ${key.name} opens nothing any more`);
+    toast(`Key ${key.name} was revoked`);
     await changed();
   };
   return h("tr", {},
@@ -54,5 +54,5 @@ function keyRow(key, changed) {
     h("td", {}, h("span", { class: "chips" }, grants)),
     h("td", {}, time(key.created_at)),
     h("td", {}, key.expires_at === null ? h("span", { class: "muted" }, "never") : time(key.expires_at)),
-    h("td", { class: "number" }, h("button", { class: "button danger", type: "button", dataset: { part: "withdraw" }, "aria-label": `Withdraw ${key.name}`, onClick: withdraw }, "Withdraw")));
+    h("td", { class: "number" }, h("button", { class: "button danger", type: "button", dataset: { part: "withdraw" }, "aria-label": `Revoke ${key.name}`, onClick: withdraw }, "Revoke")));
 }

@@ -10,7 +10,7 @@ import { rows } from "./poll.js";
  */
 export function indexes() {
   const body = h("tbody", {});
-  const none = h("p", { class: "muted" }, "There is no map yet.");
+  const none = h("p", { class: "muted" }, "No maps yet.");
   const show = rows(body, (one) => one.map, (one) => h("tr", {},
     h("th", { scope: "row" }, h("a", { href: link("maps", one.map), dataset: { part: "map" } }, one.map)),
     h("td", { class: "number" }, one.generation === null ? "none" : count(one.generation)),
@@ -18,7 +18,7 @@ export function indexes() {
     h("td", { class: "number" }, recall(one))));
   const table = h("table", { class: "table" }, h("thead", {}, h("tr", {},
     h("th", { scope: "col" }, "Map"), h("th", { scope: "col", class: "number" }, "Generation"),
-    h("th", { scope: "col", class: "number", title: "Indexed frames that the generation lacks; queries compare them one by one" }, "Tail"),
+    h("th", { scope: "col", class: "number", title: "Indexed frames that are not in this generation yet; queries compare them one by one" }, "Tail"),
     h("th", { scope: "col", class: "number", title: "Share of the 10 nearest frames that a query finds" }, "Recall@10"))), body);
   return {
     element: h("section", { class: "card", "aria-labelledby": "indexes" }, h("h2", { id: "indexes" }, "Search indexes"), none,
@@ -34,7 +34,7 @@ export function indexes() {
 
 /** The share of the nearest frames that a query finds, in words where it compares every frame. */
 function recall({ recall: found }) {
-  if (found === null || found.sample === 0) return h("span", { class: "muted", title: "A query compares every frame of this map" }, "compared whole");
+  if (found === null || found.sample === 0) return h("span", { class: "muted", title: "A query compares every frame of this map" }, "exact search");
   return h("span", { title: `Measured with ${count(found.sample)} frames; a query compares ${count(found.probes)} inverted lists` }, percent(found.share));
 }
 
@@ -65,7 +65,7 @@ export function workers() {
 export function room() {
   const list = h("dl", { class: "facts" });
   return {
-    element: h("section", { class: "card", "aria-labelledby": "room" }, h("h2", { id: "room" }, "Room on the disk"), list),
+    element: h("section", { class: "card", "aria-labelledby": "room" }, h("h2", { id: "room" }, "Disk space"), list),
     update({ bytes: found }) {
       const ofMap = found.free === null; // the disk is nobody's in particular
       const parts = [["Uploads and artifacts", found.blobs], [ofMap ? "Signatures" : "Database", found.database], ["Search index", found.index]];
@@ -74,6 +74,7 @@ export function room() {
   };
 }
 
+/** @type {[number, string][]} */
 const TIGHT = [[0.95, "bad"], [0.85, "warn"]];
 
 /**
@@ -89,7 +90,7 @@ export function limits() {
       put(list, [
         ["Frames", share(use.frames, use.quota_frames, count)],
         ["Uploads", share(use.bytes, use.quota_bytes, bytes)],
-        ["Frames are kept", days === null ? "for ever" : days === 1 ? "1 day" : `${+days.toPrecision(4)} days`],
+        ["Frames are kept", days === null ? "forever" : days === 1 ? "1 day" : `${+days.toPrecision(4)} days`],
       ].map(([name, told]) => h("div", {}, h("dt", {}, name), h("dd", { class: "number" }, told))));
     },
   };

@@ -3,7 +3,7 @@ import { get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { sheet, toast } from "../lib/states.js";
 
-const SCOPES = [["read", "read: look and query"], ["write", "write: upload and edit frames, too"], ["admin", "admin: change the map itself, too"]];
+const SCOPES = [["read", "read: view and query"], ["write", "write: also upload and edit frames"], ["admin", "admin: also change the map itself"]];
 
 /**
  * Ask for a name and grants, and make the key.
@@ -17,12 +17,12 @@ export async function newKey(signal, made) {
   const lines = h("div", { class: "grants" });
   const add = (map) => lines.append(grantLine(map));
   const why = h("p", { class: "field-error", role: "alert" });
-  const button = h("button", { class: "button primary", type: "submit" }, "Make the key");
-  const dialog = sheet({ title: "Make a key", buttons: button, children: [
-    h("label", { class: "field" }, h("span", {}, "Name: who it is for"), name),
-    h("fieldset", { class: "grants-set" }, h("legend", {}, "What it may do"), lines,
+  const button = h("button", { class: "button primary", type: "submit" }, "Create key");
+  const dialog = sheet({ title: "Create a key", buttons: button, children: [
+    h("label", { class: "field" }, h("span", {}, "Name of its user"), name),
+    h("fieldset", { class: "grants-set" }, h("legend", {}, "Permissions"), lines,
       h("datalist", { id: "key-maps" }, ["*", ...names].map((one) => h("option", { value: one }))),
-      h("p", { class: "muted" }, "* stands for all maps, and for what is of none."),
+      h("p", { class: "muted" }, "* stands for all maps and everything outside of maps."),
       h("button", { class: "button quiet", type: "button", onClick: () => add("") }, "Another map")),
     h("label", { class: "field" }, h("span", {}, "Expires (never, if empty)"), expires), why,
   ] });
@@ -31,8 +31,8 @@ export async function newKey(signal, made) {
     event.preventDefault();
     const grants = {};
     for (const line of lines.children) {
-      const map = line.querySelector("input").value.trim();
-      if (map) grants[map] = line.querySelector("select").value;
+      const map = /** @type {HTMLInputElement} */ (line.querySelector("input")).value.trim();
+      if (map) grants[map] = /** @type {HTMLSelectElement} */ (line.querySelector("select")).value;
     }
     const until = expires.value ? new Date(expires.value).toISOString() : null;
     button.disabled = true;
@@ -55,7 +55,7 @@ function grantLine(map) {
   const line = h("div", { class: "joined" },
     h("input", { class: "mono", "aria-label": "Map", list: "key-maps", value: map, autocomplete: "off", spellcheck: "false", placeholder: "name of a map, or *" }),
     h("select", { "aria-label": "Scope" }, SCOPES.map(([value, text]) => h("option", { value }, text))),
-    h("button", { class: "button quiet", type: "button", "aria-label": "Leave out this map", onClick: () => { if (line.parentElement.children.length > 1) line.remove(); } }, "×"));
+    h("button", { class: "button quiet", type: "button", "aria-label": "Remove this map", onClick: () => { if (line.parentElement && line.parentElement.children.length > 1) line.remove(); } }, "×"));
   return line;
 }
 
@@ -68,13 +68,13 @@ function secret(key) {
       await navigator.clipboard.writeText(key.secret);
       toast("Copied");
     } catch { // not in a page that came over plain http: it is selected, to be copied by hand
-      toast("Selected: copy it with Ctrl+C");
+      toast("Selected: press Ctrl+C to copy");
     }
   } }, "Copy");
   const done = h("button", { class: "button primary", type: "button", onClick: () => dialog.close() }, "I have stored it");
   const dialog = h("dialog", { class: "dialog", "aria-label": `Key ${key.name}` }, h("form", { method: "dialog" },
-    h("h2", {}, `Key ${key.name} is made`),
-    h("p", {}, h("strong", {}, "This is the only time its secret is shown."), " The service keeps a hash of it. Send it as ", h("code", {}, "Authorization: Bearer SECRET"), "."),
+    h("h2", {}, `Key ${key.name} was created`),
+    h("p", {}, h("strong", {}, "The secret is shown only once."), " The service stores only its hash. Send it as ", h("code", {}, "Authorization: Bearer SECRET"), "."),
     h("div", { class: "joined" }, field, copy), h("div", { class: "dialog-foot" }, done)));
   dialog.addEventListener("close", () => { field.value = ""; dialog.remove(); });
   document.body.append(dialog);

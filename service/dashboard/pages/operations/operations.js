@@ -25,6 +25,6 @@ export async function render(root, context) {
   const { renderTab } = await shown.load();
   await renderTab(body, context);
   put(root, tabs, me() !== null && !may("admin") && h("p", { class: "muted" },
-    "Keys, audit and snapshots are shown to keys that are admin of all maps."), body);
+    "Keys, audit log and snapshots need a key with admin access to all maps."), body);
   if (shown.tab !== "") context.title(shown.text);
 }

@@ -25,7 +25,7 @@ export async function renderTab(root, { search, signal }) {
   if (map === null && !all) { // the service as a whole is not for this key: one of its maps is
     map = (await get("maps", { signal })).items[0]?.name ?? null;
     if (map === null) {
-      put(root, empty({ title: "Nothing to tell", text: "Your key reads no map that exists, and figures of the whole service are for keys that read all maps." }));
+      put(root, empty({ title: "Nothing to show", text: "Your key cannot read any existing map, and figures of the whole service need a key for all maps." }));
       return;
     }
   }
@@ -43,6 +43,8 @@ export async function renderTab(root, { search, signal }) {
     renewTimes(failures.element);
   }
 
+  /** @type {Timer} */
+
   let timer = null;
   const again = await poll(look, POLL_S, signal, () => line.look(signal).catch(() => {}));
   const soon = () => { timer ??= setTimeout(() => { timer = null; again(); }, SOON_MS); };
@@ -51,8 +53,8 @@ export async function renderTab(root, { search, signal }) {
   const feed = await events({ map, limit: EVENTS, signal, onstate: line.live, onevent: soon });
   const choose = await mapField(map, signal, (name) => go(link("operations", { map: name })), all);
   put(root, h("div", { class: "toolbar spread" }, line.element, choose),
-    !whole && h("p", { class: "muted" }, all ? "Of this map alone. Workers, requests, query times and the disk are told of all maps together."
-      : "Of this map alone: workers, requests, query times and the disk are told to keys that may read all maps."),
+    !whole && h("p", { class: "muted" }, all ? "Figures of this map only. Workers, requests, query times and disk space cover all maps."
+      : "Figures of this map only: workers, requests, query times and disk space need a key for all maps."),
     figures.element, hour.element,
     h("div", { class: "columns" }, parts.slice(2).map((one) => one.element)),
     failures.element,
@@ -63,8 +65,8 @@ export async function renderTab(root, { search, signal }) {
 /** What broke down or was refused, and has not been tried again since. */
 function failureList(map, signal) {
   const list = h("ul", { class: "list jobs" });
-  const none = h("p", { class: "muted" }, "Nothing failed that was not tried again.");
-  const rest = h("a", { href: link("operations", { tab: "jobs", state: "dead", map }), hidden: true }, "There are more");
+  const none = h("p", { class: "muted" }, "No failed jobs, except those already retried.");
+  const rest = h("a", { href: link("operations", { tab: "jobs", state: "dead", map }), hidden: true }, "More failures");
   const own = { onchange: () => {} };
   const show = rows(list, (job) => job.job_id, (job) => jobRow(job, () => own.onchange()));
   const [status, button] = retryAllButton(map, signal, () => own.onchange());

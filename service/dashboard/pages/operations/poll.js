@@ -13,6 +13,7 @@ import { ago } from "../lib/format.js";
  * @returns {Promise<() => void>} to be called where there is reason to ask now
  */
 export async function poll(ask, s, signal, onfault = () => {}) {
+  /** @type {Timer} */
   let timer = null;
   let asking = false;
   let again = false;
@@ -64,6 +65,7 @@ function tell(state) {
  */
 export function rows(parent, key, make) {
   let known = new Map(); // key -> {element, text}
+  /** @type {[Element, string | undefined] | null} */
   let wanted = null; // the new element and part that the focus goes to, once it is in place
   return (items) => {
     const next = new Map();
@@ -87,7 +89,8 @@ export function rows(parent, key, make) {
     if (before === undefined) return after;
     const open = before.querySelector("details")?.open;
     if (open) after.querySelector("details")?.setAttribute("open", "");
-    if (before.contains(document.activeElement)) wanted = [after, document.activeElement.dataset.part];
+    const focused = /** @type {HTMLElement | null} */ (document.activeElement);
+    if (focused !== null && before.contains(focused)) wanted = [after, focused.dataset.part];
     return after;
   }
 
@@ -95,7 +98,7 @@ export function rows(parent, key, make) {
     if (wanted === null) return;
     const [element, part] = wanted;
     wanted = null;
-    (element.querySelector(`[data-part="${part}"]`) ?? element.querySelector("a, button, summary"))?.focus();
+    /** @type {HTMLElement | null} */ (element.querySelector(`[data-part="${part}"]`) ?? element.querySelector("a, button, summary"))?.focus();
   }
 }
 

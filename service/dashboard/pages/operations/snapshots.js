@@ -16,7 +16,7 @@ export async function renderTab(root, { signal, actions }) {
     ["Size", "Maps", "Frames", "Blobs", "Damaged"].map((text) => h("th", { scope: "col", class: "number" }, text)),
     h("th", { scope: "col" }, h("span", { class: "visually-hidden" }, "Actions")))), body);
   const card = h("div", { class: "card scroll" }, table);
-  const none = h("div", { hidden: true }, empty({ title: "No snapshot yet", text: "A snapshot is one state of all maps in an archive, taken while all goes on. `sceneprint restore` puts it back." }));
+  const none = h("div", { hidden: true }, empty({ title: "No snapshot yet", text: "A snapshot is a consistent archive of all maps, taken while the service runs. Restore it on the command line with “sceneprint restore”." }));
   const jobs = h("ul", { class: "list jobs" });
   const show = rows(body, (one) => one.snapshot_id, (one) => snapshotRow(one, () => again()));
   const showJobs = rows(jobs, (one) => one.job_id, (one) => jobRow(one, () => again()));
@@ -40,13 +40,13 @@ export async function renderTab(root, { signal, actions }) {
     } finally { take.disabled = false; }
   } }, "Take a snapshot");
   actions(take);
-  put(root, h("p", { class: "muted" }, "An archive holds all frames and the hashes of keys: keep it as you keep the folder."), jobs, card, none);
+  put(root, h("p", { class: "muted" }, "An archive contains all frames and the hashes of keys: protect it like the data folder."), jobs, card, none);
 }
 
 function snapshotRow(one, changed) {
   const name = `sceneprint-${one.snapshot_id}.tar`;
   const remove = async () => {
-    const text = h("p", {}, "The archive is removed from the service's disk. This cannot be undone; copies elsewhere stay.");
+    const text = h("p", {}, "The archive is removed from the service's disk. This cannot be undone. Copies elsewhere remain.");
     if (!(await confirm({ title: "Delete a snapshot", text, word: one.snapshot_id, action: "Delete" }))) return;
     await send("DELETE", at("snapshots", one.snapshot_id));
     toast("Snapshot deleted");

@@ -4,6 +4,7 @@ import { bytes, count, percent, seconds } from "../lib/format.js";
 import { sparkline } from "../lib/sparkline.js";
 
 const REMEMBERED = 60; // polls of the queue that the little line shows
+/** @type {[number, string][]} */
 const FULL = [[0.95, "bad"], [0.85, "warn"]];
 const OLD_S = 300; // a job that waits longer than this asks for a look
 
@@ -15,12 +16,12 @@ const OLD_S = 300; // a job that waits longer than this asks for a look
 export function tiles(whole) {
   const waited = [];
   const queue = tile("Waiting jobs", "waiting");
-  const oldest = tile("Oldest waits for", "oldest");
+  const oldest = tile("Oldest waiting job", "oldest");
   const frames = tile("Indexed frames", "indexed");
-  const workers = whole && tile("Workers", "workers");
-  const requests = whole && tile("Requests, last hour", "requests");
-  const disk = whole && tile("Disk", "disk");
-  const all = [queue, oldest, frames, workers, requests, disk].filter(Boolean);
+  const workers = tile("Workers", "workers");
+  const requests = tile("Requests, last hour", "requests");
+  const disk = tile("Disk", "disk");
+  const all = whole ? [queue, oldest, frames, workers, requests, disk] : [queue, oldest, frames];
   const element = h("section", { class: "tiles", "aria-label": "Now" }, all.map((one) => one.element));
   return {
     element,
@@ -32,12 +33,12 @@ export function tiles(whole) {
         && sparkline(waited, { label: `Waiting jobs since this page was opened: now ${stats.waiting}, at most ${Math.max(...waited)}`, width: 88 });
       queue.set(count(stats.waiting), [`${count(stats.jobs.running ?? 0)} running`, line]);
       const old = stats.oldest_waiting_s;
-      oldest.set(old === null ? "–" : seconds(old), old === null ? "nothing waits" : "since it was queued", old > OLD_S ? "warn" : null);
+      oldest.set(old === null ? "–" : seconds(old), old === null ? "up to date" : "since it was queued", old > OLD_S ? "warn" : null);
       frames.set(count(stats.frames.indexed ?? 0), others(stats.frames));
       if (!whole) return;
       const busy = stats.workers.filter((one) => one.job_id !== null).length;
       const idle = stats.workers.length === 0;
-      workers.set(count(stats.workers.length), idle ? "nothing is signed" : `${count(busy)} at a job`, idle ? "bad" : null);
+      workers.set(count(stats.workers.length), idle ? "idle" : `${count(busy)} busy`, idle ? "bad" : null);
       const { requests: asked, refused, busy: later, broken } = stats.total;
       requests.set(count(asked), [part(refused, "refused"), part(later, "busy"), part(broken, "broken", "bad")], null);
       const { free, disk: room } = stats.bytes;
@@ -64,6 +65,7 @@ function tile(label, figure) {
   const element = h("div", { class: "card tile" }, h("span", { class: "tile-label" }, label), value, note);
   return {
     element,
+    /** @param {any} text @param {any} more @param {string | null} [kind] */
     set(text, more, kind = null) {
       put(value, text);
       put(note, more);

@@ -20,10 +20,10 @@ function mark(shape, colour) {
 }
 
 /**
- * @param {object} shown see Scene
- * @param {object} details
- * @param {{query: object, match: object}} points
- * @param {object | undefined} tally of the pose that is shown; undefined until it has come
+ * @param {Object<string, any>} shown see Scene
+ * @param {Object<string, any>} details
+ * @param {{query: Object<string, any>, match: Object<string, any>}} points
+ * @param {Object<string, any> | undefined} tally of the pose that is shown; undefined until it has come
  * @returns {HTMLElement}
  */
 export function legend(shown, details, points, tally) {
@@ -42,24 +42,24 @@ export function legend(shown, details, points, tally) {
     const scale = points.query.scale, share = (n) => percent(n / Math.max(tally.total, 1));
     add("dot", rgb(STEPS[0]), `within ${metres(scale / 5)}`, share(tally.fifth));
     add("dot", rgb(STEPS[1]), `within ${metres((2 * scale) / 5)}`, share(tally.half));
-    add("dot", rgb(STEPS[2]), `within ${metres(scale)}, all that is allowed near by`, share(tally.all));
-    add("dot", rgb(BESIDE), "farther, hidden, or the other did not look", share(tally.outside));
-    add("dot", rgb(VIOLATES), "the other saw through", share(tally.violations));
+    add("dot", rgb(STEPS[2]), `within ${metres(scale)}, the limit at short range`, share(tally.all));
+    add("dot", rgb(BESIDE), "farther, hidden, or outside the view of the other", share(tally.outside));
+    add("dot", rgb(VIOLATES), "the other sensor saw through", share(tally.violations));
   } else {
-    rows.push(h("li", { class: "muted" }, details.transform ? "Comparing the points…" : "Nothing to compare: there is no transform."));
+    rows.push(h("li", { class: "muted" }, details.transform ? "Comparing points…" : "Nothing to compare: there is no transform."));
   }
   if (isWhole && seen("violations") && shown.colour !== "residual") {
     const n = (details.query?.violations.length ?? 0) + (details.match?.violations.length ?? 0);
     const asked = (details.query?.sampled ?? 0) + (details.match?.sampled ?? 0), isRival = shown.pose === "rival";
     const least = [details.query, details.match].some((one) => one?.violations.length >= LISTED) ? "at least " : "";
-    const more = isRival ? "some of them" : `${least}${count(n)} of ${count(asked)} points that were looked up`;
-    if (isRival ? tally?.violations : n) add("cross", "var(--violation)", "Violation: the other saw through here", more);
+    const more = isRival ? "some of them" : `${least}${count(n)} of ${count(asked)} compared points`;
+    if (isRival ? tally?.violations : n) add("cross", "var(--violation)", "Violation: the other sensor saw through here", more);
   }
-  if (seen("patches") && details.patches && shown.pose !== "rival") add("line", "var(--ink)", "Patches that coincide", `${count(details.patches.query.length)} pairs`);
+  if (seen("patches") && details.patches && shown.pose !== "rival") add("line", "var(--ink)", "Matching patches", `${count(details.patches.query.length)} pairs`);
   if (seen("cameras")) {
-    add("lens", "var(--query)", "Query’s sensor");
-    add("lens", "var(--match)", "Match’s sensor");
+    add("lens", "var(--query)", "Query sensor");
+    add("lens", "var(--match)", "Match sensor");
   }
   if (isWhole && seen("free") && shown.pose === "aligned" && details.uncertainty?.degenerate.length) add("both", "var(--accent)", "Free direction");
-  return h("ul", { class: "overlay-legend", "aria-label": "What the colours mean" }, rows);
+  return h("ul", { class: "overlay-legend", "aria-label": "Legend" }, rows);
 }

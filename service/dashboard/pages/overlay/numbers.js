@@ -6,9 +6,9 @@ import { statusOf } from "../query/words.js";
 import { apart, axisName, deviations, freedom, isOptical, shiftOf, turnOf } from "./words.js";
 
 const MEANT = {
-  accepted: "Both directions agree on this transform, and what both frames saw supports it.",
-  ambiguous: "It fits, but so does another pose, or a direction is free: not counted as found.",
-  rejected: "The best transform there is, and not to be believed.",
+  accepted: "Both directions agree on this transform, and the surfaces of both frames support it.",
+  ambiguous: "It fits, but another pose fits as well or a direction is unconstrained: not counted as found.",
+  rejected: "This is the best transform, but it is not reliable.",
 };
 
 /** Degrees that are next to none. */
@@ -17,10 +17,10 @@ const fine = (x) => (x < 1 ? `${x.toFixed(2)}°` : degrees(x));
 /** @param {string} title @param {...any} children */
 const card = (title, ...children) => h("section", { class: "card overlay-card" }, h("h2", {}, title), children);
 
-/** What came of it, in a word and a sentence. @param {object} details */
+/** What came of it, in a word and a sentence. @param {Object<string, any>} details */
 export function verdictCard(details) {
   const { validation } = details, { kind, text } = statusOf(validation);
-  const note = details.transform ? MEANT[validation.status] : "The frames gave no transform at all.";
+  const note = details.transform ? MEANT[validation.status] : "No transform was found.";
   return card("Verdict",
     h("p", {}, h("span", { class: "badge overlay-verdict", dataset: { kind } }, text)),
     h("p", { class: "overlay-reason" }, sentence(validation.reason)),
@@ -29,27 +29,27 @@ export function verdictCard(details) {
 
 export const sentence = (text) => `${text.charAt(0).toUpperCase()}${text.slice(1)}.`;
 
-/** What the verdict was reached from. @param {object} details */
+/** What the verdict was reached from. @param {Object<string, any>} details */
 export function evidenceCard(details) {
   const v = details.validation, sampled = (details.query?.sampled ?? 0) + (details.match?.sampled ?? 0);
   const residual = v.residual ? `${metres(v.residual.translation_m)}, ${fine(v.residual.rotation_deg)}` : "–";
   const rows = [
     ["Overlap", percent(v.overlap), "of the points of both frames agree"],
-    ["Plane overlap", percent(v.plane_overlap), "the same, every plane counting alike"],
-    ["Inliers", sampled ? `${count(v.inliers)} of ${count(sampled)}` : count(v.inliers), "points that lie on the other's surface"],
+    ["Plane overlap", percent(v.plane_overlap), "the same, with equal weight for every plane"],
+    ["Inliers", sampled ? `${count(v.inliers)} of ${count(sampled)}` : count(v.inliers), "points on the surface of the other frame"],
     ["Violations", v.free_space_violations === null ? "–" : percent(v.free_space_violations),
-      v.free_space_violations === null ? "without a viewpoint nothing is known of free space" : "of these and the inliers: the other saw through"],
-    ["Residual", residual, "query to match and back, estimated apart"],
-    v.ambiguity === 0 && v.status !== "accepted" ? ["Ambiguity", "–", "rivals are looked for only where all else agrees"]
-      : ["Ambiguity", percent(v.ambiguity), "of both frames, the best rival explains"],
+      v.free_space_violations === null ? "free space is unknown without a viewpoint" : "of these and the inliers: the other sensor saw through them"],
+    ["Residual", residual, "query to match and back, estimated independently"],
+    v.ambiguity === 0 && v.status !== "accepted" ? ["Ambiguity", "–", "rivals are searched only if everything else agrees"]
+      : ["Ambiguity", percent(v.ambiguity), "of both frames is explained by the best rival"],
     ["Patches", details.patches ? count(details.patches.query.length) : "–", "pairs coincide"],
   ];
-  if (!details.transform) return card("Evidence", h("p", { class: "muted" }, "Without a transform there is nothing to count."));
+  if (!details.transform) return card("Evidence", h("p", { class: "muted" }, "There is no evidence without a transform."));
   return card("Evidence", h("dl", { class: "overlay-numbers" }, rows.map(([name, value, note]) => h("div", {},
     h("dt", {}, name), h("dd", { class: "number" }, value), h("dd", { class: "overlay-note" }, note)))));
 }
 
-/** Query to match. @param {object} details @param {{query: string, match: string}} names */
+/** Query to match. @param {Object<string, any>} details */
 export function transformCard(details) {
   const { transform } = details;
   if (!transform) return null;
@@ -77,11 +77,11 @@ function axes(optical, rows) {
       values.map((value) => h("td", { class: "number" }, value))))));
 }
 
-/** How far off it may be. @param {object} details */
+/** How far off it may be. @param {Object<string, any>} details */
 export function uncertaintyCard(details) {
   const { uncertainty, transform } = details;
   if (!uncertainty || !transform) {
-    return card("Uncertainty", h("p", { class: "muted" }, "Told of accepted matches alone."));
+    return card("Uncertainty", h("p", { class: "muted" }, "Available only for accepted matches."));
   }
   const optical = isOptical(transform.parent_frame), sigma = deviations(uncertainty.covariance);
   const free = uncertainty.degenerate;
@@ -92,30 +92,30 @@ export function uncertaintyCard(details) {
     free.length
       ? h("div", {}, h("p", {}, h("span", { class: "badge", dataset: { kind: "warn" } }, `${free.length} free ${free.length === 1 ? "direction" : "directions"}`)),
         h("ul", { class: "overlay-free" }, free.map((one) => h("li", {}, freedom(one, optical)))))
-      : h("p", { class: "muted" }, "No direction is free: all six are held."));
+      : h("p", { class: "muted" }, "All six directions are constrained."));
 }
 
 /**
  * Another pose that explains the frames.
- * @param {object} details
- * @param {Object<string, object>} tallies of `tally`, by pose; the rival's may be missing yet
+ * @param {Object<string, any>} details
+ * @param {Object<string, Object<string, any>>} tallies of `tally`, by pose; the rival's may be missing yet
  */
 export function rivalCard(details, tallies) {
   const { rival, transform, validation } = details;
   if (!rival) return null;
   const away = transform && apart(rival, transform);
   const share = (pose, name) => (tallies[pose] ? percent(tallies[pose][name] / Math.max(tallies[pose].total, 1)) : "…");
-  const rows = [["On the other’s surface", "agree"], ["Violations", "violations"]];
+  const rows = [["On the surface of the other", "agree"], ["Violations", "violations"]];
   return card("Rival pose",
-    h("p", {}, "Another pose explains ", h("strong", {}, percent(validation.ambiguity)), " of both frames, every plane counting alike",
-      away && [", ", h("strong", {}, metres(away.metres)), " and ", h("strong", {}, degrees(away.degrees)), " from the one that was found"], "."),
+    h("p", {}, "Another pose explains ", h("strong", {}, percent(validation.ambiguity)), " of both frames, with equal weight for every plane",
+      away && [", ", h("strong", {}, metres(away.metres)), " and ", h("strong", {}, degrees(away.degrees)), " from the pose that was found"], "."),
     h("table", { class: "table" },
       h("thead", {}, h("tr", {}, h("td", {}, "Share of all points"), h("th", { scope: "col", class: "number" }, "Found"), h("th", { scope: "col", class: "number" }, "Rival"))),
       h("tbody", {}, rows.map(([name, key]) => h("tr", {}, h("th", { scope: "row" }, name),
         h("td", { class: "number" }, share("aligned", key)), h("td", { class: "number" }, share("rival", key)))))));
 }
 
-/** Who was compared. @param {object} answer @param {object} details @param {object | null} frame */
+/** Who was compared. @param {Object<string, any>} answer @param {Object<string, any>} details @param {Object<string, any> | null} frame */
 export function framesCard(answer, details, frame, query) {
   const asked = answer.frame;
   const row = (side, name, href, note) => h("li", { dataset: { side } },
@@ -123,7 +123,7 @@ export function framesCard(answer, details, frame, query) {
       href ? h("a", { class: "mono", href }, name) : name, note && h("span", { class: "overlay-note" }, note)));
   const told = (one) => [one?.session && `session ${one.session}`, one?.robot && `robot ${one.robot}`].filter(Boolean).join(", ");
   return card("Frames", h("ul", { class: "overlay-who" },
-    row("query", asked ? shortId(asked.frame_id) : "an upload, not kept in a map",
+    row("query", asked ? shortId(asked.frame_id) : "an upload, not stored in a map",
       asked && link("maps", asked.map, "frames", asked.frame_id), asked && [`map ${asked.map}`, told(query)].filter(Boolean).join(", ")),
     row("match", shortId(details.frame_id), link("maps", details.map, "frames", details.frame_id),
       [`map ${details.map}`, told(frame)].filter(Boolean).join(", "))));

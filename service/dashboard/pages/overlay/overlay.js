@@ -13,7 +13,7 @@ const POINTS = "application/vnd.sceneprint.points";
 /** The API's word for a pose. */
 export const TRANSFORM = { before: "none", aligned: "aligned", rival: "rival" };
 
-/** @param {HTMLElement} root @param {object} context of the router */
+/** @param {HTMLElement} root @param {Object<string, any>} context of the router */
 export async function render(root, context) {
   const { params, search, signal, title } = context;
   const query = at("queries", params.query), match = at("queries", params.query, "matches", params.frame);
@@ -55,11 +55,11 @@ export async function render(root, context) {
 /** What stands in place of the page where what it shows is not kept; null for other faults. */
 function missing(error, id) {
   if (error.status === 404 && error.type?.endsWith("unknown-query")) {
-    return empty({ title: "This answer is no longer kept", text: error.detail,
+    return empty({ title: "This answer has expired", text: error.detail,
       actions: h("a", { class: "button primary", href: "#/" }, "To the maps") });
   }
   if (error.status === 404 || (error.status === 409 && error.type?.endsWith("not-indexed"))) {
-    return empty({ title: "There is nothing to lay on each other", text: error.detail,
+    return empty({ title: "There is nothing to overlay", text: error.detail,
       actions: h("a", { class: "button primary", href: link("queries", id) }, "To the answer") });
   }
   return null;

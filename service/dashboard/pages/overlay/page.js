@@ -19,8 +19,8 @@ const PARTS = { query: "Query", match: "Match", patches: "Patches", violations: 
 
 /**
  * @param {HTMLElement} root
- * @param {object} context of the router
- * @param {object} told the answer, the match's details, points under its transform, both frames
+ * @param {Object<string, any>} context of the router
+ * @param {Object<string, any>} told the answer, the match's details, points under its transform, both frames
  *   (null where they are not, or not kept), addresses, and how points under another are loaded
  */
 export function show(root, { params, search, signal, go, actions }, { answer, details, aligned, asked, matched, query, match, map, load }) {
@@ -39,7 +39,7 @@ export function show(root, { params, search, signal, go, actions }, { answer, de
   count("aligned");
 
   const canvas = h("canvas", { class: "overlay-canvas" });
-  const lost = h("p", { class: "overlay-lost", role: "status", hidden: true }, "The browser took the graphics away. The view comes back when it gives them back.");
+  const lost = h("p", { class: "overlay-lost", role: "status", hidden: true }, "The browser suspended 3-D graphics. The view returns when the browser resumes them.");
   const said = h("div", { class: "visually-hidden", role: "status" });
   const legends = h("div");
   const bar = h("div", { class: "overlay-bar" });
@@ -63,7 +63,7 @@ export function show(root, { params, search, signal, go, actions }, { answer, de
   });
   canvas.viewer = viewer; // for who measures it
   if (!viewer.available) {
-    put(legends, h("div", { class: "overlay-flat" }, pictures(answer, details, query, signal)));
+    put(legends, h("div", { class: "overlay-flat" }, pictures(details, query, signal)));
     put(rival, rivalCard(details, tallies));
     return;
   }
@@ -76,7 +76,7 @@ export function show(root, { params, search, signal, go, actions }, { answer, de
     type: "range", min: 0, max: 100, step: 1, "aria-label": "From before to aligned", class: "overlay-slide",
     disabled: !details.transform, onInput: (event) => { scene.blend(event.target.value / 100); drawn(); },
   });
-  const slid = () => { slider.value = Math.round(100 * shown.share); };
+  const slid = () => { slider.value = String(Math.round(100 * shown.share)); };
 
   /** Points with the residuals of the pose that is shown, where they are wanted and not there. */
   async function fetched(pose) {
@@ -136,14 +136,14 @@ export function show(root, { params, search, signal, go, actions }, { answer, de
         slider,
         group("Colours", COLOURS.map(([colour, text]) => button(colour, text, shown.colour === colour, () => paint(colour))))),
       h("div", { class: "overlay-row" },
-        group("What is drawn", parts.map((part) => button(part, PARTS[part], !shown.hidden.has(part), () => toggle(part)))),
+        group("Layers", parts.map((part) => button(part, PARTS[part], !shown.hidden.has(part), () => toggle(part)))),
         button("fit", "Show all", null, () => scene.fit())));
     if (focused?.startsWith("overlay-")) document.getElementById(focused)?.focus();
     const points = shown.colour === "residual" && sets[shown.pose] ? sets[shown.pose] : aligned;
     put(legends, !details.transform && h("p", { class: "overlay-none" }, h("strong", {}, "No transform. "),
-      `${sentence(details.validation.reason)} Both are shown as their sensors saw them, from one origin.`),
+      `${sentence(details.validation.reason)} Both are shown in their own sensor frames, with a common origin.`),
     legend(shown, details, points, tallies[shown.pose]),
-    h("p", { class: "muted overlay-keys" }, "Drag to turn, with Shift to move, wheel or pinch to zoom. In the view: arrows, + and −, 0 shows all; B before or after",
+    h("p", { class: "muted overlay-keys" }, "Drag to turn, with Shift to move, wheel or pinch to zoom. In the view: arrows, + and −, 0 shows all; B toggles before and after",
       details.rival && ", R rival", ", C colours, P patches, V violations, S sensors."), said);
     put(rival, rivalCard(details, tallies));
     go(link("queries", params.query, "matches", params.frame, {
@@ -186,7 +186,7 @@ export function lens(frame, points, kind) {
 }
 
 /** Where nothing can be drawn in 3-D: both as pictures. */
-function pictures(answer, details, query, signal) {
+function pictures(details, query, signal) {
   const one = (text, path) => h("figure", {}, picture(path, { view: "depth", width: 320 },
     { alt: `Depth of the ${text.toLowerCase()}`, width: 320, height: 240, signal }), h("figcaption", { class: "muted" }, text));
   return [one("Query", `${query}/preview.png`), one("Match", `${at("maps", details.map, "frames", details.frame_id)}/preview.png`)];

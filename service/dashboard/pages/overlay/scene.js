@@ -22,20 +22,25 @@ const STRIDE = 25; // of all points that violate, as evidence counts every 25th
 
 export class Scene {
   /**
-   * @param {ReturnType<import("../viewer/viewer.js").createViewer>} viewer
-   * @param {object} details of the match, as the API tells them
+   * @param {import("../viewer/viewer.js").Viewer} viewer
+   * @param {Object<string, any>} details of the match, as the API tells them
    * @param {Object<string, {query: import("../viewer/points.js").Points, match: any}>} sets points
    *   with residuals, by pose
-   * @param {{query: object | null, match: object | null}} cameras intrinsics
+   * @param {{query: Object<string, any> | null, match: Object<string, any> | null}} cameras intrinsics
    * @param {Shown} shown
    * @param {() => void} changed the share or the pose has
    */
   constructor(viewer, details, sets, cameras, shown, changed) {
-    Object.assign(this, { viewer, details, sets, shown, changed });
+    this.viewer = viewer;
+    this.details = details;
+    this.sets = sets;
+    this.shown = shown;
+    this.changed = changed;
     this.goals = { before: identity() };
     if (details.transform) this.goals.aligned = ofRows(details.transform.matrix);
     if (details.rival) this.goals.rival = ofRows(details.rival.matrix);
-    this.turned = shown.pose === "before" ? this.first : shown.pose; // what `share` leads to
+    /** What `share` leads to. @type {Shown["pose"] | null} */
+    this.turned = shown.pose === "before" ? this.first : shown.pose;
     this.matrix = this.goals[shown.pose];
     this.timer = 0;
     const { query, match } = sets.aligned;
@@ -59,7 +64,7 @@ export class Scene {
     this.viewer.fit(this.shown.hidden.has("cameras") ? whole : [...whole, "query camera", "match camera"]);
   }
 
-  /** The pose that is turned to from "before": null where there is none. */
+  /** The pose that is turned to from "before": null where there is none. @returns {"aligned" | null} */
   get first() {
     return this.goals.aligned ? "aligned" : null;
   }

@@ -32,15 +32,15 @@ export function apart(a, b) {
 
 /**
  * A direction in which the transform is hardly held.
- * @param {{translation: object, rotation: object, deviation: number}} free
+ * @param {Object<string, any>} free with translation, rotation and deviation
  * @param {boolean} optical
  * @returns {string}
  */
 export function freedom({ translation, rotation, deviation }, optical) {
   const parts = [];
-  for (const [what, vector, told] of [
-    ["slides along", translation, metres], ["turns about", rotation, (x) => degrees((x * 180) / Math.PI)],
-  ]) {
+  /** @type {[string, Object<string, number>, (x: number) => string][]} */
+  const moves = [["slides along", translation, metres], ["turns about", rotation, (x) => degrees((x * 180) / Math.PI)]];
+  for (const [what, vector, told] of moves) {
     const v = [vector.x, vector.y, vector.z], size = Math.hypot(...v);
     if (size < 0.2) continue; // next to nothing of it
     const way = v.map((x) => x / size), k = way.findIndex((x) => Math.abs(x) > ALONG);

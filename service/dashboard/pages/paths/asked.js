@@ -52,7 +52,7 @@ function block(numbers) {
  */
 export function askedPanel(asked, { drawn, onshow, onclose }) {
   const { location } = asked;
-  const sure = asked.axes && asked.axes.map((one) => metres(one.deviation * SIGMAS)).join(" × ");
+  const sure = asked.axes?.map((one) => metres(one.deviation * SIGMAS)).join(" × ");
   return h("section", { class: "card paths-section", "aria-labelledby": "paths-asked" },
     h("div", { class: "paths-row" },
       h("h2", { id: "paths-asked" }, h("span", { class: "paths-key", dataset: { kind: "query" } }), "Query"),
@@ -63,15 +63,15 @@ export function askedPanel(asked, { drawn, onshow, onclose }) {
       sure && fact("95 % ellipsoid", `± ${sure}`))
       : h("p", { class: "muted" }, asked.elsewhere
         ? `It was found in another map, ${asked.elsewhere}.`
-        : asked.accepted ? "Its matches have no poses, so nobody knows where it is." : "No match was accepted, so it has no place."),
+        : asked.accepted ? "Its matches have no poses, so its position is unknown." : "No match was accepted, so it has no position."),
     asked.accepted > 0 && h("p", { class: "muted" },
-      `${count(asked.matches.length)} of ${count(asked.accepted)} accepted matches have a place here; `,
+      `${count(asked.matches.length)} of ${count(asked.accepted)} accepted matches have a position here; `,
       "a line leads to each."),
-    location && !drawn && h("p", { class: "paths-note" }, "It lies in a frame of reference that is not drawn. ",
+    location && !drawn && h("p", { class: "paths-note" }, "It lies in a coordinate frame that is not shown. ",
       h("button", { class: "button", type: "button", onClick: onshow }, `Draw ${asked.parent}`)),
     h("div", { class: "toolbar" },
       h("a", { class: "button", href: link("queries", asked.id) }, "The answer"),
-      h("button", { class: "button quiet", type: "button", onClick: onclose }, "Leave it out")),
+      h("button", { class: "button quiet", type: "button", onClick: onclose }, "Hide it")),
     h("span", { class: "visually-hidden" }, `Query ${shortId(asked.id)}`));
 }
 

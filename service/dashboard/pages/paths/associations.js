@@ -25,7 +25,7 @@ export function titleOf(one) {
  */
 export function associationsPanel({ associations, chosen, edges, maywrite, onchoose, onbegin }) {
   const select = h("select", { id: "paths-association", onChange: () => onchoose(select.value || null) },
-    h("option", { value: "" }, associations.length ? "None" : "There are none yet"),
+    h("option", { value: "" }, associations.length ? "None" : "No associations yet"),
     associations.map((one) => h("option", { value: one.association_id, selected: one === chosen }, titleOf(one))));
   select.disabled = associations.length === 0;
   return h("section", { class: "card paths-section", "aria-labelledby": "paths-associations" },
@@ -33,12 +33,12 @@ export function associationsPanel({ associations, chosen, edges, maywrite, oncho
     h("label", { class: "field" }, h("span", {}, "Edges of"), select),
     chosen && told(chosen, edges),
     maywrite ? h("button", { class: "button", type: "button", id: "paths-begin", onClick: onbegin }, "New association…")
-      : h("p", { class: "muted" }, "To begin a new one takes a key that may write."));
+      : h("p", { class: "muted" }, "To start a new one, you need a key with write access."));
 }
 
 function told(one, edges) {
   if (!OVER.has(one.state)) return progress(one);
-  if (one.state !== "succeeded") return h("p", { class: "paths-note" }, `It ${one.state === "cancelled" ? "was cancelled" : "broke down"}. ${one.error ?? ""}`);
+  if (one.state !== "succeeded") return h("p", { class: "paths-note" }, `It ${one.state === "cancelled" ? "was cancelled" : "failed"}. ${one.error ?? ""}`);
   const kinds = EDGES.map(({ kind }) => h("li", {},
     h("span", { class: "paths-line", dataset: { kind } }), h("span", {}, kind),
     h("span", { class: "number" }, count(one.result[kind]))));
@@ -49,14 +49,14 @@ function told(one, edges) {
   return [
     h("ul", { class: "paths-kinds" }, kinds),
     edges && edges.drawn < one.result.edges && h("p", { class: "muted" },
-      `${count(edges.drawn)} of ${count(one.result.edges)} are drawn${edges.more ? "" : ": the others have an end that is not in this picture"}.`),
+      `${count(edges.drawn)} of ${count(one.result.edges)} are shown${edges.more ? "" : ": the others have an end that is not shown"}.`),
     joins.length > 0 && h("ul", { class: "paths-joins" }, joins),
   ];
 }
 
 function progress(one) {
   const { done = 0, total = null } = one.progress ?? {};
-  const text = one.state === "queued" ? "Waits for a worker" : total ? `${count(done)} of ${count(total)} frames looked up` : "Begins";
+  const text = one.state === "queued" ? "Waiting for a worker" : total ? `${count(done)} of ${count(total)} frames queried` : "Starting";
   return h("div", { role: "status", class: "paths-progress" }, h("span", {}, text),
     h("progress", { max: total ?? 1, value: done, "aria-label": "Progress of the association" }));
 }
@@ -70,15 +70,15 @@ function progress(one) {
 export function begin(map, runs, onbegun) {
   const options = (first) => runs.map((one, i) => h("option", { value: i, selected: i === first }, one.robot === null || one.robot === one.session ? one.session : `${one.session} (${one.robot})`));
   const from = h("select", { name: "from" }, options(0));
-  const to = h("select", { name: "to" }, h("option", { value: "" }, "itself: close its loops"), options(1));
+  const to = h("select", { name: "to" }, h("option", { value: "" }, "itself (loop closures)"), options(1));
   const error = h("p", { class: "field-error", role: "alert" });
-  const button = h("button", { class: "button primary", type: "submit" }, "Begin");
+  const button = h("button", { class: "button primary", type: "submit" }, "Start");
   const dialog = sheet({
     title: "New association",
     children: [
-      h("p", { class: "muted" }, "Each frame of the first run is looked up among those of the second, and what is accepted becomes an edge. Some 0.1 s a frame."),
-      h("label", { class: "field" }, h("span", {}, "Look up the frames of"), from),
-      h("label", { class: "field" }, h("span", {}, "among those of"), to), error,
+      h("p", { class: "muted" }, "Each frame of the first run is queried among the frames of the second; accepted matches become edges. This takes about 0.1 s per frame."),
+      h("label", { class: "field" }, h("span", {}, "Query the frames of"), from),
+      h("label", { class: "field" }, h("span", {}, "among the frames of"), to), error,
     ],
     buttons: button,
   });
@@ -113,10 +113,10 @@ export async function follow(map, id, onchange, signal) {
       .catch((error) => { if (error.status === 0 || error.status === 503) return null; throw error; });
     if (now) onchange(now);
     if (now && OVER.has(now.state)) {
-      if (now.state !== "succeeded") toast(`The association ${now.state === "cancelled" ? "was cancelled" : "broke down"}. ${now.error ?? ""}`, { kind: "bad" });
+      if (now.state !== "succeeded") toast(`The association ${now.state === "cancelled" ? "was cancelled" : "failed"}. ${now.error ?? ""}`, { kind: "bad" });
       return;
     }
-    await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+    await new Promise((resolve) => { setTimeout(resolve, POLL_MS); });
     if (signal.aborted) return;
   }
 }

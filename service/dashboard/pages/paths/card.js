@@ -11,7 +11,8 @@ import { placeOf } from "./shapes.js";
  * @param {{map: string, signal: AbortSignal, onchoose: (one: {path: number, place: number} | null) => void,
  *   onapproach: () => void}} how
  * @returns {{element: HTMLElement, paths: (paths: any[]) => void,
- *   show: (one: {path: number, place: number} | null) => void}}
+ *   show: (one: {path: number, place: number} | null) => void,
+ *   readonly chosen: {path: number, place: number} | null}}
  */
 export function chooser({ map, signal, onchoose, onapproach }) {
   let drawn = [], chosen = null;
@@ -26,7 +27,7 @@ export function chooser({ map, signal, onchoose, onapproach }) {
     h("h2", { id: "paths-frame" }, "Frame"),
     h("div", { class: "paths-along" },
       h("label", { class: "field" }, h("span", {}, "Run"), runs),
-      h("label", { class: "field" }, h("span", { class: "paths-row" }, "Along it", where), along)),
+      h("label", { class: "field" }, h("span", { class: "paths-row" }, "Position in the run", where), along)),
     card);
 
   function show(one) {
@@ -34,7 +35,7 @@ export function chooser({ map, signal, onchoose, onapproach }) {
     const path = one && drawn[one.path];
     put(where, path ? `${count(one.place + 1)} of ${count(path.ids.length)}` : "");
     if (!path) {
-      put(card, h("p", { class: "muted" }, "Click near a frustum, or go along a run here."));
+      put(card, h("p", { class: "muted" }, "Click near a frustum, or step along a run here."));
       return;
     }
     runs.value = String(one.path);
@@ -52,8 +53,8 @@ export function chooser({ map, signal, onchoose, onapproach }) {
         h("span", { class: "muted" }, path.byTime ? "Taken " : "Received ", time(new Date(1000 * path.times[one.place]).toISOString())),
         h("span", { class: "muted number" }, `${[x, y, z].map((v) => v.toFixed(2)).join(", ")} m in ${path.parent}`),
         h("div", { class: "toolbar" },
-          h("button", { class: "button", type: "button", onClick: onapproach }, "Go there"),
-          h("a", { class: "button", href: link("maps", map, "query", { frame: id }) }, "Ask with it"),
+          h("button", { class: "button", type: "button", onClick: onapproach }, "Go to it"),
+          h("a", { class: "button", href: link("maps", map, "query", { frame: id }) }, "Query with it"),
           h("button", { class: "button quiet", type: "button", onClick: () => onchoose(null) }, "Done"))));
   }
 

@@ -10,8 +10,9 @@ const POSES = 6000, MOST_POSES = 2000;
 export const MOST_EDGES = 2000;
 
 /**
- * @typedef {{session: string, robot: string | null, parent: string, number: number, frames: number}} Run
- *   frames: of the session, with those that have no pose
+ * @typedef {{session: string, robot: string | null, parent: string, number: number, frames: number,
+ *   timed: boolean, last: string | null}} Run
+ *   frames: of the session, with those that have no pose; timed: whether they say when they were taken
  * @typedef {Run & {ids: string[], times: number[], poses: number[][], posed: number, leftOut: number,
  *   camera: Object<string, number> | null, isCloud: boolean, byTime: boolean}} Path
  *   poses: T_parent_sensor, 16 column-major
@@ -29,13 +30,13 @@ export function runsOf(sessions) {
   for (const one of sessions) robots.set(one.session, (robots.get(one.session) ?? 0) + 1);
   for (const one of sessions) {
     const frames = Object.values(one.frames).reduce((a, b) => a + b, 0);
-    const name = one.session ?? (one.robot === null ? "Frames of no session" : `${one.robot}, no session`);
+    const name = one.session ?? (one.robot === null ? "Frames without a session" : `${one.robot}, no session`);
     if (one.with_pose === 0) {
       without.push({ name, frames, why: "no poses" });
     } else if (one.session === null) {
-      without.push({ name, frames, why: "poses, but no session: a path is that of one" });
+      without.push({ name, frames, why: "poses, but no session, which a path needs" });
     } else if (one.robot === null && robots.get(one.session) > 1) {
-      without.push({ name, frames, why: "no robot, and robots have runs of the same name" });
+      without.push({ name, frames, why: "no robot, and several robots have runs of this name" });
     } else {
       for (const parent of one.parent_frames) {
         runs.push({

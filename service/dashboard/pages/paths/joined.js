@@ -34,9 +34,9 @@ export function bridges(associations) {
  * @returns {Map<string, {matrix: number[], over: Bridge[]}>} by the name of the frame; its own too
  */
 export function reach(parent, joins) {
+  /** @type {Map<string, {matrix: number[], over: Bridge[]}>} */
   const found = new Map([[parent, { matrix: identity(), over: [] }]]);
-  for (const here of found.keys()) { // what is added meanwhile comes later: breadth first
-    const { matrix, over } = found.get(here);
+  for (const [here, { matrix, over }] of found) { // what is added meanwhile comes later: breadth first
     for (const one of joins) {
       const [there, step] = one.to === here ? [one.from, one.matrix]
         : one.from === here ? [one.to, inverseRigid(one.matrix)] : [here, null];

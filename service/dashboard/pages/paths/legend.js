@@ -11,7 +11,7 @@ import { tokenOf } from "./scene.js";
  * @param {() => void} onchange
  */
 export function legend(paths, hidden, onchange) {
-  const boxes = paths.map((one, i) => h("input", {
+  const boxes = paths.map((_, i) => h("input", {
     type: "checkbox", checked: !hidden.has(i), onChange: (event) => {
       if (event.target.checked) hidden.delete(i); else hidden.add(i);
       onchange();
@@ -46,7 +46,7 @@ const poses = ({ ids, posed }) => (ids.length < posed ? `${count(ids.length)} of
 export function leftOut(without) {
   if (!without.length) return null;
   return h("details", { class: "paths-left", open: without.length <= 4 },
-    h("summary", {}, `Not in the picture: ${count(without.length)} ${without.length === 1 ? "run" : "runs"}`),
+    h("summary", {}, `Not shown: ${count(without.length)} ${without.length === 1 ? "run" : "runs"}`),
     h("ul", {}, without.slice(0, 50).map((one) => h("li", {},
       h("strong", {}, one.name), h("span", { class: "muted" }, ` · ${count(one.frames)} ${one.frames === 1 ? "frame" : "frames"}: ${one.why}`)))),
     without.length > 50 && h("p", { class: "muted" }, `and ${count(without.length - 50)} more`));

@@ -41,20 +41,57 @@ function missing(error) {
 
 function nothing(map, without) {
   const text = without.length
-    ? "Its frames came without poses, or without a session. Send `pose`, `session` and `captured_at` with a frame, or edit them."
-    : "Upload frames with poses, and the ways that the robots took are drawn here.";
+    ? "Its frames have no poses or no session. Send `pose`, `session` and `captured_at` with a frame, or edit them."
+    : "Upload frames with poses to see the paths of the robots here.";
   const upload = may("write", map) && h("a", { class: "button primary", href: link("maps", map, "upload") }, "Upload frames");
   const box = empty({ title: "There is no path to draw", text, actions: upload });
-  if (without.length) box.append(leftOut(without));
+  const list = leftOut(without);
+  if (list) box.append(list);
   return box;
 }
 
 class Page {
   #paths = new Map(); // by run, as they were fetched
-  #drawn = []; #hidden = new Set(); #edges = null; #turn = 0; #joins = []; #reached = new Map();
+  /** @type {ReturnType<typeof createScene>} */
+  scene;
+  /** @type {ReturnType<typeof chooser>} */
+  card;
+  /** @type {HTMLSelectElement} */
+  parents;
+  /** @type {HTMLSelectElement} */
+  ups;
+  /** @type {HTMLInputElement} */
+  together;
+  /** @type {HTMLElement} */
+  said;
+  /** @type {HTMLElement} */
+  asks;
+  /** @type {HTMLElement} */
+  runsBox;
+  /** @type {HTMLElement} */
+  joinsBox;
+  /** @type {HTMLElement} */
+  words;
+  /** @type {any[]} */
+  #drawn = [];
+  #hidden = new Set();
+  /** @type {any} of the association that is drawn */
+  #edges = null;
+  #turn = 0;
+  /** @type {import("./joined.js").Bridge[]} */
+  #joins = [];
+  /** @type {Map<string, any>} */
+  #reached = new Map();
 
   constructor(root, told) {
-    Object.assign(this, told);
+    this.map = told.map;
+    this.signal = told.signal;
+    this.go = told.go;
+    this.search = told.search;
+    this.runs = told.runs;
+    this.without = told.without;
+    this.more = told.more; // whether the map has more runs than it told
+    this.associations = told.associations;
     this.asked = told.asked?.gone ? null : told.asked;
     this.gone = Boolean(told.asked?.gone);
     this.#joins = bridges(this.associations);
@@ -76,14 +113,14 @@ class Page {
     this.scene = createScene(stage, { signal: this.signal, onpick: (path, place) => this.#choose({ path, place }) });
     this.card = chooser({
       map: this.map, signal: this.signal, onchoose: (one) => this.#choose(one),
-      onapproach: () => { const one = this.card.chosen; this.scene.approach(this.#drawn[one.path].world[one.place]); },
+      onapproach: () => { const one = this.card.chosen; if (one) this.scene.approach(this.#drawn[one.path].world[one.place]); },
     });
     const button = (text, onClick) => h("button", { class: "button", type: "button", onClick }, text);
     this.parents = h("select", { id: "paths-parent", onChange: () => { this.parent = this.parents.value; this.#draw(); } });
     this.together = h("input", { type: "checkbox", id: "paths-joined", checked: this.joined, onChange: () => { this.joined = this.together.checked; this.#draw(); } });
     this.ups = h("select", { id: "paths-up", onChange: () => { this.up = this.ups.value || null; this.#draw(); } },
-      [["", "Up: as held"], ["z", "Up: z"], ["y", "Up: y"], ["-y", "Up: −y"]].map(([value, text]) => h("option", { value, selected: (this.up ?? "") === value }, text)));
-    this.ups.setAttribute("aria-label", "Which axis is up");
+      [["", "Up axis: auto"], ["z", "Up axis: z"], ["y", "Up axis: y"], ["-y", "Up axis: −y"]].map(([value, text]) => h("option", { value, selected: (this.up ?? "") === value }, text)));
+    this.ups.setAttribute("aria-label", "Up axis");
     this.said = h("p", { class: "visually-hidden", role: "status" });
     this.asks = h("div", { hidden: true });
     this.runsBox = h("div", {});
@@ -97,15 +134,14 @@ class Page {
       h("div", { class: "paths-side" }, this.asks,
         h("section", { class: "card paths-section", "aria-labelledby": "paths-runs" }, h("h2", { id: "paths-runs" }, "Runs"),
           h("label", { class: "field" }, h("span", {}, "Drawn in the frame"), this.parents),
-          h("label", { class: "paths-check" }, this.together, h("span", {}, "with what associations joined to it")),
+          h("label", { class: "paths-check" }, this.together, h("span", {}, "and frames joined to it by associations")),
           this.runsBox),
         this.joinsBox), this.said));
   }
 
   /** Draw what the choices say; what was fetched before is not fetched again. */
   async #draw() {
-    this.turn = this.#turn += 1;
-    const turn = this.turn;
+    const turn = this.#turn += 1;
     this.#reached = this.joined ? reach(this.parent, this.#joins) : reach(this.parent, []);
     const wanted = this.runs.filter((one) => this.#reached.has(one.parent));
     const shown = wanted.slice().sort((a, b) => (b.last ?? "").localeCompare(a.last ?? "")).slice(0, MOST_DRAWN)
@@ -129,7 +165,7 @@ class Page {
   }
 
   async #path(run, share) {
-    const key = `${run.number} ${share > 4 ? share : 4}`; // few runs are fetched with the same share
+    const key = `${run.number} ${Math.max(share, 4)}`; // few runs are fetched with the same share
     if (!this.#paths.has(key)) {
       try {
         this.#paths.set(key, await pathOf(this.map, run, Math.max(share, 4), this.signal));
@@ -146,16 +182,16 @@ class Page {
     put(this.parents, names.map((one) => h("option", { value: one, selected: one === this.parent }, one)));
     const without = [...this.without];
     for (const one of found) {
-      if (!one.ids?.length) without.push({ name: one.session, frames: one.frames, why: one.why ?? "its poses are of no frame that is there" });
+      if (!one.ids?.length) without.push({ name: one.session, frames: one.frames, why: one.why ?? "the parent frame of its poses is not available" });
     }
     const say = (run, why) => without.push({ name: run.session, frames: run.frames, why });
-    for (const run of wanted) if (!shown.includes(run)) say(run, `older than the ${MOST_DRAWN} that are drawn`);
+    for (const run of wanted) if (!shown.includes(run)) say(run, `older than the ${MOST_DRAWN} runs drawn`);
     for (const run of this.runs) {
-      if (!wanted.includes(run)) say(run, `poses in ${run.parent}, which nothing joins to ${this.parent}`);
+      if (!wanted.includes(run)) say(run, `poses in ${run.parent}, which no association joins to ${this.parent}`);
     }
     const list = h("div", { class: "paths-runs" });
     put(list, legend(this.#drawn, this.#hidden, () => this.scene.hide(this.#hidden)));
-    const many = this.more && h("p", { class: "muted" }, `Of the first ${count(MOST_RUNS)} runs of the map.`);
+    const many = this.more && h("p", { class: "muted" }, `From the first ${count(MOST_RUNS)} runs of the map.`);
     put(this.runsBox, list, leftOut(without), many);
     put(this.said, `${count(this.#drawn.length)} runs are drawn in ${this.parent}, ${count(without.length)} are not.`);
   }
@@ -164,7 +200,7 @@ class Page {
     this.asks.hidden = !this.asked && !this.gone;
     if (this.gone) {
       put(this.asks, h("section", { class: "card paths-section" }, h("h2", {}, "Query"),
-        h("p", { class: "muted" }, "Its answer is not kept any more: answers are for an hour. Ask again to see it here.")));
+        h("p", { class: "muted" }, "Its answer has expired: answers are stored for an hour. Query again to see it here.")));
       return;
     }
     if (!this.asked) return;
@@ -191,6 +227,7 @@ class Page {
   /** Fetch and draw the edges of the association that is chosen. */
   async #association() {
     const one = this.association;
+    /** @type {Object<string, any> | null} */
     let told = null;
     if (one?.state === "succeeded") {
       if (this.#edges?.of !== one.association_id) {
@@ -219,7 +256,7 @@ class Page {
       },
       onbegin: () => begin(this.map, this.runs.filter((one, i, all) => all.findIndex((other) => other.session === one.session && other.robot === one.robot) === i), (begun) => this.#begun(begun)),
     }));
-    put(this.words, h("summary", {}, "As tables"), h("h3", {}, "Runs"), runsTable(this.#drawn, this.parent),
+    put(this.words, h("summary", {}, "Tables"), h("h3", {}, "Runs"), runsTable(this.#drawn, this.parent),
       told && [h("h3", {}, "Edges"), edgesTable(this.map, told.edges, told.more)]);
   }
 

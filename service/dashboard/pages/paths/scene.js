@@ -39,12 +39,31 @@ export function createScene(place, { onpick, signal }) {
 }
 
 class Scene {
-  #parts; #viewer = null; #up = null; #drawn = []; #origin = [0, 0, 0]; #hidden = new Set();
-  #box = null; #size = 0.1; #ratio = 0; #wide = 1; #asked = null; #selected = null; #labels = [];
+  #parts;
+  /** @type {any} the viewer; null until paths are shown */
+  #viewer = null;
+  /** @type {any} "z", "y" or "-y"; null until paths are shown */
+  #up = null;
+  /** @type {(import("./data.js").Path & {world: number[][]})[]} */
+  #drawn = [];
+  #origin = [0, 0, 0];
+  #hidden = new Set();
+  /** @type {any} about all that is drawn; null about nothing */
+  #box = null;
+  #size = 0.1;
+  #ratio = 0;
+  #wide = 1;
+  /** @type {Object<string, any> | null} */
+  #asked = null;
+  /** @type {{path: number, place: number} | null} */
+  #selected = null;
+  /** @type {any[]} */
+  #labels = [];
 
   constructor(canvas, parts, onpick, signal) {
     this.canvas = canvas;
     this.#parts = parts;
+    /** @type {number[] | null} */
     let down = null;
     canvas.addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; });
     canvas.addEventListener("click", (event) => {
@@ -59,7 +78,7 @@ class Scene {
   /** The viewer; its up axis is that of the poses that came first. */
   get viewer() { return this.#viewer; }
 
-  /** What is up, where the poses say so. @returns {"z" | "y" | "-y"} */
+  /** What is up, where the poses say so. @returns {"z" | "y" | "-y" | null} */
   get up() { return this.#up; }
 
   /**

@@ -75,7 +75,7 @@ export function spaced(places, apart, most) {
 /** The least of 1, 2, 5, 10, 20... times a power of ten that is not below. @param {number} x */
 export function nice(x) {
   const power = 10 ** Math.floor(Math.log10(x));
-  return power * [1, 2, 5, 10].find((step) => step * power >= x * (1 - 1e-9));
+  return power * ([1, 2, 5, 10].find((step) => step * power >= x * (1 - 1e-9)) ?? 10);
 }
 
 /** The box about places; null about none. @param {number[][]} places */

@@ -16,9 +16,9 @@ export function runsTable(paths, parent) {
     h("td", { class: "number" }, count(one.leftOut - (one.posed - one.ids.length))),
     h("td", { class: "number" }, wayOf(one.poses)),
     h("td", {}, one.byTime ? time(iso(one.times[0])) : "–")));
-  return h("div", { class: "paths-scroll", tabindex: "0", role: "region", "aria-label": "Runs in the picture" }, h("table", { class: "table" },
-    h("caption", { class: "visually-hidden" }, "Runs in the picture"),
-    h("thead", {}, h("tr", {}, [["No.", 1], ["Run"], ["Robot"], ["Frame of its poses"], ["In the picture by"], ["Poses", 1], ["Drawn", 1], ["Without", 1], ["Way drawn", 1], ["Begun"]]
+  return h("div", { class: "paths-scroll", tabindex: "0", role: "region", "aria-label": "Runs shown" }, h("table", { class: "table" },
+    h("caption", { class: "visually-hidden" }, "Runs shown"),
+    h("thead", {}, h("tr", {}, [["No.", 1], ["Run"], ["Robot"], ["Parent frame"], ["Joined by"], ["Poses", 1], ["Drawn", 1], ["Without", 1], ["Path length", 1], ["Started"]]
       .map(([name, number]) => h("th", { scope: "col", class: number && "number" }, name)))),
     h("tbody", {}, rows)));
 }
@@ -34,7 +34,7 @@ export function edgesTable(map, edges, more) {
   const rest = edges.length > MOST_ROWS || more;
   return h("div", { class: "paths-scroll", tabindex: "0", role: "region", "aria-label": "Edges of the association" }, h("table", { class: "table" },
     h("caption", { class: "visually-hidden" }, "Edges of the association"),
-    h("thead", {}, h("tr", {}, [["From"], ["To"], ["Loops near by"], ["Strength"], ["Overlap", 1], ["Residual", 1]]
+    h("thead", {}, h("tr", {}, [["From"], ["To"], ["Nearby loops"], ["Strength"], ["Overlap", 1], ["Residual", 1]]
       .map(([name, number]) => h("th", { scope: "col", class: number && "number" }, name)))),
     h("tbody", {}, rows)), rest && h("p", { class: "muted" }, `The first ${count(rows.length)}; GET …/edges has all of them.`));
 }

@@ -15,7 +15,7 @@ export const styles = ["query/query.css"];
 /** @param {HTMLElement} root @param {Object<string, any>} context see main.js */
 export async function render(root, { params, signal, title, actions }) {
   title(`Answer ${shortId(params.query)}`);
-  const come = soon(root, "Fetching the answer");
+  const come = soon(root, "Loading the answer");
   let answer;
   let question;
   try {
@@ -28,7 +28,7 @@ export async function render(root, { params, signal, title, actions }) {
     return;
   }
   come();
-  const other = again(answer, "Ask with other options");
+  const other = again(answer, "Query with other options");
   other.className = "button primary";
   actions(other);
   const pictures = thumbs(signal);
@@ -51,15 +51,15 @@ function asked(question) {
       : ` with an uploaded ${question.kind === "cloud" ? "cloud" : "depth image"}`,
     who.length > 0 && ` of ${who.join(", ")}`, ". ",
     said.length ? ["Options: ", h("span", { class: "mono" }, said.map(([name, value]) => `${name} ${typeof value === "object" ? JSON.stringify(value) : value}`).join(", ")), "."]
-      : "All options as by default.");
+      : "Default options.");
 }
 
 function notKept(id) {
   const address = recall(id);
   return empty({
-    title: "This answer is no longer kept",
-    text: ["Answers are kept for about an hour, and while there is room; or there never was one of this id, or it is not for your key.",
-      !address && " Ask again with the frame, from the page of its map."],
-    actions: [address && h("a", { class: "button primary", href: address }, "Ask again as before"), h("a", { class: "button", href: "#/" }, "All maps")],
+    title: "This answer has expired",
+    text: ["Answers expire after about an hour, or earlier if space runs out. The id may also be wrong, or your key may not see it.",
+      !address && " Send the frame again from the page of its map."],
+    actions: [address && h("a", { class: "button primary", href: address }, "Repeat the query"), h("a", { class: "button", href: "#/" }, "All maps")],
   });
 }

@@ -22,7 +22,7 @@ const PAUSE_MS = 250;
 /** @param {HTMLElement} root @param {Object<string, any>} context see main.js */
 export async function render(root, { params, search, signal, go, title }) {
   title(`Query ${params.map}`);
-  const come = soon(root, "Fetching the map");
+  const come = soon(root, "Loading the map");
   const [map, models, sessions, question] = await Promise.all([
     get(at("maps", params.map), { signal }), get("models", { signal }),
     get(`${at("maps", params.map)}/sessions`, { params: { limit: 100 }, signal }).catch(() => ({ items: [] })),
@@ -42,8 +42,15 @@ function kept(error) {
 }
 
 class Page {
+  /** @type {ReturnType<typeof chooser>} */
+  chooser;
+
   constructor({ root, params, search, signal, go, map, question, fields, sessions }) {
-    Object.assign(this, { root, map: params.map, signal, go, isEmpty: !map.frames.indexed });
+    this.root = root;
+    this.map = params.map;
+    this.signal = signal;
+    this.go = go;
+    this.isEmpty = !map.frames.indexed;
     const told = question ? fromOptions(question.options) : { said: null, rest: {} };
     const given = fromSearch(search);
     // of a kept query its own options, and over them what the address says
@@ -73,18 +80,18 @@ class Page {
       this.maps = several.value === "*" ? "*" : several.value.split(",");
       this.later(0);
     } }, h("option", { value: this.map }, "this map"),
-    this.asked.join() !== this.map && h("option", { value: this.asked.join() }, `as asked: ${this.asked.join(", ")}`),
-    h("option", { value: "*" }, "all that I may read"));
+    this.asked.join() !== this.map && h("option", { value: this.asked.join() }, `as in the query: ${this.asked.join(", ")}`),
+    h("option", { value: "*" }, "all maps that you may read"));
     several.value = this.maps === "*" ? "*" : this.maps.join();
     const more = Object.keys(this.rest);
     put(this.root, h("div", { class: "query-page" },
-      h("details", { class: "card query-panel", open: innerWidth >= 1000 }, h("summary", {}, h("h2", {}, "How to ask")),
+      h("details", { class: "card query-panel", open: innerWidth >= 1000 }, h("summary", {}, h("h2", {}, "Options")),
         h("div", { class: "field query-field" }, h("label", { for: "ask-maps" }, "Maps"), several,
-          h("small", { class: "muted" }, "Of several maps one ranking is made; they must be of one model.")),
-        more.length > 0 && h("p", { class: "muted" }, `Its filter also has ${more.join(", ")}, as it was asked.`),
+          h("small", { class: "muted" }, "Several maps give one ranking; they must use the same model.")),
+        more.length > 0 && h("p", { class: "muted" }, `The filter also contains ${more.join(", ")}, from the original query.`),
         this.panel),
       this.state, h("div", { class: "query-main" }, this.chooser, this.result)));
-    if (this.lost !== null) this.say(`Answer ${shortId(this.lost)} is no longer kept. Pick a frame, or drop the file again.`);
+    if (this.lost !== null) this.say(`Answer ${shortId(this.lost)} has expired. Pick a frame, or drop the file again.`);
     this.chooser.tell(this.source);
     if (this.source) this.run(); else this.nothing();
   }
@@ -92,9 +99,9 @@ class Page {
   nothing() {
     const upload = h("a", { class: "button primary", href: link("maps", this.map, "upload") }, "Upload frames");
     put(this.result, this.isEmpty
-      ? empty({ title: "Nothing can be found here yet", text: "No frame of this map is indexed. What is dropped here is looked up, and not added.", actions: upload })
+      ? empty({ title: "Nothing to search yet", text: "No frame of this map is indexed. Files dropped here are queries; they are not added to the map.", actions: upload })
       : h("section", { class: "card query-start", "aria-label": "Pick a frame" }, h("h2", {}, "Where was this taken?"),
-        h("p", { class: "muted" }, "Pick a frame of the map, which does not find itself, or drop a depth image or point cloud above. Every option that is changed asks again."),
+        h("p", { class: "muted" }, "Pick a frame of the map (it will not find itself), or drop a depth image or point cloud above. Each change of an option runs the query again."),
         gallery(this.map, { pictures: this.pictures, signal: this.signal, onpick: (id) => this.take({ frame: { map: this.map, frame_id: id } }) })));
   }
 
@@ -132,7 +139,7 @@ class Page {
     this.say("Asking…");
     this.result.setAttribute("aria-busy", "true");
     if (this.answer === null) put(this.result, loading("Asking"));
-    const source = this.source;
+    const source = /** @type {import("./asking.js").Source} */ (this.source);
     try {
       const options = { ...toOptions(this.said, this.rest), explain: true, explain_frame: this.why };
       const answer = await this.answered(source, options, signal);

@@ -35,7 +35,7 @@ export async function ask(source, maps, options, signal) {
     source.query = data.query_id;
     return data;
   }
-  const { map, frame_id: id } = source.frame;
+  const { map, frame_id: id } = /** @type {{map: string, frame_id: string}} */ (source.frame);
   if (maps !== "*" && maps.length === 1 && maps[0] === map) {
     return (await send("POST", `${at("maps", map)}/queries`, { json: { frame_id: id, ...plain(options) }, signal })).data;
   }

@@ -8,7 +8,9 @@
  */
 export function choice() {
   const listeners = [];
+  /** @type {string | null} */
   let pointed = null;
+  /** @type {string | null} */
   let chosen = null;
   const tell = () => { for (const heard of listeners) heard(pointed ?? chosen, chosen); };
   return {

@@ -19,10 +19,10 @@ export function controls(fields, said, { onchange, sessions = [] }) {
   function refill() {
     for (const one of rows) one.refill();
     const n = fields.filter(({ name }) => said[name] !== null).length;
-    put(told, n ? `${n} changed` : "All as by default");
+    put(told, n ? `${n} changed` : "Default options");
     reset.disabled = n === 0;
   }
-  const element = h("form", { class: "query-controls", onsubmit: (event) => event.preventDefault(), "aria-label": "How to ask" },
+  const element = h("form", { class: "query-controls", onsubmit: (event) => event.preventDefault(), "aria-label": "Options" },
     h("div", { class: "query-controls-head" }, told, reset),
     Object.entries(GROUPS).map(([group, title], i) => h("details", { class: "query-group", open: i === 0 || any(fields, said, group) },
       h("summary", {}, title),
@@ -82,7 +82,7 @@ const kinds = {
     const typed = number(field, id, set);
     return { elements: [h("div", { class: "query-pair" }, typed, unitOf(field))], refill() { fillNumber(typed, shown()); } };
   },
-  flag(field, id, set, shown) {
+  flag(_field, id, set, shown) {
     const box = h("input", { type: "checkbox", id, "aria-describedby": `${id}-about`, onchange: () => set(box.checked) });
     return { elements: [box], refill() { box.checked = Boolean(shown()); } };
   },
@@ -91,7 +91,7 @@ const kinds = {
       field.choices.map(([value, text]) => h("option", { value }, text)));
     return { elements: [select], refill() { select.value = shown(); } };
   },
-  text(field, id, set, shown, sessions) {
+  text(_field, id, set, shown, sessions) {
     const typed = h("input", { type: "text", id, list: `${id}-known`, autocomplete: "off", "aria-describedby": `${id}-about`,
       onchange: () => set(typed.value.trim() || null) });
     return { elements: [typed, h("datalist", { id: `${id}-known` }, sessions.map((value) => h("option", { value })))],

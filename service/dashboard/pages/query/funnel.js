@@ -8,12 +8,12 @@ const STEPS = [
   ["passed", "pass the filter", "do not pass the filter"],
   ["compared", "compared", "were not compared"],
   ["ranked", "ranked", "are farther away"],
-  ["selected", "selected", "are like selected ones, or others were taken first"],
+  ["selected", "selected", "resemble selected frames, or others were selected first"],
   ["validated", "validated", "were not tried"],
-  ["accepted", "accepted", "did not stand validation"],
+  ["accepted", "accepted", "failed validation"],
 ];
 /** Why a stage let nothing pass, where it was left out. */
-const OUT = { selected: "diversification was not asked for", validated: "validation was not asked for, or no time was left", accepted: "nothing was validated" };
+const OUT = { selected: "diversification was not requested", validated: "validation was not requested, or the deadline passed", accepted: "nothing was validated" };
 /** At which step a frame is lost, by `lost_at`. */
 export const LOST_AT = {
   query: "map", state: "map", filter: "passed", shortlist: "compared", ranking: "ranked", selection: "selected",
@@ -33,6 +33,7 @@ export function funnel(answer) {
   const isWithout = (name) => (name === "selected" && counts.selected === 0 && counts.ranked > 0)
     || (name === "validated" && answer.status === "unvalidated" && counts.validated === 0)
     || (name === "accepted" && counts.validated === 0);
+  /** @type {any} */
   let before = null;
   const steps = STEPS.map(([name, text, loss]) => {
     const n = counts[name];
@@ -58,7 +59,7 @@ export function funnel(answer) {
       for (const step of steps) {
         const isHere = step.dataset.step === where;
         step.dataset.lost = isHere ? (at === null ? "not" : "here") : "";
-        step.lastElementChild.textContent = isHere ? (at === null ? "it came through" : "lost here") : "";
+        /** @type {Element} */ (step.lastElementChild).textContent = isHere ? (at === null ? "passed" : "lost here") : "";
       }
     },
   });

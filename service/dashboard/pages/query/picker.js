@@ -14,6 +14,7 @@ const A_PAGE = 12;
  */
 export function gallery(map, { pictures, signal, onpick }) {
   const grid = h("ol", { class: "query-picker-grid" });
+  /** @type {(string | null)[]} */
   const cursors = [null];
   const typed = h("input", { type: "text", class: "mono", autocomplete: "off", spellcheck: "false", placeholder: "frame id",
     onkeydown: (event) => { if (event.key === "Enter") { event.preventDefault(); take(); } } });
@@ -34,7 +35,7 @@ export function gallery(map, { pictures, signal, onpick }) {
       next.disabled = page.next_cursor === null;
       next.value = page.next_cursor ?? "";
       put(grid, page.items.length === 0 && h("li", { class: "muted" }, "No indexed frame."), page.items.map((one) => h("li", {},
-        h("button", { type: "button", class: "query-pick", title: one.frame_id, "aria-label": `Take frame ${one.frame_id}`, onclick: () => onpick(one.frame_id) },
+        h("button", { type: "button", class: "query-pick", title: one.frame_id, "aria-label": `Use frame ${one.frame_id}`, onclick: () => onpick(one.frame_id) },
           pictures.frame(map, one.frame_id, "depth", `Preview of frame ${shortId(one.frame_id)}`),
           h("span", { class: "mono" }, shortId(one.frame_id)), h("small", { class: "muted" }, one.session ?? "")))));
     } catch (error) {
@@ -49,7 +50,7 @@ export function gallery(map, { pictures, signal, onpick }) {
   }, () => {}); // the gallery itself tells what is wrong
   return h("div", { class: "query-gallery" },
     h("div", { class: "toolbar query-gallery-bar" }, h("label", { class: "field" }, h("span", {}, "Session"), session),
-      h("label", { class: "field" }, h("span", {}, "By id"), typed), h("button", { type: "button", class: "button", onclick: take }, "Take this id"),
+      h("label", { class: "field" }, h("span", {}, "By id"), typed), h("button", { type: "button", class: "button", onclick: take }, "Use this id"),
       h("span", { class: "toolbar query-gallery-pages" }, back, next)), grid);
 }
 

@@ -17,5 +17,5 @@ export function recall(id) {
 }
 
 function read() {
-  try { return JSON.parse(sessionStorage.getItem(KEPT_AS)) ?? []; } catch { return []; }
+  try { return JSON.parse(sessionStorage.getItem(KEPT_AS) ?? "[]") ?? []; } catch { return []; }
 }

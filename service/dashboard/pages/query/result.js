@@ -35,7 +35,7 @@ export async function showAnswer(root, answer, { signal, turn = signal, isOwnPag
   const map = h("section", { class: "card query-heat", "aria-label": "Similarity of the ranking" });
   put(root, lead(answer, before, isOwnPage),
     answer.explanations === null && h("p", { class: "muted query-note" },
-      "It was not asked with explanations: distances of what was not selected, and why, are told when it is asked again. ",
+      "This query ran without explanations. Query again to see the distances of frames that were not selected, and why. ",
       again(answer)),
     rows(answer, ranked, { pictures, choice: looked, before }),
     whyNot(answer, { ask, choice: looked, funnel: steps, change, pick }),
@@ -46,7 +46,7 @@ export async function showAnswer(root, answer, { signal, turn = signal, isOwnPag
 }
 
 /** To where it is asked again with other options. */
-export function again(answer, text = "Ask it again") {
+export function again(answer, text = "Query again") {
   return h("a", { href: link("maps", answer.maps[0], "query", { query: answer.query_id }) }, text);
 }
 
@@ -59,12 +59,12 @@ function lead(answer, before, isOwnPage) {
     h("div", { class: "query-verdict-text" },
       h("p", {}, h("strong", {}, `${title}. `), text),
       details.length > 0 && h("ul", { class: "query-verdict-details" }, details.map((one) => h("li", {}, one))),
-      changed !== null && h("p", { class: "query-changed" }, h("span", { class: "muted" }, "Against the answer before: "),
+      changed !== null && h("p", { class: "query-changed" }, h("span", { class: "muted" }, "Compared with the previous answer: "),
         changed.length ? changed.join("; ") : "nothing changed"),
       pose && poseOf(pose, answer.kind)),
     h("div", { class: "query-verdict-links" },
       pose && h("a", { class: "button", href: link("maps", pose.map ?? answer.maps[0], "paths", { query: answer.query_id }) }, "On the map"),
-      !isOwnPage && h("a", { class: "button", href: link("queries", answer.query_id), title: "Can be shared for an hour" }, `Answer ${shortId(answer.query_id)}`)));
+      !isOwnPage && h("a", { class: "button", href: link("queries", answer.query_id), title: "Can be shared for one hour" }, `Answer ${shortId(answer.query_id)}`)));
 }
 
 function poseOf(location, kind) {
@@ -72,14 +72,14 @@ function poseOf(location, kind) {
   const ahead = kind === "depth" && matrix.slice(0, 3).map((row) => number(row[2])).join(", ");
   const sure = deviation(location.uncertainty?.covariance);
   const free = location.uncertainty?.degenerate ?? [];
-  return h("details", { class: "query-pose" }, h("summary", {}, "The pose in full"),
+  return h("details", { class: "query-pose" }, h("summary", {}, "Full pose"),
     h("dl", { class: "query-facts" }, [
       ["Translation, m", [t.x, t.y, t.z].map((x) => x.toFixed(4)).join(", ")],
       ["Rotation x, y, z, w", [q.x, q.y, q.z, q.w].map((x) => x.toFixed(5)).join(", ")],
-      ahead && ["Looks along", ahead],
+      ahead && ["Viewing direction", ahead],
       ["In the frame", parent], ["Of", location.pose.child_frame],
       sure && ["One standard deviation", `${metres(sure.m)}, ${degrees(sure.deg)} (worst axis)`],
-      free.length > 0 && ["Hardly held", `${free.length} ${free.length === 1 ? "direction" : "directions"}`],
+      free.length > 0 && ["Poorly constrained", `${free.length} ${free.length === 1 ? "direction" : "directions"}`],
     ].filter(Boolean).map(([term, value]) => h("div", {}, h("dt", {}, term), h("dd", { class: "number" }, value)))));
 }
 
@@ -117,6 +117,7 @@ function heat(root, answer, { alike, ranked }, looked, signal, turn) {
   const field = h("select", { id: "heat-limit", onchange: () => load(Number(field.value)) }, limits.map((n) => h("option", { value: n, selected: n === FIRST }, n >= answer.counts.ranked ? `all ${answer.counts.ranked}` : `first ${n}`)));
   if (![...field.options].some((one) => one.selected && Number(one.value) === FIRST)) field.value = String(limits.at(-1));
   const body = h("div");
+  /** @type {{point: (row: number | null) => void} | null} */
   let shown = null;
   let keys = [];
   let asked = 0; // the last that was asked for is the one to be shown
@@ -136,7 +137,7 @@ function heat(root, answer, { alike, ranked }, looked, signal, turn) {
 
   function draw({ frames, similarity }) {
     if (frames.length === 0) {
-      put(body, h("p", { class: "muted" }, "No frame of the ranking is left to be compared: they were deleted since, or the map has changed its model."));
+      put(body, h("p", { class: "muted" }, "No ranked frame is left to compare: the frames were deleted, or the map changed its model."));
       return;
     }
     keys = frames.map(keyOf);
@@ -152,15 +153,16 @@ function heat(root, answer, { alike, ranked }, looked, signal, turn) {
     put(body, shown);
   }
 
-  put(root, h("div", { class: "toolbar query-heat-head" }, h("h3", {}, "How alike they are, each to each"),
+  put(root, h("div", { class: "toolbar query-heat-head" }, h("h3", {}, "Pairwise similarity"),
     h("label", { for: "heat-limit" }, h("span", { class: "muted" }, "Of the ranking "), field)),
-  h("p", { class: "muted" }, "The query first, then its ranking, the nearest first. ",
-    isSelected.size > 0 ? "Bars beside the numbers mark what the diverse selection took: it avoids bright cells." : ""), body);
+  h("p", { class: "muted" }, "The query first, then its ranking, nearest first. ",
+    isSelected.size > 0 ? "Bars beside the numbers mark the diverse selection, which avoids bright cells." : ""), body);
   if (alike !== null) draw(alike); else load(FIRST);
 }
 
 function gist(similarity) {
   const n = similarity.length;
+  /** @type {[number, number] | null} */
   let pair = null;
   for (let i = 1; i < n; i += 1) for (let j = 1; j < i; j += 1) if (pair === null || similarity[i][j] > similarity[pair[0]][pair[1]]) pair = [j, i];
   const [, ...own] = similarity[0];

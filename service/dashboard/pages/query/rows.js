@@ -6,7 +6,7 @@ import { figures, keyOf, number, statusOf } from "./words.js";
 
 const VIEWS = [["depth", "Depth"], ["normals", "Normals"], ["patches", "Patches"]];
 /** Why nothing was tried, where validation was left out. */
-const NOT_ASKED = "not asked for";
+const NOT_ASKED = "not requested";
 let view = "depth"; // as it was chosen last, for the next answer
 
 /**
@@ -45,12 +45,12 @@ export function rows(answer, ranked, { pictures, choice, before = null }) {
           ranked.told && h("span", { class: "query-figure" }, h("span", { class: "muted" }, "distance "), count(one.distance)),
           similarity(one.similarity)],
         (one) => `of rank ${one.rank}`),
-      line("DR", isSelection ? "Diverse selection" : "Diversification was not asked for", isSelection
+      line("DR", isSelection ? "Diverse selection" : "Diversification was not requested", isSelection
         ? `${count(selected.length)} of ${count(answer.counts.ranked)} ranked` : "",
       isSelection ? selected : [], (one) => [
         h("span", { class: "query-figure" }, h("span", { class: "muted" }, "gain "), number(one.diversity_gain)), bar(one.diversity_gain)],
-      (one) => `selected, it brings a gain of ${number(one.diversity_gain)}`),
-      line("VDR", validated.length ? "Validated, best first" : isTried ? "Nothing was validated" : "Validation was not asked for", validated.length
+      (one) => `selected, with a gain of ${number(one.diversity_gain)}`),
+      line("VDR", validated.length ? "Validated, best first" : isTried ? "Nothing was validated" : "Validation was not requested", validated.length
         ? `${count(answer.counts.accepted)} of ${count(answer.counts.validated)} accepted${skipped ? `, ${skipped} not tried` : ""}` : "",
       isTried ? answer.matches : [], (one) => evidence(answer, one, was),
       (one) => `${statusOf(one.validation).text}: ${one.validation.reason}`, "wide"),
@@ -73,7 +73,7 @@ export function rows(answer, ranked, { pictures, choice, before = null }) {
     const key = keyOf(one);
     const label = `Rank ${one.rank}, frame ${one.frame_id}${several ? ` of map ${one.map}` : ""}`;
     const status = row === "VDR" ? one.validation.status : null;
-    const button = h("button", { type: "button", class: "query-pick", "aria-pressed": "false", "aria-label": `${label}: mark it in all rows`,
+    const button = h("button", { type: "button", class: "query-pick", "aria-pressed": "false", "aria-label": `${label}: highlight it in all rows`,
       onclick: () => choice.toggle(key) },
     pictures.frame(one.map, one.frame_id, view, `Preview of frame ${shortId(one.frame_id)}`), h("span", { class: "query-rank" }, one.rank));
     const element = h("li", { class: "query-tile", dataset: { key, status },
@@ -91,7 +91,7 @@ export function rows(answer, ranked, { pictures, choice, before = null }) {
   const clear = (event) => { if (event.key === "Escape") choice.choose(null); };
   return h("section", { class: "query-figure-block", "aria-label": "Rows R, DR, VDR", onkeydown: clear },
     h("div", { class: "toolbar query-rows-bar" },
-      h("span", { class: "muted" }, "Point at a frame to follow it through the rows; click to keep it marked."),
+      h("span", { class: "muted" }, "Hover over a frame to follow it through the rows; click to keep it highlighted."),
       h("label", { class: "query-view", for: "query-view" }, "Pictures ", pick)),
     h("div", { class: "query-figure-grid" }, query, body));
 }
@@ -103,7 +103,7 @@ function asked(answer, pictures) {
     frame ? pictures.frame(frame.map, frame.frame_id, view, alt) : pictures.query(id, view, alt),
     h("figcaption", {}, h("strong", {}, "Query"),
       frame ? h("a", { class: "mono", href: link("maps", frame.map, "frames", frame.frame_id), title: frame.frame_id }, shortId(frame.frame_id))
-        : h("span", { class: "muted" }, "uploaded", view === "patches" && "; its patches are not kept, this is its depth"),
+        : h("span", { class: "muted" }, "uploaded", view === "patches" && "; its patches are not stored, this is its depth"),
       frame && !answer.maps.every((one) => one === frame.map) && h("span", { class: "muted" }, `of map ${frame.map}`))];
 }
 
@@ -112,7 +112,7 @@ function evidence(answer, one, was) {
   const measured = figures(one.validation);
   return [
     h("span", { class: "badge", dataset: { kind } }, text),
-    was && was.get(keyOf(one)) !== text && h("span", { class: "query-was" }, was.has(keyOf(one)) ? `was ${was.get(keyOf(one))}` : "was no candidate"),
+    was && was.get(keyOf(one)) !== text && h("span", { class: "query-was" }, was.has(keyOf(one)) ? `was ${was.get(keyOf(one))}` : "was not a candidate"),
     h("span", { class: "query-reason" }, one.validation.reason),
     measured.length > 0 && h("dl", { class: "query-figures" }, measured.map(([term, value]) => [h("dt", {}, term), h("dd", { class: "number" }, value)])),
     one.transform && h("a", { class: "query-overlay", href: link("queries", answer.query_id, "matches", one.frame_id, { map: one.map }) }, "Overlay in 3-D"),
@@ -139,7 +139,7 @@ function mark(lines, tiles, reasons, key, chosen) {
     const fate = one.fates.get(key);
     const isLoss = !lost && fate === undefined && one.list.childElementCount > 0;
     lost ||= isLoss;
-    const reason = reasons.get(key)?.reason ?? (one.name === "R" ? "it is not ranked" : "it is none of these");
+    const reason = reasons.get(key)?.reason ?? (one.name === "R" ? "it is not ranked" : "it is not among these");
     one.trace.dataset.lost = String(isLoss);
     const text = fate !== undefined ? `${shortId(key.slice(key.indexOf("/") + 1))}: ${fate}` : isLoss ? `Lost here: ${reason}` : "";
     put(one.trace, text);

@@ -11,14 +11,15 @@ import { pickFrame } from "./picker.js";
  */
 export function chooser({ map, pictures, signal, onchoose }) {
   const given = settings();
+  /** @type {File | null} */
   let waiting = null; // a depth image whose camera is not known yet
   const fields = cameraFields(given, { onchange: () => { send.disabled = !hasCamera(given); } });
-  const send = h("button", { type: "button", class: "button primary", onclick: () => take(waiting) }, "Ask with this file");
-  const camera = h("details", { class: "query-camera" }, h("summary", {}, "Camera of files"), fields, send);
-  const told = h("span", { class: "query-source" }, "Nothing is asked yet.");
+  const send = h("button", { type: "button", class: "button primary", onclick: () => take(waiting) }, "Query with this file");
+  const camera = h("details", { class: "query-camera" }, h("summary", {}, "Camera settings"), fields, send);
+  const told = h("span", { class: "query-source" }, "No query yet.");
   const wrong = h("p", { class: "field-error", role: "alert" });
   const file = h("input", { type: "file", accept: ACCEPT, class: "visually-hidden", id: "ask-file", multiple: true,
-    onchange: () => { read([...file.files]); file.value = ""; } });
+    onchange: () => { read([...file.files ?? []]); file.value = ""; } });
   const pick = (title) => pickFrame(map, { pictures, signal, title });
 
   /** A frame, with the camera that lies beside it, or before or after it. */
@@ -42,7 +43,7 @@ export function chooser({ map, pictures, signal, onchoose }) {
       camera.open = true;
       send.hidden = false;
       send.disabled = true;
-      put(wrong, `${one.name} is a depth image: say with which camera it was taken.`);
+      put(wrong, `${one.name} is a depth image: enter its camera settings.`);
       fields.querySelector("input")?.focus();
       return;
     }
@@ -59,7 +60,7 @@ export function chooser({ map, pictures, signal, onchoose }) {
   }
 
   send.hidden = true;
-  const element = h("section", { class: "card query-source-card", "aria-label": "What is asked",
+  const element = h("section", { class: "card query-source-card", "aria-label": "Query frame",
     ondragover: (event) => { event.preventDefault(); element.dataset.over = "true"; },
     ondragleave: () => { element.dataset.over = "false"; },
     ondrop: (event) => { event.preventDefault(); element.dataset.over = "false"; read([...event.dataTransfer.files]); } },
@@ -76,7 +77,7 @@ export function chooser({ map, pictures, signal, onchoose }) {
   return Object.assign(element, {
     pick,
     tell(source) {
-      put(told, !source ? "Nothing is asked yet." : source.file ? ["File ", h("strong", {}, source.file.name)]
+      put(told, !source ? "No query yet." : source.file ? ["File ", h("strong", {}, source.file.name)]
         : source.frame ? ["Frame ", h("strong", { class: "mono", title: source.frame.frame_id }, shortId(source.frame.frame_id)), source.frame.map === map ? "" : ` of map ${source.frame.map}`]
           : ["The frame of answer ", h("strong", { class: "mono" }, shortId(source.query))]);
     },

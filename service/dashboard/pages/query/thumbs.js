@@ -58,7 +58,7 @@ async function draw(element, coming, alt) {
     element.dataset.drawn = "true";
   } catch (error) {
     if (error.name === "AbortError") return;
-    const why = error.status === 404 ? "no longer there" : error.status === 409 ? "nothing to see" : "cannot be shown";
+    const why = error.status === 404 ? "deleted" : error.status === 409 ? "no preview" : "not available";
     element.setAttribute("aria-label", `${alt}: ${why}. ${error.message}`);
     element.title = error.message;
     element.dataset.drawn = why;

@@ -7,16 +7,16 @@ import { figures } from "./words.js";
 
 /** What each place of loss means, and what would bring the frame further. */
 const LOST = {
-  state: ["It is not searched at all", "Only indexed frames can be found.", null],
+  state: ["It is not searched", "Only indexed frames can be found.", null],
   query: ["It is the query itself", "A frame does not find itself.", null],
-  filter: ["Lost at the filter", "Only frames that pass it are searched.", () => [{ session: null, not_within_s: null }, "Ask without the filter"]],
+  filter: ["Lost at the filter", "Only frames that pass the filter are searched.", () => [{ session: null, not_within_s: null }, "Query without the filter"]],
   shortlist: ["Lost at the index", "The search did not compare the frame.", () => [{ exact: true }, "Compare every frame"]],
-  ranking: ["Lost in the ranking", "Others are nearer by their signatures.", null],
-  selection: ["Lost in the selection", "Others of the ranking were taken as candidates.",
-    (answer) => [{ candidates: Math.min(200, Math.max(2 * answer.counts.selected, answer.counts.ranked)) }, "Ask with all of the ranking as candidates"]],
-  turn: ["It was not its turn", "Enough were accepted before it.", (answer) => [{ k: Math.min(50, answer.counts.accepted + 5) }, "Ask for more matches"]],
-  deadline: ["Lost to the deadline", "No time was left for it.", () => [{ deadline_ms: null }, "Ask without a deadline"]],
-  validation: ["Lost at validation", "Laid on the query, it does not stand.", null],
+  ranking: ["Lost in the ranking", "Other signatures are nearer.", null],
+  selection: ["Lost in the selection", "Other ranked frames were selected as candidates.",
+    (answer) => [{ candidates: Math.min(200, Math.max(2 * answer.counts.selected, answer.counts.ranked)) }, "Query with the whole ranking as candidates"]],
+  turn: ["It was not tried", "Enough matches were accepted before it.", (answer) => [{ k: Math.min(50, answer.counts.accepted + 5) }, "Query for more matches"]],
+  deadline: ["Lost to the deadline", "The deadline passed before it was tried.", () => [{ deadline_ms: null }, "Query without a deadline"]],
+  validation: ["Lost at validation", "It does not fit the query.", null],
 };
 
 /**
@@ -52,7 +52,7 @@ export function whyNot(answer, { ask, choice, funnel, change, pick }) {
     const id = typed.value.trim();
     if (!id) return;
     const own = ++turn;
-    put(result, loading("Asking again"));
+    put(result, loading("Querying again"));
     try {
       const told = await ask(id);
       if (own !== turn) return;
@@ -67,7 +67,7 @@ export function whyNot(answer, { ask, choice, funnel, change, pick }) {
 
   return h("section", { class: "card query-why", "aria-label": "Why not this frame?" },
     h("h3", {}, "Why not this frame?"),
-    h("p", { class: "muted" }, "Any frame of the map, whether it was ever a candidate or not. It is compared exactly and laid on the query for this."),
+    h("p", { class: "muted" }, "Choose any frame of the map. It is compared exactly and aligned with the query."),
     h("form", { class: "toolbar", onsubmit: (event) => { event.preventDefault(); run(); } },
       h("label", { class: "field query-why-field", for: "why-frame" }, h("span", {}, "Frame id"), typed),
       h("datalist", { id: "why-known" }, known.map((value) => h("option", { value }))),
@@ -81,16 +81,16 @@ export function whyNot(answer, { ask, choice, funnel, change, pick }) {
 }
 
 function explained(told, answer, change) {
-  const [title, text, remedy] = told.lost_at === null ? ["It is a match", "It was not lost anywhere.", null] : LOST[told.lost_at] ?? [told.lost_at, "", null];
+  const [title, text, remedy] = told.lost_at === null ? ["It is a match", "It passed every stage.", null] : LOST[told.lost_at] ?? [told.lost_at, "", null];
   const kind = told.lost_at === null ? "good" : "bad";
   const [said, offer] = remedy?.(answer) ?? [];
-  const yes = (value) => (value === null ? "not looked at" : value ? "yes" : "no");
+  const yes = (value) => (value === null ? "not checked" : value ? "yes" : "no");
   const facts = [
     ["State", told.state], ["Passes the filter", yes(told.passes_filter)],
     ["Exact rank", told.rank === null ? "–" : `${count(told.rank)} of ${count(told.of)}`],
     ["Distance", count(told.distance)], ["Similarity", percent(told.similarity)],
     ["Compared by the search", yes(told.shortlisted)], ["Ranked", yes(told.ranked)], ["A candidate", yes(told.selected)],
-    ...(told.validation ? [["Laid on the query", told.validation.status], ...figures(told.validation)] : []),
+    ...(told.validation ? [["Aligned with the query", told.validation.status], ...figures(told.validation)] : []),
   ];
   return [
     h("div", { class: "query-why-head", dataset: { lost: told.lost_at ?? "none" } },

@@ -24,7 +24,7 @@ export function keyOf(one) {
 /**
  * The verdict of an answer.
  * @param {Object<string, any>} answer
- * @returns {{kind: string, shape: string, title: string, text: string, details: string[]}}
+ * @returns {{kind: string, shape: string, title: string, text: string, details: any[]}}
  */
 export function verdict(answer) {
   const { counts, matches, location } = answer;
@@ -35,39 +35,40 @@ export function verdict(answer) {
     const kind = sure === "weak" ? "warn" : "good";
     if (location === null) {
       return { kind, shape: "✓", title: "Found",
-        text: `The query shows the place of frame ${shortId(best.frame_id)} in map ${best.map}. Where that is, is not known: no match has a pose.`,
+        text: `The query shows the same place as frame ${shortId(best.frame_id)} in map ${best.map}. Its position is unknown, as no match has a pose.`,
         details: [`${sure} match`, `${counts.accepted} of ${counts.validated} validated frames accepted`] };
     }
     const p = location.pose.translation;
     const spread = deviation(location.uncertainty?.covariance);
     return { kind, shape: "✓", title: "Found",
       text: `In map ${location.map ?? best.map}, at x ${number(p.x)}, y ${number(p.y)}, z ${number(p.z)} m in ${location.pose.parent_frame}.`,
-      details: [`${location.support} of ${location.votes} matches agree on it`, `best match ${sure}`,
+      details: [`${location.support} of ${location.votes} matches agree`, `best match ${sure}`,
         spread && `± ${metres(spread.m)}, ± ${degrees(spread.deg)} (one standard deviation, worst axis)`,
         location.votes > 1 && `they lie ${metres(location.spread_m)}, ${degrees(location.spread_deg)} apart`].filter(Boolean) };
   }
   if (answer.status === "ambiguous") {
     const fits = matches.filter((one) => one.validation.status === "ambiguous");
     return { kind: "warn", shape: "≈", title: "Ambiguous, so not found",
-      text: `${fits.length === 1 ? `Frame ${shortId(fits[0].frame_id)} fits` : `${fits.length} frames fit`} the query, but in more than one way: the place cannot be told from what both see.`,
+      text: `${fits.length === 1 ? `Frame ${shortId(fits[0].frame_id)} fits` : `${fits.length} frames fit`} the query, but in more than one way: the shared view does not determine the place.`,
       details: [fits[0]?.validation.reason].filter(Boolean) };
   }
   if (answer.status === "unvalidated") {
-    const why = answer.deadline_reached ? "The deadline came before a match was accepted." : "Validation was not asked for.";
+    const why = answer.deadline_reached ? "The deadline passed before a match was accepted." : "Validation was not requested.";
     const [near] = matches.filter((one) => one.validation.status === "skipped").sort((a, b) => a.rank - b.rank);
-    const nearest = counts.validated ? "Of those that were not tried the nearest" : "The nearest frame";
+    const nearest = counts.validated ? "The nearest frame that was not tried" : "The nearest frame";
     return { kind: "neutral", shape: "?", title: "Not validated",
-      text: near ? `${why} ${nearest} is ${shortId(near.frame_id)} of map ${near.map}, ${percent(near.similarity)} similar; whether it is the same place is not known.` : why,
+      text: near ? `${why} ${nearest} is ${shortId(near.frame_id)} of map ${near.map}, ${percent(near.similarity)} similar; it may or may not show the same place.` : why,
       details: [] };
   }
   return { kind: "bad", shape: "✕", title: "Not found", text: notFound(answer, where), details: reasons(matches) };
 }
 
+/** @param {Object<string, any>} answer @param {string} where */
 function notFound({ counts }, where) {
-  if (counts.map === 0) return `No frame of ${where} can be found yet: none is indexed, or the query itself is the only one.`;
+  if (counts.map === 0) return `No frame of ${where} is searchable yet: none is indexed, or the query itself is the only one.`;
   if (counts.passed === 0) return `None of the ${count(counts.map)} frames of ${where} passes the filter.`;
   const tried = counts.validated === 1 ? "One frame was" : `${count(counts.validated)} frames were`;
-  return `${tried} laid on the query, and ${counts.validated === 1 ? "it does not fit" : "none fits"}: the place is not in ${where}, or too little of it is in view.`;
+  return `${tried} aligned with the query, and ${counts.validated === 1 ? "it does not fit" : "none fits"}: the place is not in ${where}, or too little of it is in view.`;
 }
 
 // the same reason of ten candidates is one reason
@@ -119,8 +120,8 @@ export function differences(before, after) {
   const short = (key) => shortId(key.slice(key.indexOf("/") + 1));
   const gained = [...now].filter((key) => !was.has(key));
   const lost = [...was].filter((key) => !now.has(key));
-  if (gained.length) found.push(`accepted now: ${gained.map(short).join(", ")}`);
-  if (lost.length) found.push(`accepted no more: ${lost.map(short).join(", ")}`);
+  if (gained.length) found.push(`newly accepted: ${gained.map(short).join(", ")}`);
+  if (lost.length) found.push(`no longer accepted: ${lost.map(short).join(", ")}`);
   return found;
 }
 

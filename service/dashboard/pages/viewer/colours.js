@@ -7,6 +7,7 @@ export const STEPS = [[38, 130, 60], [140, 190, 70], [240, 200, 60]];
 export const BESIDE = [150, 155, 160];
 export const VIOLATES = [200, 40, 40];
 
+/** @type {any} the context that colours are read from, once there is one */
 let pen = null;
 const known = new Map(); // a token's bytes, until the theme changes
 

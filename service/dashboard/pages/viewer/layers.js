@@ -22,13 +22,59 @@ function movedBox({ low, high }, matrix) {
 }
 
 class Layer {
+  /** Bounds of what is drawn, null of nothing, and some of its points, before its matrix;
+   * undefined: to be computed. @type {any} */
+  own;
+  /** @type {number[][] | undefined} */
+  some;
+  // of a cloud, see Viewer.cloud
+  /** @type {any} see points.js */
+  points;
+  /** @type {Uint8Array | undefined} */
+  patchColours;
+  /** @type {keyof typeof MODES | undefined} */
+  colour;
+  /** @type {number | undefined} */
+  size;
+  /** @type {number | undefined} */
+  shade;
+  // of shapes, see Viewer.lines
+  /** @type {any} numbers */
+  positions;
+  /** @type {ArrayLike<number> | undefined} */
+  colours;
+  /** @type {number | undefined} */
+  width;
+  /** @type {number | undefined} */
+  alpha;
+  onTop = false;
+  // of both
+  /** @type {any} a token's name, or red, green, blue */
+  tint;
+  /** @type {string} */
+  kind;
+  /** @type {any} buffers of the context */
+  made = null;
+  /** @type {boolean | undefined} whether the buffers hold what is to be drawn */
+  fresh = false;
+
   constructor(told) {
     this.visible = true;
     this.matrix = identity();
     this.set(told);
   }
 
-  /** @param {object} told what changes; what is undefined stays */
+  /** What it takes up, null for nothing. @returns {{low: number[], high: number[]} | null} */
+  bounds() {
+    return null;
+  }
+
+  /** Points that show where it is. @returns {number[][]} */
+  samples() {
+    return [];
+  }
+
+  /** @param {Object<string, any>} told what changes; what is undefined stays */
   set(told) {
     for (const [name, value] of Object.entries(told)) if (value !== undefined) this[name] = value;
   }
@@ -77,7 +123,7 @@ export class CloudLayer extends Layer {
     const isOther = told.points !== undefined && told.points !== this.points;
     if (isOther) this.own = this.some = undefined;
     super.set(told);
-    this.fresh = !isOther && told.patchColours === undefined && this.fresh;
+    this.fresh &&= !isOther && told.patchColours === undefined;
   }
 
   bounds() {
@@ -166,7 +212,7 @@ export class ShapeLayer extends Layer {
     // colours that are not sent again are not those of new positions of another number
     if (told.positions !== undefined && told.colours === undefined) this.colours = undefined;
     super.set(told);
-    this.fresh = told.positions === undefined && told.colours === undefined && this.fresh;
+    this.fresh &&= told.positions === undefined && told.colours === undefined;
   }
 
   bounds() {
@@ -243,7 +289,7 @@ export class ShapeLayer extends Layer {
 /** Each so many values four times: an instance for each segment would do without, but costs a GPU
  * that is none (SwiftShader) 25 us. @param {Float32Array | Uint8Array} values @param {number} size */
 function fourTimes(values, size) {
-  const out = new values.constructor(4 * values.length);
+  const out = values instanceof Float32Array ? new Float32Array(4 * values.length) : new Uint8Array(4 * values.length);
   for (let at = 0; at + size <= values.length; at += size) {
     const one = values.subarray(at, at + size);
     for (let k = 0; k < 4; k += 1) out.set(one, 4 * at + k * size);

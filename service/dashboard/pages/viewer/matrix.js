@@ -1,6 +1,6 @@
 // 4 x 4 matrices as WebGL takes them, column by column, and the little else the viewer computes.
 
-/** @typedef {Float64Array | number[]} Matrix 16 numbers, column-major */
+/** @typedef {number[]} Matrix 16 numbers, column-major */
 
 export const identity = () => [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
 

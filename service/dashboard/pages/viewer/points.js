@@ -28,17 +28,18 @@ const HEADER = 48, STRIDE = 12;
 export function parsePoints(data) {
   const view = new DataView(data);
   if (data.byteLength < HEADER || view.getUint32(0, true) !== MAGIC) {
-    throw new RangeError("These bytes are no points of sceneprint.");
+    throw new RangeError("This is not point data of sceneprint.");
   }
   const version = view.getUint16(4, true), flags = view.getUint16(6, true);
   const count = view.getUint32(8, true), stride = view.getUint32(12, true);
   if (version !== 1 || stride !== STRIDE) {
-    throw new RangeError(`Points of version ${version} are not known to this page: reload it.`);
+    throw new RangeError(`This page does not support point data of version ${version}: reload it.`);
   }
   if (data.byteLength !== HEADER + count * stride) {
-    throw new RangeError("The points were cut short: load them again.");
+    throw new RangeError("The point data is incomplete: load it again.");
   }
-  const three = (at) => [0, 4, 8].map((k) => view.getFloat32(at + k, true));
+  /** @returns {[number, number, number]} */
+  const three = (at) => [view.getFloat32(at, true), view.getFloat32(at + 4, true), view.getFloat32(at + 8, true)];
   return {
     count, stride, data, offset: HEADER, total: view.getUint32(40, true),
     origin: three(16), extent: three(28), scale: view.getFloat32(44, true),

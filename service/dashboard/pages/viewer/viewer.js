@@ -15,14 +15,18 @@ const NOTHING = { low: [-1, -1, -1], high: [1, 1, 1] };
 const DENSEST = 2;
 
 /**
+ * @typedef {object} Options
+ * @property {string} label what is to be seen, for who does not see it
+ * @property {"-y" | "y" | "z"} [up] "-y" of a camera's optical axes, "z" of maps and LiDAR
+ * @property {boolean} [antialias]
+ * @property {string} [background] a token's name
+ * @property {(lost: boolean) => void} [onlost] the context went, or came back
+ * @property {() => void} [onview] it was drawn anew: labels may have to move
+ */
+
+/**
  * @param {HTMLCanvasElement} canvas with a size of its own by CSS
- * @param {object} options
- * @param {string} options.label what is to be seen, for who does not see it
- * @param {"-y" | "y" | "z"} [options.up] "-y" of a camera's optical axes, "z" of maps and LiDAR
- * @param {boolean} [options.antialias]
- * @param {string} [options.background] a token's name
- * @param {(lost: boolean) => void} [options.onlost] the context went, or came back
- * @param {() => void} [options.onview] it was drawn anew: labels may have to move
+ * @param {Options} options
  * @returns {Viewer} where there is no WebGL 2 its `available` is false, a sentence stands in place
  *   of the canvas, and all else does nothing
  */
@@ -30,10 +34,23 @@ export function createViewer(canvas, options) {
   return new Viewer(canvas, options);
 }
 
-class Viewer {
-  #gl; #made = null; #layers = new Map(); #dirty = 0; #watcher; #stops = [];
-  #fitted = null; #lost = false;
+export class Viewer {
+  /** @type {any} the context; null without WebGL 2 */
+  #gl;
+  /** @type {any} programs of the context; null before there is one */
+  #made = null;
+  /** @type {Map<string, any>} */
+  #layers = new Map();
+  #dirty = 0;
+  /** @type {ResizeObserver} */
+  #watcher;
+  /** @type {(() => void)[]} */
+  #stops = [];
+  /** @type {number[][] | null} what is in view, until one looks elsewhere */
+  #fitted = null;
+  #lost = false;
 
+  /** @param {HTMLCanvasElement} canvas @param {Options} options */
   constructor(canvas, {
     label, up = "-y", antialias = true, background = "sunken", onlost = () => {},
     onview = () => {},
@@ -48,7 +65,7 @@ class Viewer {
     if (!this.available) {
       const told = document.createElement("p");
       told.className = "viewer-none muted";
-      told.textContent = "This browser has no WebGL 2, so nothing can be drawn in 3-D here.";
+      told.textContent = "This browser does not support WebGL 2, which the 3-D view needs.";
       canvas.hidden = true;
       canvas.after(told);
       return;
@@ -90,7 +107,7 @@ class Viewer {
   /**
    * Set a cloud, or change one: what is left out stays.
    * @param {string} id
-   * @param {object} told points, matrix (16, column-major), colour ("tint", "normal", "patch",
+   * @param {Object<string, any>} told points, matrix (16, column-major), colour ("tint", "normal", "patch",
    *   "residual", "height"), tint (a token's name, or red, green, blue), size (metres), shade (share
    *   of light that a slant surface loses), visible, patchColours (Uint8Array, rgb of each patch)
    */
@@ -126,7 +143,8 @@ class Viewer {
     if (this.#layers.delete(id)) this.redraw();
   }
 
-  /** Look at some layers, or at all that can be seen, from the side one is looking from. */
+  /** Look at some layers, or at all that can be seen, from the side one is looking from.
+   * @param {string[] | null} [ids] */
   fit(ids = null) {
     if (!this.available) return;
     const there = [...this.#layers].filter(([id, one]) => (ids ? ids.includes(id) : one.visible));
@@ -136,7 +154,7 @@ class Viewer {
     this.redraw();
   }
 
-  /** @param {object} where target (metres), distance (metres), azimuth, elevation (radians) */
+  /** @param {Partial<Orbit>} where target (metres), distance (metres), azimuth, elevation (radians) */
   look(where) {
     if (!this.available) return;
     this.#fitted = null;
@@ -176,7 +194,7 @@ class Viewer {
    * pixels. Chromium warns in its console that this is slow. */
   pixels(x = 0, y = 0, width = this.canvas.width, height = this.canvas.height) {
     this.#draw();
-    const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+    const copy = /** @type {OffscreenCanvasRenderingContext2D} */ (new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true }));
     copy.drawImage(this.canvas, -x, -y);
     return copy.getImageData(0, 0, width, height).data;
   }

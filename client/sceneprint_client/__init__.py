@@ -1,0 +1,38 @@
+"""The client of sceneprint: place recognition from depth frames and point clouds, over HTTP.
+
+    with Client("http://robot-server:8008") as client:  # or Client.embedded("maps")
+        client.create_map("warehouse")
+        client.upload("warehouse", path, wait_s=10)
+        answer = client.query("warehouse", path)
+
+Names are loaded when first used, so that importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sceneprint_client.client import Client, Status
+    from sceneprint_client.frame_files import FrameFile, meta_of
+
+__version__ = "0.2.0"
+__all__ = ["Client", "FrameFile", "Status", "__version__", "meta_of"]
+
+_HOME = {
+    "Client": "client",
+    "FrameFile": "frame_files",
+    "Status": "client",
+    "meta_of": "frame_files",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'sceneprint_client' has no attribute {name!r}")
+    return getattr(import_module(f"sceneprint_client.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,257 @@
+"""A service as its operator sees it: keys, changes, events, figures, models, snapshots."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import BinaryIO
+from urllib.parse import quote
+
+import httpx
+
+from sceneprint_client.api import Job, Page
+from sceneprint_client.api.admin import (
+    Audited,
+    Event,
+    EventPage,
+    Key,
+    MadeKey,
+    Me,
+    ModelInfo,
+    NewKey,
+    Scope,
+    SnapshotFile,
+    Stats,
+)
+from sceneprint_client.api.base import checked
+from sceneprint_client.errors import DamagedSnapshot, InvalidRequest, SnapshotError, Unreachable
+from sceneprint_client.http import PAGE, error_of, follow_stream
+from sceneprint_client.jobs import JobMethods
+from sceneprint_client.requests import given, snapshot_path
+
+_EVENTS = "/v1/events"
+#: Times that a download goes on where it broke off.
+_DOWNLOADS = 5
+
+
+class AdminMethods(JobMethods):
+    """Keys, events, figures, models and snapshots of a service."""
+
+    def create_key(
+        self, name: str, grants: Mapping[str, Scope], expires_at: datetime | None = None
+    ) -> MadeKey:
+        """Make a key; only what is returned has its secret.
+
+        Parameters
+        ----------
+        name : who it is for; unique
+        grants : `read`, `write` or `admin` by name of a map, `*` for all
+        expires_at : when it opens nothing any more, with a zone; default: never
+
+        Raises
+        ------
+        InvalidRequest : a name or grant that is none.
+        Conflict : there is a key of that name.
+        Forbidden : the key of this client is not for `admin` of all.
+        """
+        new = checked(NewKey, "The key", name=name, grants=dict(grants), expires_at=expires_at)
+        return self._ask(MadeKey, "POST", "/v1/keys", json=new.model_dump(mode="json"))
+
+    def keys(self) -> list[Key]:
+        """All keys by name, without their secrets."""
+        return list(self._items(Page[Key], "/v1/keys"))
+
+    def revoke_key(self, name: str) -> None:
+        """Let a key open nothing any more; UnknownKey where there is none of that name."""
+        self._delete(f"/v1/keys/{quote(name, safe='')}")
+
+    def me(self) -> Me:
+        """What the key of this client may do."""
+        return self._ask(Me, "GET", "/v1/keys/me")
+
+    def audit(self, actor: str | None = None, map_name: str | None = None) -> Iterator[Audited]:
+        """Who changed what, the newest first.
+
+        Parameters
+        ----------
+        actor : name of the key that made the changes; default: of all, and of none
+        map_name : that was changed; default: any, and none
+        """
+        return self._items(Page[Audited], "/v1/audit", actor=actor, map=map_name)
+
+    # events and figures
+
+    def events(
+        self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
+        follow: bool = True,
+    ) -> Iterator[Event]:  # fmt: skip
+        """Events in the order in which they happened: those that are kept, and those to come.
+
+        A stream that breaks is taken up again where it broke, for as long as it takes: nothing is
+        lost, and nothing comes twice. Where events are no longer kept, one of the kind
+        `events.missed` stands in their place.
+
+        Parameters
+        ----------
+        map_name : only of this map
+        kinds : beginnings of the kinds that are wanted, such as `frame.`; default: all
+        after : id of the event to begin behind, "0" for all that are kept; default: these, or the
+            newest where they are followed
+        follow : go on for ever with what happens; else end with what has happened
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : a kind that cannot be one, or an id of no event.
+        Unreachable : there is no service, when this is asked first.
+        """
+        if follow:
+            wanted = given(map=map_name, kind=list(kinds))
+            return follow_stream(lambda last: self._open_stream(_EVENTS, last, wanted), after)
+        return self._kept_events(map_name, kinds, after)
+
+    def event_page(
+        self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
+        cursor: str | None = None, limit: int = 100, newest_first: bool = True,
+    ) -> EventPage:  # fmt: skip
+        """Some of the events that are kept, the newest first; `cursor` is that of another page."""
+        asked = given(
+            map=map_name, kind=list(kinds), after=after, cursor=cursor, limit=limit,
+            order="newest" if newest_first else "oldest",
+        )  # fmt: skip
+        headers = {"Accept": "application/json"}
+        return self._ask(EventPage, "GET", _EVENTS, params=asked, headers=headers)
+
+    def _kept_events(
+        self, map_name: str | None, kinds: Sequence[str], after: str | None
+    ) -> Iterator[Event]:
+        cursor = None
+        while True:
+            page = self.event_page(
+                map_name, kinds=kinds, after=after, cursor=cursor, limit=PAGE, newest_first=False
+            )
+            yield from page.items
+            cursor = page.next_cursor
+            if cursor is None:
+                return
+
+    def stats(self, map_name: str | None = None, *, minutes: int = 60) -> Stats:
+        """How the service, or one map, does now and did in the last minutes, at most 60.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : too many minutes, or none.
+        """
+        if not 1 <= minutes <= 60:
+            raise InvalidRequest(
+                f"{minutes} minutes of history were asked for. Give 1 to 60.",
+                (("minutes", "out of its range"),),
+            )
+        return self._ask(Stats, "GET", "/v1/stats", params=given(minutes=minutes, map=map_name))
+
+    def models(self) -> list[ModelInfo]:
+        """Models that maps can be signed with: those that ship, and those that maps have or had."""
+        return self._ask(Page[ModelInfo], "GET", "/v1/models").items
+
+    # snapshots
+
+    def take_snapshot(self, *, wait_s: float | None = None) -> Job:
+        """Have a snapshot taken of all maps: one state of database and uploads, in one archive.
+
+        Parameters
+        ----------
+        wait_s : seconds to wait until it is taken; default: none
+
+        Returns
+        -------
+        job : `result` is a SnapshotFile when it has succeeded
+
+        Raises
+        ------
+        Forbidden : the key is no administrator's.
+        """
+        job = self._ask(Job, "POST", "/v1/snapshots")
+        if wait_s is None:
+            return job
+        return self.wait([job.job_id], timeout_s=wait_s)[0]
+
+    def snapshots(self) -> list[SnapshotFile]:
+        """Snapshots that the service keeps, the newest first."""
+        return self._ask(Page[SnapshotFile], "GET", "/v1/snapshots").items
+
+    def download_snapshot(self, snapshot_id: str, path: str | Path) -> SnapshotFile:
+        """Fetch a snapshot, for `sceneprint restore`; its checksum is compared.
+
+        Parameters
+        ----------
+        snapshot_id : of `snapshots`
+        path : of the archive to write; nothing is overwritten
+
+        Raises
+        ------
+        UnknownSnapshot : there is none, or no longer.
+        SnapshotError : the path is taken.
+        DamagedSnapshot : what came is not what was taken.
+        OSError : it cannot be written.
+        """
+        path = Path(path)
+        # asked first: an unknown one leaves nothing behind
+        known = {one.snapshot_id: one for one in self.snapshots()}
+        if path.exists():
+            raise SnapshotError(f"{path} is there, and nothing is overwritten. Name another.")
+        part = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
+        try:
+            with open(part, "xb", opener=_private) as file:
+                self._fetch_snapshot(snapshot_id, file)
+            if snapshot_id not in known or _digest_of(part) != known[snapshot_id].sha256:
+                raise DamagedSnapshot(
+                    f"Snapshot {snapshot_id} did not come as it was taken. Download it again, or "
+                    "take another."
+                )
+            part.rename(path)
+        finally:
+            part.unlink(missing_ok=True)
+        return known[snapshot_id]
+
+    def delete_snapshot(self, snapshot_id: str) -> None:
+        """Remove a snapshot; UnknownSnapshot where there is none."""
+        self._delete(snapshot_path(snapshot_id))
+
+    def _fetch_snapshot(self, snapshot_id: str, file: BinaryIO) -> None:
+        """Write the bytes of one to a file; a download that breaks off goes on."""
+        path, lost = snapshot_path(snapshot_id), 0
+        while True:
+            headers = {"Range": f"bytes={file.tell()}-"} if file.tell() else {}
+            try:
+                with self._http.stream("GET", path, headers=headers) as response:
+                    if not response.is_success:
+                        response.read()
+                        raise error_of(response)
+                    for chunk in response.iter_raw():
+                        file.write(chunk)
+                return
+            except httpx.TransportError as error:
+                lost += 1
+                if lost == _DOWNLOADS:
+                    raise Unreachable(
+                        f"{self._url}: the download of snapshot {snapshot_id} broke off {lost} "
+                        f"times ({error}). Try again when the network is better."
+                    ) from error
+
+
+def _private(path: str, flags: int) -> int:
+    """An archive has all pictures, and the hashes of keys."""
+    return os.open(path, flags, 0o600)
+
+
+def _digest_of(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()

@@ -1,0 +1,255 @@
+"""Which frames of a map a list has, the sessions of a map, and the trajectory of one."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal
+
+from pydantic import AwareDatetime, BeforeValidator, Field, ValidationInfo, field_validator
+from pydantic_core import from_json
+
+from sceneprint_client.api.base import ApiRecord, FrameState, Given, Label, Note
+from sceneprint_client.api.frames import GivenBase, GivenPose, GivenVector
+from sceneprint_client.api.maps import Days, Quota
+
+
+def _one_or_many(given: object) -> object:
+    return [given] if isinstance(given, str) else given
+
+
+#: One name or several, as a query string repeats them.
+_Names = Annotated[list[Label], BeforeValidator(_one_or_many), Field(max_length=100)]
+
+
+class FrameListing(Given):
+    """Which frames a list has; all that is given must hold.
+
+    A frame that lacks what a condition asks about, such as a time, is left out.
+    """
+
+    state: FrameState | None = Field(
+        default=None, description="In this state; by default in any but `deleted`."
+    )
+    robot: _Names = Field(default=[], description="Taken by this one; repeated: by one of them.")
+    session: _Names = Field(default=[], description="Taken in this one; repeated: in one of them.")
+    tag: _Names = Field(default=[], description="It has this tag; repeated: all of them.")
+    captured_after: AwareDatetime | None = Field(
+        default=None, description="Taken then, or later; with a time zone."
+    )
+    captured_before: AwareDatetime | None = Field(default=None, description="Then, or earlier.")
+    received_after: AwareDatetime | None = Field(
+        default=None, description="Uploaded then, or later."
+    )
+    received_before: AwareDatetime | None = Field(default=None, description="Then, or earlier.")
+    parent_frame: Label | None = Field(default=None, description="Its pose leads there.")
+    has_pose: bool | None = Field(default=None, description="Whether it has a pose.")
+    content_id: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = Field(
+        default=None, description="Of its samples and camera."
+    )
+    order: Literal["asc", "desc"] = Field(
+        default="asc", description="As they came; `desc`: the newest first."
+    )
+
+
+class FramePage(FrameListing):
+    """A part of a list of frames."""
+
+    cursor: str | None = Field(default=None, description="`next_cursor` of the page before.")
+    limit: Annotated[int, Field(ge=1, le=1000)] = 100
+
+
+class Session(ApiRecord):
+    """What one robot took in one run."""
+
+    robot: str | None
+    session: str | None
+    frames: dict[str, int] = Field(description="How many are in each state that has any.")
+    with_pose: int = Field(description="How many of them have a pose.")
+    first_captured_at: datetime | None
+    last_captured_at: datetime | None
+    parent_frames: list[str] = Field(
+        description="Where their poses lead, at most 20: those of most frames first."
+    )
+
+
+class Run(Given):
+    """Whose poses a trajectory has."""
+
+    session: Label = Field(description="Of the frames.")
+    robot: Label | None = Field(
+        default=None, description="Needed where several robots called a run so."
+    )
+    parent_frame: Label | None = Field(
+        default=None, description="Needed where the poses lead to several."
+    )
+    captured_after: AwareDatetime | None = Field(
+        default=None, description="A part of it: taken then, or later; with a time zone."
+    )
+    captured_before: AwareDatetime | None = Field(default=None, description="Then, or earlier.")
+    most: Annotated[int, Field(ge=2, le=10_000)] | None = Field(
+        default=None,
+        description="At most so many poses, evenly taken along the run, the first and the last "
+        "among them. A run may then be of any length.",
+    )
+    clock: Literal["captured", "received"] = Field(
+        default="captured",
+        description="By which time: `received`, in the order in which frames came, has those too "
+        "that do not say when they were taken.",
+    )
+
+
+class Trajectory(ApiRecord):
+    """The poses of one run, in the order of time."""
+
+    map: str
+    session: str
+    robot: str | None
+    parent_frame: str | None = Field(
+        description="Where the poses lead; null where no frame of the run has one."
+    )
+    child_frame: str = Field(
+        default="optical",
+        description="Of each camera: x right, y down, z forward; of a cloud, its sensor's.",
+    )
+    frame_ids: list[str]
+    poses: list[list[float]] = Field(
+        description="A row for each frame, as in a TUM file: t tx ty tz qx qy qz qw, seconds "
+        "since 1970 by the clock that was asked for, metres, unit quaternion."
+    )
+    posed: int = Field(
+        description="Poses that there are: as many as are told, or more where `most` was given."
+    )
+    left_out: int = Field(
+        description="Frames of the run that are not in it: without pose or time, with a pose that "
+        "leads elsewhere, of a time that is there already, or one too many for `most`."
+    )
+
+
+# Which frames of a map a query may find, as JSON.
+
+
+def parsed(given: object) -> object:
+    """What a form gives as text, as JSON has it.
+
+    Raises
+    ------
+    ValueError : a text that is no JSON.
+    """
+    if not isinstance(given, str):
+        return given
+    try:
+        return from_json(given)
+    except ValueError as error:
+        raise ValueError(f"not JSON ({error}); a form has an object as JSON text") from error
+
+
+_Several = Annotated[list[Label], Field(min_length=1, max_length=100)]
+#: One name, or several of which any will do.
+Names = Annotated[_Several, BeforeValidator(_one_or_many, json_schema_input_type=Label | _Several)]
+
+
+class Region(Given):
+    """A box along the axes of the frame that poses lead to; its faces belong to it."""
+
+    parent_frame: Label = Field(
+        description="Frames whose pose leads to another frame, or that have none, are outside."
+    )
+    min: GivenVector
+    max: GivenVector
+
+    @field_validator("max")
+    @classmethod
+    def _above_min(cls, corner: GivenVector, info: ValidationInfo) -> GivenVector:
+        least = info.data.get("min")
+        wrong = [
+            axis
+            for axis in "xyz"
+            if least is not None and getattr(corner, axis) < getattr(least, axis)
+        ]
+        if wrong:
+            raise ValueError(f"{', '.join(wrong)}: less than in `min`")
+        return corner
+
+
+class Filter(Given):
+    """What a frame must be for a query to find it; all that is given must hold.
+
+    A frame that lacks what a condition asks about, such as a time, does not pass it.
+    """
+
+    robot: Names | None = Field(default=None, description="Taken by this one, or one of these.")
+    session: Names | None = Field(default=None, description="Taken in this one, or one of these.")
+    captured_after: AwareDatetime | None = Field(default=None, description="Then, or later.")
+    captured_before: AwareDatetime | None = Field(default=None, description="Then, or earlier.")
+    tags: list[Label] = Field(default=[], max_length=32, description="It has all of them.")
+    not_within_s: float | None = Field(
+        default=None,
+        gt=0,
+        description="Leaves out frames of the query's own session taken at most so many seconds "
+        "before or after it: for loop closure. Those of the session without a time are left out "
+        "too; a session is another's where both name robots and the robots differ.",
+    )
+    region: Region | None = Field(default=None, description="Its pose lies in there.")
+    exclude_frames: list[Label] = Field(
+        default=[], max_length=1000, description="It is none of these ids."
+    )
+
+    @field_validator("captured_before")
+    @classmethod
+    def _not_earlier(cls, before: datetime | None, info: ValidationInfo) -> datetime | None:
+        after: Any = info.data.get("captured_after")
+        if before is not None and after is not None and before < after:
+            raise ValueError("earlier than `captured_after`")
+        return before
+
+
+# What of a frame and of a map can be edited: JSON merge patches (RFC 7396).
+
+
+class FrameEdit(Given):
+    """What to change of a frame: what is left out stays, null removes.
+
+    Samples, camera and how they are read are what a frame is, and cannot be edited: delete it and
+    upload it again.
+    """
+
+    robot: Label | None = Field(default=None, description="Who took the frame.")
+    session: Label | None = Field(
+        default=None,
+        description="In which run. The parent frame of a pose that was named after it stays.",
+    )
+    captured_at: AwareDatetime | None = Field(default=None, description="When, with its zone.")
+    tags: Annotated[list[Label], Field(max_length=32)] | None = Field(
+        default=None, description="All of them: they are replaced together."
+    )
+    pose: GivenPose | None = Field(
+        default=None,
+        description="T_parent_sensor. `parent_frame` alone renames it; `translation` or "
+        "`rotation` alone leave the other; each of them is replaced as a whole.",
+    )
+    T_base_sensor: GivenBase | None = Field(
+        default=None, description="Where the sensor sits on the robot; parts of it as of `pose`."
+    )
+
+
+class MapEdit(Given):
+    """What to change of a map: what is left out stays, null removes."""
+
+    title: Note | None = Field(default=None, description="For people.")
+    quota_frames: Quota | None = Field(
+        default=None,
+        description="Most frames that it may hold; what is there beyond it stays. Only the "
+        "operator sets it: `admin` for `*`.",
+    )
+    quota_bytes: Quota | None = Field(
+        default=None, description="Most bytes of uploads that it may hold; as `quota_frames`."
+    )
+    retention_days: Days | None = Field(
+        default=None,
+        description="Days after which a frame is deleted, for good, counted from when it was "
+        "received. Workers delete what is older within minutes.",
+    )
+
+
+#: Fields of a map that are not its own administrators' to set, but the operator's.
+OPERATORS = frozenset(("quota_frames", "quota_bytes"))

@@ -1,0 +1,205 @@
+"""Associations of sessions as JSON: what to associate, edges, joins, graphs."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from sceneprint_client.api.admin import Progress
+from sceneprint_client.api.base import ApiRecord, Given, JobState, Label, Transform
+from sceneprint_client.api.listing import Filter
+from sceneprint_client.api.options import ValidationOptions
+
+#: Frames apart that loop closures are looked for from, unless told otherwise.
+APART = 100
+#: Files that a graph comes as.
+GraphFormat = Literal["g2o", "tum", "json"]
+
+
+class NewAssociation(Given):
+    """Which sessions of a map to associate, frame by frame."""
+
+    sessions: Annotated[list[Label], Field(min_length=1, max_length=2)] = Field(
+        description="Two: each frame of the first is looked up among those of the second. One: "
+        "loop closures, each frame is looked up among those taken before it."
+    )
+    robots: Annotated[list[Label], Field(min_length=1, max_length=2)] | None = Field(
+        default=None,
+        description="Who took each of the sessions, in their order; needed where several robots "
+        "call their sessions alike.",
+    )
+    filter: Filter | None = Field(
+        default=None, description="Only frames that pass it are taken, of either session."
+    )
+    apart: int | None = Field(
+        default=None,
+        ge=1,
+        le=1_000_000,
+        description="Of one session: frames that come between, in the order of time; default: "
+        f"{APART}, or 1 where `not_within_s` is given.",
+    )
+    not_within_s: float | None = Field(
+        default=None,
+        gt=0,
+        description="Of one session: seconds that come between; frames without a time are left "
+        "out.",
+    )
+    k: int = Field(default=3, ge=1, le=10, description="Accepted edges wanted of each frame.")
+    candidates: int = Field(
+        default=10,
+        ge=1,
+        le=100,
+        description="How many of a frame's ranking are selected and validated until `k` are "
+        "accepted, some 20 ms each.",
+    )
+    seed: int = Field(default=0, ge=0, lt=2**32, description="Of the random choices.")
+    min_overlap: float = Field(
+        default=0.0, ge=0.0, le=1.0, description="Least overlap of an edge that is kept."
+    )
+    validation: ValidationOptions | None = Field(
+        default=None, description="What an edge must stand to be accepted."
+    )
+
+    @model_validator(mode="after")
+    def _sensible(self) -> NewAssociation:
+        if self.robots is not None and len(self.robots) != len(self.sessions):
+            raise ValueError("robots: name one for each session, in the same order")
+        if len(self.sessions) == 2:
+            robots = self.robots or ["", ""]
+            if self.sessions[0] == self.sessions[1] and robots[0] == robots[1]:
+                raise ValueError("sessions: name it once to look for loop closures within it")
+            if self.apart is not None or self.not_within_s is not None:
+                raise ValueError("apart, not_within_s: they are for loop closures in one session")
+        if self.filter is not None and self.filter.not_within_s is not None:
+            raise ValueError("filter.not_within_s: give not_within_s beside the filter instead")
+        return self
+
+
+class Edge(ApiRecord):
+    """Two frames that see one place, and how they lie to each other."""
+
+    number: int = Field(description="From 0, in the order in which edges were found.")
+    from_frame: str = Field(description="The frame that was looked up.")
+    to_frame: str = Field(description="The frame that was found.")
+    from_session: str | None
+    to_session: str | None
+    from_robot: str | None
+    to_robot: str | None
+    transform: Transform = Field(description="x_to = matrix @ x_from, between the sensors' frames.")
+    information: list[float] | None = Field(
+        description="36 numbers, row by row in the order x y z rx ry rz, metres and radians: the "
+        "inverse of the covariance of an error that comes after the transform, along the axes of "
+        "`from_frame`: T_true = matrix @ exp(error)."
+    )
+    overlap: float = Field(description="Share of both frames' points that agree.")
+    residual_m: float = Field(description="Both directions composed: 0 if they agreed.")
+    residual_deg: float
+    strength: Literal["strong", "weak"]
+    inliers: int = Field(description="Points of both frames that agree.")
+    ambiguity: float = Field(description="Share that the best other transform explains.")
+    similarity: float = Field(description="Of the signatures, 0 to 1.")
+    from_pose: Transform | None = Field(
+        default=None, description="Of `from_frame`, in the parent frame that it was sent with."
+    )
+    to_pose: Transform | None = Field(default=None, description="Of `to_frame`.")
+    consistent: bool | None = Field(
+        description="Whether loops with edges near by close. `false`: it was outvoted, and is "
+        "left out of graphs and joins. null: there is nothing near by to compare it with, or no "
+        "poses, or the association is not over."
+    )
+    loops: int | None = Field(description="Edges near by that it was compared with.")
+    closed: int | None = Field(description="Of them those that agree with it.")
+
+
+class Join(ApiRecord):
+    """How the parent frames of two sessions lie to each other, by consensus of the edges."""
+
+    from_session: str
+    to_session: str
+    from_robot: str | None
+    to_robot: str | None
+    from_parent: str = Field(description="Parent frame of the poses of `from_session`.")
+    to_parent: str
+    transform: Transform | None = Field(
+        description="x_to = matrix @ x_from, between the parent frames; null where the edges do "
+        "not agree on one."
+    )
+    strength: Literal["strong", "weak"] | None = Field(
+        description="`strong` where many edges of several frames agree that reach over a metre; "
+        "null without a transform."
+    )
+    support: int = Field(description="Edges that agree with it.")
+    votes: int = Field(description="Edges between the two parent frames that were not outvoted.")
+    rival: int = Field(description="Edges that agree on the best other transform.")
+    spread_m: float | None = Field(
+        description="Root mean square of what edges that agree differ by, where their frames are."
+    )
+    spread_deg: float | None
+    reason: str
+
+
+class AssociationResult(ApiRecord):
+    """What an association came to."""
+
+    frames: int = Field(description="Frames that were looked up.")
+    skipped: int = Field(description="Frames that could not be, as they were deleted meanwhile.")
+    validated: int = Field(description="Pairs of frames that were validated.")
+    edges: int = Field(description="Of them accepted.")
+    consistent: int = Field(description="Edges that loops with others confirm.")
+    inconsistent: int = Field(description="Edges that were outvoted.")
+    unchecked: int = Field(description="Edges that nothing near by confirms or denies.")
+    joins: list[Join] = Field(
+        description="How the sessions lie to each other; of one session only where its frames "
+        "have several parent frames."
+    )
+
+
+class Association(ApiRecord):
+    """An association of sessions: a job and what it came to."""
+
+    association_id: str = Field(description="Also the id of its job: GET /v1/jobs/{job_id}.")
+    map: str
+    asked: NewAssociation
+    state: JobState
+    progress: Progress | None = Field(description="In frames that are looked up.")
+    result: AssociationResult | None = Field(description="When it has succeeded.")
+    error: str | None
+    created_at: datetime
+    finished_at: datetime | None
+
+
+class Vertex(ApiRecord):
+    """A frame in a graph."""
+
+    vertex: int = Field(description="Its number in g2o.")
+    frame_id: str
+    robot: str | None
+    session: str | None
+    captured_at: datetime | None
+    pose: Transform | None = Field(
+        description="In `frame` of the graph where the sessions are joined; else in the parent "
+        "frame that it was sent with. null where it has none and no edge leads to one that has."
+    )
+
+
+class GraphEdge(ApiRecord):
+    """A constraint between two vertices, as g2o has it."""
+
+    kind: Literal["association", "odometry"]
+    first: int
+    second: int
+    matrix: list[list[float]] = Field(description="T_first_second, 4 x 4.")
+    information: list[float] = Field(
+        description="36 numbers, row by row in the order x y z rx ry rz, metres and radians, "
+        "along the axes of `second`."
+    )
+
+
+class Graph(ApiRecord):
+    """What an optimiser needs: where frames are, and how they lie to each other."""
+
+    frame: str | None = Field(description="That joined poses are in; null where none has a pose.")
+    vertices: list[Vertex]
+    edges: list[GraphEdge]

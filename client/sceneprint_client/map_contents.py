@@ -1,0 +1,333 @@
+"""Maps and what they hold: frames and what was made of them, sessions, trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic_core import to_json
+
+from sceneprint_client.api import Frame, FrameState, Map, NewMap, Page
+from sceneprint_client.api.base import checked
+from sceneprint_client.api.listing import FrameListing, Run, Session, Trajectory
+from sceneprint_client.api.maps import By, Growth, GrowthOf
+from sceneprint_client.api.results import (
+    CLOUD_FRAMES,
+    VIEWS,
+    WIDTH,
+    WIDTHS,
+    CloudFrame,
+    FramePatches,
+    FrameSignature,
+    View,
+)
+from sceneprint_client.errors import InvalidRequest
+from sceneprint_client.http import ServiceConnection
+from sceneprint_client.requests import frame_path, map_path
+
+
+class MapMethods(ServiceConnection):
+    """Maps, their frames, and what is made of these."""
+
+    def create_map(
+        self, name: str, title: str | None = None, model: str = "depth", **limits: float | None
+    ) -> Map:
+        """Make a map, or find that it is there as wanted.
+
+        Parameters
+        ----------
+        name, title, model : of the map
+        limits : `quota_frames` and `quota_bytes`, which are the operator's to set, and
+            `retention_days`; see NewMap
+
+        Raises
+        ------
+        InvalidRequest : the name is no slug, or there is no such model or limit.
+        MapExists : there is one of that name with another title or model, or other limits.
+        Forbidden : a quota is given, and the key has not `admin` for `*`.
+        """
+        new = checked(NewMap, "The map", name=name, title=title, model=model, **limits)
+        return self._ask(Map, "POST", "/v1/maps", json=new.model_dump(exclude_unset=True))
+
+    def maps(self) -> list[Map]:
+        """All maps by name."""
+        return self._ask(Page[Map], "GET", "/v1/maps").items
+
+    def map(self, name: str) -> Map:
+        """A map; UnknownMap where there is none."""
+        return self._ask(Map, "GET", map_path(name))
+
+    def edit_map(
+        self, map_name: str, changes: Mapping[str, Any], if_match: str | None = None, *,
+        dry_run: bool = False,
+    ) -> Map:  # fmt: skip
+        """Change title, quotas and retention of a map; parameters and errors as of `edit_frame`.
+
+        Quotas are the operator's: they ask for a key with `admin` for `*`, else Forbidden. With
+        `dry_run` nothing is changed, and the map told as it would be: `overdue` is how many frames
+        its retention would delete at once.
+        """
+        parameters = {"dry_run": "true"} if dry_run else {}
+        return self._ask(
+            Map, "PATCH", map_path(map_name), params=parameters, **_edit_request(changes, if_match)
+        )
+
+    def delete_map(self, name: str) -> None:
+        """Remove a map with all that is in it, for good; UnknownMap where there is none."""
+        self._delete(map_path(name))
+
+    def reencode(self, map_name: str, model: str) -> Map:
+        """Have a map signed with another model, to which it switches when all frames are.
+
+        Parameters
+        ----------
+        map_name : of the map
+        model : `depth`, `lidar`, `paper`, or the id or label of one of `models`
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : no such model.
+        Conflict : it is the map's model, or the map is being signed with a third one.
+        """
+        return self._ask(Map, "POST", f"{map_path(map_name)}/reencoding", json={"model": model})
+
+    def cancel_reencoding(self, map_name: str) -> Map:
+        """Let a map keep the model that it has.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        Conflict : no other model is on its way.
+        """
+        return self._ask(Map, "DELETE", f"{map_path(map_name)}/reencoding")
+
+    def growth(self, map_name: str, by: By = "day", last: int = 30) -> Growth:
+        """How many frames a map has by the hour or the day (UTC) in which they were indexed.
+
+        Parameters
+        ----------
+        map_name : of the map
+        by : what is counted by
+        last : hours or days, with the one that is not over; at most 400
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : neither hours nor days, or too many.
+        """
+        wanted = checked(GrowthOf, "The growth", by=by, last=last)
+        path = f"{map_path(map_name)}/growth"
+        return self._ask(Growth, "GET", path, params=wanted.model_dump())
+
+    # frames
+
+    def frame(self, map_name: str, frame_id: str) -> Frame:
+        """A frame; UnknownMap or UnknownFrame where there is none."""
+        return self._ask(Frame, "GET", frame_path(map_name, frame_id))
+
+    def frames(
+        self, map_name: str, state: FrameState | None = None, *,
+        robot: str | Iterable[str] = (), session: str | Iterable[str] = (),
+        tags: str | Iterable[str] = (), captured_after: datetime | None = None,
+        captured_before: datetime | None = None, received_after: datetime | None = None,
+        received_before: datetime | None = None, parent_frame: str | None = None,
+        has_pose: bool | None = None, content_id: str | None = None,
+        order: Literal["asc", "desc"] = "asc",
+    ) -> Iterator[Frame]:  # fmt: skip
+        """Frames of a map in the order they came; deleted ones only where asked for.
+
+        All that is given must hold; a frame that lacks what is asked about is left out.
+
+        Parameters
+        ----------
+        map_name : of the map
+        state : in this one
+        robot, session : by this one, or one of these
+        tags : it has all of them
+        captured_after, captured_before : taken then or later, then or earlier; with a time zone
+        received_after, received_before : uploaded then or later, then or earlier
+        parent_frame : its pose leads there
+        has_pose : whether it has one
+        content_id : of its samples and camera, or points and viewpoint
+        order : "desc" for the newest first
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : a name that none can be, or a time without zone.
+        """
+        wanted = checked(
+            FrameListing, "The list", state=state, robot=_names(robot), session=_names(session),
+            tag=_names(tags), captured_after=captured_after, captured_before=captured_before,
+            received_after=received_after, received_before=received_before,
+            parent_frame=parent_frame, has_pose=has_pose, content_id=content_id, order=order,
+        )  # fmt: skip
+        parameters = wanted.model_dump(mode="json", exclude_defaults=True)
+        return self._items(Page[Frame], f"{map_path(map_name)}/frames", **parameters)
+
+    def edit_frame(
+        self, map_name: str, frame_id: str, changes: Mapping[str, Any],
+        if_match: str | None = None,
+    ) -> Frame:  # fmt: skip
+        """Change the metadata of a frame; filters see it at once.
+
+        Parameters
+        ----------
+        map_name, frame_id : of the frame
+        changes : as JSON has them, see FrameEdit: what is left out stays, None removes
+        if_match : `etag` of the frame as it was read; None to overwrite whatever came since
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : there is none, or it was deleted.
+        InvalidRequest, InvalidPose : a field is unknown, no metadata, or not as it should be.
+        PreconditionFailed : it has been edited since.
+        """
+        return self._ask(
+            Frame, "PATCH", frame_path(map_name, frame_id), **_edit_request(changes, if_match)
+        )
+
+    def delete_frame(self, map_name: str, frame_id: str) -> None:
+        """Take a frame out of its map; UnknownMap or UnknownFrame where there is none."""
+        self._delete(frame_path(map_name, frame_id))
+
+    # sessions
+
+    def sessions(self, map_name: str) -> Iterator[Session]:
+        """Runs of a map by session and robot: how many frames, when, where their poses lead.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        """
+        return self._items(Page[Session], f"{map_path(map_name)}/sessions")
+
+    def trajectory(
+        self, map_name: str, session: str, *, robot: str | None = None,
+        parent_frame: str | None = None, captured_after: datetime | None = None,
+        captured_before: datetime | None = None, most: int | None = None,
+        clock: Literal["captured", "received"] = "captured",
+    ) -> Trajectory:  # fmt: skip
+        """The poses of a run in the order of time.
+
+        Parameters
+        ----------
+        map_name : of the map
+        session : of the run
+        robot : needed where several called a run so
+        parent_frame : needed where the poses lead to several
+        captured_after, captured_before : a part of it; with a time zone
+        clock : `received` has frames too that do not say when they were taken, as they came
+        most : poses, evenly taken along it, at most so many; `posed` tells how many there are
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : it is not clear which run is meant, or it is too long for one answer.
+        """
+        run = _run(session, robot, parent_frame, captured_after, captured_before, most, clock)
+        return self._ask(Trajectory, "GET", **_run_request(map_name, run, "application/json"))
+
+    def trajectory_text(
+        self, map_name: str, session: str, *, robot: str | None = None,
+        parent_frame: str | None = None, captured_after: datetime | None = None,
+        captured_before: datetime | None = None, most: int | None = None,
+        clock: Literal["captured", "received"] = "captured",
+    ) -> str:  # fmt: skip
+        """As `trajectory`, as text of a TUM file."""
+        run = _run(session, robot, parent_frame, captured_after, captured_before, most, clock)
+        return self._bytes(**_run_request(map_name, run, "text/plain")).decode()
+
+    # what is made of a frame
+
+    def cloud(self, map_name: str, frame_id: str, within: CloudFrame = "optical") -> bytes:
+        """The surface that a frame saw, points and normals as PLY.
+
+        Parameters
+        ----------
+        map_name, frame_id : of an indexed frame
+        within : its coordinates: "optical" of the sensor, "parent" of its pose, "base" of the
+            robot
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : there is none, or it was deleted.
+        NotIndexed : nothing has been made of it, or not yet.
+        InvalidRequest : it has no pose, or no base.
+        """
+        if within not in CLOUD_FRAMES:
+            raise _unknown("frame", within, CLOUD_FRAMES)
+        return self._bytes(f"{frame_path(map_name, frame_id)}/cloud.ply", params={"frame": within})
+
+    def preview(
+        self, map_name: str, frame_id: str, view: View = "depth", width: int = WIDTH
+    ) -> bytes:
+        """A picture of an indexed frame as PNG: "depth", "normals" or "patches". Errors as of
+        `cloud`.
+        """
+        if view not in VIEWS:
+            raise _unknown("view", view, VIEWS)
+        if not WIDTHS[0] <= width <= WIDTHS[1]:
+            raise InvalidRequest(
+                f"The width is {width}. Give one from {WIDTHS[0]} to {WIDTHS[1]}.",
+                (("width", "out of its range"),),
+            )
+        return self._bytes(
+            f"{frame_path(map_name, frame_id)}/preview.png", params={"view": view, "width": width}
+        )
+
+    def patches(self, map_name: str, frame_id: str) -> FramePatches:
+        """The surface patches of an indexed frame. Errors as of `cloud`."""
+        return self._ask(FramePatches, "GET", f"{frame_path(map_name, frame_id)}/patches")
+
+    def signature(self, map_name: str, frame_id: str) -> FrameSignature:
+        """The signature of an indexed frame. Errors as of `cloud`."""
+        return self._ask(FrameSignature, "GET", f"{frame_path(map_name, frame_id)}/signature")
+
+    def upload_of(self, map_name: str, frame_id: str) -> bytes:
+        """A frame's upload, byte for byte as it came.
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : there is none, or it was deleted.
+        NotIndexed : it was not kept.
+        """
+        return self._bytes(f"{frame_path(map_name, frame_id)}/upload")
+
+
+def _names(given: str | Iterable[str]) -> list[str]:
+    return [given] if isinstance(given, str) else list(given)
+
+
+def _run(
+    session: str, robot: str | None, parent_frame: str | None, after: datetime | None,
+    before: datetime | None, most: int | None, clock: Literal["captured", "received"],
+) -> Run:  # fmt: skip
+    return checked(
+        Run, "The run", session=session, robot=robot, parent_frame=parent_frame,
+        captured_after=after, captured_before=before, most=most,
+        clock=clock,
+    )  # fmt: skip
+
+
+def _run_request(map_name: str, run: Run, accept: str) -> dict[str, Any]:
+    """Arguments of a request for a trajectory."""
+    parameters = run.model_dump(mode="json", exclude_none=True)
+    path = f"{map_path(map_name)}/trajectory"
+    return {"path": path, "params": parameters, "headers": {"Accept": accept}}
+
+
+def _edit_request(changes: Mapping[str, Any], if_match: str | None) -> dict[str, Any]:
+    """Arguments of a request that edits."""
+    headers = {"Content-Type": "application/merge-patch+json"}
+    if if_match is not None:
+        headers["If-Match"] = f'"{if_match}"'
+    return {"content": to_json(dict(changes)), "headers": headers}
+
+
+def _unknown(what: str, name: str, known: Iterable[str]) -> InvalidRequest:
+    return InvalidRequest(
+        f"There is no {what} {name!r:.40}. Give one of {', '.join(known)}.", ((what, "unknown"),)
+    )

@@ -1,0 +1,248 @@
+"""Queries: where was this frame taken, where am I, are these two frames of one place; and what
+their answers rest on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sceneprint_client.api import (
+    Answer,
+    Comparison,
+    FrameMeta,
+    Localization,
+    NamedFrame,
+    Query,
+    SeveralQuery,
+    Similarity,
+    ValidationOptions,
+)
+from sceneprint_client.api.base import checked
+from sceneprint_client.api.results import (
+    COLOURS,
+    TRANSFORMS,
+    MatchDetails,
+    OverlayColour,
+    OverlayTransform,
+    Similarities,
+)
+from sceneprint_client.errors import InvalidRequest
+from sceneprint_client.http import ServiceConnection
+from sceneprint_client.requests import (
+    QueryFrame,
+    QueryOptions,
+    compared_frame,
+    form_text,
+    given,
+    map_path,
+    match_path,
+    meta_json,
+    named_or_sent,
+    query_form,
+    query_json,
+    query_of,
+    query_path,
+)
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from sceneprint_client.frame_files import FrameFile
+
+#: Most frames of a ranking that are compared with each other.
+_MOST_ALIKE = 200
+
+
+class QueryMethods(ServiceConnection):
+    """Queries, and what can be looked at after one."""
+
+    def query(
+        self, map_name: str | None = None, frame: bytes | Path | FrameFile | None = None,
+        meta: FrameMeta | None = None, *, frame_id: str | None = None,
+        maps: str | Iterable[str] | None = None, **how: Unpack[QueryOptions],
+    ) -> Answer:  # fmt: skip
+        """Where was this frame taken? The frame is not added to the map.
+
+        Parameters
+        ----------
+        map_name : of the map
+        frame, meta : as for `upload`
+        frame_id : of a frame of the map, in place of `frame`; it does not find itself
+        maps : names of maps of one model that are asked as one, or `*` for all, in place of
+            `map_name`; with `frame_id`, `map_name` says which map that frame is of
+        how : k, stages, exact, filter, seed and the rest of the fields of Query; a filter, and
+            what else has fields, as a dictionary or a record
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : there is none.
+        FrameError, DatasetError : the frame cannot be read, or nothing in it can be signed.
+        InvalidRequest : an option is out of its range, the frame of the map is not indexed, or
+            the maps are of several models.
+        TypeError : not one of `frame` and `frame_id`, no map, or an option that there is not.
+        """
+        if maps is None:
+            name, wanted = named_or_sent(map_name, frame, meta, frame_id)
+            query = query_of(Query, how)
+            return self._ask(
+                Answer, "POST", f"{map_path(name)}/queries", **_query_request(wanted, query)
+            )
+        if (frame_id is None) != (map_name is None):
+            raise TypeError("with `maps`, give `map_name` where `frame_id` names a frame of it")
+        _, wanted = named_or_sent(map_name or "", frame, meta, frame_id)
+        named = wanted if isinstance(wanted, NamedFrame) else None
+        asked = maps if isinstance(maps, str) else list(maps)
+        several = query_of(SeveralQuery, how, maps=asked, frame=named)
+        if isinstance(wanted, NamedFrame):
+            request = {"json": query_json(several)}
+        else:
+            request = query_form(*wanted, several)
+        return self._ask(Answer, "POST", "/v1/queries", **request)
+
+    def localize(
+        self, map_name: str, frame: bytes | Path | FrameFile | None = None,
+        meta: FrameMeta | None = None, *, frame_id: str | None = None, **how: Unpack[QueryOptions],
+    ) -> Localization:  # fmt: skip
+        """Where in a map was this frame taken? One status and one pose; see `query`."""
+        name, wanted = named_or_sent(map_name, frame, meta, frame_id)
+        request = _query_request(wanted, query_of(Query, how))
+        return self._ask(Localization, "POST", f"{map_path(name)}/localize", **request)
+
+    def similarity(
+        self, a: bytes | Path | FrameFile | NamedFrame | tuple[str, str],
+        b: bytes | Path | FrameFile | NamedFrame | tuple[str, str],
+        meta_a: FrameMeta | None = None, meta_b: FrameMeta | None = None, *, validate: bool = True,
+        validation: ValidationOptions | dict[str, Any] | None = None, seed: int = 0,
+        model: str | None = None,
+    ) -> Similarity:  # fmt: skip
+        """How alike are two frames, and do they see one place?
+
+        Parameters
+        ----------
+        a, b : each a frame as for `upload`, or a stored one: (map, frame id)
+        meta_a, meta_b : what is known of those that are not stored
+        validate, validation, seed, model : see Comparison
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : there is none.
+        FrameError, DatasetError : a frame cannot be read, or nothing in it can be signed.
+        InvalidRequest : an option is out of its range, or the frames are of two models.
+        """
+        how = checked(
+            Comparison, "The comparison", validate=validate, validation=validation, seed=seed,
+            model=model,
+        )  # fmt: skip
+        body = how.model_dump(mode="json", exclude_defaults=True, by_alias=True)
+        files = {}
+        for name, frame, meta in (("a", a, meta_a), ("b", b, meta_b)):
+            found = compared_frame(frame, meta)
+            if isinstance(found, NamedFrame):
+                body[f"frame_{name}"] = found.model_dump()
+            else:
+                files[name] = (name, found[0], "application/octet-stream")
+                body[f"meta_{name}"] = meta_json(found[1])
+        if not files:
+            return self._ask(Similarity, "POST", "/v1/similarity", json=body)
+        fields = {name: form_text(value) for name, value in body.items()}
+        return self._ask(Similarity, "POST", "/v1/similarity", files=files, data=fields)
+
+    # what can be looked at after a query
+
+    def answer(self, query_id: str) -> Answer:
+        """The answer to a query once more, for about an hour.
+
+        Raises
+        ------
+        UnknownQuery : it is not kept, or no longer.
+        """
+        return self._ask(Answer, "GET", query_path(query_id))
+
+    def query_cloud(self, query_id: str) -> bytes:
+        """The surface that a query saw, points and normals as PLY, in its sensor's frame.
+
+        Raises
+        ------
+        UnknownQuery : it is not kept, or no longer.
+        NotIndexed : it was asked without validation.
+        """
+        return self._bytes(f"{query_path(query_id)}/cloud.ply")
+
+    def similarities(self, query_id: str, limit: int = 50) -> Similarities:
+        """How alike a query and its nearest frames are, each to each.
+
+        Parameters
+        ----------
+        query_id : of an answer
+        limit : how many of the ranking, 1 to 200
+
+        Raises
+        ------
+        UnknownQuery : it is not kept, or no longer.
+        InvalidRequest : a limit out of its range.
+        """
+        if not 1 <= limit <= _MOST_ALIKE:
+            raise InvalidRequest(
+                f"{limit} frames cannot be compared with each other. Ask for 1 to {_MOST_ALIKE}.",
+                (("limit", f"give 1 to {_MOST_ALIKE}"),),
+            )
+        return self._ask(
+            Similarities, "GET", f"{query_path(query_id)}/similarities", params={"limit": limit}
+        )
+
+    def match_details(
+        self, query_id: str, frame_id: str, map_name: str | None = None
+    ) -> MatchDetails:
+        """One match of a query, validated once more, with what its figures were counted on.
+
+        Parameters
+        ----------
+        query_id, frame_id : of an answer and of one of its matches
+        map_name : where matches of several maps have that id; default: the first of them
+
+        Raises
+        ------
+        UnknownQuery : it is not kept, or no longer.
+        UnknownMap, UnknownFrame : no match has that id, or it was deleted since.
+        NotIndexed : the query was asked without validation, or the map has another model now.
+        """
+        return self._ask(
+            MatchDetails, "GET", match_path(query_id, frame_id), params=given(map=map_name)
+        )
+
+    def overlay(
+        self, query_id: str, frame_id: str, map_name: str | None = None,
+        color: OverlayColour = "source", transform: OverlayTransform = "aligned",
+    ) -> bytes:  # fmt: skip
+        """A query's points and a match's in the match's sensor's frame, coloured, as PLY.
+
+        Parameters
+        ----------
+        query_id, frame_id, map_name : see `match_details`
+        color : by "source", "normal" or "residual"
+        transform : "aligned" as it was found, "rival" as the next best, or "none"
+
+        Raises
+        ------
+        UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : see `match_details`.
+        InvalidRequest : there is no such transform, or no such way to colour.
+        """
+        for name, value, known in (("color", color, COLOURS), ("transform", transform, TRANSFORMS)):
+            if value not in known:
+                raise InvalidRequest(
+                    f"{value!r:.80} is no {name} of an overlay. Give one of {', '.join(known)}.",
+                    ((name, f"give one of {', '.join(known)}"),),
+                )
+        return self._bytes(
+            f"{match_path(query_id, frame_id)}/overlay.ply",
+            params=given(map=map_name, color=color, transform=transform),
+        )
+
+
+def _query_request(frame: QueryFrame, query: Query) -> dict[str, Any]:
+    """Arguments of a request that asks for a stored frame of the map, or for one at hand."""
+    if isinstance(frame, NamedFrame):
+        return {"json": {"frame_id": frame.frame_id, **query_json(query)}}
+    return query_form(*frame, query)

@@ -1,0 +1,409 @@
+"""What lies beside a frame's file: its camera, how its points are read, its pose.
+
+folder  --find_camera-->  Camera          `intrinsics.json` beside the frames or above them
+folder  --find_cloud_source-->  CloudSource          `clouds.json` likewise, or nothing
+text  --read_pose-->  T_parent_sensor (4, 4)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint_client.api.frames import CloudFormat
+from sceneprint_client.errors import DatasetError, InvalidIntrinsics, InvalidPose, naming
+from sceneprint_client.files import read_object, read_text
+
+_PARENTS = 4  #: folders above the frames that are looked into
+_MAXIMUM_BYTES = 65_536
+
+# The camera.
+
+#: Most samples a depth image may have (an 8-megapixel sensor); more is refused unread.
+MAXIMUM_SAMPLES = 8_388_608
+
+#: Longest focal length and farthest principal point that are believed, pixels.
+MAXIMUM_PIXELS = 1e7
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera: pixel = (fx x/z + cx, fy y/z + cy), pixel centres at integers.
+
+    Parameters
+    ----------
+    width, height : size of the image, pixels
+    fx, fy : focal lengths, pixels
+    cx, cy : principal point, pixels
+    distortion : Brown-Conrady coefficients k1, k2, p1, p2[, k3] in OpenCV's order and
+        meaning; empty for an image without distortion
+
+    Raises
+    ------
+    InvalidIntrinsics : a size below 1, a focal length that is not positive and finite, a
+        principal point that is not finite, or a number of coefficients other than 0, 4, 5.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise InvalidIntrinsics(
+                f"The image size {self.width} x {self.height} is empty. "
+                "Give the width and height of the depth image in pixels."
+            )
+        if self.width * self.height > MAXIMUM_SAMPLES:
+            raise InvalidIntrinsics(
+                f"The image size {self.width} x {self.height} exceeds the limit of "
+                f"{MAXIMUM_SAMPLES} samples. Send the image at a lower resolution."
+            )
+        for name, value in (("fx", self.fx), ("fy", self.fy)):
+            if not (math.isfinite(value) and value > 0):
+                raise InvalidIntrinsics(
+                    f"The focal length {name} = {value} is not a positive number, so pixels "
+                    "have no direction. Give it in pixels, as the sensor's calibration states."
+                )
+            if not 1e-3 <= value <= MAXIMUM_PIXELS:
+                raise InvalidIntrinsics(
+                    f"The focal length {name} = {value:g} is that of no camera. "
+                    "Give it in pixels, as the sensor's calibration states."
+                )
+        if not (math.isfinite(self.cx) and math.isfinite(self.cy)):
+            raise InvalidIntrinsics(
+                f"The principal point ({self.cx}, {self.cy}) is not finite. "
+                "Give cx and cy in pixels, as the sensor's calibration states."
+            )
+        if max(abs(self.cx), abs(self.cy)) > MAXIMUM_PIXELS:
+            raise InvalidIntrinsics(
+                f"The principal point ({self.cx:g}, {self.cy:g}) is that of no camera. "
+                "Give cx and cy in pixels, as the sensor's calibration states."
+            )
+        if len(self.distortion) not in (0, 4, 5):
+            raise InvalidIntrinsics(
+                f"{len(self.distortion)} distortion coefficients were given. "
+                "Give k1, k2, p1, p2 and optionally k3, or none."
+            )
+        if not all(math.isfinite(k) for k in self.distortion):
+            raise InvalidIntrinsics(
+                f"The distortion coefficients {self.distortion} are not all finite. "
+                "Give k1, k2, p1, p2 and optionally k3 as the calibration states."
+            )
+
+    def without_distortion(self) -> Intrinsics:
+        """The same camera after its images have been undistorted."""
+        return replace(self, distortion=())
+
+
+INTRINSICS_FILE = "intrinsics.json"
+_INTRINSICS_EXAMPLE = (
+    '{"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, '
+    '"depth_scale": 1000}'
+)
+_REQUIRED = ("width", "height", "fx", "fy", "cx", "cy")
+_OPTIONAL = ("depth_scale", "distortion", "depth_along_ray")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A sensor: its lens, and how it stores depth.
+
+    Parameters
+    ----------
+    intrinsics : of the depth images, with their distortion
+    depth_scale : stored units per metre
+    along_ray : depth is the range along the pixel's ray and not z
+
+    Raises
+    ------
+    InvalidIntrinsics : the depth scale is no positive number.
+    """
+
+    intrinsics: Intrinsics
+    depth_scale: float = 1000.0
+    along_ray: bool = False
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.depth_scale) and self.depth_scale > 0):
+            raise InvalidIntrinsics(
+                f"The depth scale {self.depth_scale} is not a positive number. "
+                "Give the stored units per metre, 1000 for millimetres."
+            )
+
+
+def find_camera(folder: Path) -> Camera:
+    """Return the camera of the nearest `intrinsics.json`, here or up to 4 folders above.
+
+    Raises
+    ------
+    DatasetError : there is none; the message shows one to write.
+    InvalidIntrinsics : as `read_camera`.
+    """
+    absolute = folder.resolve() if ".." in folder.parts else folder.absolute()
+    for place in (absolute, *absolute.parents[:_PARENTS]):
+        candidate = place / INTRINSICS_FILE
+        if candidate.is_file():
+            return read_camera(candidate)
+    raise DatasetError(
+        f"{folder}: There is no {INTRINSICS_FILE} here or in the {_PARENTS} folders above, so the "
+        f"camera is unknown. Write one such as {_INTRINSICS_EXAMPLE} (pixels; depth_scale is "
+        "stored units per metre)."
+    )
+
+
+def read_camera(path: Path) -> Camera:
+    """Return the camera that a JSON file describes.
+
+    Fields: width, height, fx, fy, cx, cy in pixels; and, if they differ from what is said
+    here, depth_scale (1000), distortion (none), depth_along_ray (false).
+
+    Raises
+    ------
+    InvalidIntrinsics : the file cannot be read, is no JSON object, lacks a field, has one
+        too many, or a value that no camera has; names the file.
+    """
+    fields = read_object(path, _MAXIMUM_BYTES, InvalidIntrinsics, _INTRINSICS_EXAMPLE)
+    with naming(str(path)):
+        return _camera(fields)
+
+
+def _camera(fields: dict[str, object]) -> Camera:
+    missing = [name for name in _REQUIRED if name not in fields]
+    if missing:
+        raise InvalidIntrinsics(
+            f"{', '.join(missing)} is missing. Write it such as {_INTRINSICS_EXAMPLE}."
+        )
+    unknown = sorted(set(fields) - {*_REQUIRED, *_OPTIONAL})
+    if unknown:
+        # a misspelt optional field would otherwise be silently without effect
+        raise InvalidIntrinsics(
+            f"{', '.join(unknown)!r:.80} is no field of it. "
+            f"The fields are {', '.join((*_REQUIRED, *_OPTIONAL))}."
+        )
+    distortion = fields.get("distortion", [])
+    if not isinstance(distortion, list):
+        raise InvalidIntrinsics("distortion is no list. Write k1, k2, p1, p2 and optionally k3.")
+    along_ray = fields.get("depth_along_ray", False)
+    if not isinstance(along_ray, bool):
+        raise InvalidIntrinsics("depth_along_ray is neither true nor false. Write one of them.")
+    return Camera(
+        Intrinsics(
+            width=_whole(fields, "width"),
+            height=_whole(fields, "height"),
+            fx=_intrinsics_number("fx", fields["fx"]),
+            fy=_intrinsics_number("fy", fields["fy"]),
+            cx=_intrinsics_number("cx", fields["cx"]),
+            cy=_intrinsics_number("cy", fields["cy"]),
+            distortion=tuple(_intrinsics_number("distortion", value) for value in distortion),
+        ),
+        depth_scale=_intrinsics_number("depth_scale", fields.get("depth_scale", 1000)),
+        along_ray=along_ray,
+    )
+
+
+def _whole(fields: dict[str, object], name: str) -> int:
+    value = fields[name]
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise InvalidIntrinsics(
+            f"{name} is {value!r:.40}, not a whole number. Write the size in pixels."
+        )
+    return value
+
+
+def _intrinsics_number(name: str, value: object) -> float:
+    # bool is a kind of int in Python; "true" is no length in pixels
+    if not isinstance(value, bool) and isinstance(value, int | float):
+        try:
+            return float(value)
+        except OverflowError:
+            pass
+    raise InvalidIntrinsics(f"{name} is {value!r:.40}, not a number. Write it as one.")
+
+
+# How points are read.
+
+
+CLOUDS_FILE = "clouds.json"
+_CLOUDS_EXAMPLE = (
+    '{"viewpoint": {"x": 0, "y": 0, "z": 1.7}, "units_per_metre": 1, "format": "kitti"}'
+)
+_FIELDS = ("viewpoint", "units_per_metre", "format")
+_FORMATS: tuple[CloudFormat, ...] = get_args(CloudFormat)
+
+
+Position = tuple[float, float, float]
+
+
+class Unsaid(Enum):
+    """What is given for a viewpoint of which nothing is said: the file says it, or the origin."""
+
+    UNSAID = "unsaid"
+
+
+UNSAID = Unsaid.UNSAID
+
+
+@dataclass(frozen=True)
+class CloudSource:
+    """How a file of points is to be read.
+
+    Parameters
+    ----------
+    file_format : of it, or None: its first bytes tell
+    viewpoint : where the sensor was, metres in the file's axes; None for points of many views;
+        UNSAID: as the file says, else the origin
+    units_per_metre : of its coordinates
+    """
+
+    file_format: CloudFormat | None = None
+    viewpoint: Position | Unsaid | None = UNSAID
+    units_per_metre: float = 1.0
+
+
+def find_cloud_source(folder: Path) -> CloudSource:
+    """Return what the nearest `clouds.json` says, here or up to 4 folders above; without one,
+    nothing is said.
+
+    Raises
+    ------
+    DatasetError : it cannot be read, is no JSON object, or has a field or value that is none.
+    """
+    absolute = folder.resolve() if ".." in folder.parts else folder.absolute()
+    for place in (absolute, *absolute.parents[:_PARENTS]):
+        candidate = place / CLOUDS_FILE
+        if candidate.is_file():
+            return _read_source(candidate)
+    return CloudSource()
+
+
+def _read_source(path: Path) -> CloudSource:
+    fields = read_object(path, _MAXIMUM_BYTES, DatasetError, _CLOUDS_EXAMPLE)
+    with naming(str(path)):
+        unknown = sorted(set(fields) - {*_FIELDS})
+        if unknown:
+            raise DatasetError(
+                f"{', '.join(unknown)!r:.80} is no field of it. "
+                f"The fields are {', '.join(_FIELDS)}."
+            )
+        told = fields.get("format")
+        if told is not None and told not in _FORMATS:
+            raise DatasetError(f"format is {told!r:.40}. Known are {', '.join(_FORMATS)}.")
+        units = _cloud_number("units_per_metre", fields.get("units_per_metre", 1.0))
+        if not units > 0.0:
+            raise DatasetError(f"units_per_metre is {units}. Write 1000 for millimetres.")
+        return CloudSource(told, _viewpoint(fields), units)
+
+
+def _viewpoint(fields: dict[str, object]) -> Position | Unsaid | None:
+    if "viewpoint" not in fields:
+        return UNSAID
+    told = fields["viewpoint"]
+    if told is None:
+        return None
+    if not isinstance(told, dict) or set(told) != {"x", "y", "z"}:
+        raise DatasetError(
+            f"viewpoint is {told!r:.60}. Write it such as {_CLOUDS_EXAMPLE}, or null for points "
+            "that were not seen from one place."
+        )
+    return (
+        _cloud_number("x", told["x"]),
+        _cloud_number("y", told["y"]),
+        _cloud_number("z", told["z"]),
+    )
+
+
+def _cloud_number(name: str, value: object) -> float:
+    if not isinstance(value, bool) and isinstance(value, int | float):
+        try:
+            number = float(value)
+        except OverflowError:  # JSON has whole numbers of any length
+            number = math.inf
+        if math.isfinite(number):
+            return number
+    raise DatasetError(f"{name} is {value!r:.40}, no finite number. Write it as one.")
+
+
+# Poses.
+
+_TOLERANCE = 1e-2  #: how far a written rotation may be from a true one
+_MAXIMUM_POSE_BYTES = 65_536
+
+
+def read_pose(path: Path) -> NDArray[np.float64]:
+    """Return T_parent_sensor (4, 4) of a text file with 16 numbers, row by row.
+
+    Raises
+    ------
+    InvalidPose : the file cannot be read, or as `rigid_transform`; names the file.
+    """
+    words = read_text(path, _MAXIMUM_POSE_BYTES, InvalidPose).split()
+    with naming(str(path)):
+        if len(words) != 16:
+            raise InvalidPose(
+                f"The file holds {len(words)} words and a pose is 16 numbers. "
+                "Write 4 rows of 4, sensor to parent."
+            )
+        return rigid_transform(np.array(_numbers(words)).reshape(4, 4))
+
+
+def rigid_transform(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the pose with its rotation made orthonormal to machine precision.
+
+    Parameters
+    ----------
+    matrix : (4, 4) T_parent_sensor, its rotation good to 1e-2
+
+    Returns
+    -------
+    T_parent_sensor : (4, 4) float64, the rotation nearest to the one given
+
+    Raises
+    ------
+    InvalidPose : the matrix is not 4 x 4 numbers, not finite, or not rigid.
+    """
+    try:
+        pose = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as cause:
+        raise InvalidPose("The pose is not made of numbers. Give 4 x 4 of them.") from cause
+    if pose.shape != (4, 4):
+        raise InvalidPose(f"The pose has shape {pose.shape}. Give 4 x 4 numbers.")
+    if not np.isfinite(pose).all():
+        raise InvalidPose(
+            "The pose is not finite, as where tracking was lost. Leave the frame or its pose out."
+        )
+    if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
+        raise InvalidPose(
+            "The last row of the pose is not 0 0 0 1. Give sensor-to-parent, row by row."
+        )
+    rotation = pose[:3, :3]
+    # entries first: the product of large ones overflows
+    rigid = np.abs(rotation).max() < 2.0
+    if not rigid or np.abs(rotation.T @ rotation - np.eye(3)).max() > _TOLERANCE:
+        raise InvalidPose(
+            f"The rotation of the pose is not orthonormal to {_TOLERANCE}. "
+            "Give a rigid transform without scale."
+        )
+    if np.linalg.det(rotation) < 0.0:
+        raise InvalidPose("The rotation of the pose mirrors. Give right-handed axes.")
+    left, _, right = np.linalg.svd(rotation)
+    pose[:3, :3] = left @ right
+    pose[3] = (0.0, 0.0, 0.0, 1.0)
+    return pose
+
+
+def _numbers(words: list[str]) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError as cause:
+        raise InvalidPose(f"A word is no number ({cause}). Write numbers only.") from cause

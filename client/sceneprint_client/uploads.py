@@ -1,0 +1,187 @@
+"""Uploads: one frame, one under an id of the caller, many at once."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sceneprint_client.api import Added, Frame, FrameMeta, FrameState
+from sceneprint_client.api.frames import (
+    MOST_OF_BATCH,
+    MOST_PRIORITY,
+    Batch,
+    BatchItem,
+    check_frame_id,
+    novelty_of,
+)
+from sceneprint_client.errors import InvalidRequest
+from sceneprint_client.http import ServiceConnection, read_record
+from sceneprint_client.jobs import growing_pauses
+from sceneprint_client.requests import frame_bytes, frame_form, frame_path, map_path, meta_json
+
+if TYPE_CHECKING:
+    from sceneprint_client.frame_files import FrameFile
+
+#: Longest time the service is asked to wait for a worker, seconds.
+_LONGEST_WAIT_S = 60
+
+
+class UploadMethods(ServiceConnection):
+    """How frames come into a map."""
+
+    def upload(
+        self, map_name: str, frame: bytes | Path | FrameFile, meta: FrameMeta | None = None,
+        *, wait_s: float | None = None, priority: int = 0,
+        if_novel: float | bool | None = None,
+    ) -> Added:  # fmt: skip
+        """Take a frame into a map; it is safe when this returns, and signed soon after.
+
+        Parameters
+        ----------
+        map_name : of the map
+        frame : content of a PNG or NPY file or of a cloud, the file, or a frame of `find_sequences`
+        meta : what is known of it; default: what `meta_of` finds
+        wait_s : seconds to wait until it is signed; default: none
+        priority : from -10 to 10; frames of a greater one are signed first
+        if_novel : keep it only if the map lacks the place: if its nearest frame is farther than
+            this share of the distance of unrelated frames, or than 0.3 of it where just True;
+            else the frame ends `redundant`, and `reason` says which frame is near
+
+        Returns
+        -------
+        added : its state tells whether it is signed yet
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        FrameError, DatasetError : the frame cannot be read, or its camera or pose is none.
+        FrameConflict : the map has the same content with other metadata.
+        InvalidRequest : a priority or `if_novel` out of its range.
+        """
+        until = time.monotonic() + (wait_s or 0.0)
+        added, _ = self.add(
+            map_name, frame, meta, wait_s=wait_s, priority=priority, if_novel=if_novel
+        )
+        return self._settled(map_name, added, until)
+
+    def add(
+        self, map_name: str, frame: bytes | Path | FrameFile, meta: FrameMeta | None = None,
+        *, wait_s: float | None = None, priority: int = 0,
+        if_novel: float | bool | None = None,
+    ) -> tuple[Added, bool]:  # fmt: skip
+        """As `upload`, with a flag: False where the map had the frame already.
+
+        The wait may end early; `upload` goes on to the end of it.
+        """
+        return self._upload(
+            "POST", f"{map_path(map_name)}/frames", frame, meta, wait_s or 0.0,
+            _upload_fields(priority, if_novel),
+        )  # fmt: skip
+
+    def put_frame(
+        self, map_name: str, frame_id: str, frame: bytes | Path | FrameFile,
+        meta: FrameMeta | None = None, *, wait_s: float | None = None, priority: int = 0,
+        if_novel: float | bool | None = None,
+    ) -> Added:  # fmt: skip
+        """Take a frame into a map under an id of your own; sent again, it is the one there.
+
+        Parameters
+        ----------
+        map_name : of the map
+        frame_id : up to 64 letters, digits, dots, hyphens and underscores, the first a letter or
+            digit
+        frame, meta, wait_s, priority, if_novel : as for `upload`
+
+        Raises
+        ------
+        UnknownMap, FrameError, DatasetError : as `upload`.
+        FrameConflict : there is a frame of that id with other content or metadata.
+        InvalidRequest : an id that is none; a priority or `if_novel` out of its range.
+        """
+        check_frame_id(frame_id)
+        until = time.monotonic() + (wait_s or 0.0)
+        added, _ = self._upload(
+            "PUT", frame_path(map_name, frame_id), frame, meta, wait_s or 0.0,
+            _upload_fields(priority, if_novel),
+        )  # fmt: skip
+        return self._settled(map_name, added, until)
+
+    def upload_batch(
+        self, map_name: str, frames: Sequence[bytes | Path | FrameFile],
+        metas: Sequence[FrameMeta] | FrameMeta | None = None, *, priority: int = 0,
+        if_novel: float | bool | None = None,
+    ) -> list[BatchItem]:  # fmt: skip
+        """Take up to 64 frames into a map in one commit; what is wrong with one costs no other.
+
+        Parameters
+        ----------
+        map_name : of the map
+        frames, metas : as for `upload`; one for all, or one for each
+        priority, if_novel : of all
+
+        Returns
+        -------
+        items : of each frame in their order
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        UnreadableFrame, DatasetError : a file cannot be read; nothing was sent.
+        InvalidRequest : too many frames, or not as many metadata.
+        """
+        if isinstance(metas, FrameMeta):
+            metas = [metas] * len(frames)
+        if not 1 <= len(frames) <= MOST_OF_BATCH or (metas and len(metas) != len(frames)):
+            raise InvalidRequest(
+                f"The batch has {len(frames)} frames. Give 1 to {MOST_OF_BATCH}, and one `meta` "
+                "for all or for each.",
+                (("frames", "too many or too few"),),
+            )
+        known = [None] * len(frames) if metas is None else metas
+        sent = [frame_bytes(*one, with_pose=True) for one in zip(frames, known, strict=True)]
+        metadata = json.dumps([meta_json(meta) for _, meta in sent])
+        files = [("frame", ("frame", data, "application/octet-stream")) for data, _ in sent]
+        return self._ask(
+            Batch, "POST", f"{map_path(map_name)}/frames/batch", files=files,
+            data={"metas": metadata, **_upload_fields(priority, if_novel)},
+        ).items  # fmt: skip
+
+    def _upload(
+        self, method: str, path: str, frame: bytes | Path | FrameFile, meta: FrameMeta | None,
+        wait_s: float, fields: dict[str, str],
+    ) -> tuple[Added, bool]:  # fmt: skip
+        """Send a frame; the service does not wait for one it had already."""
+        sent = frame_form(*frame_bytes(frame, meta, with_pose=True))
+        sent["data"] |= fields
+        # where this process is the worker, nobody would sign it meanwhile
+        wait = 0 if self._worker is not None else min(int(wait_s), _LONGEST_WAIT_S)
+        response = self._send(
+            method, path, headers={"Prefer": f"wait={wait}"} if wait else {},
+            timeout=self._timeout_s + wait, **sent,
+        )  # fmt: skip
+        return read_record(Added, response), response.status_code != 200
+
+    def _settled(self, map_name: str, added: Added, until: float) -> Added:
+        """An upload once its job is over, or as it is at a time of `time.monotonic`."""
+        for pause in growing_pauses(until):
+            if added.state not in (FrameState.RECEIVED, FrameState.SIGNING):
+                break
+            self._let_work(pause)
+            now = self._ask(Frame, "GET", frame_path(map_name, added.frame_id))
+            added = added.model_copy(update={"state": now.state, "reason": now.reason})
+        return added
+
+
+def _upload_fields(priority: int, if_novel: float | bool | None) -> dict[str, str]:
+    """Fields of an upload beside the frame; a service of before knows of none."""
+    if abs(priority) > MOST_PRIORITY:
+        raise InvalidRequest(
+            f"The priority is {priority}. Give one from {-MOST_PRIORITY} to {MOST_PRIORITY}.",
+            (("priority", "out of its range"),),
+        )
+    novelty = novelty_of(if_novel)
+    fields = {"priority": str(priority)} if priority else {}
+    return fields if novelty is None else {**fields, "if_novel": repr(novelty)}

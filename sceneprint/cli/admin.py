@@ -1,0 +1,162 @@
+"""`sceneprint keys`: keys for a service that listens beyond its own machine."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Any
+
+from sceneprint.cli.options import one_line, require_database, whole_number
+from sceneprint.cli.serve import add_data_option, settings_of
+from sceneprint_client.api.admin import EVERY, SCOPES
+
+if TYPE_CHECKING:
+    from sceneprint_client.api.admin import Audited, Key, Scope
+
+_SECONDS = {"m": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
+
+
+def add_keys(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "keys",
+        help="create, list and revoke the API keys of a service",
+        description="Create, list or revoke API keys. A service needs them once it listens "
+        "beyond its own machine. The secret of a key is printed once, on creation; only its "
+        "hash is stored.",
+    )
+    what = command.add_mutually_exclusive_group(required=True)
+    what.add_argument("--create", metavar="NAME", help="create a key and print its secret")
+    what.add_argument(
+        "--list",
+        action="store_true",
+        help="list keys with their creation time, name, scope and expiry",
+    )
+    what.add_argument("--revoke", metavar="NAME", help="revoke a key")
+    command.add_argument("--scope", choices=SCOPES, help="scope of the new key (default: admin)")
+    command.add_argument(
+        "--map",
+        action="append",
+        metavar="MAP",
+        help=(
+            "map that the key is valid for; repeatable (default: all maps and everything "
+            "outside of maps)"
+        ),
+    )
+    command.add_argument(
+        "--expires",
+        type=_duration,
+        metavar="TIME",
+        help="lifetime of the key, such as 12h, 30d or 8w (default: no expiry)",
+    )
+    add_data_option(command)
+    command.set_defaults(run=run_keys)
+
+
+def run_keys(options: argparse.Namespace) -> int:
+    """Do what was asked for with the keys of the data folder."""
+    from sceneprint.engine import Engine
+    from sceneprint.errors import InvalidRequest
+
+    given = [name for name in ("scope", "map", "expires") if getattr(options, name) is not None]
+    if given and options.create is None:
+        raise InvalidRequest(f"--{given[0]} applies to a new key only. Use it with --create.")
+    with Engine(settings_of(options)) as engine:
+        if options.list:
+            cursor = None
+            while True:
+                page = engine.list_keys(cursor, 1000)
+                for key in page.items:
+                    print(_key_line(key))
+                cursor = page.next_cursor
+                if cursor is None:
+                    break
+        elif options.revoke is not None:
+            engine.revoke_key(options.revoke)
+            engine.audit.command("keys --revoke", target=options.revoke)
+            print(f"key {one_line(options.revoke)} is revoked")
+        else:
+            scope: Scope = options.scope or "admin"
+            grants = dict.fromkeys(options.map or [EVERY], scope)
+            until = None if options.expires is None else datetime.now(UTC) + options.expires
+            made = engine.create_key(options.create, grants, until)
+            engine.audit.command("keys --create", target=made.name)
+            print(made.secret)
+            print(
+                "save this secret now: it is not stored and cannot be shown again", file=sys.stderr
+            )
+    return 0
+
+
+def _key_line(key: Key) -> str:
+    grants = ", ".join(
+        f"{scope} of {'all' if name == EVERY else name}" for name, scope in key.grants.items()
+    )
+    text = f"{key.created_at:%Y-%m-%dT%H:%M:%SZ}  {one_line(key.name)}  {grants}"
+    if key.expires_at is None:
+        return text
+    ends = "expired" if key.expires_at <= datetime.now(UTC) else "until"
+    return f"{text}, {ends} {key.expires_at:%Y-%m-%dT%H:%M:%SZ}"
+
+
+def _duration(text: str) -> timedelta:
+    found = re.fullmatch(r"([1-9][0-9]{0,4})([mhdw])", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a duration such as 12h, 30d or 8w")
+    return timedelta(seconds=int(found[1]) * _SECONDS[found[2]])
+
+
+# `sceneprint audit`: who changed what.
+
+
+def add_audit(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "audit",
+        help="print the audit log",
+        description="Print the audit log, newest entry first: who changed what, and from which "
+        "address. Frame uploads are not logged here; see the frames themselves.",
+    )
+    command.add_argument(
+        "--actor",
+        metavar="NAME",
+        help="only changes made with this key, or `command` for the command line",
+    )
+    command.add_argument("--map", metavar="MAP", help="only changes to this map")
+    command.add_argument(
+        "--limit",
+        type=whole_number,
+        default=100,
+        metavar="N",
+        help="maximum number of entries (default: 100)",
+    )
+    command.add_argument("--json", action="store_true", help="print one JSON object per line")
+    add_data_option(command)
+    command.set_defaults(run=run_audit)
+
+
+def run_audit(options: argparse.Namespace) -> int:
+    """Print the changes."""
+    from sceneprint.engine import Engine
+
+    settings = settings_of(options)
+    require_database(settings)
+    with Engine(settings) as engine:
+        cursor, left = None, options.limit
+        while left > 0:
+            page = engine.audit.page(cursor, min(left, 1000), options.actor, options.map)
+            for one in page.items:
+                print(one.model_dump_json() if options.json else _audit_line(one))
+            cursor, left = page.next_cursor, left - len(page.items)
+            if cursor is None:
+                break
+    return 0
+
+
+def _audit_line(one: Audited) -> str:
+    who = "no key" if one.actor is None else one.actor
+    whence = "" if one.address is None else f" from {one.address}"
+    what = " ".join(part for part in (one.action, one.map, one.target) if part)
+    return one_line(f"{one.at:%Y-%m-%dT%H:%M:%SZ}  {who}{whence}  {what}")

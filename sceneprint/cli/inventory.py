@@ -1,0 +1,535 @@
+"""`sceneprint frames`: what a map holds, and frames out of it as files."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+from datetime import datetime
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic_core import from_json
+
+from sceneprint.atomic_files import write_whole
+from sceneprint.cli.options import (
+    add_service_options,
+    one_line,
+    open_client,
+    positive,
+    whole_number,
+)
+from sceneprint.errors import CannotRetry, InvalidRequest
+from sceneprint.models import PRESETS
+from sceneprint_client.api.base import FrameState, JobState
+from sceneprint_client.api.results import CLOUD_FRAMES, VIEWS, WIDTH
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from sceneprint_client import Client
+    from sceneprint_client.api import Frame, Job, Map
+    from sceneprint_client.api.admin import Event
+    from sceneprint_client.api.listing import Session
+
+#: Options that take a file for something of one frame.
+_FILES = ("cloud", "preview", "patches", "signature", "upload")
+
+
+def add_frames(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "frames",
+        help="list frames and sessions of a map, download their files, edit metadata",
+        description="List the frames of a map in order of upload, or its sessions, or write the "
+        "trajectory of a session. With FRAME: show that frame, download its files, or edit its "
+        "metadata.",
+    )
+    command.add_argument("map", metavar="MAP")
+    command.add_argument("frame_id", nargs="?", metavar="FRAME", help="id of one frame")
+    _add_listing(command.add_argument_group("select frames, sessions or poses"))
+    _add_files(command.add_argument_group("actions on one frame"))
+    command.add_argument("--json", action="store_true", help="print JSON")
+    add_service_options(command)
+    command.set_defaults(run=run_frames)
+
+
+def _add_listing(group: Any) -> None:
+    group.add_argument("--robot", action="append", metavar="NAME", help="repeatable: matches any")
+    group.add_argument("--session", action="append", metavar="NAME", help="repeatable: matches any")
+    group.add_argument("--tag", action="append", metavar="TAG", help="repeatable: matches all")
+    group.add_argument("--state", choices=[str(state) for state in FrameState])
+    group.add_argument("--parent-frame", metavar="NAME", help="parent frame of the poses")
+    group.add_argument(
+        "--after",
+        type=_time,
+        metavar="TIME",
+        help="captured at or after this time: 2026-11-16T09:30:00Z",
+    )
+    group.add_argument(
+        "--before", type=_time, metavar="TIME", help="captured at or before this time"
+    )
+    group.add_argument("--newest", action="store_true", help="newest first")
+    group.add_argument("--limit", type=positive, metavar="N", help="maximum number to list")
+    group.add_argument("--sessions", action="store_true", help="list sessions instead")
+    group.add_argument(
+        "--trajectory",
+        type=Path,
+        metavar="FILE",
+        help="write the poses of one --session as a TUM trajectory",
+    )
+
+
+def _add_files(group: Any) -> None:
+    group.add_argument("--cloud", type=Path, metavar="FILE", help="write its point cloud as PLY")
+    group.add_argument(
+        "--within", choices=CLOUD_FRAMES, default="optical",
+        help="coordinate frame of the cloud: the sensor, the parent frame of its pose, or the "
+        "robot's base (default: optical)",
+    )  # fmt: skip
+    group.add_argument("--preview", type=Path, metavar="FILE", help="write a preview as PNG")
+    group.add_argument(
+        "--view", choices=VIEWS, default="depth", help="view of the preview (default: depth)"
+    )
+    group.add_argument("--width", type=positive, default=WIDTH, metavar="PIXELS")
+    group.add_argument("--patches", type=Path, metavar="FILE", help="write its patches as JSON")
+    group.add_argument("--signature", type=Path, metavar="FILE", help="write its signature as JSON")
+    group.add_argument(
+        "--upload", type=Path, metavar="FILE", help="write the uploaded file unchanged"
+    )
+    group.add_argument(
+        "--edit", type=_changes, metavar="JSON",
+        help="edit its metadata: '{\"tags\": [\"door\"], \"robot\": null}'",
+    )  # fmt: skip
+
+
+def run_frames(options: argparse.Namespace) -> int:
+    """List, write or edit."""
+    of_one = [name for name in (*_FILES, "edit") if getattr(options, name) is not None]
+    if options.frame_id is None and of_one:
+        raise InvalidRequest(f"--{of_one[0]} applies to one frame. Give its id after the map.")
+    if options.trajectory is not None and len(options.session or ()) != 1:
+        raise InvalidRequest("--trajectory needs a session. Name it with --session.")
+    with open_client(options) as client:
+        if options.frame_id is not None:
+            _one(client, options)
+        elif options.trajectory is not None:
+            _trajectory(client, options)
+        elif options.sessions:
+            _sessions(client.sessions(options.map), as_json=options.json)
+        else:
+            found = client.frames(
+                options.map, None if options.state is None else FrameState(options.state),
+                robot=options.robot or (), session=options.session or (), tags=options.tag or (),
+                parent_frame=options.parent_frame, captured_after=options.after,
+                captured_before=options.before, order="desc" if options.newest else "asc",
+            )  # fmt: skip
+            _print_frames(itertools.islice(found, options.limit), as_json=options.json)
+    return 0
+
+
+def _one(client: Client, options: argparse.Namespace) -> None:
+    of = options.map, options.frame_id
+    frame = client.frame(*of) if options.edit is None else client.edit_frame(*of, options.edit)
+    makers = {
+        "cloud": lambda: client.cloud(*of, options.within),
+        "preview": lambda: client.preview(*of, options.view, options.width),
+        "patches": lambda: client.patches(*of).model_dump_json().encode(),
+        "signature": lambda: client.signature(*of).model_dump_json().encode(),
+        "upload": lambda: client.upload_of(*of),
+    }
+    written = []
+    for name in _FILES:
+        path = getattr(options, name)
+        if path is not None:
+            write_whole(path, makers[name]())
+            written.append(path)
+    if options.json or not written:
+        print(frame.model_dump_json(indent=None if options.json else 2))
+    else:
+        print("\n".join(f"wrote {path}" for path in written))
+
+
+def _trajectory(client: Client, options: argparse.Namespace) -> None:
+    if len(options.robot or ()) > 1:
+        raise InvalidRequest("--trajectory accepts one robot only. Give --robot once.")
+    text = client.trajectory_text(
+        options.map, options.session[0], robot=(options.robot or [None])[0],
+        parent_frame=options.parent_frame, captured_after=options.after,
+        captured_before=options.before,
+    )  # fmt: skip
+    write_whole(options.trajectory, text.encode())
+    poses = sum(not line.startswith("#") for line in text.splitlines())
+    print(f"wrote {options.trajectory}: {poses} poses")
+
+
+def _print_frames(frames: Iterable[Frame], *, as_json: bool) -> None:
+    any_yet = False
+    for one in frames:
+        if as_json:
+            print(one.model_dump_json())
+            continue
+        if not any_yet:
+            print(f"{'frame':32}  state      captured             pose  robot/session  tags")
+            any_yet = True
+        at = "" if one.captured_at is None else f"{one.captured_at:%Y-%m-%d %H:%M:%S}"
+        who = one_line(f"{one.robot or '-'}/{one.session or '-'}")
+        pose = "no" if one.pose is None else "yes"
+        tags = one_line(",".join(one.tags))
+        print(f"{one.frame_id:32}  {one.state:9}  {at:19}  {pose:4}  {who}  {tags}".rstrip())
+    if not any_yet and not as_json:
+        print("no frames match")
+
+
+def _sessions(sessions: Iterable[Session], *, as_json: bool) -> None:
+    any_yet = False
+    for one in sessions:
+        if as_json:
+            print(one.model_dump_json())
+            continue
+        if not any_yet:
+            print("frames  indexed  poses  first captured       last captured        robot/session")
+            any_yet = True
+        first, last = (
+            "" if at is None else f"{at:%Y-%m-%d %H:%M:%S}"
+            for at in (one.first_captured_at, one.last_captured_at)
+        )
+        who = one_line(f"{one.robot or '-'}/{one.session or '-'}")
+        n = sum(one.frames.values())
+        print(
+            f"{n:6}  {one.frames.get('indexed', 0):7}  {one.with_pose:5}  {first:19}  {last:19}  "
+            f"{who}"
+        )
+    if not any_yet and not as_json:
+        print("no sessions yet")
+
+
+def _time(text: str) -> datetime:
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a time such as 2026-11-16T09:30:00Z"
+        ) from error
+    if when.tzinfo is None:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} has no time zone: append Z or an offset such as +01:00"
+        )
+    return when
+
+
+def _changes(text: str) -> dict[str, Any]:
+    try:
+        given = from_json(text, allow_inf_nan=False)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"not JSON ({error})") from error
+    if not isinstance(given, dict):
+        raise argparse.ArgumentTypeError("not a JSON object")
+    return given
+
+
+# `sceneprint events`: what happened in the maps of a service, and what happens.
+
+#: Events listed unless told otherwise.
+LISTED = 20
+
+
+def add_events(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "events",
+        help="list or follow the events of a service",
+        description="List the latest events of a service, oldest first, or follow them until "
+        "Ctrl-C. A broken stream resumes where it stopped.",
+    )
+    command.add_argument("--map", metavar="MAP", help="only events of this map")
+    command.add_argument(
+        "--kind", action="append", default=[], metavar="KIND",
+        help="only kinds with this prefix, such as frame. or frame.indexed; repeatable",
+    )  # fmt: skip
+    command.add_argument("--follow", action="store_true", help="keep printing new events")
+    command.add_argument(
+        "--after",
+        metavar="ID",
+        help="start after the event with this id; 0: start with the oldest stored event",
+    )
+    command.add_argument(
+        "--limit", type=whole_number, metavar="N",
+        help=f"maximum number of events (default: {LISTED}; with --after or --follow: all)",
+    )  # fmt: skip
+    command.add_argument("--json", action="store_true", help="print JSON, one event per line")
+    add_service_options(command)
+    command.set_defaults(run=run_events)
+
+
+def run_events(options: argparse.Namespace) -> int:
+    """List, or follow."""
+    with open_client(options) as client:
+        if options.follow:
+            found = client.events(options.map, kinds=options.kind, after=options.after)
+        elif options.after is not None:
+            found = client.events(
+                options.map, kinds=options.kind, after=options.after, follow=False
+            )
+        else:
+            found = iter(_latest(client, options))
+        _print(islice(found, options.limit), as_json=options.json)
+    return 0
+
+
+def _latest(client: Client, options: argparse.Namespace) -> list[Event]:
+    """The newest events, the oldest of them first."""
+    found: list[Event] = []
+    cursor, most = None, LISTED if options.limit is None else options.limit
+    while len(found) < most:
+        page = client.event_page(
+            options.map, kinds=options.kind, cursor=cursor,
+            limit=min(most - len(found), 500),
+        )  # fmt: skip
+        found += page.items
+        cursor = page.next_cursor
+        if cursor is None:
+            break
+    return found[::-1]
+
+
+def _print(found: Iterable[Event], *, as_json: bool) -> None:
+    for event in found:
+        if as_json:
+            print(event.model_dump_json())
+        else:
+            about = [event.map, event.frame_id, *(f"{k}={v}" for k, v in event.data.items())]
+            told = "  ".join(one_line(one) for one in about if one is not None)
+            print(f"{event.id}  {event.at:%Y-%m-%d %H:%M:%S}  {event.kind:22}  {told}".rstrip())
+        sys.stdout.flush()  # who follows wants it now, also through a pipe
+
+
+# `sceneprint jobs`: the jobs of a service, given up or tried again.
+
+
+def add_jobs(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "jobs",
+        help="list, retry or cancel the jobs of a service",
+        description="List the jobs of a service, newest first, or retry or cancel some.",
+    )
+    choice = command.add_mutually_exclusive_group()
+    choice.add_argument("--retry", metavar="ID", help="retry a dead or cancelled job")
+    choice.add_argument(
+        "--retry-dead",
+        action="store_true",
+        help="retry all dead jobs that were not retried yet",
+    )
+    choice.add_argument("--cancel", metavar="ID", help="cancel an unfinished job")
+    command.add_argument(
+        "--state", choices=[str(state) for state in JobState], help="list only jobs in this state"
+    )
+    command.add_argument("--json", action="store_true", help="print JSON, tracebacks included")
+    add_service_options(command)
+    command.set_defaults(run=run_jobs)
+
+
+def run_jobs(options: argparse.Namespace) -> int:
+    """List, cancel or retry."""
+    asked = options.retry is not None or options.retry_dead or options.cancel is not None
+    if asked and options.state is not None:
+        raise InvalidRequest(
+            "--state only filters the list. Leave it out with --retry or --cancel."
+        )
+    with open_client(options) as client:
+        if options.retry is not None:
+            _print_job(client.retry_job(options.retry), as_json=options.json)
+        elif options.cancel is not None:
+            _print_job(client.cancel_job(options.cancel), as_json=options.json)
+        elif options.retry_dead:
+            return _retry_dead(client, as_json=options.json)
+        else:
+            state = None if options.state is None else JobState(options.state)
+            _print_jobs(client.jobs(state), as_json=options.json)
+    return 0
+
+
+def _retry_dead(client: Client, *, as_json: bool) -> int:
+    """Retry the dead; a job that was followed by another of its frame is history, and stays.
+
+    Returns
+    -------
+    code : 2 where one cannot be tried again
+    """
+    again, refused = 0, 0
+    for job in list(client.jobs(JobState.DEAD)):  # all before the first: pages would shift
+        of_frame = job.map is not None and job.frame_id is not None and job.kind == "sign"
+        if of_frame and client.frame(str(job.map), str(job.frame_id)).job_id != job.job_id:
+            continue
+        try:
+            retried = client.retry_job(job.job_id)
+        except CannotRetry as error:
+            refused += 1
+            print(f"sceneprint jobs: {one_line(str(error))}", file=sys.stderr)
+            continue
+        again += 1
+        _print_job(retried, as_json=as_json)
+    if not as_json:
+        print(f"{again} jobs queued again, {refused} cannot be retried")
+    return 2 if refused else 0
+
+
+def _print_job(job: Job, *, as_json: bool) -> None:
+    print(job.model_dump_json() if as_json else f"job {job.job_id} of map {job.map}, {job.state}")
+
+
+def _print_jobs(jobs: Iterable[Job], *, as_json: bool) -> None:
+    if as_json:
+        for job in jobs:
+            print(job.model_dump_json())
+        return
+    any_yet = False
+    for job in jobs:
+        if not any_yet:
+            print(f"{'job':32}  state      prio  tries  created              map  error")
+            any_yet = True
+        print(
+            f"{job.job_id:32}  {job.state:9}  {job.priority:4}  {job.attempts:5}  "
+            f"{job.created_at:%Y-%m-%d %H:%M:%S}  {job.map}  {one_line(job.error or '')}".rstrip()
+        )
+    if not any_yet:
+        print("no jobs match")
+
+
+# `sceneprint maps`: the maps of a service.
+
+#: What a limit is called that takes one away.
+NONE = "none"
+
+
+def add_maps(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "maps",
+        help="list, create, edit or delete the maps of a service",
+        description="List the maps of a service, or create, edit or delete one. Only operators "
+        "can set quotas: that needs a key with `admin` for `*`.",
+    )
+    choice = command.add_mutually_exclusive_group()
+    choice.add_argument(
+        "--create", metavar="NAME", help="create a map; its name may contain a-z, 0-9, - and _"
+    )
+    choice.add_argument("--edit", metavar="NAME", help="edit the title or limits of a map")
+    choice.add_argument("--delete", metavar="NAME", help="delete a map with all its frames")
+    command.add_argument("--title", help="human-readable title of the map")
+    command.add_argument(
+        "--model", choices=PRESETS, help=f"model of the new map (default: {PRESETS[0]})"
+    )
+    for name, metavar, kind, told in (
+        ("--quota-frames", "N", int, "maximum number of frames in the map"),
+        ("--quota-bytes", "N", int, "maximum size of its uploads in bytes"),
+        ("--retention-days", "DAYS", float, "delete frames this many days after their upload"),
+    ):
+        command.add_argument(
+            name, metavar=metavar, type=_limit(kind), help=f"{told}; `{NONE}` for no limit"
+        )
+    command.add_argument("--yes", action="store_true", help="confirm a deletion")
+    command.add_argument("--json", action="store_true", help="print JSON")
+    add_service_options(command)
+    command.set_defaults(run=run_maps)
+
+
+def run_maps(options: argparse.Namespace) -> int:
+    """List, make, change or delete."""
+    names = ("title", "quota_frames", "quota_bytes", "retention_days")
+    given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
+    limits = {n: None if value == NONE else value for n, value in given.items() if n != "title"}
+    if options.create is None and options.model is not None:
+        raise InvalidRequest("--model applies only to a new map. Add --create NAME.")
+    if given and options.create is None and options.edit is None:
+        raise InvalidRequest(
+            f"--{next(iter(given)).replace('_', '-')} applies only when you create or edit a "
+            "map. Add --create NAME or --edit NAME."
+        )
+    with open_client(options) as client:
+        if options.delete is not None:
+            _delete(client, options.delete, sure=options.yes)
+        elif options.edit is not None:
+            title = {"title": options.title or None} if "title" in given else {}
+            edited = _edit(client, options.edit, title | limits, sure=options.yes)
+            print(edited.model_dump_json() if options.json else _line(edited))
+        elif options.create is not None:
+            model = options.model or PRESETS[0]
+            made = client.create_map(options.create, options.title, model, **limits)
+            print(made.model_dump_json() if options.json else _line(made))
+        else:
+            _print_maps(client.maps(), as_json=options.json)
+    return 0
+
+
+def _limit(kind: type[int] | type[float]) -> Any:
+    def read(given: str) -> float | str:
+        return NONE if given == NONE else kind(given)
+
+    read.__name__ = "number"  # argparse tells it
+    return read
+
+
+def _edit(client: Client, name: str, changes: dict[str, Any], *, sure: bool) -> Map:
+    if not changes:
+        raise InvalidRequest("There is nothing to change. Add --title or a limit.")
+    if changes.get("retention_days") is not None and not sure:
+        told = client.edit_map(name, changes, dry_run=True)
+        if told.overdue:
+            raise InvalidRequest(
+                f"This would permanently delete the {told.overdue} frames of map {name} that are "
+                f"older than {told.retention_days:g} days. Nothing was changed. Add --yes to go "
+                "ahead."
+            )
+    return client.edit_map(name, changes)
+
+
+def _delete(client: Client, name: str, *, sure: bool) -> None:
+    n_frames = sum(client.map(name).frames.values())
+    if not sure:
+        raise InvalidRequest(
+            f"This would permanently delete map {name} and its {n_frames} frames. Add --yes to "
+            "go ahead."
+        )
+    client.delete_map(name)
+    print(f"deleted map {name} and its {n_frames} frames")
+
+
+def _line(one: Map) -> str:
+    limits = _limits(one)
+    return f"map {one.name}, {one.model}{limits and ', '}{limits}"
+
+
+def _limits(one: Map) -> str:
+    """What a map has of what it may have, and for how long."""
+    parts = []
+    if one.quota_frames is not None:
+        parts.append(f"{one.used_frames} of {one.quota_frames} frames")
+    if one.quota_bytes is not None:
+        parts.append(f"{one.used_bytes / 1e6:.1f} of {one.quota_bytes / 1e6:.1f} MB")
+    if one.retention_days is not None:
+        parts.append(f"kept {one.retention_days:g} days")
+    return ", ".join(parts)
+
+
+def _print_maps(maps: list[Map], *, as_json: bool) -> None:
+    if as_json:
+        for one in maps:
+            print(one.model_dump_json())
+        return
+    if not maps:
+        print("no maps yet; create one with `sceneprint maps --create NAME` or `sceneprint upload`")
+        return
+    width = max(3, *(len(one.name) for one in maps))
+    print(f"{'map':{width}}  indexed  waiting  rejected  failed  model                 title")
+    for one in maps:
+        n = one.frames
+        waiting = n.get("received", 0) + n.get("signing", 0)
+        title, limits = one_line(one.title or ""), _limits(one)
+        told = f"{title}  ({limits})".strip() if limits else title
+        print(
+            f"{one.name:{width}}  {n.get('indexed', 0):7}  {waiting:7}  {n.get('rejected', 0):8}  "
+            f"{n.get('failed', 0):6}  {one.model:20}  {told}".rstrip()
+        )

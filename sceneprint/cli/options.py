@@ -1,0 +1,474 @@
+"""How a command asks a map; the same options for every command that does."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from sceneprint.errors import FrameError, InvalidRequest, UnusableStore
+from sceneprint.geometry.signature.pair_table import compiled_at
+from sceneprint.models import PRESETS, Model, read_model
+from sceneprint.pipeline import Signer, open_signer, sign
+from sceneprint.settings import Settings
+from sceneprint.types import DepthFrame, Intrinsics
+from sceneprint_client.addresses import DEFAULT_URL
+from sceneprint_client.api.frames import MOST_PRIORITY, GivenBase, novelty_of
+
+if TYPE_CHECKING:
+    from sceneprint_client import Client
+    from sceneprint_client.api import Answer
+
+# Which frames of a map a command asks among.
+
+
+def add_filter_options(command: argparse.ArgumentParser) -> None:
+    """`--robot` and its like; all that are given must hold."""
+    group = command.add_argument_group(
+        "filter",
+        "search only frames that match all of these; frames without the value are excluded",
+    )
+    group.add_argument("--robot", action="append", metavar="NAME", help="repeatable: matches any")
+    group.add_argument("--session", action="append", metavar="NAME", help="repeatable: matches any")
+    group.add_argument(
+        "--after",
+        metavar="TIME",
+        help="captured at or after this time, such as 2026-11-16T09:30:00Z",
+    )
+    group.add_argument("--before", metavar="TIME", help="captured at or before this time")
+    group.add_argument("--tag", action="append", metavar="TAG", help="repeatable: matches all")
+    group.add_argument(
+        "--not-within",
+        type=float,
+        metavar="SECONDS",
+        help="for loop closure: exclude frames of the query's session within this time of it",
+    )
+    group.add_argument(
+        "--region",
+        type=_box,
+        metavar="X0,Y0,Z0,X1,Y1,Z1",
+        help=(
+            "box that contains the pose, in metres (write --region=-1,... if it starts with a "
+            "minus)"
+        ),
+    )
+    group.add_argument(
+        "--region-frame", metavar="NAME", help="parent frame of the box and of the poses"
+    )
+    group.add_argument(
+        "--exclude", action="append", metavar="FRAME", help="exclude this frame; repeatable"
+    )
+
+
+def filter_of(options: argparse.Namespace) -> dict[str, Any] | None:
+    """The filter that the options describe, as JSON has it; None where there is none.
+
+    Raises
+    ------
+    InvalidRequest : one of --region and --region-frame without the other.
+    """
+    region = None
+    if (options.region is None) != (options.region_frame is None):
+        raise InvalidRequest(
+            "A box needs a parent frame. Give --region and --region-frame together."
+        )
+    if options.region is not None:
+        least, most = options.region
+        region = {"parent_frame": options.region_frame, "min": least, "max": most}
+    given = {
+        "robot": options.robot,
+        "session": options.session,
+        "captured_after": options.after,
+        "captured_before": options.before,
+        "tags": options.tag,
+        "not_within_s": options.not_within,
+        "region": region,
+        "exclude_frames": options.exclude,
+    }
+    return {name: value for name, value in given.items() if value is not None} or None
+
+
+def _box(text: str) -> tuple[dict[str, float], dict[str, float]]:
+    """Two corners."""
+    try:
+        numbers = [float(one) for one in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 6:
+        raise argparse.ArgumentTypeError(f"{text!r} is not six comma-separated numbers")
+    x, y, z = zip(numbers[:3], numbers[3:], strict=True)
+    return {"x": x[0], "y": y[0], "z": z[0]}, {"x": x[1], "y": y[1], "z": z[1]}
+
+
+# Options of the commands that judge transforms: how they are found, and when they are believed.
+
+
+def add_judging_options(command: argparse.ArgumentParser) -> None:
+    """`--mode` and `--matching`."""
+    command.add_argument(
+        "--mode",
+        choices=("full", "paper"),
+        default="full",
+        help="accept on all evidence, or on the residual alone as in the paper (default: full)",
+    )
+    command.add_argument(
+        "--matching",
+        choices=("histograms", "sequence"),
+        default="histograms",
+        help="find correspondences by histograms, or by aligned sequences of neighbours as in "
+        "the paper, which is slower (default: histograms)",
+    )
+
+
+# Numbers on the command line, checked where they are read.
+
+
+def whole_number(text: str) -> int:
+    """A whole number from 0 up."""
+    return _at_least(text, 0)
+
+
+def positive(text: str) -> int:
+    """A whole number from 1 up."""
+    return _at_least(text, 1)
+
+
+def _at_least(text: str, least: int) -> int:
+    try:
+        number = int(text)
+    except ValueError:
+        number = least - 1
+    if number < least:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {least}")
+    return number
+
+
+def metres(text: str) -> float:
+    """A positive distance."""
+    try:
+        distance = float(text)
+    except ValueError:
+        distance = math.nan
+    if not 0 < distance <= 1e4:  # false for NaN as well
+        raise argparse.ArgumentTypeError(f"{text!r} is not a distance of up to 10000 m")
+    return distance
+
+
+# What options of `sceneprint upload` say, read from text.
+
+
+def base_of(text: str) -> GivenBase:
+    """Seven numbers."""
+    try:
+        tx, ty, tz, qx, qy, qz, qw = (float(part) for part in text.split(","))
+        return GivenBase.model_validate(
+            {
+                "translation": {"x": tx, "y": ty, "z": tz},
+                "rotation": {"x": qx, "y": qy, "z": qz, "w": qw},
+            }
+        )
+    except ValueError as error:  # pydantic's too
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not seven comma-separated numbers: metres and a unit quaternion"
+        ) from error
+
+
+def priority_of(text: str) -> int:
+    """A whole number from -10 to 10."""
+    if text.removeprefix("-") not in {str(number) for number in range(MOST_PRIORITY + 1)}:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from -10 to 10")
+    return int(text)
+
+
+def share_of(text: str) -> float:
+    """A share of the distance of unrelated frames."""
+    try:
+        share = novelty_of(text)
+    except InvalidRequest:
+        share = None
+    if share is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0, up to 1")
+    return share
+
+
+# Commands that work on what is there make nothing that is not.
+
+
+def require_database(settings: Settings) -> None:
+    """See that a data folder has a database: a mistyped --data would make a new, empty one.
+
+    Raises
+    ------
+    UnusableStore : it has none.
+    """
+    if settings.database_url is None and not (settings.data_dir / "sceneprint.db").is_file():
+        raise UnusableStore(
+            f"{settings.data_dir}: there is no database here. Name the data folder with --data."
+        )
+
+
+# Where a command finds its service.
+
+
+def add_service_options(command: argparse.ArgumentParser) -> None:
+    """`--url` and `--key`."""
+    command.add_argument(
+        "--url",
+        default=os.environ.get("SCENEPRINT_URL") or None,
+        help=f"address of the service (default: SCENEPRINT_URL, or {DEFAULT_URL})",
+    )
+    command.add_argument(
+        "--key",
+        default=os.environ.get("SCENEPRINT_KEY") or None,
+        help="API key, if the service requires one (default: SCENEPRINT_KEY)",
+    )
+
+
+def open_client(options: argparse.Namespace) -> Client:
+    """A client of the service that the options name.
+
+    Raises
+    ------
+    Unreachable : the address is none.
+    """
+    from sceneprint_client import Client
+
+    return Client(options.url or DEFAULT_URL, options.key)
+
+
+def one_line(text: str) -> str:
+    """A text that may hold line breaks and escapes; a line of ours never does."""
+    return text if text.isprintable() else ascii(text)[1:-1]
+
+
+def add_asking_options(command: argparse.ArgumentParser) -> None:
+    """`--k` and its like, with the filter."""
+    command.add_argument(
+        "--k",
+        type=positive,
+        default=5,
+        metavar="K",
+        help="number of accepted matches to return (default: 5)",
+    )
+    command.add_argument("--exact", action="store_true", help="compare every frame of the map")
+    command.add_argument(
+        "--seed",
+        type=whole_number,
+        default=0,
+        metavar="S",
+        help="random seed (default: 0)",
+    )
+    command.add_argument(
+        "--candidates",
+        type=positive,
+        metavar="N",
+        help="number of ranked frames to select and validate (default: 10, or K if larger)",
+    )
+    command.add_argument(
+        "--diversity",
+        type=setting,
+        action="append",
+        metavar="NAME=VALUE",
+        help="set a parameter of the selection, sigma or omega; repeatable",
+    )
+    command.add_argument(
+        "--validation",
+        type=setting,
+        action="append",
+        metavar="NAME=VALUE",
+        help="set a validation option, such as mode=paper or residual_m=0.05; repeatable",
+    )
+    command.add_argument(
+        "--deadline-ms",
+        type=positive,
+        metavar="MS",
+        help="start no candidate that would finish after this time",
+    )
+    command.add_argument(
+        "--explain", action="store_true", help="explain at which stage each frame dropped out"
+    )
+    command.add_argument(
+        "--explain-frame",
+        metavar="FRAME",
+        help="explain at which stage this frame of the map dropped out",
+    )
+    command.add_argument(
+        "--no-keep", action="store_true", help="do not store the answer for `GET /v1/queries/ID`"
+    )
+    add_filter_options(command)
+
+
+def options_of(options: argparse.Namespace) -> dict[str, Any]:
+    """How to ask, as `Client.query` takes it."""
+    return {
+        "k": options.k,
+        "exact": options.exact,
+        "seed": options.seed,
+        "candidates": options.candidates,
+        "diversity": settings_of(options.diversity),
+        "validation": settings_of(options.validation),
+        "deadline_ms": options.deadline_ms,
+        "explain": options.explain,
+        "explain_frame": options.explain_frame,
+        "keep": not options.no_keep,
+        "filter": filter_of(options),
+    }
+
+
+def setting(text: str) -> tuple[str, str]:
+    """A name and a value; whether there is such a name, the query knows."""
+    name, equals, value = text.partition("=")
+    if not equals or not name:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")
+    return name, value
+
+
+def settings_of(given: Sequence[tuple[str, str]] | None) -> dict[str, str] | None:
+    """Names with their values; None where none was given."""
+    return None if given is None else dict(given)
+
+
+def explained_lines(answer: Answer) -> list[str]:
+    """Why the frames of the ranking came as far as they did, a line each; none if not asked."""
+    lines = [
+        f"  {one.rank:4}  {one_line(one.frame_id)}  {one.similarity:4.2f}  {one.stage}: "
+        f"{one.outcome.replace('_', ' ')}; {one_line(one.reason)}"
+        for one in answer.explanations or []
+    ]
+    one = answer.explained_frame
+    if one is not None:
+        place = "not searched" if one.rank is None else f"rank {one.rank} of {one.of}"
+        lost = "a match" if one.lost_at is None else f"lost at {one.lost_at}"
+        lines.append(f"  {one_line(one.frame_id)}: {place}; {lost}: {one_line(one.reason)}")
+    return lines
+
+
+# Signals that end a command as Ctrl-C does, so that it clears away what is its own.
+
+_ENDING = (signal.SIGTERM, signal.SIGHUP)
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Raise KeyboardInterrupt for SIGTERM and SIGHUP; in the main thread only.
+
+    Once: `make` and a closed terminal send several, and clearing away must not be cut short.
+    """
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        for number in taken:
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    # `nohup` has SIGHUP ignored, and means it
+    taken = [one for one in _ENDING if signal.getsignal(one) is signal.SIG_DFL]
+    for number in taken:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
+
+
+# Opening a signer for a command: which model, and a word before the machine goes quiet.
+
+
+def add_model_options(command: argparse.ArgumentParser) -> None:
+    """`--preset` or `--model`."""
+    choice = command.add_mutually_exclusive_group()
+    choice.add_argument(
+        "--preset",
+        choices=PRESETS,
+        help=f"preset that ships with sceneprint (default: {PRESETS[0]})",
+    )
+    choice.add_argument("--model", type=Path, metavar="FILE", help="path of your own model")
+
+
+def open_for(options: argparse.Namespace, settings: Settings, *, psi: bool = False) -> Signer:
+    """The signer the options ask for, its code loaded and its table open.
+
+    Says so before the machine goes quiet to compile, and shows the table being built.
+
+    Parameters
+    ----------
+    options : of `add_model_options`
+    settings : see Settings
+    psi : sign with psi itself; of the preset `paper` where no model is named
+
+    Raises
+    ------
+    UnreadableModel : no such model.
+    """
+    if _is_new():
+        _print("first use after installation: compiling, once, for about half a minute")
+    chosen = options.model or options.preset or ("paper" if psi else PRESETS[0])
+    model = read_model(chosen)
+    signer = _open_signer(model.of_psi if psi else model, str(chosen), settings)
+    with suppress(FrameError):  # a model of another range may see nothing there
+        sign(_wall(), signer)  # so that the first frame's time is that of signing, not of loading
+    return signer
+
+
+def prepare_presets(settings: Settings, say: Callable[[str], None] | None = None) -> None:
+    """See that code is compiled and the presets' tables are built, once an installation.
+
+    So that a service's first frame does not wait for what a person can watch now.
+
+    Parameters
+    ----------
+    settings : see Settings
+    say : what tells of each step, as it takes a while (default: lines on standard error)
+    """
+    from sceneprint.engine.models import warm
+
+    if _is_new():
+        tell, begun = say or _print, time.monotonic()
+        tell("first use after installation: compiling for depth images (about 40 seconds)")
+        signer = _open_signer(read_model(PRESETS[0]), PRESETS[0], settings)
+        warm(signer)
+        spent = time.monotonic() - begun
+        tell(f"compiled for depth images in {spent:.0f} s; now for clouds (about 15 seconds)")
+        warm(signer, clouds=True)
+        tell(f"compilation finished in {time.monotonic() - begun:.0f} s")
+    for preset in PRESETS:
+        _open_signer(read_model(preset), preset, settings)
+
+
+def _is_new() -> bool:
+    """Whether the code is yet to be compiled."""
+    folder, pattern = compiled_at()
+    return not any(Path(folder).glob(pattern))
+
+
+def _print(text: str) -> None:
+    print(f"sceneprint: {text}", file=sys.stderr)
+
+
+def _open_signer(model: Model, name: str, settings: Settings) -> Signer:
+    name = f"pair table of {name}"
+    # no bar among the lines of a log
+    with tqdm(desc=name, unit="bin", unit_scale=True, delay=0.5, disable=None) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        return open_signer(model, settings.cache_dir, progress)
+
+
+def _wall() -> DepthFrame:
+    """A flat wall 2 m ahead."""
+    camera = Intrinsics(256, 192, 300, 300, 127.5, 95.5)  # halved once, as most are
+    return DepthFrame(np.full((192, 256), 2.0, np.float32), camera)

@@ -1,0 +1,332 @@
+"""`sceneprint associate`: join two sessions of a map, or close the loops of one."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+from sceneprint.atomic_files import check_writable, write_whole
+from sceneprint.cli.options import (
+    add_filter_options,
+    add_service_options,
+    filter_of,
+    one_line,
+    open_client,
+    positive,
+    whole_number,
+)
+from sceneprint.errors import DatasetError, InvalidRequest
+from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint_client.api import JobState
+
+if TYPE_CHECKING:
+    from sceneprint_client import Client
+    from sceneprint_client.api import Answer
+    from sceneprint_client.api.reconstructions import Coverage, Reconstruction
+    from sceneprint_client.api.sessions import Association, GraphFormat, Join
+
+#: What a file is by its name's end.
+_FORMATS: dict[str, GraphFormat] = {".g2o": "g2o", ".txt": "tum", ".tum": "tum", ".json": "json"}
+
+
+def add_associate(commands: Any) -> None:
+    """Describe the command to the parser.
+
+    Length: a statement for each option, in the order of `--help`.
+    """
+    command = commands.add_parser(
+        "associate",
+        help="join two sessions of a map, or find the loop closures of one",
+        description="Find where two sessions of a map see the same places and how they align, "
+        "or find the loop closures of a single session. Can write the pose graph for an "
+        "optimiser.",
+    )
+    command.add_argument("map", metavar="MAP")
+    command.add_argument(
+        "--session",
+        action="append",
+        required=True,
+        metavar="NAME",
+        help="once for loop closures; twice to join two sessions, the first onto the second",
+    )
+    command.add_argument(
+        "--robot",
+        action="append",
+        metavar="NAME",
+        help=(
+            "robot of each session, in the same order; needed if several robots use the same "
+            "session name"
+        ),
+    )
+    command.add_argument(
+        "--after", metavar="TIME", help="only frames captured at or after this time"
+    )
+    command.add_argument(
+        "--before", metavar="TIME", help="only frames captured at or before this time"
+    )
+    command.add_argument(
+        "--apart",
+        type=positive,
+        metavar="N",
+        help="loop closure: minimum number of frames between the two (default: 100)",
+    )
+    command.add_argument(
+        "--not-within",
+        type=float,
+        metavar="SECONDS",
+        help="loop closure: minimum time between the two",
+    )
+    command.add_argument(
+        "--k", type=positive, default=3, metavar="K", help="number of edges per frame (default: 3)"
+    )
+    command.add_argument(
+        "--candidates",
+        type=positive,
+        default=10,
+        metavar="N",
+        help="candidates to try per frame until it has K edges (default: 10)",
+    )
+    command.add_argument(
+        "--seed",
+        type=whole_number,
+        default=0,
+        metavar="S",
+        help="random seed (default: 0)",
+    )
+    command.add_argument(
+        "--min-overlap",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="minimum overlap of an edge, 0 to 1",
+    )
+    command.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="write the pose graph: .g2o, .txt (the vertices as a TUM trajectory) or .json",
+    )
+    command.add_argument(
+        "--odometry", action="store_true", help="include edges between consecutive frames"
+    )
+    command.add_argument("--json", action="store_true", help="print JSON")
+    add_service_options(command)
+    command.set_defaults(run=run_associate)
+
+
+def run_associate(options: argparse.Namespace) -> int:
+    """Associate, and wait; returns 2 where it did not succeed."""
+    if len(options.session) > 2:
+        raise InvalidRequest(
+            "An association needs one or two sessions. Give --session once or twice."
+        )
+    kind = None if options.out is None else _FORMATS.get(options.out.suffix.lower())
+    if options.out is not None and kind is None:
+        raise InvalidRequest(
+            f"{options.out.name!a:.80} has no known file type. Use a name for --out that ends in "
+            f"{', '.join(_FORMATS)}."
+        )
+    if options.out is not None:  # it may take an hour
+        check_writable(options.out)
+    times = {"captured_after": options.after, "captured_before": options.before}
+    wanted = {name: value for name, value in times.items() if value is not None}
+    with (
+        open_client(options) as client,
+        tqdm(desc="associate", unit="frame", disable=None) as bar,
+    ):
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        told = client.associate(
+            options.map, *options.session, robots=options.robot, filter=wanted or None,
+            apart=options.apart, not_within_s=options.not_within, k=options.k,
+            candidates=options.candidates, seed=options.seed, min_overlap=options.min_overlap,
+            progress=progress,
+        )  # fmt: skip
+        if kind is not None and told.state is JobState.SUCCEEDED:
+            graph = client.graph(options.map, told.association_id, kind, odometry=options.odometry)
+            write_whole(options.out, graph.encode())
+    print(told.model_dump_json() if options.json else "\n".join(association_lines(told)))
+    if told.state is JobState.SUCCEEDED and options.out is not None and not options.json:
+        print(f"wrote {options.out}")
+    return 0 if told.state is JobState.SUCCEEDED else 2
+
+
+def association_lines(told: Association) -> list[str]:
+    """An association for people: what was found, and whether the sessions are joined."""
+    name = f"association {told.association_id}"
+    if told.result is None:
+        why = "" if told.error is None else f": {one_line(told.error)}"
+        return [f"{name} is {told.state}{why}"]
+    r = told.result
+    lines = [
+        f"{name}: {r.edges} edges from {r.frames} frames ({r.validated} pairs validated)",
+        f"edges: {r.consistent} confirmed by loops, {r.inconsistent} outvoted, {r.unchecked} "
+        "unchecked",
+    ]
+    lines += [line for one in r.joins for line in _join(one)]
+    if len(told.asked.sessions) == 2 and not r.joins:
+        lines.append("not joined: no edge connects frames with poses")
+    return lines
+
+
+def _join(one: Join) -> list[str]:
+    names = f"{one_line(one.from_parent)} onto {one_line(one.to_parent)}"
+    if one.transform is None:
+        return [f"not joined, {names}: {one_line(one.reason)}"]
+    sure = "surely" if one.strength == "strong" else "weakly (check it before you rely on it)"
+    t, r = one.transform.translation, one.transform.rotation
+    return [
+        f"joined {sure}, {names}: {one_line(one.reason)}, spread "
+        f"{100 * (one.spread_m or 0.0):.1f} cm, {one.spread_deg or 0.0:.1f} deg",
+        f"  translation {t.x:.4f} {t.y:.4f} {t.z:.4f} m, rotation {r.x:.6f} {r.y:.6f} {r.z:.6f} "
+        f"{r.w:.6f} (x y z w)",
+    ]
+
+
+# `sceneprint reconstruct`: what a place looks like, fused from the frames found there.
+
+#: Longest wait for a worker, seconds.
+_PATIENCE_S = 600.0
+
+
+def add_reconstruct(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "reconstruct",
+        help="fuse the matches of a frame to a mesh and a picture",
+        description="Query a map with a depth frame, and let a worker fuse the accepted matches "
+        "to a surface in the camera frame of the query. Exit code 1 if no match is accepted.",
+    )
+    command.add_argument("map", metavar="MAP")
+    command.add_argument(
+        "frame", metavar="FRAME", help="a depth image, or the id of a frame of the map"
+    )
+    command.add_argument("--out", type=Path, metavar="FILE", help="PLY to write (mesh.ply)")
+    command.add_argument("--picture", type=Path, metavar="FILE", help="PNG to write")
+    command.add_argument(
+        "--k",
+        type=positive,
+        default=10,
+        metavar="K",
+        help="number of accepted matches to fuse (default: 10)",
+    )
+    command.add_argument(
+        "--seed",
+        type=whole_number,
+        default=0,
+        metavar="S",
+        help="random seed (default: 0)",
+    )
+    command.add_argument(
+        "--voxel",
+        type=float,
+        metavar="METRES",
+        help="size of a voxel (default: the finest that fits)",
+    )
+    command.add_argument(
+        "--strong", action="store_true", help="fuse only strongly accepted matches"
+    )
+    command.add_argument("--cloud", action="store_true", help="write points without triangles")
+    command.add_argument(
+        "--without-query", action="store_true", help="fuse only the matches, not the frame itself"
+    )
+    add_filter_options(command)
+    add_service_options(command)
+    command.set_defaults(run=run_reconstruct)
+
+
+def run_reconstruct(options: argparse.Namespace) -> int:
+    """Query, reconstruct, and write the files; returns 1 where nothing could be fused."""
+    out = options.out
+    if out is None and options.picture is None:
+        out = Path("mesh.ply")
+    for path in (out, options.picture):
+        if path is not None:
+            check_writable(path)
+    with open_client(options) as client:
+        answer = _query(client, options)
+        name = one_line(options.frame)
+        if answer.status != "found":
+            print(f"{name}: {answer.status.replace('_', ' ')}, so there is nothing to fuse")
+            return 1
+        made = client.reconstruct(
+            answer,
+            strength="strong" if options.strong else "any",
+            include_query=not options.without_query,
+            voxel_m=options.voxel,
+            output="cloud" if options.cloud else "mesh",
+        )
+        made = _waited(client, made, answer.counts.accepted)
+        if made.coverage is None:
+            why = one_line(made.error or "no worker has finished it yet; see `sceneprint jobs`")
+            print(f"sceneprint reconstruct: job {made.job_id} is {made.state}: {why}",
+                  file=sys.stderr)  # fmt: skip
+            return 2
+        print("\n".join([f"{name}:", *coverage_lines(made.coverage)]))
+        for path, fetch in (
+            (out, client.reconstruction_mesh),
+            (options.picture, client.reconstruction_picture),
+        ):
+            if path is not None:
+                write_whole(path, fetch(made.job_id))
+                print(f"wrote {one_line(str(path))}")
+    return 0
+
+
+def coverage_lines(coverage: Coverage) -> list[str]:
+    """What the views show together, for people."""
+    lines = [
+        f"  {len(coverage.views)} views show {coverage.area_m2:.2f} m2 of surface and "
+        f"{coverage.observed_volume_m3:.2f} m3 of space; {coverage.query_explained:.0%} of the "
+        "frame is covered by the others"
+    ]
+    total = 0.0
+    for view in coverage.views:
+        total += view.added_m2
+        who = "the frame itself" if view.frame_id is None else view.frame_id
+        rank = "" if view.rank is None else f"rank {view.rank}, {view.strength}"
+        lines.append(f"  {who:34} {rank:18} +{view.added_m2:6.2f} m2  {total:7.2f}".rstrip())
+    lines += [f"  skipped: {one.frame_id}: {one_line(one.reason)}" for one in coverage.left_out]
+    kind = f"{coverage.triangles} triangles" if coverage.triangles else "a cloud"
+    lines.append(f"  {coverage.points} points, {kind}, voxels of {1000 * coverage.voxel_m:.0f} mm")
+    return lines
+
+
+def _query(client: Client, options: argparse.Namespace) -> Answer:
+    wanted, path = filter_of(options), Path(options.frame)
+    if not path.exists():
+        return client.query(
+            options.map, frame_id=options.frame, k=options.k, seed=options.seed, filter=wanted
+        )
+    return client.query(options.map, _only(path), k=options.k, seed=options.seed, filter=wanted)
+
+
+def _only(path: Path) -> FrameReference:
+    """The one frame at a path.
+
+    Raises
+    ------
+    DatasetError : none, or several.
+    """
+    found = [frame for sequence in find_sequences(path) for frame in sequence.frames]
+    if len(found) != 1:
+        raise DatasetError(f"{path}: {len(found)} frames found. Name a single frame file.")
+    return found[0]
+
+
+def _waited(client: Client, made: Reconstruction, views: int) -> Reconstruction:
+    """The reconstruction when its job is over, or patience is; a bar shows that it goes on."""
+    with tqdm(total=1, desc=f"fuse {views} views", unit="job", disable=None) as bar:
+
+        def progress(done: int, _: int) -> None:
+            bar.update(done - bar.n)
+
+        client.wait([made.job_id], timeout_s=_PATIENCE_S, progress=progress)
+    return client.reconstruction(made.job_id)

@@ -1,0 +1,858 @@
+"""`sceneprint fsck`: what of a data folder is lost, damaged or left over, and its repair."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+from sceneprint.atomic_files import check_writable, write_whole
+from sceneprint.cli.options import (
+    ended_by_signals,
+    one_line,
+    open_client,
+    positive,
+    require_database,
+    whole_number,
+)
+from sceneprint.cli.serve import add_data_option, settings_of
+from sceneprint.errors import InvalidRequest
+
+if TYPE_CHECKING:
+    from sceneprint.engine import Engine
+    from sceneprint.maintenance.fsck.check import FindingOutcome
+    from sceneprint.maintenance.fsck.indexes import IndexStats
+    from sceneprint.maintenance.snapshot.creation import Snapshot
+    from sceneprint.maintenance.thin import Proposal
+    from sceneprint.settings import Settings
+    from sceneprint_client.api import Map
+    from sceneprint_client.api.admin import SnapshotFile
+
+#: What was looked at, in the order in which it is told.
+_COUNTED = (
+    "models", "frames", "signatures", "blobs", "files", "generations", "tables",
+)  # fmt: skip
+
+
+def add_fsck(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "fsck",
+        help="check and repair database, blobs and caches",
+        description="Check rows, signatures, uploads, artifacts and caches of a data folder, "
+        "and report problems and what --repair would do. Changes nothing without --repair. The "
+        "service may be running. Exit code 1 if problems remain, 2 if the folder cannot be "
+        "checked.",
+    )
+    add_data_option(command)
+    command.add_argument("--map", metavar="MAP", help="check only this map")
+    how = command.add_mutually_exclusive_group()
+    how.add_argument(
+        "--repair",
+        action="store_true",
+        help="repair what can be repaired; damaged files move to `quarantine` in the data folder",
+    )
+    how.add_argument(
+        "--quick",
+        action="store_true",
+        help="check that files exist, without reading their contents",
+    )
+    command.add_argument(
+        "--grace",
+        type=whole_number,
+        metavar="SECONDS",
+        help="keep unreferenced files that changed within this time (default: 3600)",
+    )
+    command.add_argument(
+        "--json", type=Path, metavar="FILE", help="also write the findings to this file"
+    )
+    command.set_defaults(run=run_fsck)
+
+
+def run_fsck(options: argparse.Namespace) -> int:
+    """Check, tell, and repair if asked to; returns 1 where something is left."""
+    from sceneprint.atomic_files import check_writable, write_whole
+    from sceneprint.engine import Engine
+    from sceneprint.maintenance.fsck.check import GRACE_S, fsck
+
+    if options.json is not None:
+        check_writable(options.json)
+    counts, outcomes = Counter[str](), []
+    with ended_by_signals(), _progress_bar() as progress:
+        for outcome in fsck(
+            settings_of(options), map_name=options.map, repair=options.repair,
+            quick=options.quick, progress=progress, counts=counts,
+            grace_s=GRACE_S if options.grace is None else min(options.grace, 10**10),
+        ):  # fmt: skip
+            outcomes.append(outcome)
+            tqdm.write(_line(outcome))
+    repaired = sum(each.done is not None for each in outcomes)
+    if repaired:
+        with Engine(settings_of(options)) as engine:
+            engine.audit.command("fsck --repair", map_name=options.map, repaired=repaired)
+    if options.json is not None:
+        record = {"checked": dict(counts), "findings": [_record(each) for each in outcomes]}
+        write_whole(options.json, (json.dumps(record, indent=1) + "\n").encode())
+    print("checked " + ", ".join(f"{counts[name]} {name}" for name in _COUNTED))
+    print(_summary(outcomes, repair=options.repair))
+    return 1 if any(each.left for each in outcomes) else 0
+
+
+def _line(outcome: FindingOutcome) -> str:
+    finding = outcome.finding
+    if outcome.done is not None:
+        then = f"done: {outcome.done}"
+    elif outcome.error is not None:
+        then = f"NOT REPAIRED: {outcome.error}"
+    else:
+        then = "" if finding.would is None else f"would: {finding.would}"
+    text = f"{finding.severity:8}  {finding.kind}  {finding.what}: {finding.means}"
+    return one_line(f"{text}; {then}" if then else text)
+
+
+def _summary(outcomes: list[FindingOutcome], *, repair: bool) -> str:
+    kinds = Counter(each.finding.severity for each in outcomes)
+    damaged, unneeded, left = kinds["damage"], kinds["leftover"], sum(o.left for o in outcomes)
+    if not damaged and not unneeded:
+        return "no problems found"
+    found = f"{damaged} damaged, {unneeded} left over"
+    if repair:
+        done = f"{damaged + unneeded - left} repaired, {left} not"
+        return f"{found}: {done}. Run it again once workers have signed the queued frames."
+    possible = sum(o.finding.repair is not None for o in outcomes)
+    return f"{found}; nothing was changed: `sceneprint fsck --repair` can repair {possible}"
+
+
+def _record(outcome: FindingOutcome) -> dict[str, object]:
+    finding = outcome.finding
+    return {
+        "kind": finding.kind,
+        "severity": finding.severity,
+        "what": finding.what,
+        "means": finding.means,
+        "would": finding.would,
+        "map": finding.map,
+        "frame_id": finding.frame_id,
+        "path": None if finding.path is None else str(finding.path),
+        "done": outcome.done,
+        "error": outcome.error,
+    }
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar on a terminal, of one subject after the other."""
+    with tqdm(disable=None, leave=False) as bar:
+
+        def progress(subject: str, done: int, total: int) -> None:
+            if bar.disable:
+                return
+            if bar.desc != f"{subject}: ":
+                bar.reset(total)
+                bar.set_description(subject)
+            bar.total, bar.n = total, done
+            bar.refresh()
+
+        yield progress
+
+
+# `sceneprint index`: the search indexes of a data folder, looked at, verified, made anew.
+
+
+def add_index(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "index",
+        help="inspect, verify, rebuild or purge the search indexes",
+        description="Manage the search indexes of a data folder. They are caches: a damaged "
+        "index loses no frame, and `rebuild` restores it from the database.",
+    )
+    what = command.add_subparsers(dest="what", required=True, metavar="ACTION")
+    stats = what.add_parser(
+        "stats", help="show frames, lag, bytes per frame, and recall against exact search"
+    )
+    stats.add_argument(
+        "--sample", type=whole_number, default=100, metavar="N",
+        help="number of queries to measure recall (default: 100)",
+    )  # fmt: skip
+    stats.add_argument("--seed", type=whole_number, default=0, metavar="N", help="random seed")
+    stats.add_argument("--json", action="store_true", help="print JSON, one line per map")
+    verify = what.add_parser(
+        "verify", help="read and check the whole index; exit code 1 if something is wrong"
+    )
+    rebuild = what.add_parser("rebuild", help="rebuild the index from the database")
+    purge = what.add_parser(
+        "purge",
+        help="erase every byte of deleted frames on this node now, without waiting for PURGE_S",
+    )
+    add_data_option(purge)
+    for one in (stats, verify, rebuild):
+        one.add_argument("map", nargs="*", metavar="MAP", help="default: all maps")
+        add_data_option(one)
+    command.set_defaults(run=run_index)
+
+
+def run_index(options: argparse.Namespace) -> int:
+    """Do what was asked for with the indexes of the data folder."""
+    from sceneprint.engine import Engine
+
+    settings = settings_of(options)
+    require_database(settings)
+    with Engine(settings) as engine:
+        if options.what == "purge":
+            return _purge(engine)
+        do = {"stats": _stats, "verify": _verify, "rebuild": _rebuild}[options.what]
+        for name in options.map:  # all of them are there, before anything is done with one
+            engine.get_map(name)
+        names = options.map or [one.name for one in engine.list_maps().items]
+        if not names:
+            print("no maps yet")
+        return max((do(engine, name, options) for name in names), default=0)
+
+
+def _stats(engine: Engine, name: str, options: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from sceneprint.maintenance.fsck.indexes import describe_index
+
+    with tqdm(unit="query", leave=False, disable=not sys.stderr.isatty()) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        found = describe_index(engine, name, options.sample, options.seed, progress)
+    if options.json:
+        print(json.dumps(asdict(found) | {"bytes_beyond_upload": found.bytes_beyond_upload}))
+    else:
+        print("\n".join(_lines(found)))
+    return 0
+
+
+def _lines(s: IndexStats) -> list[str]:
+    index = "no index" if s.generation == 0 else f"generation {s.generation}"
+    recall = "1 (queries compare every frame)" if s.recall is None else f"{s.recall:.3f}"
+    lists = f", {s.probes} lists compared" if s.probes else ""
+    spread = "" if s.spread is None else f"; 100th neighbour at {s.spread:.2f} of the 10th"
+    return [
+        f"map {s.map}, {s.model}",
+        f"  frames      {s.frames}, {index}",
+        f"  lag         {s.lag_frames} frames, {s.lag_s:.0f} s; {s.deleted} deleted entries",
+        f"  bytes       {s.bytes_beyond_upload} per frame besides its upload of "
+        f"{s.upload_bytes}: signature {s.signature_bytes}, artifact {s.artifact_bytes}, index "
+        f"{s.index_bytes}",
+        f"  recall@10   {recall}{lists} ({s.sample} frames){spread}",
+    ]
+
+
+def _verify(engine: Engine, name: str, _: argparse.Namespace) -> int:
+    from sceneprint.maintenance.fsck.indexes import verify_index
+
+    wrong = verify_index(engine, name)
+    for line in wrong:
+        print(f"map {name}: {line}")
+    if wrong:
+        print(f"map {name}: rebuild it with `sceneprint index rebuild {name}`")
+    else:
+        print(f"map {name}: ok")
+    return int(bool(wrong))
+
+
+def _rebuild(engine: Engine, name: str, options: argparse.Namespace) -> int:
+    try:
+        print(f"map {name}: generation {engine.rebuild_index(name)}")
+    except InvalidRequest as error:  # of all maps, those are passed over that can have none
+        if options.map:
+            raise
+        print(f"map {name}: {error}")
+    return 0
+
+
+def _purge(engine: Engine) -> int:
+    found = engine.purging.now()
+    print(
+        f"purged {found.blobs} blobs, {found.answers} stored answers, {found.reconstructions} "
+        f"reconstructions; rebuilt {found.indexes} indexes"
+    )
+    if not engine.store.database.shrink_log():
+        print("the database log is in use: run this again when nothing reads the database")
+        return 1
+    return 0
+
+
+# `sceneprint snapshot`: all that must not be lost, in one archive.
+
+#: Damaged blobs that are named one by one.
+_SHOWN = 10
+#: Longest wait for a service to take one, seconds.
+_PATIENCE_S = 6 * 3600.0
+
+
+def add_snapshot(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "snapshot",
+        help="back up database and blobs to one archive, while the service runs",
+        description="Write a consistent snapshot of database and blobs to an archive. The "
+        "service and its workers may keep running. Search indexes are left out, as they can be "
+        "rebuilt. Exit code 1 if a blob was missing or damaged and could not be included. The "
+        "archive contains all frames and the hashes of keys: protect it like the data folder.",
+    )
+    add_data_option(command)
+    add_database_option(command)
+    command.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="archive to write, or its folder (default: SCENEPRINT_SNAPSHOT_URL, else "
+        "sceneprint-TIME.tar here)",
+    )
+    command.add_argument(
+        "--url",
+        metavar="URL",
+        help=(
+            "take the snapshot on the service at this address and download it, instead of "
+            "reading a local folder"
+        ),
+    )
+    command.add_argument(
+        "--key",
+        default=os.environ.get("SCENEPRINT_KEY") or None,
+        help="API key, if that service requires one (default: SCENEPRINT_KEY)",
+    )
+    command.set_defaults(run=run_snapshot)
+
+
+def run_snapshot(options: argparse.Namespace) -> int:
+    """Take a snapshot; returns 1 where something could not be taken along."""
+    from sceneprint.maintenance.snapshot.creation import take_snapshot
+
+    name = f"sceneprint-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tar"
+    path = Path(name) if options.out is None else options.out
+    if path.is_dir():
+        path = path / name
+    start = time.perf_counter()
+    if options.url is not None:
+        return _fetched(options, path)
+    settings = named_database(options)
+    if options.out is None and settings.snapshot_url is not None:
+        return _shelved(settings)
+    with ended_by_signals(), byte_progress("snapshot") as progress:
+        taken = take_snapshot(settings, path, progress)
+    print(f"{one_line(str(path))}: {contents(taken)} in {time.perf_counter() - start:.1f} s")
+    return 1 if name_damaged(taken, "Run `sceneprint fsck` to see what can be repaired.") else 0
+
+
+def add_database_option(command: argparse.ArgumentParser) -> None:
+    """`--database`."""
+    command.add_argument(
+        "--database",
+        metavar="URL",
+        help="URL such as postgresql://user@host/name (default: SCENEPRINT_DATABASE_URL, else "
+        "SQLite in the data folder); put a password into that variable or PGPASSWORD",
+    )
+
+
+def named_database(options: argparse.Namespace) -> Settings:
+    """Settings of the environment, and the database that `--database` names.
+
+    Raises
+    ------
+    InvalidRequest : its URL has a password, which everybody on the machine could see.
+    """
+    from pydantic import SecretStr
+    from sqlalchemy import make_url
+    from sqlalchemy.exc import ArgumentError
+
+    from sceneprint.errors import InvalidRequest
+
+    settings = settings_of(options)
+    if options.database is None:
+        return settings
+    try:
+        told = make_url(options.database)
+        shown = told.password is not None or "password" in told.query
+    except (ArgumentError, ValueError):
+        raise InvalidRequest(
+            "--database: not a database URL such as postgresql://user@host/name."
+        ) from None
+    if shown:
+        raise InvalidRequest(
+            "--database: a password on the command line is visible to everybody on this "
+            "machine. Set PGPASSWORD, or put the whole URL into SCENEPRINT_DATABASE_URL."
+        )
+    return settings.model_copy(update={"database_url": SecretStr(options.database)})
+
+
+def _shelved(settings: Settings) -> int:
+    """Take a snapshot to where those of the service are; returns 1 where blobs were lost."""
+    from sceneprint.maintenance.snapshot.catalog import SnapshotCatalog, new_snapshot_id
+
+    start = time.perf_counter()
+    with ended_by_signals(), byte_progress("snapshot") as progress:
+        taken = SnapshotCatalog(settings).take(new_snapshot_id(), progress)
+    return _report_snapshot(
+        taken, f"snapshot {taken.snapshot_id} in {settings.snapshot_url}", start
+    )
+
+
+def _fetched(options: argparse.Namespace, path: Path) -> int:
+    """Have a service take a snapshot, and download it; returns 1 where blobs were lost."""
+    from sceneprint.errors import InvalidRequest, SnapshotError
+    from sceneprint_client.api.admin import SnapshotFile
+
+    if options.data is not None:
+        raise InvalidRequest(
+            "--url names a service and --data a local folder. Give only one of them."
+        )
+    start = time.perf_counter()
+    with open_client(options) as client:
+        job = client.take_snapshot(wait_s=_PATIENCE_S)
+        if job.result is None:
+            why = job.error or "no worker has finished it; see `sceneprint jobs`"
+            raise SnapshotError(f"The service did not take the snapshot: job {job.job_id}: {why}")
+        taken = SnapshotFile.model_validate(job.result)
+        client.download_snapshot(taken.snapshot_id, path)
+    return _report_snapshot(taken, str(path), start)
+
+
+def _report_snapshot(taken: SnapshotFile, place: str, start: float) -> int:
+    """Say what has been taken; returns 1 where blobs were lost."""
+    print(
+        f"{one_line(place)}: {taken.maps} maps, {taken.frames} frames, {taken.blobs} blobs, "
+        f"{taken.bytes / 1e6:,.1f} MB in {time.perf_counter() - start:.1f} s"
+    )
+    if taken.damaged:
+        print(
+            f"{taken.damaged} lost blobs are not in the archive; its damaged.jsonl lists them.",
+            file=sys.stderr,
+        )
+    return 1 if taken.damaged else 0
+
+
+@contextmanager
+def byte_progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar of bytes on a terminal; yields what is to be told of bytes done and in all."""
+    with tqdm(desc=what, unit="B", unit_scale=True, disable=None) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield progress
+
+
+def contents(snapshot: Snapshot) -> str:
+    """What is in a snapshot, in a few words."""
+    held = snapshot.manifest
+    return (
+        f"{held.maps} maps, {held.n_frames} frames, {held.blobs.count} blobs, "
+        f"{held.bytes / 1e6:,.1f} MB"
+    )
+
+
+def name_damaged(snapshot: Snapshot, advice: str) -> bool:
+    """Name on standard error what is not in a snapshot; whether there is any."""
+    if not snapshot.damaged:
+        return False
+    for one in snapshot.damaged[:_SHOWN]:
+        of = ", ".join(f"{use.role} of {use.map}/{use.frame}" for use in one.of)
+        print(one_line(f"not in it: blob {one.digest[:12]}, {one.why}: {of}"), file=sys.stderr)
+    more = len(snapshot.damaged) - _SHOWN
+    if more > 0:
+        print(f"... and {more} more, in damaged.jsonl of the archive", file=sys.stderr)
+    print(f"Everything else is included. {advice}", file=sys.stderr)
+    return True
+
+
+# `sceneprint restore`: a data folder of a snapshot, or the store of a fleet.
+
+
+def add_restore(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "restore",
+        help="verify a snapshot and restore it to a data folder or a database",
+        description="Verify a snapshot and restore it to a data folder, all or nothing. With "
+        "the URL of an empty PostgreSQL database, its rows go there in one transaction, and its "
+        "blobs to SCENEPRINT_BLOB_URL or else the data folder. A folder that is not empty stays "
+        "untouched unless you give --replace, which moves it aside and never deletes it: stop "
+        "every process that uses it first. Exit code 1 if the snapshot lists blobs that were "
+        "damaged when it was taken; 2 if nothing was restored.",
+    )
+    command.add_argument(
+        "archive",
+        type=Path,
+        metavar="ARCHIVE",
+        help="archive of `sceneprint snapshot`, or the id of a snapshot that a service has taken",
+    )
+    add_data_option(command)
+    add_database_option(command)
+    choice = command.add_mutually_exclusive_group()
+    choice.add_argument(
+        "--verify-only",
+        action="store_true",
+        help="read and check the whole snapshot without restoring it",
+    )
+    choice.add_argument("--replace", action="store_true", help="move the existing folder aside")
+    command.set_defaults(run=run_restore)
+
+
+def run_restore(options: argparse.Namespace) -> int:
+    """Verify or restore; returns 1 where blobs were damaged when the snapshot was taken."""
+    settings, start = named_database(options), time.perf_counter()
+    with ended_by_signals(), _archive(options, settings) as archive:
+        if options.verify_only:
+            snapshot, done, aside = *_verified(archive), None
+        elif settings.database_url is not None:
+            snapshot, done, aside = *_filled(archive, settings, options), None
+        else:
+            snapshot, done, aside = _restore_to_folder(archive, settings, options)
+    seconds = time.perf_counter() - start
+    shown = one_line(str(options.archive))
+    print(f"{shown} {done}: {contents(snapshot)} of "
+          f"{snapshot.manifest.created_at:%Y-%m-%dT%H:%M:%SZ} in {seconds:.1f} s")  # fmt: skip
+    if aside is not None:
+        print(f"the previous contents are now in {one_line(str(aside))}", file=sys.stderr)
+    advice = (
+        "These frames were already damaged when the snapshot was taken. Delete them, or upload "
+        "them again."
+    )
+    return 1 if name_damaged(snapshot, advice) else 0
+
+
+@contextmanager
+def _archive(options: argparse.Namespace, settings: Settings) -> Iterator[Path]:
+    """The archive as a file; what is none may be the id of a snapshot that a service has taken."""
+    from sceneprint.maintenance.snapshot.catalog import SnapshotCatalog, is_snapshot_id
+
+    named: Path = options.archive
+    if named.exists() or not is_snapshot_id(str(named)):
+        yield named
+        return
+    # of a folder that is to be made nothing may be there
+    fleet = settings.database_url is not None
+    place = settings.data_dir if fleet else settings.data_dir.absolute().parent
+    with SnapshotCatalog(settings).local(str(named), place) as archive:
+        yield archive
+
+
+def _verified(archive: Path) -> tuple[Snapshot, str]:
+    from sceneprint.maintenance.snapshot.restoration import verify_snapshot
+
+    with byte_progress("verify") as progress:
+        return verify_snapshot(archive, progress), "is complete"
+
+
+def _filled(archive: Path, settings: Settings, options: argparse.Namespace) -> tuple[Snapshot, str]:
+    """Restored into the database of a fleet."""
+    from sceneprint.maintenance.snapshot.postgres import restore_to_fleet
+    from sceneprint.store.database import reach_database
+
+    database = reach_database(settings.database)
+    database.close()
+    if database.is_sqlite:
+        raise InvalidRequest(
+            "SCENEPRINT_DATABASE_URL is set to SQLite, but a snapshot is restored to the data "
+            "folder, where no service would look for it. Unset the variable, for the service "
+            "too."
+        )
+    if options.replace:
+        raise InvalidRequest(
+            "--replace moves a folder aside, which a database cannot do. Create an empty "
+            "database (CREATE DATABASE), and name that."
+        )
+    with byte_progress("restore") as progress:
+        snapshot = restore_to_fleet(archive, settings, progress)
+    return snapshot, f"is restored to {one_line(database.shown)}"
+
+
+def _restore_to_folder(
+    archive: Path, settings: Settings, options: argparse.Namespace
+) -> tuple[Snapshot, str, Path | None]:
+    """Restored to a folder."""
+    from sceneprint.maintenance.snapshot.restoration import restore_snapshot
+
+    if settings.blob_url is not None:
+        raise InvalidRequest(
+            "SCENEPRINT_BLOB_URL is set, but blobs are restored to the data folder, where no "
+            "service would look for them. Unset the variable, or restore into a fleet with "
+            "--database."
+        )
+    with byte_progress("restore") as progress:
+        snapshot, aside = restore_snapshot(
+            archive, settings.data_dir, replace=options.replace, progress=progress
+        )
+    return snapshot, f"is restored to {one_line(str(settings.data_dir))}", aside
+
+
+# `sceneprint thin`: which frames a map can lose, and losing them.
+
+#: Frames that are listed on the screen.
+SHOWN = 5
+
+
+def add_thin(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "thin",
+        help="find redundant frames of a map, and delete them with --yes",
+        description="Find frames whose signatures are close to those of other frames in the "
+        "same map. Deletes nothing without --yes. Works on the data folder, also while a "
+        "service runs on it.",
+    )
+    command.add_argument("map", metavar="MAP")
+    how = command.add_mutually_exclusive_group(required=True)
+    how.add_argument(
+        "--keep",
+        type=positive,
+        metavar="N",
+        help="keep the N most diverse frames (by a determinantal point process)",
+    )
+    how.add_argument(
+        "--novelty",
+        type=_share,
+        metavar="D",
+        help="in order of upload, keep a frame if no kept frame is within D, as a share of the "
+        "distance of unrelated frames; 0.2 is cautious",
+    )
+    command.add_argument("--session", metavar="NAME", help="only frames of this session")
+    command.add_argument(
+        "--seed",
+        type=whole_number,
+        default=0,
+        metavar="S",
+        help="random seed for --keep (default: 0)",
+    )
+    command.add_argument(
+        "--json", type=Path, metavar="FILE", help="write the list of redundant frames"
+    )
+    command.add_argument("--yes", action="store_true", help="delete the frames")
+    add_data_option(command)
+    command.set_defaults(run=run_thin)
+
+
+def run_thin(options: argparse.Namespace) -> int:
+    """Propose, and carry it out where told to."""
+    from sceneprint.engine import Engine
+    from sceneprint.maintenance.thin import carry_out, propose
+
+    if options.json is not None:
+        check_writable(options.json)
+    settings = settings_of(options)
+    require_database(settings)
+    with Engine(settings) as engine:
+        with _Bar("compare") as bar:
+            proposal = propose(
+                engine, options.map, keep=options.keep, novelty=options.novelty,
+                session=options.session, seed=options.seed, progress=bar.tell,
+            )  # fmt: skip
+        _print_proposal(proposal, options)
+        if options.json is not None:
+            write_whole(options.json, json.dumps(_document(proposal, options), indent=1).encode())
+        if not options.yes:
+            if proposal.losses:
+                print("nothing was deleted; add --yes to delete them")
+            return 0
+        with _Bar("delete") as bar:
+            deleted = carry_out(engine, proposal, bar.tell)
+        if deleted:
+            engine.audit.command("thin", map_name=options.map, deleted=deleted)
+    left = len(proposal.losses) - deleted
+    why = (
+        f", {left} were not: they, or the frames that stand for them, are already gone"
+        if left
+        else ""
+    )
+    print(f"{deleted} frames deleted{why}")
+    return 0
+
+
+def _print_proposal(proposal: Proposal, options: argparse.Namespace) -> None:
+    n, lost = proposal.n_frames, len(proposal.losses)
+    where = f"map {proposal.map}, model {proposal.model}"
+    if options.session is not None:
+        where += f", session {one_line(options.session)}"
+    if options.keep is not None:
+        where += f", seed {options.seed}"
+    print(where)
+    if not lost:
+        print(f"none of {n} frames is redundant")
+        return
+    median, largest = proposal.shares
+    print(
+        f"{lost} of {n} frames are redundant, {n - lost} stay; frees about "
+        f"{_size(proposal.freed_bytes)}"
+    )
+    print(
+        f"distance to the nearest frame that stays: {median:.3f} of that of unrelated frames "
+        f"(median), {largest:.3f} (maximum)"
+    )
+    for one in sorted(proposal.losses, key=lambda loss: -loss.share)[:SHOWN]:
+        print(f"  {one.frame_id}  {one.share:.3f} from {one.like}")
+    if lost > SHOWN:
+        print(f"  and {lost - SHOWN} nearer ones (--json FILE lists all)")
+
+
+def _document(proposal: Proposal, options: argparse.Namespace) -> dict[str, Any]:
+    median, largest = proposal.shares
+    return {
+        "map": proposal.map,
+        "model": proposal.model,
+        "session": options.session,
+        "keep": options.keep,
+        "novelty": options.novelty,
+        "seed": None if options.keep is None else options.seed,
+        "frames": proposal.n_frames,
+        "freed_bytes": proposal.freed_bytes,
+        "median_share": median,
+        "largest_share": largest,
+        "losses": [asdict(one) for one in proposal.losses],
+    }
+
+
+class _Bar:
+    """A bar that is told of steps done and their total."""
+
+    def __init__(self, what: str) -> None:
+        self._bar = tqdm(desc=what, unit="frame", disable=None, delay=0.5)
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def tell(self, done: int, total: int) -> None:
+        self._bar.total = total
+        self._bar.update(done - self._bar.n)
+
+
+def _share(text: str) -> float:
+    try:
+        share = float(text)
+    except ValueError:
+        share = math.nan
+    if not 0 <= share <= 2:  # false for NaN as well
+        raise argparse.ArgumentTypeError(f"{text!r} is not a share from 0 to 2")
+    return share
+
+
+def _size(n_bytes: int) -> str:
+    return f"{n_bytes / 1e9:.1f} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.1f} MB"
+
+
+# `sceneprint reencode`: a map signed with another model, to which it then switches.
+
+#: Seconds without a frame signed after which no worker is believed to be there.
+STALL_S = 120.0
+#: Seconds between two looks; longer where a look takes more than a tenth of it.
+LOOK_S = 0.5
+
+
+def add_reencode(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "reencode",
+        help="switch a map to another model",
+        description="Sign every frame of a map again with another model, from the stored "
+        "uploads. Workers sign new uploads first. Queries use the current model until all "
+        "frames are signed; then the map switches at once. Works on the data folder, also while "
+        "a service runs on it. Run the same command again to retry failed frames.",
+    )
+    command.add_argument("map", metavar="MAP")
+    what = command.add_mutually_exclusive_group(required=True)
+    what.add_argument("--model", metavar="MODEL", help="depth, lidar, paper, or a model file")
+    what.add_argument("--status", action="store_true", help="show the progress")
+    what.add_argument(
+        "--cancel",
+        action="store_true",
+        help="keep the current model, and discard signatures of the new one",
+    )
+    command.add_argument("--wait", action="store_true", help="wait until the map has switched")
+    add_data_option(command)
+    command.set_defaults(run=run_reencode)
+
+
+def run_reencode(options: argparse.Namespace) -> int:
+    """Begin, watch or give up; returns 2 where waiting was no use."""
+    from sceneprint.engine import Engine
+
+    settings = settings_of(options)
+    require_database(settings)
+    with Engine(settings) as engine:
+        if options.model is not None:
+            told = engine.reencode(options.map, options.model)
+            engine.audit.command("reencode --model", map_name=options.map, model=str(options.model))
+        elif options.cancel:
+            told = engine.cancel_reencode(options.map)
+            engine.audit.command("reencode --cancel", map_name=options.map)
+        else:
+            told = engine.get_map(options.map)
+        if options.wait and told.reencoding is not None:
+            return _wait(engine, told)
+        _print_reencoding(told)
+    return 0
+
+
+def _print_reencoding(told: Map) -> None:
+    print(f"map {told.name}, model {told.model}")
+    coming = told.reencoding
+    if coming is None:
+        return
+    print(f"next model: {coming.model}; {coming.done} frames signed, {coming.left} waiting")
+    if coming.failed:
+        print(
+            f"{coming.failed} frames cannot be signed with it: they will be rejected when the "
+            "map switches"
+        )
+    if coming.dead:
+        print(
+            f"{coming.dead} frames failed every attempt, and the map does not switch until they "
+            "are signed or deleted: see their jobs, then run this with --model again"
+        )
+
+
+def _wait(engine: Engine, told: Map) -> int:
+    """Wait while frames are signed now and then."""
+    coming = told.reencoding
+    assert coming is not None
+    last, since = -1, time.monotonic()
+    with tqdm(desc=f"sign with {coming.model}", unit="frame", disable=None) as bar:
+        while True:
+            looked = time.monotonic()
+            told = engine.get_map(told.name)
+            took = time.monotonic() - looked
+            now = told.reencoding
+            if now is None or now.model_id != coming.model_id:
+                break
+            done = now.done + now.failed
+            bar.total = done + now.left + now.dead
+            bar.update(done - bar.n)
+            if done != last:
+                last, since = done, time.monotonic()
+            if (now.dead and not now.left) or time.monotonic() - since > STALL_S:
+                bar.close()
+                _print_reencoding(told)
+                if not now.dead:
+                    print(
+                        f"no progress for {STALL_S:.0f} s. Check that workers are running; "
+                        "`sceneprint work` starts some.",
+                        file=sys.stderr,
+                    )
+                return 2
+            time.sleep(max(LOOK_S, 10 * took))
+    _print_reencoding(told)
+    return 0 if told.model_id == coming.model_id else 2

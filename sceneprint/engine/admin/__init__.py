@@ -1,0 +1,1 @@
+"""Keys, statistics and the tasks of an operator."""

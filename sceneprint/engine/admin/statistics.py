@@ -1,0 +1,526 @@
+"""How the service does now, and did in the last hour: from the store, whoever wrote it.
+
+frames, jobs, events, samples  --Statistics.tell-->  Stats
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, func, select
+
+from sceneprint.engine.search.local_index import index_folder, is_index_folder
+from sceneprint.engine.serializers import when
+from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
+from sceneprint.index.manifest import GenerationManifest, manifests, read_manifest
+from sceneprint.settings import Settings
+from sceneprint.store import Blobs, Database, FolderBlobs, Store
+from sceneprint.store.events import anchor_number, newest_number
+from sceneprint.store.frame_queries import (
+    bytes_of_files,
+    count_uploads,
+    frames_with_uploads,
+    spread_frames,
+    weigh,
+)
+from sceneprint.store.frames import count_states
+from sceneprint.store.maps import count_frames, find_map, list_maps
+from sceneprint.store.metrics import (
+    Sample,
+    add_sample,
+    at_work,
+    count_events,
+    count_jobs_of,
+    count_maps,
+    count_samples,
+    oldest_waiting,
+    samples_since,
+)
+from sceneprint.store.queue import count_jobs, read_clock
+from sceneprint.store.signatures import count_indexed
+from sceneprint.store.tables import MapRow
+from sceneprint.store.wakeup import Wakeup
+from sceneprint_client.api import JobState
+from sceneprint_client.api.admin import (
+    OUTCOMES,
+    Counted,
+    IndexRecall,
+    IndexState,
+    Latency,
+    MapUse,
+    Minute,
+    ReplicaSeen,
+    Sizes,
+    Stats,
+    WorkerSeen,
+)
+
+# Times of many answers in a few numbers that can be added up: a histogram of fixed bounds.
+#
+# Bin i holds what took from FIRST_S * STEP^i up to STEP times that. The bounds are the same in
+# every
+# process, so that the histograms of several add to that of all, and a quantile of the sum is that
+# of all answers, but for the width of a bin: it is wrong by 9 % at most.
+
+#: Lower bound of bin 0, seconds, and how much wider each bin reaches than the one before.
+FIRST_S, STEP = 1e-4, 2.0**0.25
+#: Bins: what takes longer than FIRST_S STEP^91, 12 minutes, is in the last one.
+BINS = 92
+
+
+def bin_of(seconds: float) -> int:
+    """The bin of a time."""
+    if seconds <= FIRST_S:
+        return 0
+    return min(int(math.log(seconds / FIRST_S, STEP)), BINS - 1)
+
+
+def quantile(histogram: Mapping[int, int], share: float) -> float | None:
+    """The time that this share of all answers did not take longer than.
+
+    Parameters
+    ----------
+    histogram : number of answers in each bin that has any
+    share : from 0 to 1
+
+    Returns
+    -------
+    seconds, the geometric middle of the bin; None where there were no answers
+    """
+    total = sum(histogram.values())
+    if total == 0:
+        return None
+    rank, seen = max(math.ceil(share * total), 1), 0
+    for place in sorted(histogram):
+        seen += histogram[place]
+        if seen >= rank:
+            return float(FIRST_S * STEP ** (place + 0.5))
+    raise AssertionError("the ranks of all bins are their sum")
+
+
+class Latencies:
+    """A histogram that grows."""
+
+    def __init__(self) -> None:
+        self._bins: Counter[int] = Counter()
+
+    def add(self, seconds: float) -> None:
+        """Count an answer."""
+        self._bins[bin_of(seconds)] += 1
+
+    def as_json(self) -> dict[str, int]:
+        """As it is stored."""
+        return {str(place): number for place, number in sorted(self._bins.items())}
+
+
+def merged(parts: list[Mapping[str, int]]) -> dict[int, int]:
+    """Several stored histograms as one."""
+    total: Counter[int] = Counter()
+    for part in parts:
+        for place, number in part.items():
+            total[int(place)] += int(number)
+    return dict(total)
+
+
+# How far the search indexes are behind their maps, and which events they need to be believed.
+
+#: Maps that are told of at most: those that changed most often.
+MOST = 200
+
+
+def index_state(connection: Connection, indexes: Path, row: MapRow) -> IndexState:
+    """The newest index of a map that can be read, by its manifest alone."""
+    for _, path in manifests(index_folder(indexes, row)):
+        found = _read(path)
+        if found is not None and found.revision <= row.revision:
+            tail = count_indexed(connection, row.number, found.revision)
+            recall = IndexRecall(**asdict(found.recall))
+            return IndexState(map=row.name, generation=found.number, tail=tail, recall=recall)
+    tail = count_indexed(connection, row.number, 0)
+    return IndexState(map=row.name, generation=None, tail=tail, recall=None)
+
+
+def index_states(connection: Connection, indexes: Path) -> list[IndexState]:
+    """Of the maps that changed most often; the longest tail first."""
+    rows = sorted(list_maps(connection), key=lambda row: -row.revision)[:MOST]
+    found = [index_state(connection, indexes, row) for row in rows]
+    return sorted(found, key=lambda state: (-state.tail, state.map))
+
+
+def anchors(indexes: Path) -> frozenset[int]:
+    """Numbers of the events that the indexes of this machine are held to."""
+    if not indexes.is_dir():
+        return frozenset()
+    folders = [folder for folder in indexes.iterdir() if is_index_folder(folder.name)]
+    read = [_read(path) for folder in folders for _, path in manifests(folder)]
+    numbers = [anchor_number(one.anchor) for one in read if one is not None]
+    return frozenset(number for number in numbers if number is not None)
+
+
+def _read(path: Path) -> GenerationManifest | None:
+    try:
+        return read_manifest(path)
+    except DamagedIndex:
+        return None  # readers pass it over too
+
+
+# How much room a store takes on its disk.
+
+#: Blobs that are measured one by one; of more, the rest is taken to be like them.
+MEASURED = 5_000
+#: Frames of one map that are; taken evenly in the order they came.
+WEIGHED = 1_000
+#: Frames of a whole store that are weighed where blobs are not files, and blobs that are asked for.
+SPREAD, ASKED = 64, 16
+_HERE = func.current_database()
+
+
+def sizes(settings: Settings, store: Store) -> Sizes:
+    """Bytes of all parts of a store."""
+    free, disk = _free_of(settings.data_dir)
+    blobs = settings.blobs
+    return Sizes(
+        database=_of_database(store.database),
+        blobs=_of_blobs(blobs) if isinstance(blobs, Path) else _of_objects(store),
+        index=sum(_files_of(settings.indexes, deep=True)),
+        free=free,
+        disk=disk,
+    )
+
+
+def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRow) -> Sizes:
+    """Bytes of what one map takes: of it alone, so that nothing shows of any other.
+
+    A blob that several frames share counts for each of them.
+
+    Parameters
+    ----------
+    connection : of the store's database
+    store : see Store
+    indexes : folder of search indexes
+    row : of the map
+    """
+    numbers, total = frames_with_uploads(connection, row.number, WEIGHED)
+    weight = weigh(connection, numbers)
+    artifacts = _of_artifacts(store.blobs, weight.artifacts)
+    share = max(len(numbers), 1)
+    return Sizes(
+        database=weight.signature_bytes * total // share,
+        blobs=(weight.upload_bytes + artifacts) * total // share,
+        index=sum(_files_of(index_folder(indexes, row), deep=True)),
+        free=None,
+        disk=None,
+    )
+
+
+def _of_database(database: Database) -> int | None:
+    if not database.is_sqlite:
+        with database.read() as connection:
+            return int(connection.execute(select(func.pg_database_size(_HERE))).scalar_one())
+    path = database.file
+    if path is None:
+        return None
+    return sum(_size(one) for one in (path, path.with_name(path.name + "-wal")))
+
+
+def _of_objects(store: Store) -> int:
+    """Bytes of all blobs in an object store: some of the rows are weighed, nothing is listed."""
+    with store.database.read() as connection:
+        some = spread_frames(connection, SPREAD)
+        weight = weigh(connection, some)
+        total = count_uploads(connection)
+        files = bytes_of_files(connection)
+    each = (weight.upload_bytes + _of_artifacts(store.blobs, weight.artifacts)) / max(len(some), 1)
+    return int(each * total) + files
+
+
+def _of_artifacts(blobs: Blobs, artifacts: Sequence[str]) -> int:
+    """Bytes of some blobs; of many that each cost a request, a few stand for all."""
+    if isinstance(blobs, FolderBlobs):
+        return sum(blobs.size(one) or 0 for one in artifacts)
+    some = artifacts[:: max(-(-len(artifacts) // ASKED), 1)]
+    try:
+        asked = sum(blobs.size(one) or 0 for one in some)
+    except UnusableStore:  # other figures are told while the store is away
+        return 0
+    return asked * len(artifacts) // max(len(some), 1)
+
+
+def _of_blobs(folder: Path) -> int:
+    """Bytes of all blobs: their names are hashes, so that any of the 256 folders is like all."""
+    try:
+        parts = sorted(one.path for one in os.scandir(folder) if one.is_dir())
+    except OSError:
+        return 0
+    total, seen = 0, 0
+    for done, part in enumerate(parts, 1):
+        found = list(_files_of(Path(part)))
+        total, seen = total + sum(found), seen + len(found)
+        if seen >= MEASURED:
+            return total * len(parts) // done
+    return total
+
+
+def _files_of(folder: Path, *, deep: bool = False) -> Iterator[int]:
+    try:
+        for one in os.scandir(folder):
+            if one.is_file(follow_symlinks=False):
+                yield _size(one)
+            elif deep and one.is_dir(follow_symlinks=False):
+                yield from _files_of(Path(one.path), deep=True)
+    except OSError:
+        return  # removed meanwhile, or not there yet
+
+
+def _size(path: Path | os.DirEntry[str]) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def _free_of(folder: Path) -> tuple[int, int]:
+    """Bytes left on a disk, and all that it has."""
+    try:
+        found = shutil.disk_usage(folder)
+    except OSError:
+        return 0, 0
+    return found.free, found.total
+
+
+MINUTE_S, HOUR_S = 60.0, 3600.0
+#: Seconds for which the sizes of folders, which take long to measure, are told again.
+MEASURED_S = 30.0
+#: Seconds for which figures are told again: whoever asks, and however often, it costs little.
+TOLD_S = 1.0
+#: What samples are kept of: what a service counted, and workers that began.
+SERVICE, WORKER = "service", "worker"
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How the whole store is.
+
+    Parameters
+    ----------
+    frames, jobs : number in each state that has any
+    maps : number
+    oldest_waiting_s : see Stats; 0 where none waits
+    indexes, workers, sizes : see Stats
+    began : workers that began in the last hour
+    events : number of the newest event
+    replica : see Stats
+    """
+
+    frames: dict[str, int]
+    jobs: dict[str, int]
+    maps: int
+    oldest_waiting_s: float
+    indexes: list[IndexState]
+    workers: list[WorkerSeen]
+    sizes: Sizes
+    began: int
+    events: int
+    replica: ReplicaSeen | None = None
+
+
+class Statistics:
+    """Figures of one store.
+
+    Parameters
+    ----------
+    store, settings, bell : see there
+    """
+
+    def __init__(self, store: Store, settings: Settings, bell: Wakeup) -> None:
+        self._store, self._settings, self._bell = store, settings, bell
+        self._sizes: tuple[float, Sizes] | None = None
+        self._sizes_of: dict[int, tuple[float, Sizes]] = {}
+        self._figures: tuple[float, Figures] | None = None
+        self._lock = threading.Lock()
+
+    def tell(self, minutes: int = 60, map_name: str | None = None) -> Stats:
+        """All figures, of the whole store or of one map.
+
+        Parameters
+        ----------
+        minutes : of history, from 1 to 60
+        map_name : only of this map
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        """
+        now = time.time()
+        start = (now // MINUTE_S - minutes + 1) * MINUTE_S
+        with self._store.database.read() as connection:
+            row = None if map_name is None else find_map(connection, map_name)
+            kinds = [f"frame.{outcome}" for outcome in OUTCOMES]
+            happened = count_events(connection, kinds, start, MINUTE_S, map_name)
+            samples: list[Sample] | None = None
+            if row is None:
+                frames, jobs = count_states(connection), count_jobs(connection)
+                maps, indexes = count_maps(connection), index_states(connection, self._indexes)
+                samples = samples_since(connection, SERVICE, start)
+                oldest = oldest_waiting(connection)
+                workers = self.workers(connection)
+            else:
+                frames = count_frames(connection, row.number)
+                jobs = count_jobs_of(connection, row.number)
+                maps, indexes = 1, [index_state(connection, self._indexes, row)]
+                oldest, workers = oldest_waiting(connection, row.number), None
+            taken = None if row is None else self._sizes_of_map(connection, row)
+        return Stats(
+            at=when(now),
+            map=map_name,
+            maps=maps,
+            frames=frames,
+            jobs=jobs,
+            waiting=jobs.get(JobState.QUEUED, 0),
+            oldest_waiting_s=None if oldest is None else max(now - oldest, 0.0),
+            indexes=indexes,
+            workers=workers,
+            bytes=taken or self.sizes(),
+            use=None if row is None else _use(row),
+            replica=self.replica() if row is None else None,
+            total=Counted(**_recent_counts(happened, range(minutes), samples)),
+            minutes=_minutes(happened, samples, start, minutes),
+        )
+
+    @property
+    def _indexes(self) -> Path:
+        return self._settings.indexes
+
+    def figures(self) -> Figures:
+        """The whole store, looked at now and then."""
+        with self._lock:  # who comes meanwhile waits, and is told the same
+            now = time.monotonic()
+            if self._figures is None or now - self._figures[0] > TOLD_S:
+                self._figures = now, self._look()
+            return self._figures[1]
+
+    def replica(self) -> ReplicaSeen | None:
+        """How the read replica does, if there is one."""
+        if self._store.replica is None:
+            return None
+        found = self._store.replica.standing()
+        behind_s = None if found.behind_s is None else round(found.behind_s, 3)
+        return ReplicaSeen(used=found.used, behind_s=behind_s)
+
+    def began(self, worker: str) -> None:
+        """Note that a worker has begun; where that cannot be written, nobody will know."""
+        with suppress(SceneprintError), self._store.database.write(turn=False) as connection:
+            add_sample(connection, WORKER, worker, {})
+
+    def _look(self) -> Figures:
+        now = time.time()
+        with self._store.database.read() as connection:
+            oldest = oldest_waiting(connection)
+            return Figures(
+                frames=count_states(connection),
+                jobs=count_jobs(connection),
+                maps=count_maps(connection),
+                oldest_waiting_s=0.0 if oldest is None else max(now - oldest, 0.0),
+                indexes=index_states(connection, self._indexes),
+                workers=self.workers(connection),
+                sizes=self.sizes(),
+                began=count_samples(connection, WORKER, now - HOUR_S),
+                events=newest_number(connection),
+                replica=self.replica(),
+            )
+
+    def workers(self, connection: Connection) -> list[WorkerSeen]:
+        """Processes that wait for jobs, with SQLite on this machine, and those that have one."""
+        busy = at_work(connection, read_clock(connection))
+        names = sorted({*self._bell.listeners(connection), *busy})
+        return [WorkerSeen(name=name, job_id=busy.get(name)) for name in names]
+
+    def sizes(self) -> Sizes:
+        """Bytes on the disk, measured now and then."""
+        now = time.monotonic()
+        if self._sizes is None or now - self._sizes[0] > MEASURED_S:
+            self._sizes = now, sizes(self._settings, self._store)
+        return self._sizes[1]
+
+    def _sizes_of_map(self, connection: Connection, row: MapRow) -> Sizes:
+        now = time.monotonic()
+        kept = {n: one for n, one in list(self._sizes_of.items()) if now - one[0] <= MEASURED_S}
+        if row.number not in kept:  # two that ask at once measure twice, and tell the same
+            found = sizes_of_map(connection, self._store, self._indexes, row)
+            kept[row.number] = now, found
+            self._sizes_of = kept
+        return kept[row.number][1]
+
+
+def _use(row: MapRow) -> MapUse:
+    return MapUse(
+        frames=row.used_frames,
+        bytes=row.used_bytes,
+        quota_frames=row.quota_frames,
+        quota_bytes=row.quota_bytes,
+        retention_days=row.retention_days,
+    )
+
+
+def _minutes(
+    happened: Mapping[tuple[int, str], int], samples: list[Sample] | None, start: float, count: int
+) -> list[Minute]:
+    """What happened in each minute; a minute in which nothing did is told too."""
+    of_minute: dict[int, list[Sample]] = {place: [] for place in range(count)}
+    for sample in samples or ():
+        place = int((sample.at - start) // MINUTE_S)
+        if place in of_minute:  # a clock that was set back may be ahead of now
+            of_minute[place].append(sample)
+    return [
+        Minute(
+            at=when(start + place * MINUTE_S),
+            **_recent_counts(
+                happened, range(place, place + 1), None if samples is None else of_minute[place]
+            ),
+        )
+        for place in range(count)
+    ]
+
+
+def _recent_counts(
+    happened: Mapping[tuple[int, str], int], places: range, samples: list[Sample] | None
+) -> dict[str, Any]:
+    """Fields of `Counted` for some minutes."""
+    told: dict[str, Any] = {
+        outcome: sum(happened.get((place, f"frame.{outcome}"), 0) for place in places)
+        for outcome in OUTCOMES
+    }
+    if samples is None:
+        return told | dict.fromkeys(("queries", "latency", "requests", "refused", "busy", "broken"))
+    queries: Counter[str] = Counter()
+    statuses: Counter[int] = Counter()
+    for sample in samples:
+        queries.update(sample.data["queries"])
+        statuses.update({int(status): n for status, n in sample.data["statuses"].items()})
+    return told | {
+        "queries": dict(queries),
+        "latency": _latency([sample.data["latencies"] for sample in samples]),
+        "requests": sum(statuses.values()),
+        "refused": sum(n for status, n in statuses.items() if 400 <= status < 500),
+        "busy": statuses[503],
+        "broken": sum(n for status, n in statuses.items() if status >= 500 and status != 503),
+    }
+
+
+def _latency(parts: list[dict[str, int]]) -> Latency | None:
+    histogram = merged(parts)  # type: ignore[arg-type]
+    found = [quantile(histogram, share) for share in (0.5, 0.95, 0.99)]
+    if any(one is None for one in found):
+        return None
+    p50, p95, p99 = (round(one, 6) for one in found if one is not None)
+    return Latency(p50=p50, p95=p95, p99=p99)

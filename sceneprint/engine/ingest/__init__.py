@@ -1,0 +1,1 @@
+"""Uploads: decoded, checked for duplicates, stored and queued."""

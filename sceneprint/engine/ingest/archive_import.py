@@ -1,0 +1,389 @@
+"""Archives of sequences into a map: taken whole at the door, and frame by frame by a worker.
+
+chunks  --Receiver-->  a blob that can be sought in  --begin-->  job  --handler-->  items
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection
+
+from sceneprint.engine.ingest.uploads import Upload, Uploads, item_of
+from sceneprint.engine.ingest.uploads import UploadResult as UploadOutcome
+from sceneprint.engine.jobs.lifecycle import get_job
+from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
+from sceneprint.engine.maps.map_frames import row_of
+from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
+from sceneprint.errors import (
+    SceneprintError,
+    StoreError,
+    UnreadableArchive,
+    UnreadableFrame,
+    UnusableStore,
+)
+from sceneprint.formats.archive.archive import Archive, open_archive
+from sceneprint.formats.archive.entries import Inflater
+from sceneprint.formats.dataset import FrameReference
+from sceneprint.formats.dataset.frame_reference import FrameSequence
+from sceneprint.formats.dataset.upload_metadata import parent_frame_of, session_of
+from sceneprint.store import Store, queue
+from sceneprint.store.blobs.folder import IncomingBlob
+from sceneprint.store.database_errors import unusable
+from sceneprint.store.idempotency import IdempotentRequest
+from sceneprint.store.maps import find_map
+from sceneprint.store.queue import (
+    JobFile,
+    files_of,
+    find_job,
+    finished_with_file,
+    items_of,
+    remove_parts,
+    unknown_job,
+)
+from sceneprint_client.api import Job, Page
+from sceneprint_client.api.frames import ImportItem, ImportOptions
+from sceneprint_client.frame_files import meta_of
+
+# Frames of an archive into a map, some at a time; what is wrong with one costs no other.
+#
+#     archive  --steps_of-->  Steps  --next_of-->  those taken at once  --take-->  ImportItems
+#
+# A frame goes the way of every upload, so that what is done again after a crash finds it there.
+
+#: Frames that are taken in one commit, and bytes of more than one: a cloud may have 512 MiB, and
+#: what is taken at once is in memory.
+_AT_ONCE, _BYTES_AT_ONCE = 16, 128 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A frame of an archive, or why there is none."""
+
+    name: str
+    sequence: FrameSequence | None = None
+    reference: FrameReference | None = None
+    refused: SceneprintError | None = None
+
+
+def steps_of(archive: Archive, every: int) -> Iterator[Step]:
+    """All there is to tell of an archive, in the same order each time."""
+    for name, reason in archive.refused:
+        yield Step(name, refused=UnreadableArchive(reason))
+    for sequence in archive.sequences:
+        for reference in sequence.frames[::every]:
+            yield Step(archive.name_of(reference), sequence, reference)
+
+
+def next_of(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[Step]:
+    """The steps that are taken at once, at least one."""
+    count = size = 0
+    for step in steps[done : done + _AT_ONCE]:
+        size += 0 if step.reference is None else archive.size_of(step.reference)
+        if count and size > _BYTES_AT_ONCE:
+            break
+        count += 1
+    return steps[done : done + count]
+
+
+def take(
+    uploads: Uploads, task: LongJob, archive: Archive, steps: Sequence[Step], options: ImportOptions
+) -> list[ImportItem]:
+    """Take some frames in one commit, as long as the job is this worker's.
+
+    Parameters
+    ----------
+    uploads : what takes them
+    task : of the import
+    archive, steps : see `next_of`
+    options : of the import
+    """
+
+    def fence(connection: Connection) -> None:  # cancelled, or of a map that was made anew
+        queue.check_held(connection, task.claim)
+
+    outcomes: list[UploadOutcome | None] = []
+    taken = []
+    for step in steps:
+        try:
+            taken.append(_upload(archive, step, options))
+            outcomes.append(None)
+        except StoreError:
+            raise
+        except SceneprintError as error:
+            outcomes.append(UploadOutcome(None, error=type(error)(archive.told(error))))
+        except MemoryError:
+            outcomes.append(_too_large())
+    rest = iter(_added(uploads, task.of_map.name, taken, fence))
+    return [
+        _item(step.name, outcome or next(rest))
+        for step, outcome in zip(steps, outcomes, strict=True)
+    ]
+
+
+def _added(
+    uploads: Uploads, map_name: str, taken: list[Upload], fence: Callable[[Connection], None]
+) -> list[UploadOutcome]:
+    """Add them together; where memory does not do for that, one by one."""
+    if not taken:
+        return []
+    try:
+        return uploads.add_all(map_name, taken, fence=fence)[0]
+    except MemoryError:
+        if len(taken) == 1:
+            return [_too_large()]
+    return [one for each in taken for one in _added(uploads, map_name, [each], fence)]
+
+
+def _too_large() -> UploadOutcome:
+    return UploadOutcome(
+        None,
+        error=UnreadableFrame(
+            "The frame needs more memory than a worker may use. Send a smaller one."
+        ),
+    )
+
+
+def _upload(archive: Archive, step: Step, options: ImportOptions) -> Upload:
+    if step.sequence is None or step.reference is None:
+        raise step.refused or ValueError("neither a frame nor refused")
+    meta = meta_of(
+        step.reference,
+        robot=options.robot,
+        session=options.session or session_of(step.sequence),
+        tags=options.tags,
+        with_pose=options.with_poses,
+        parent_frame=options.parent_frame or parent_frame_of(step.sequence, options.robot),
+        base=options.T_base_sensor,
+    )
+    data = archive.data_of(step.reference)
+    return Upload(data, meta, options.priority, options.if_novel)
+
+
+def _item(name: str, outcome: UploadOutcome) -> ImportItem:
+    item = item_of(outcome)
+    return ImportItem(
+        name=name,
+        status=item.status,
+        frame_id=None if item.frame is None else item.frame.frame_id,
+        job_id=None if item.frame is None else item.frame.job_id,
+        problem=item.problem,
+    )
+
+
+KIND, FILE = "import", "archive"
+#: Seconds for which the archive of an import that was given up is kept for another try, and
+#: between two looks for those.
+KEPT_S, TIDY_S = 86_400.0, 60.0
+#: How much more a compressed tar may hold than the largest archive that is taken.
+_UNPACKED = 4
+
+
+class Receiver:
+    """An archive on its way in; see `Imports.receive`.
+
+    Parameters
+    ----------
+    blob : that it becomes, compressed tars inflated
+    most_bytes : that it may have
+    """
+
+    def __init__(self, blob: IncomingBlob, most_bytes: int) -> None:
+        self._blob, self._inflater = blob, Inflater(most_bytes)
+
+    def write(self, chunk: bytes) -> None:
+        """Take the next part.
+
+        Raises
+        ------
+        UnreadableArchive : it is no archive, is damaged, or holds more than it may.
+        StoreFull, UnusableStore : it cannot be written.
+        """
+        for piece in self._inflater.pieces(chunk):
+            self._blob.write(piece)
+
+    def end(self) -> JobFile:
+        """Keep it, durable; raises as `write`."""
+        for piece in self._inflater.end():
+            self._blob.write(piece)
+        return JobFile(FILE, self._blob.keep(), self._blob.size, "application/octet-stream")
+
+
+class Imports:
+    """Imports of archives.
+
+    Parameters
+    ----------
+    store, tasks, uploads : see there
+    most_bytes : of an archive, as it is sent
+    """
+
+    def __init__(self, store: Store, tasks: Tasks, uploads: Uploads, most_bytes: int) -> None:
+        self._store, self._tasks, self._uploads = store, tasks, uploads
+        self._most = most_bytes
+        self._tidied = time.monotonic()
+        tasks.register(KIND, self.handle)
+
+    @contextmanager
+    def receive(self, map_name: str) -> Iterator[Receiver]:
+        """Take an archive in parts; what is not kept by `Receiver.end` is removed.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        ReadOnlyStore, StoreFull, UnusableStore : nothing can be kept.
+        """
+        with self._store.database.read() as connection:
+            find_map(connection, map_name)
+        self._store.database.require_writable()
+        with self._store.blobs.incoming() as blob:
+            yield Receiver(blob, _UNPACKED * self._most)
+
+    def begin(
+        self,
+        map_name: str,
+        archive: JobFile,
+        options: ImportOptions,
+        once: IdempotentRequest | None = None,
+    ) -> tuple[Job, bool]:
+        """Queue the import of an archive that was received.
+
+        Returns
+        -------
+        job : that imports it
+        replayed : whether `once` began it before
+
+        Raises
+        ------
+        UnknownMap, IdempotencyConflict : see `Tasks.begin_once`; the archive is removed.
+        UnusableStore : an import of the same archive has just ended, and removed it.
+        """
+        data = options.model_dump(mode="json")
+        try:
+            job, again = self._tasks.begin_once(
+                KIND, map_name, data, options.priority, [archive], once
+            )
+        except Swept as error:
+            raise UnusableStore(f"{error} Send the archive again.") from error
+        except SceneprintError:
+            collect_deleted_blobs(self._store, [archive.blob])
+            raise
+        if again:
+            collect_deleted_blobs(self._store, [archive.blob])
+        return job, again
+
+    def get(self, map_name: str, job_id: str) -> Job:
+        """An import of a map; UnknownMap or UnknownJob where there is none."""
+        with self._store.database.read() as connection:
+            find_map(connection, map_name)
+        job = get_job(self._store, job_id)
+        if job.kind != KIND or job.map != map_name:
+            raise unknown_job(job_id)
+        return job
+
+    def items(
+        self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100
+    ) -> Page[ImportItem]:
+        """What came of the members of an archive so far, in their order.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : there is none.
+        InvalidRequest : a cursor that was not given out.
+        """
+        self.get(map_name, job_id)
+        first = row_of(cursor) or 0
+        with self._store.database.read() as connection:
+            number = find_job(connection, job_id).number
+            found = items_of(connection, number, first, limit + 1)
+        more = str(first + limit) if len(found) > limit else None
+        return Page[ImportItem](
+            items=[ImportItem(**one) for one in found[:limit]], next_cursor=more
+        )
+
+    def handle(self, task: LongJob, until: float) -> SliceResult:
+        """Import a part of an archive: frames until the time is over, at least some."""
+        options = ImportOptions.model_validate(task.data)
+        with self._store.database.read() as connection:
+            file = files_of(connection, task.claim.job.number).get(FILE)
+        if file is None:
+            raise UnreadableArchive(
+                "The archive was removed because its import failed or was cancelled too long "
+                "ago. Send it again."
+            )
+        try:
+            with self._opened(file, options.name) as archive:
+                return self._slice(task, archive, options, until)
+        except UnreadableArchive:  # trying again cannot help, and it may be large
+            with self._store.database.write() as connection:
+                number = task.claim.job.number
+                gone = remove_parts(connection, number, items=False, files=[FILE])
+            collect_deleted_blobs(self._store, gone)
+            raise
+
+    def tidy(self) -> int:
+        """Remove archives of imports that were given up long ago, if it is time; returns how many.
+
+        Raises
+        ------
+        UnusableStore : it cannot be written; it is tried again the next time.
+        """
+        if time.monotonic() - self._tidied < TIDY_S:
+            return 0
+        self._tidied = time.monotonic()
+        long_ago = time.time() - KEPT_S
+        with self._store.database.read() as connection:  # most often there is none: no lock
+            if not finished_with_file(connection, KIND, FILE, long_ago):
+                return 0
+        with self._store.database.write() as connection:
+            gone = [
+                blob
+                for number in finished_with_file(connection, KIND, FILE, long_ago)
+                for blob in remove_parts(connection, number, items=False, files=[FILE])
+            ]
+        collect_deleted_blobs(self._store, gone)
+        return len(gone)
+
+    @contextmanager
+    def _opened(self, file: JobFile, name: str) -> Iterator[Archive]:
+        try:
+            opened = self._store.blobs.open(file.blob)
+        except FileNotFoundError as error:
+            raise UnreadableArchive(
+                "The archive is missing from the store. Send it again."
+            ) from error
+        except OSError as error:
+            raise unusable("The archive cannot be read", error) from error
+        try:
+            with opened, open_archive(opened, Path(tempfile.gettempdir()), name) as archive:
+                yield archive
+        except OSError as error:
+            raise unusable("The archive cannot be unpacked", error) from error
+
+    def _slice(
+        self, task: LongJob, archive: Archive, options: ImportOptions, until: float
+    ) -> SliceResult:
+        steps = list(steps_of(archive, options.every))
+        progress = {"done": 0, "received": 0, "there": 0, "refused": 0} | task.progress
+        progress["total"] = len(steps)
+        items: list[dict[str, Any]] = []
+        while progress["done"] < len(steps) and (not items or time.monotonic() < until):
+            some = next_of(archive, steps, progress["done"])
+            for item in take(self._uploads, task, archive, some, options):
+                items.append(item.model_dump(mode="json"))
+                what = {202: "received", 200: "there"}.get(item.status, "refused")
+                progress[what] += 1
+            progress["done"] += len(some)
+        over = progress["done"] >= len(steps)
+        counts = {name: progress[name] for name in ("received", "there", "refused")}
+        result = {"sequences": len(archive.sequences), **counts, "ignored": archive.ignored}
+        return SliceResult(
+            over, progress, items, drop=[FILE] if over else (), result=result if over else None,
+            event="import.done" if over else None,
+        )  # fmt: skip

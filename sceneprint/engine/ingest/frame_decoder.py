@@ -1,0 +1,258 @@
+"""The door of the engine: uploaded bytes and their metadata to a frame, and who it is.
+
+bytes, FrameMeta  --read_upload-->  Read: Frame | Cloud  --content_id-->  64 digits
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from typing import Any
+
+import numpy as np
+
+from sceneprint.engine.serializers import pose_matrix
+from sceneprint.errors import (
+    InvalidRequest,
+    MissingDependency,
+    SceneprintError,
+    UnreadableCloud,
+    UnreadableFrame,
+    UnsupportedType,
+)
+from sceneprint.formats.dataset import decode_frame
+from sceneprint.formats.points import UNSAID, decode_cloud, decode_scan, format_of
+from sceneprint.store.tables import FrameRow
+from sceneprint.types import AnyFrame, Cloud, Floats, Intrinsics
+from sceneprint_client.api import CameraIntrinsics, FrameMeta
+from sceneprint_client.api.frames import CloudFormat, GivenBase, Kind
+
+#: What the coordinates of a cloud as they were sent are called, where its viewpoint is elsewhere.
+GIVEN_FRAME = "cloud"
+
+
+@dataclass(frozen=True, eq=False)
+class Read:
+    """An upload as it was read.
+
+    Parameters
+    ----------
+    frame : as the geometry reads it
+    cloud : of a cloud, what is stored of it: how it was packed, where it was seen from, the units
+        a metre has, how many points it has, and what was done to them
+    base : what the frame of the robot's base is called, and T_base_sensor; None where not known
+    """
+
+    frame: AnyFrame
+    cloud: dict[str, Any] | None
+    base: tuple[str, Floats] | None
+
+    @property
+    def kind(self) -> Kind:
+        """A depth image or a point cloud."""
+        return "depth" if self.cloud is None else "cloud"
+
+
+def read_upload(data: bytes, meta: FrameMeta) -> Read:
+    """The frame of an upload, checked as far as can be without signing it.
+
+    Raises
+    ------
+    FrameError : undecodable samples, a camera that is none or of another image, a pose or
+        T_base_sensor that is not rigid, or no sample at all.
+    InvalidRequest : a depth image without a camera, a cloud with one, or what has no meaning for
+        the kind it is; UnsupportedType where what unpacks it is not installed.
+    """
+    pose = None if meta.pose is None else pose_matrix(meta.pose)
+    base = None if meta.T_base_sensor is None else base_of(meta.T_base_sensor, None)
+    if _is_cloud(data, meta):
+        return _read_cloud(data, meta, pose)
+    _refuse(meta, "depth image", {"viewpoint": "file", "units_per_metre": 1.0, "format": None})
+    if meta.intrinsics is None:
+        raise _without_camera(data)
+    frame = decode_frame(
+        data,
+        _camera(meta.intrinsics),
+        depth_scale=meta.depth_scale,
+        along_ray=meta.depth_along_ray,
+        pose=pose,
+    )
+    return Read(frame, None, base)
+
+
+def read_stored(data: bytes, row: FrameRow) -> AnyFrame:
+    """The frame of an upload that was let in before."""
+    if row.cloud is not None:
+        # a lost upload may have come again, packed otherwise
+        return decode_cloud(
+            data,
+            file_format=_packing(data),
+            viewpoint=viewpoint_of(row),
+            units_per_metre=row.cloud["units_per_metre"],
+            name=row.id,
+        )
+    return decode_frame(
+        data,
+        _camera(CameraIntrinsics.model_validate(row.intrinsics)),
+        depth_scale=row.depth_scale,
+        along_ray=row.depth_along_ray,
+        name=row.id,
+    )
+
+
+def viewpoint_of(row: FrameRow) -> tuple[float, float, float] | None:
+    """Where a stored cloud was seen from, in its own coordinates; None where it has no such place,
+    and of a depth image.
+    """
+    if row.cloud is None or row.cloud["viewpoint"] is None:
+        return None
+    x, y, z = row.cloud["viewpoint"]
+    return x, y, z
+
+
+def content_id(read: Read) -> str:
+    """Hash of what the geometry reads: samples in metres and camera, or points and viewpoint; not
+    how they were packed.
+    """
+    if isinstance(read.frame, Cloud):
+        viewpoint = None if read.cloud is None else read.cloud["viewpoint"]
+        digest = hashlib.sha256(f"cloud {json.dumps(viewpoint)}\n".encode())
+        digest.update(np.ascontiguousarray(read.frame.points, "<f4").data)
+        return digest.hexdigest()
+    camera = json.dumps(astuple(read.frame.intrinsics)).encode()
+    digest = hashlib.sha256(camera + b"\n")
+    digest.update(read.frame.depth.astype("<f4", copy=False).data)
+    return digest.hexdigest()
+
+
+def columns(
+    meta: FrameMeta, pose: Floats | None, base: tuple[str, Floats] | None
+) -> dict[str, Any]:
+    """What of an upload's metadata is stored with it, by the columns of the table.
+
+    Parameters
+    ----------
+    meta : see FrameMeta
+    pose, base : T_parent_sensor, and see Read
+    """
+    parent = None
+    if meta.pose is not None:
+        own = meta.session if meta.robot is None else f"{meta.robot}/{meta.session}"
+        parent = meta.pose.parent_frame or own  # two robots may call their runs alike
+    return {
+        "intrinsics": None if meta.intrinsics is None else meta.intrinsics.model_dump(),
+        "depth_scale": meta.depth_scale,
+        "depth_along_ray": meta.depth_along_ray,
+        "robot": meta.robot,
+        "session": meta.session,
+        "captured_at": None if meta.captured_at is None else meta.captured_at.timestamp(),
+        "tags": meta.tags,
+        "pose_parent": parent,
+        "pose": None if pose is None else pose.tolist(),
+        "base_frame": None if base is None else base[0],
+        "base": None if base is None else base[1].tolist(),
+    }
+
+
+def base_of(
+    given: GivenBase | None, viewpoint: Sequence[float] | None
+) -> tuple[str, Floats] | None:
+    """What a robot's base is called, and T_base_sensor.
+
+    Parameters
+    ----------
+    given : as the caller said it
+    viewpoint : of a cloud: where nothing was said and it is not the origin, the coordinates as
+        they were sent take the base's place, so that answers speak of them too
+
+    Raises
+    ------
+    InvalidPose : not a rigid transform.
+    """
+    if given is not None:
+        return given.base_frame, pose_matrix(given, "T_base_sensor")
+    if viewpoint is None or not any(viewpoint):
+        return None
+    T = np.eye(4)
+    T[:3, 3] = viewpoint
+    return GIVEN_FRAME, T
+
+
+def _packing(data: bytes) -> CloudFormat:
+    """How a cloud is packed that was let in: what does not say so is a KITTI scan."""
+    return format_of(data) or "kitti"
+
+
+def _is_cloud(data: bytes, meta: FrameMeta) -> bool:
+    """Whether an upload is a point cloud; an array may be either, and with a camera is an image."""
+    if meta.format is not None:
+        return True
+    found = format_of(data)
+    return found is not None and (found != "npy" or meta.intrinsics is None)
+
+
+def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None) -> Read:
+    _refuse(
+        meta, "point cloud", {"intrinsics": None, "depth_scale": 1000.0, "depth_along_ray": False}
+    )
+    given = meta.viewpoint
+    said = None if given is None else UNSAID if given == "file" else (given.x, given.y, given.z)
+    try:
+        scan = decode_scan(
+            data,
+            file_format=meta.format,
+            viewpoint=said,
+            units_per_metre=meta.units_per_metre,
+            pose=pose,
+        )
+    except MissingDependency as error:  # of this machine, and yet it is the file that asks for it
+        raise UnsupportedType(str(error)) from error
+    if scan.file_format != _packing(data):  # it could not be read again without what was said
+        raise UnreadableCloud(
+            f"The file is read as {scan.file_format.upper()} but does not start like one. Write "
+            "the file again."
+        )
+    # nobody means -0.0 by another place
+    seen_from = None if scan.viewpoint is None else [value + 0.0 for value in scan.viewpoint]
+    stored = {
+        "format": scan.file_format,
+        "viewpoint": seen_from,
+        "units_per_metre": meta.units_per_metre,
+        "points": len(scan.cloud.points),
+        "note": scan.cloud.note or None,
+    }
+    return Read(scan.cloud, stored, base_of(meta.T_base_sensor, seen_from))
+
+
+def _refuse(meta: FrameMeta, kind: str, defaults: dict[str, object]) -> None:
+    """See that nothing is said of a frame that would have no effect on it; InvalidRequest."""
+    said = [name for name, default in defaults.items() if getattr(meta, name) != default]
+    if said:
+        raise InvalidRequest(
+            f"The frame is a {kind}, and {' and '.join(f'`{name}`' for name in said)} would have "
+            "no effect. Leave it out, or check that you sent the right file.",
+            tuple((name, f"does not apply to a {kind}") for name in said),
+        )
+
+
+def _without_camera(data: bytes) -> SceneprintError:
+    """Why an upload without intrinsics is not read."""
+    if data.startswith((b"\x89PNG", b"\x93NUMPY")):
+        return InvalidRequest(
+            "The frame is a depth image, but its intrinsics are missing. Send width, height, "
+            "fx, fy, cx and cy of the camera. If it is a point cloud as NPY, give it the shape "
+            "(N, 3) or (N, 4).",
+            (("intrinsics", "needed for a depth image"),),
+        )
+    if not data:
+        return UnreadableFrame("The file is empty. Write it again.")
+    return UnreadableFrame(
+        "The file is neither a depth image (PNG or NPY) nor a point cloud (PLY, PCD, LAS, LAZ "
+        "or NPY). For a KITTI file, set format=kitti."
+    )
+
+
+def _camera(k: CameraIntrinsics) -> Intrinsics:
+    return Intrinsics(k.width, k.height, k.fx, k.fy, k.cx, k.cy, tuple(k.distortion))

@@ -1,0 +1,448 @@
+"""Uploads into the store: checked, durable, and queued, many in one commit.
+
+    Upload  --prepare-->  Prepared  --blob-->  durable  --commit-->  Added
+
+When an upload is answered, nothing can lose it. The disk is waited for by many at once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, select
+
+from sceneprint import errors
+from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upload
+from sceneprint.engine.upkeep.blob_garbage import collect_blobs, collect_deleted_blobs
+from sceneprint.engine.upkeep.repair import take_upload, without_loss
+from sceneprint.errors import (
+    FrameConflict,
+    InvalidRequest,
+    QuotaExceeded,
+    SceneprintError,
+    StoreError,
+    UnknownMap,
+    UnusableStore,
+)
+from sceneprint.store import Store
+from sceneprint.store.batching import Grouping
+from sceneprint.store.events import record_event
+from sceneprint.store.frames import add_frame, frames_of_content, living_frame, loosen, renew_frame
+from sceneprint.store.idempotency import IdempotentRequest
+from sceneprint.store.maps import find_map
+from sceneprint.store.queue import enqueue, jobs_of
+from sceneprint.store.quotas import require_room
+from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
+from sceneprint.store.wakeup import Wakeup
+from sceneprint_client.api import Added, FrameMeta, FrameState
+from sceneprint_client.api.frames import BatchItem, check_frame_id, problem_of
+
+# Who an upload is: the frame that is there, a frame of its own, or a contradiction.
+
+#: What to call a column when it differs.
+_FIELDS = {
+    "pose_parent": "pose.parent_frame", "base": "T_base_sensor", "content_id": "content",
+    "cloud": "units_per_metre",
+}  # fmt: skip
+
+
+def find_duplicate(
+    connection: Connection, row: MapRow, content: str, known: dict[str, Any],
+    frame_id: str | None = None,
+) -> FrameRow | None:  # fmt: skip
+    """The frame that an upload is of; None where the map has none yet.
+
+    Parameters
+    ----------
+    connection : of the database
+    row : of the map
+    content : of the upload
+    known : its metadata, by column
+    frame_id : that the caller wants for it; None: any frame of that content is it
+
+    Raises
+    ------
+    FrameConflict : there is one, with other content or metadata.
+    """
+    if frame_id is not None:
+        frame = living_frame(connection, row.number, frame_id)
+        if frame is None:
+            return None
+        differing = _differing(frame, {"content_id": content, **known})
+        if differing:
+            raise FrameConflict(
+                f"Frame {frame.id} of map {row.name} already exists with a different "
+                f"{', '.join(differing)}. Delete it first, send it unchanged, or use another id."
+            )
+        return frame
+    found = frames_of_content(connection, row.number, content)
+    for frame in found:
+        if not _differing(frame, known):
+            return frame
+    if found:
+        raise FrameConflict(
+            f"Frame {found[0].id} has the same content, but a different "
+            f"{', '.join(_differing(found[0], known))}. A map stores the same content once: "
+            "delete that frame first, send it unchanged, or PUT it under its own id."
+        )
+    return None
+
+
+def _differing(frame: FrameRow, known: dict[str, Any]) -> list[str]:
+    return [
+        _FIELDS.get(name, name)
+        for name, value in known.items()
+        if _given_value(name, getattr(frame, name)) != _given_value(name, value)
+    ]
+
+
+def _given_value(name: str, value: Any) -> Any:
+    """What of a column the caller has said: not how a cloud was packed, nor what was found in it.
+
+    Its viewpoint is part of its content.
+    """
+    return value["units_per_metre"] if name == "cloud" and value is not None else value
+
+
+def being_signed(state: FrameState) -> bool:
+    """Whether a frame waits for a worker, or has one."""
+    return state in (FrameState.RECEIVED, FrameState.SIGNING)
+
+
+def is_retried(state: FrameState) -> bool:
+    """Whether an upload of the same gives a frame another try.
+
+    It broke down every time, or was near to a frame that may be gone since.
+    """
+    return state in (FrameState.FAILED, FrameState.REDUNDANT)
+
+
+# What is remembered of uploads that are to take effect once, and what is told of them again.
+
+
+@dataclass(frozen=True)
+class UploadResult:
+    """What came of an upload.
+
+    Parameters
+    ----------
+    added : the frame and its job; None where it was refused
+    new : False where it was there already, and there is nothing to be done
+    error : why it was refused
+    """
+
+    added: Added | None
+    new: bool = False
+    error: SceneprintError | None = None
+
+    @property
+    def taken(self) -> Added:
+        """The frame and its job; raises `error` where there is none."""
+        if self.added is None:
+            raise self.error or ValueError("neither taken nor refused")
+        return self.added
+
+
+def item_of(outcome: UploadResult) -> BatchItem:
+    """What came of one upload of many."""
+    if outcome.error is not None:
+        problem = problem_of(outcome.error)
+        return BatchItem(status=problem.status, frame=None, problem=problem)
+    return BatchItem(status=202 if outcome.new else 200, frame=outcome.taken, problem=None)
+
+
+def upload_response(connection: Connection, frame: FrameRow) -> Added:
+    """A frame as uploads are answered."""
+    job = jobs_of(connection, [frame.number])[frame.number]
+    return Added(frame_id=frame.id, job_id=job.id, state=frame.state, reason=frame.reason)
+
+
+def stored_response(outcomes: Sequence[UploadResult]) -> dict[str, Any]:
+    """What came of uploads, as JSON that is remembered."""
+    return {"frames": [_stored_outcome(one) for one in outcomes]}
+
+
+def replayed(
+    connection: Connection, row: MapRow, data: dict[str, Any]
+) -> list[UploadResult] | None:
+    """What came of uploads, as it is now; None where the map was deleted and made anew since."""
+    found = []
+    for one in data["frames"]:
+        if "error" in one:
+            found.append(UploadResult(None, error=_error(one)))
+            continue
+        asked = select(frames).where(
+            frames.c.id == one["frame_id"], frames.c.map_number == row.number
+        )
+        frame = connection.execute(asked).mappings().first()
+        if frame is None:
+            return None
+        found.append(UploadResult(upload_response(connection, frame_row(frame)), one["new"]))
+    return found
+
+
+def _stored_outcome(outcome: UploadResult) -> dict[str, Any]:
+    if outcome.added is not None:
+        return {"frame_id": outcome.added.frame_id, "new": outcome.new}
+    error = outcome.error
+    fields = error.fields if isinstance(error, InvalidRequest) else ()
+    return {"error": type(error).__name__, "detail": str(error), "fields": fields}
+
+
+def _error(kept: dict[str, Any]) -> SceneprintError:
+    kind: type[SceneprintError] = getattr(errors, kept["error"])
+    if issubclass(kind, InvalidRequest):
+        return kind(kept["detail"], tuple((place, reason) for place, reason in kept["fields"]))
+    return kind(kept["detail"])
+
+
+@dataclass(frozen=True, eq=False)
+class Upload:
+    """A frame as it is sent.
+
+    Parameters
+    ----------
+    data : a depth image as PNG or NPY, or a point cloud: see `sceneprint.formats.points`
+    meta : what is known of it
+    priority : frames of a greater one are signed first; of one that is there it changes nothing
+    if_novel : keep it only if the nearest frame of the map is farther, as a share of the distance
+        of unrelated frames; None to keep it anyway. Of one that is not signed yet, the weaker
+        condition counts
+    frame_id : that it is to have; None: one of ours, and none where the map has its content
+    """
+
+    data: bytes
+    meta: FrameMeta
+    priority: int = 0
+    if_novel: float | None = None
+    frame_id: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """An upload that was looked at: who it is, and what is stored with it."""
+
+    upload: Upload
+    blob: str
+    content: str
+    known: dict[str, Any]
+
+
+class Uploads:
+    """Takes frames into maps; safe to share between threads.
+
+    Parameters
+    ----------
+    store, bell : see there
+    decoding : uploads that are decoded at once, which takes processors and memory; any number
+        may wait for the disk
+    """
+
+    def __init__(self, store: Store, bell: Wakeup, decoding: int) -> None:
+        self._store, self._bell = store, bell
+        self._decoding = threading.BoundedSemaphore(decoding)
+        self._writes = Grouping(store.database)
+
+    def add(
+        self, map_name: str, upload: Upload, once: IdempotentRequest | None = None
+    ) -> tuple[UploadResult, bool]:
+        """Take a frame into a map; it is safe when this returns, and signed soon after.
+
+        The same content with the same metadata is the frame that is there; one that failed, or
+        that was not kept as the map had its place, is tried again, and one whose upload was lost or
+        damaged on disk has it again.
+
+        Returns
+        -------
+        outcome : of which `added` is there
+        replayed : whether it is that of an earlier request of the same `once`
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : a frame id that is none; or see `read_upload`.
+        FrameError : see `read_upload`.
+        FrameConflict : the frame is there with other content or metadata.
+        QuotaExceeded : the map's quota has no room for one more; nothing was taken.
+        IdempotencyConflict : see `Once`.
+        UnusableStore : the disk is full, or the database cannot be written; nothing was taken.
+        """
+        [outcome], again = self.add_all(map_name, [upload], once)
+        if outcome.error is not None:
+            raise outcome.error
+        return outcome, again
+
+    def add_all(
+        self, map_name: str, uploads: Sequence[Upload], once: IdempotentRequest | None = None,
+        fence: Callable[[Connection], None] | None = None,
+    ) -> tuple[list[UploadResult], bool]:  # fmt: skip
+        """Take frames into a map in one commit; see `add`, but what is wrong with one is told.
+
+        Parameters
+        ----------
+        map_name, uploads, once : see `add`
+        fence : called in that commit before anything is written; whatever it raises of
+            `SceneprintError` is raised, and none was taken
+
+        Raises
+        ------
+        UnknownMap, IdempotencyConflict, UnusableStore : as `add`; none was taken.
+        """
+        with self._store.database.read() as connection:
+            row = find_map(connection, map_name)  # before the work of decoding
+            before = _before(connection, row, once)
+            if before is not None:
+                return before, True
+        outcomes: list[UploadResult | None] = [None] * len(uploads)
+        ready: dict[int, _Prepared] = {}
+        for i, upload in enumerate(uploads):
+            try:
+                ready[i] = self._prepared(upload)
+            except StoreError:
+                raise
+            except SceneprintError as error:
+                outcomes[i] = UploadResult(None, error=error)
+        for i in list(ready):
+            found = self._settled(map_name, ready[i])
+            if found is not None:
+                outcomes[i] = found
+                if once is None or found.added is None:
+                    del ready[i]
+        again = False
+        if ready:
+            outcomes, again = self._write(map_name, ready, outcomes, once, fence)
+        if any(one is not None and one.new for one in outcomes) and not again:
+            self._bell.ring()
+        return [one for one in outcomes if one is not None], again
+
+    def _prepared(self, upload: Upload) -> _Prepared:
+        if upload.frame_id is not None:
+            check_frame_id(upload.frame_id)
+        with self._decoding:
+            read = read_upload(upload.data, upload.meta)
+            content = content_id(read)
+        blob = hashlib.sha256(upload.data).hexdigest()
+        known = {**columns(upload.meta, read.frame.pose, read.base), "cloud": read.cloud}
+        return _Prepared(upload, blob, content, known)
+
+    def _settled(self, map_name: str, ready: _Prepared) -> UploadResult | None:
+        """What comes of an upload for which nothing has to be written; None: it has to be."""
+        try:
+            with self._store.database.read() as connection:
+                row = find_map(connection, map_name)
+                frame = find_duplicate(
+                    connection, row, ready.content, ready.known, ready.upload.frame_id
+                )
+                if frame is None:  # what has no room is not even written to the disk
+                    require_room(connection, row, len(ready.upload.data))
+                if frame is None or is_retried(frame.state):
+                    return None
+                if being_signed(frame.state) and frame.novelty is not None:
+                    return None  # its condition may have to be loosened
+                there = upload_response(connection, frame)
+        except (StoreError, UnknownMap):
+            raise
+        except SceneprintError as error:
+            return UploadResult(None, error=error)
+        return UploadResult(self._healed(map_name, there, ready.upload.data))
+
+    def _write(
+        self, map_name: str, ready: dict[int, _Prepared], known: list[UploadResult | None],
+        once: IdempotentRequest | None, fence: Callable[[Connection], None] | None,
+    ) -> tuple[list[UploadResult | None], bool]:  # fmt: skip
+        """Store those uploads of which it is not known yet what comes of them.
+
+        Returns
+        -------
+        outcomes : of all
+        replayed : whether they are those of an earlier request
+        """
+        self._store.database.require_writable()  # before a blob to which nothing could refer
+        todo = {i: one for i, one in ready.items() if known[i] is None}
+        blobs = {one.blob: one.upload.data for one in todo.values()}
+        left = list[str]()  # blobs that may be of no use
+
+        def do(connection: Connection) -> tuple[list[UploadResult | None], bool] | None:
+            if fence is not None:
+                fence(connection)
+            row = find_map(connection, map_name)
+            before = _before(connection, row, once)
+            if before is not None:
+                left[:] = blobs
+                return list(before), True
+            if not all(map(self._store.blobs.holds, blobs)):
+                return None  # a deletion has removed one
+            left.clear()
+            written = {i: _stored(connection, row, one, left) for i, one in todo.items()}
+            outcomes = [written.get(i, one) for i, one in enumerate(known)]
+            came = [one for one in outcomes if one is not None]
+            # what had no room may have it when it is sent again
+            if once is not None and not any(isinstance(one.error, QuotaExceeded) for one in came):
+                once.keep(connection, stored_response(came))
+            return outcomes, False
+
+        while True:
+            try:
+                for data in blobs.values():
+                    self._store.blobs.put(data)
+                found = self._writes.run(do)
+            except SceneprintError:
+                with suppress(UnusableStore):  # leave nothing, on a full disk least of all
+                    collect_blobs(self._store, list(blobs))
+                raise
+            if found is not None:
+                collect_deleted_blobs(self._store, left)
+                return found
+
+    def _healed(self, map_name: str, there: Added, data: bytes) -> Added:
+        """The frame that is there; what came takes the place of an upload that was lost."""
+        left = take_upload(self._store, map_name, there.frame_id, data)
+        if left:
+            collect_blobs(self._store, left)
+        return there.model_copy(update={"reason": without_loss(there.reason)})
+
+
+def _before(
+    connection: Connection, row: MapRow, once: IdempotentRequest | None
+) -> list[UploadResult] | None:
+    """What came of the same request before."""
+    data = None if once is None else once.found(connection)
+    return None if data is None else replayed(connection, row, data)
+
+
+def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[str]) -> UploadResult:
+    """What comes of an upload; blobs that are of no use any more are added to `left`."""
+    upload = ready.upload
+    try:  # once more: another upload may have been first
+        frame = find_duplicate(connection, row, ready.content, ready.known, upload.frame_id)
+    except FrameConflict as error:
+        left.append(ready.blob)
+        return UploadResult(None, error=error)
+    if frame is not None and not is_retried(frame.state):
+        loosen(connection, frame.number, upload.if_novel)
+        left.append(ready.blob)
+        return UploadResult(upload_response(connection, frame))
+    new = frame is None or frame.state == FrameState.REDUNDANT
+    # a failed one is counted already, and may come packed otherwise
+    held = 0 if frame is None or new else frame.bytes
+    try:
+        require_room(connection, row, len(upload.data) - held, new=new)
+    except QuotaExceeded as error:
+        left.append(ready.blob)
+        return UploadResult(None, error=error)
+    of_blob = {"blob": ready.blob, "bytes": len(upload.data), "novelty": upload.if_novel}
+    if frame is None:
+        values = {"content_id": ready.content, **of_blob, **ready.known}
+        frame = add_frame(connection, row.number, values, upload.frame_id)
+    else:  # it was given up, and somebody asks for another try
+        left.append(frame.blob)  # it was packed otherwise
+        frame = renew_frame(connection, frame.number, of_blob)
+    job = enqueue(connection, "sign", frame.number, upload.priority)
+    record_event(connection, "frame.received", row.name, frame.id, job.id)
+    added = Added(frame_id=frame.id, job_id=job.id, state=frame.state, reason=None)
+    return UploadResult(added, new=True)

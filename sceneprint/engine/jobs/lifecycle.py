@@ -1,0 +1,348 @@
+"""The ends a job can come to, other than the good one, and the job while it is in hand."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+import traceback
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+
+from sqlalchemy import Connection
+
+from sceneprint.engine.maps.map_frames import opened_cursor
+from sceneprint.engine.serializers import job_record
+from sceneprint.engine.upkeep.blob_garbage import collect_blobs
+from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError, UnusableStore
+from sceneprint.store import Store, queue
+from sceneprint.store.events import record_event
+from sceneprint.store.frames import frame_of, set_state
+from sceneprint.store.maps import map_of
+from sceneprint.store.model_switch import REENCODE
+from sceneprint.store.queue import fail_of_dead
+from sceneprint.store.queue import list_jobs as list_stored
+from sceneprint.store.signatures import StoredSignature
+from sceneprint.store.tables import FrameRow, JobRow, MapRow
+from sceneprint_client.api import FrameState, Job, JobState, Page
+
+log = logging.getLogger(__name__)
+
+#: Seconds until a job is tried again whose result could not be stored.
+LEFT_S = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """A job in hand.
+
+    Parameters
+    ----------
+    claim : on the job
+    frame, map : that it is about
+    """
+
+    claim: queue.Claim
+    frame: FrameRow
+    map: MapRow
+
+    @property
+    def again(self) -> bool:
+        """Whether the frame is indexed, stays so all the while, and is signed once more."""
+        return self.claim.job.kind == REENCODE
+
+    @property
+    def model_id(self) -> str:
+        """Of the model to sign with."""
+        return self.claim.job.model_id or self.map.model_id
+
+
+class Outdated(Exception):
+    """The map has come to have another model since the job was claimed."""
+
+
+def put_back(store: Store, work: Work, after_s: float = 0.0) -> None:
+    """Queue again what was claimed and not begun, as when a worker is told to stop."""
+    with suppress(LostLease), store.database.write() as connection:
+        queue.give_back(connection, work.claim, after_s)
+        if not work.again:
+            set_state(connection, work.frame.number, FrameState.RECEIVED)
+
+
+def leave(store: Store, work: Work, made: StoredSignature | None) -> None:
+    """Give a job back, as far as the store lets us; else its lease runs out.
+
+    Others go before it: it may be its own folder of blobs alone that cannot be written.
+    """
+    with suppress(UnusableStore):
+        put_back(store, work, LEFT_S)
+        if made is not None:
+            collect_blobs(store, [made.geometry])
+
+
+def restart_jobs(store: Store, work: Work) -> JobState | None:
+    """What was signed with a model that the map no longer has, or will not have, is of no use."""
+    if not work.again:
+        put_back(store, work)
+        return JobState.QUEUED
+    try:
+        with store.database.write() as connection:
+            queue.finish(connection, work.claim, JobState.CANCELLED)
+    except LostLease:
+        return None
+    return JobState.CANCELLED
+
+
+def record_job_event(connection: Connection, kind: str, work: Work) -> None:
+    """Note what has become of a job."""
+    record_event(connection, kind, work.map.name, work.frame.id, work.claim.job.id)
+
+
+def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
+    """A frame that holds nothing to sign: it would hold nothing the next time either."""
+    reason = str(error).removeprefix(f"{work.frame.id}: ")
+    try:
+        with store.database.write() as connection:
+            queue.finish(connection, work.claim, JobState.FAILED, reason)
+            if not work.again:
+                if map_of(connection, work.frame.map_number).model_id != work.model_id:
+                    raise Outdated
+                set_state(connection, work.frame.number, FrameState.REJECTED, reason)
+                record_job_event(connection, "frame.rejected", work)
+    except LostLease:
+        return None
+    except Outdated:
+        return restart_jobs(store, work)
+    return JobState.FAILED
+
+
+def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
+    """Queue a job again over which something went wrong, or let it be dead."""
+    reason = (
+        str(error) if isinstance(error, SceneprintError) else f"{type(error).__name__}: {error}"
+    )
+    trace = "".join(traceback.format_exception(error))
+    log.error("job raised an exception", extra=about(work, error=reason, traceback=trace))
+    try:
+        with store.database.write() as connection:
+            state = queue.fail(connection, work.claim, reason, trace)
+            if work.again:
+                return state
+            dead = state == JobState.DEAD
+            after = FrameState.FAILED if dead else FrameState.RECEIVED
+            set_state(connection, work.frame.number, after, reason if dead else None)
+            if dead:
+                record_event(
+                    connection, "frame.failed", work.map.name, work.frame.id, work.claim.job.id
+                )
+    except LostLease:
+        return None
+    return state
+
+
+def about(work: Work, **more: object) -> dict[str, object]:
+    """What a line of the log says of a job."""
+    return {
+        "job_id": work.claim.job.id,
+        "frame_id": work.frame.id,
+        "map": work.map.name,
+        "attempt": work.claim.job.attempts,
+        **more,
+    }
+
+
+# Holding a lease while the work goes on.
+
+
+@contextmanager
+def renewed(store: Store, claim: queue.Claim, lease_s: float, longest_s: float) -> Iterator[None]:
+    """Renew a lease from a thread of its own while the work goes on."""
+    done = threading.Event()
+
+    def renew() -> None:
+        until = time.monotonic() + longest_s
+        while not done.wait(lease_s / 3) and time.monotonic() < until:
+            try:
+                with store.database.write(turn=False) as connection:
+                    queue.renew(connection, claim, lease_s)
+            except LostLease:
+                return  # the end of the work will learn of it
+            except SceneprintError as error:  # the database may be back before the lease is over
+                log.warning("lease not renewed", extra={"error": str(error)})
+
+    thread = threading.Thread(target=renew, name="lease", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+# Jobs beyond their doing: listed, cancelled, tried again, and taken from workers that died.
+
+CANCELLED = "its job was cancelled"
+_BEING_SIGNED = (FrameState.RECEIVED, FrameState.SIGNING)
+_GIVEN_UP = (FrameState.FAILED, FrameState.REJECTED)
+
+
+def list_jobs(
+    store: Store, state: JobState | None, cursor: str | None, limit: int, kind: str | None = None,
+    map_names: Collection[str] | None = None,
+) -> Page[Job]:  # fmt: skip
+    """Jobs, the newest first.
+
+    Parameters
+    ----------
+    store : see Store
+    state, kind : that are wanted; default: all
+    cursor, limit : of the page
+    map_names : whose jobs are wanted; default: of all maps, and of none
+
+    Raises
+    ------
+    InvalidRequest : a cursor that was not given out.
+    """
+    before = opened_cursor(store.seals, "job", cursor)
+    with store.database.read() as connection:
+        found = list_stored(connection, before, limit + 1, state, kind, map_names)
+    items = [
+        job_record(one.job, one.frame_id, one.map_name, one.followed_by) for one in found[:limit]
+    ]
+    more = store.seals.seal("job", found[limit - 1].job.number) if len(found) > limit else None
+    return Page[Job](items=items, next_cursor=more)
+
+
+def get_job(store: Store, job_id: str) -> Job:
+    """A job; UnknownJob where there is none."""
+    with store.database.read() as connection:
+        return _job_record(connection, queue.find_job(connection, job_id))
+
+
+def cancel(store: Store, job_id: str) -> Job:
+    """Give a job up that is not over; of one that is cancelled already nothing changes.
+
+    A worker that is at it goes on to the end, and what it brings is refused.
+
+    Raises
+    ------
+    UnknownJob : there is none.
+    JobOver : there is nothing left to give up.
+    """
+    with store.database.write() as connection:
+        job = queue.find_job(connection, job_id)
+        if job.state != JobState.CANCELLED:
+            queue.cancel(connection, job)
+            _fail_frame(connection, job, CANCELLED)
+        return _job_record(connection, queue.find_job(connection, job_id))
+
+
+def retry(store: Store, job_id: str) -> tuple[Job, bool]:
+    """Try again what was given up, in a new job of the same priority.
+
+    Returns
+    -------
+    job : the new one
+    new : False where the frame is being tried again already, by a job that is returned
+
+    Raises
+    ------
+    UnknownJob : there is none.
+    CannotRetry : it was not given up, its frame has a later job that is over, or its upload is
+        gone.
+    """
+    with store.database.write() as connection:
+        job = queue.find_job(connection, job_id)
+        if job.frame_number is None:
+            return _retry_task(connection, job)
+        frame = frame_of(connection, job.frame)
+        row = map_of(connection, frame.map_number)
+        latest = queue.last_of(connection, job.kind, frame.number, job.model_id) or job
+        if latest.number != job.number and not latest.state.over:
+            return _job_record(connection, latest), False
+        if latest.number != job.number:
+            raise CannotRetry(
+                f"Job {job.id} was replaced by {latest.id}, which is {latest.state}. Retry that "
+                "one."
+            )
+        wanted = frame.state in _GIVEN_UP
+        if job.kind == REENCODE:
+            wanted = frame.state == FrameState.INDEXED and row.next_model_id == job.model_id
+        if not (job.state.over and wanted) or job.state == JobState.SUCCEEDED:
+            raise CannotRetry(
+                f"Job {job.id} is {job.state} and its frame is {frame.state}, so there is "
+                "nothing to retry."
+            )
+        if not store.blobs.holds(frame.blob):
+            raise CannotRetry(
+                f"The upload of frame {frame.id} is missing from the data folder, so it cannot "
+                "be signed. Restore the folder from a backup, or upload the frame again."
+            )
+        again = queue.enqueue(connection, job.kind, frame.number, job.priority, job.model_id)
+        if job.kind != REENCODE:
+            set_state(connection, frame.number, FrameState.RECEIVED)
+            record_event(connection, "frame.received", row.name, frame.id, again.id)
+        return _job_record(connection, again), True
+
+
+def worker_died(
+    store: Store, job_id: str, token: int, error: str, traceback: str, *, counts: bool
+) -> JobState | None:
+    """Take a job from a worker that died over it, now and not when its lease runs out.
+
+    Parameters
+    ----------
+    store : see Store
+    job_id, token : of the dead worker's claim
+    error, traceback : what is known of its death
+    counts : whether the job may have been the cause
+
+    Returns
+    -------
+    state : of the job; None where the death changed nothing
+    """
+    with store.database.write() as connection:
+        job = fail_of_dead(connection, job_id, token, error, traceback, counts=counts)
+        if job is None:
+            return None
+        if job.frame_number is None:
+            pass  # it is of no single frame
+        elif job.state == JobState.DEAD:
+            _fail_frame(connection, job, error)
+        elif frame_of(connection, job.frame).state == FrameState.SIGNING:
+            set_state(connection, job.frame, FrameState.RECEIVED)
+    about = {"job_id": job_id, "state": job.state, "attempt": job.attempts, "error": error}
+    log.error("worker died during a job", extra={**about, "traceback": traceback})
+    return job.state
+
+
+def _fail_frame(connection: Connection, job: JobRow, reason: str) -> None:
+    """A frame that will not be signed; one that is indexed, or gone, stays so."""
+    if job.frame_number is None:
+        return
+    frame = frame_of(connection, job.frame)
+    if frame.state in _BEING_SIGNED:
+        set_state(connection, frame.number, FrameState.FAILED, reason)
+        name = map_of(connection, frame.map_number).name
+        record_event(connection, "frame.failed", name, frame.id, job.id)
+
+
+def _retry_task(connection: Connection, job: JobRow) -> tuple[Job, bool]:
+    """A long job goes on where it stood, as the same job: what it found so far is kept."""
+    if not job.state.over:
+        return _job_record(connection, job), False
+    if job.state == JobState.SUCCEEDED:
+        raise CannotRetry(f"Job {job.id} is {job.state}, so there is nothing to retry.")
+    queue.revive(connection, job)
+    return _job_record(connection, queue.find_job(connection, job.id)), True
+
+
+def _job_record(connection: Connection, job: JobRow) -> Job:
+    frame_id = followed_by = None
+    if job.frame_number is not None:
+        frame_id = frame_of(connection, job.frame).id
+        last = queue.last_of(connection, job.kind, job.frame_number, job.model_id)
+        followed_by = None if last is None or last.number == job.number else last.id
+    name = None if job.map_number is None else map_of(connection, job.map_number).name
+    return job_record(job, frame_id, name, followed_by)

@@ -1,0 +1,240 @@
+"""What a worker does: claim, sign, and store what came of it in one commit."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from sceneprint.engine.ingest.frame_decoder import read_stored
+from sceneprint.engine.ingest.novelty import Stale, judge, look
+from sceneprint.engine.jobs.lifecycle import (
+    Outdated,
+    Work,
+    about,
+    break_down,
+    leave,
+    record_job_event,
+    reject,
+    renewed,
+    restart_jobs,
+)
+from sceneprint.engine.jobs.tasks import LongJob
+from sceneprint.engine.models import Signers
+from sceneprint.engine.search.local_index import Readers
+from sceneprint.engine.upkeep.blob_garbage import collect_blobs
+from sceneprint.errors import (
+    DamagedBlob,
+    FrameError,
+    LostLease,
+    SceneprintError,
+    StoreAway,
+    UnusableStore,
+)
+from sceneprint.formats.artifact import write_geometry
+from sceneprint.pipeline import prepare
+from sceneprint.store import Store, queue
+from sceneprint.store.events import record_event
+from sceneprint.store.frames import frame_of, set_state
+from sceneprint.store.maps import map_of
+from sceneprint.store.model_switch import REENCODE, enqueue_all, models_of
+from sceneprint.store.signatures import (
+    StoredSignature,
+    geometry_blobs,
+    index_frame,
+    replace_signature,
+)
+from sceneprint_client.api import FrameState, JobState
+
+log = logging.getLogger(__name__)
+
+#: Seconds that a result waits for a server that is away, and between two tries. Less than a worker
+#: has that is told to stop.
+AWAY_S, AGAIN_S = 12.0, 0.5
+
+
+def claim(store: Store, worker: str, lease_s: float) -> Work | LongJob | None:
+    """Take the next job, or None where there is none; gives up those that kill every worker.
+
+    A job of no single frame comes as a Task.
+
+    Parameters
+    ----------
+    store : see Store
+    worker : who asks
+    lease_s : seconds until the lease must be renewed
+    """
+    with store.database.read() as connection:
+        if not queue.has_due(connection):
+            return None
+        given_up = queue.is_given_up(connection)
+    if given_up:
+        _abandon(store)
+    with store.database.write(turn=False) as connection:
+        held = queue.claim(connection, worker, lease_s)
+        if held is None:
+            return None
+        if held.job.frame_number is None:
+            number = held.job.map_number
+            return LongJob(held, None if number is None else map_of(connection, number))
+        frame = frame_of(connection, held.job.frame)
+        if held.job.kind != REENCODE:
+            set_state(connection, frame.number, FrameState.SIGNING)
+        return Work(held, frame, map_of(connection, frame.map_number))
+
+
+def _abandon(store: Store) -> None:
+    """Give up jobs that kill every worker, and their frames."""
+    with store.database.write() as connection:
+        for job in queue.dead_letter(connection):
+            if job.kind == REENCODE or job.frame_number is None:
+                continue
+            frame = frame_of(connection, job.frame)
+            set_state(connection, frame.number, FrameState.FAILED, job.error)
+            name = map_of(connection, frame.map_number).name
+            record_event(connection, "frame.failed", name, frame.id, job.id)
+
+
+def run(
+    store: Store, signers: Signers, readers: Readers, work: Work, lease_s: float, longest_s: float,
+    broke: Callable[[], None] | None = None,
+) -> JobState | None:  # fmt: skip
+    """Sign a claimed frame.
+
+    Parameters
+    ----------
+    store, signers, readers : see there
+    work : of `claim`
+    lease_s : seconds for which each renewal holds
+    longest_s : seconds after which it is renewed no more: what takes so long does not end
+    broke : told of an error that nobody raised on purpose, when what came of it is stored:
+        whatever this process holds may be unsound from now on
+
+    Returns
+    -------
+    state : of the job; queued where it broke down, or the map's model changed, and it will be
+        tried again; None where the lease was lost, and with it the work
+    """
+    start = time.perf_counter()
+    state: JobState | None
+    made: StoredSignature | None = None
+    gone: list[str] = []
+    try:
+        with renewed(store, work.claim, lease_s, longest_s):
+            made = _sign(store, signers, work)
+            gone = _store_patiently(store, signers, readers, work, made)
+        state = JobState.SUCCEEDED
+    except LostLease as error:
+        log.warning("lease lost", extra=about(work, error=str(error)))
+        state = None
+    except Outdated:
+        state = restart_jobs(store, work)
+    except FrameError as error:
+        state = reject(store, work, error)
+    except UnusableStore:  # a full disk is no fault of the frame's, and costs it no try
+        leave(store, work, made)
+        raise
+    except Exception as error:
+        state = break_down(store, work, error)
+        if broke is not None and not isinstance(error, SceneprintError):
+            broke()
+    if made is not None and state != JobState.SUCCEEDED:
+        gone = [made.geometry]  # nothing came to refer to it
+    if gone:
+        collect_blobs(store, gone)
+    if state is None:
+        return None
+    milliseconds = round(1e3 * (time.perf_counter() - start), 1)
+    log.info("job %s", state, extra=about(work, state=state, milliseconds=milliseconds))
+    return state
+
+
+def _sign(store: Store, signers: Signers, work: Work) -> StoredSignature:
+    if work.model_id not in models_of(work.map):
+        raise Outdated
+    frame = read_stored(store.blobs.get(work.frame.blob), work.frame)
+    signature, geometry = prepare(frame, signers(work.model_id))
+    return StoredSignature(
+        model_id=signature.model_id,
+        vector=signature.vector.tobytes(),
+        geometry=store.blobs.put(write_geometry(geometry)),
+        n_patches=signature.n_patches,
+        n_pairs=signature.n_pairs,
+    )
+
+
+def _store_patiently(
+    store: Store, signers: Signers, readers: Readers, work: Work, made: StoredSignature
+) -> list[str]:
+    """As `_store`, while another server takes the place of one that fell.
+
+    Where the fall hid that it was committed, the lease is found to be over: it took effect once.
+    """
+    until = time.monotonic() + AWAY_S
+    while True:
+        try:
+            return _store(store, signers, readers, work, made)
+        except StoreAway:
+            if time.monotonic() > until:
+                raise
+            time.sleep(AGAIN_S)
+
+
+def _store(
+    store: Store, signers: Signers, readers: Readers, work: Work, made: StoredSignature
+) -> list[str]:
+    """Signature, artifact, state and end of the job in one commit.
+
+    Returns
+    -------
+    blobs : that a frame refers to no more which was not to be kept: its map has the place
+    """
+    if work.again:
+        return _replace_signature(store, work, made)
+    while True:
+        seen = None
+        if work.frame.novelty is not None:
+            seen = look(store.database, readers, work.map, made)
+        with suppress(Stale), store.database.write() as connection:
+            queue.finish(connection, work.claim, JobState.SUCCEEDED)
+            row = map_of(connection, work.frame.map_number)
+            if row.model_id != made.model_id:
+                raise Outdated
+            reason = None
+            if seen is not None:
+                reason = judge(connection, work.frame, made, seen, signers(made.model_id).model)
+            if reason is not None:
+                set_state(connection, work.frame.number, FrameState.REDUNDANT, reason)
+                record_job_event(connection, "frame.redundant", work)
+                return [work.frame.blob, made.geometry]
+            if not store.blobs.holds(made.geometry):  # nothing referred to it until now
+                raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
+            index_frame(connection, work.frame, made)
+            if row.next_model_id is not None:
+                enqueue_all(connection, row, [work.frame.number])
+            record_job_event(connection, "frame.indexed", work)
+            return []
+
+
+def _replace_signature(store: Store, work: Work, made: StoredSignature) -> list[str]:
+    """Signature and artifact of an indexed frame, beside those of another model or in the place
+    of damaged ones, and the end of the job in one commit.
+
+    Returns
+    -------
+    blobs : that the frame refers to no more
+    """
+    number = work.frame.number
+    with store.database.write() as connection:
+        queue.finish(connection, work.claim, JobState.SUCCEEDED)
+        row = map_of(connection, work.frame.map_number)
+        indexed = frame_of(connection, number).state == FrameState.INDEXED
+        if not indexed or made.model_id not in models_of(row):
+            raise Outdated
+        if not store.blobs.holds(made.geometry):
+            raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
+        before = geometry_blobs(connection, [number], made.model_id).values()
+        replace_signature(connection, work.frame, made)
+        record_job_event(connection, "frame.reencoded", work)
+        return [blob for blob in before if blob != made.geometry]

@@ -1,0 +1,317 @@
+"""Jobs that are of no single frame: long ones, done in slices.
+
+    begin  -->  queued  --claim-->  Task  --handler, a slice at a time-->  Outcome, stored at once
+
+What a slice found, how far it came, and that the job goes on or is over, is one commit, fenced by
+the job's token. A slice whose worker died is done again from where the last one ended.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+from sceneprint.engine.jobs.lifecycle import renewed
+from sceneprint.engine.serializers import job_record
+from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
+from sceneprint.errors import (
+    Conflict,
+    FrameError,
+    InvalidRequest,
+    LostLease,
+    MissingDependency,
+    NotFound,
+    SceneprintError,
+    SnapshotError,
+    StoreError,
+    UnknownJob,
+    UnusableStore,
+)
+from sceneprint.store import Store, queue
+from sceneprint.store.events import record_event
+from sceneprint.store.idempotency import IdempotentRequest
+from sceneprint.store.maps import find_map, map_of
+from sceneprint.store.queue import (
+    Claim,
+    JobFile,
+    add_files,
+    append_items,
+    files_of,
+    find_job,
+    remove_parts,
+)
+from sceneprint.store.tables import MapRow
+from sceneprint.store.wakeup import Wakeup
+from sceneprint_client.api import Job, JobState
+
+# A long job in hand, and what a slice of it comes to.
+
+
+class Swept(StoreError):
+    """A deletion removed a file between its making and the commit that would have referred to it;
+    nothing was stored."""
+
+
+@dataclass(frozen=True, eq=False)
+class LongJob:
+    """A long job in hand.
+
+    Parameters
+    ----------
+    claim : on the job
+    map : that it is about; None where it is of none
+    """
+
+    claim: Claim
+    map: MapRow | None
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """What was asked for."""
+        return self.claim.job.data or {}
+
+    @property
+    def progress(self) -> dict[str, Any]:
+        """How far the slices before have come: of the last `Outcome`; empty before the first."""
+        return self.claim.job.progress or {}
+
+    @property
+    def of_map(self) -> MapRow:
+        """The map, of a kind of job that always has one."""
+        if self.map is None:
+            raise ValueError(f"job {self.claim.job.id} has no map")
+        return self.map
+
+
+@dataclass(frozen=True, eq=False)
+class SliceResult:
+    """What a slice came to.
+
+    Parameters
+    ----------
+    over : whether the job is done
+    progress : `done` and `total` for people, and whatever the next slice needs to go on
+    items : found in this slice
+    files : made in this slice, blobs that are there
+    result : in short, at the end
+    drop : names of files of the job that are of no use any more
+    event : kind of the event that tells of the end, such as association.found; its data is `result`
+    """
+
+    over: bool
+    progress: dict[str, Any]
+    items: list[dict[str, Any]] = field(default_factory=list)
+    files: list[JobFile] = field(default_factory=list)
+    result: dict[str, Any] | None = None
+    drop: Collection[str] = ()
+    event: str | None = None
+
+
+#: Does a slice of a job until the time of `time.monotonic` that is given; may be done again.
+Handler = Callable[[LongJob, float], SliceResult]
+
+
+log = logging.getLogger(__name__)
+
+#: Seconds of a slice: frames that wait to be signed come between two.
+SLICE_S = 15.0
+#: Seconds until a job is tried again whose result could not be stored.
+LEFT_S = 5.0
+#: Errors that trying again cannot help: what was asked for cannot be done.
+HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, SnapshotError)
+
+
+class Tasks:
+    """Kinds of long jobs, each with what does it.
+
+    Parameters
+    ----------
+    store, bell : see there
+    """
+
+    def __init__(self, store: Store, bell: Wakeup) -> None:
+        self._store, self._bell = store, bell
+        self._handlers: dict[str, Handler] = {}
+        self._longest: dict[str, float] = {}
+
+    def register(self, kind: str, handler: Handler, longest_s: float | None = None) -> None:
+        """Let jobs of a kind be done by this process.
+
+        Parameters
+        ----------
+        kind, handler : see there
+        longest_s : that a slice may take, where that may be more than of other kinds
+        """
+        self._handlers[kind] = handler
+        if longest_s is not None:
+            self._longest[kind] = longest_s
+
+    def longest_s(self, kind: str, usual_s: float) -> float:
+        """Seconds after which a slice of that kind of job does not end any more."""
+        return max(self._longest.get(kind, 0.0), usual_s)
+
+    def begin(
+        self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
+        files: Collection[JobFile] = (),
+    ) -> Job:  # fmt: skip
+        """Queue a job of a kind.
+
+        Parameters
+        ----------
+        kind : such as associate
+        map_name : that it is about, or None
+        data : what is asked for, as JSON
+        priority : as of frames
+        files : that it works on
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        Swept : a file is gone; put it once more.
+        """
+        return self.begin_once(kind, map_name, data, priority, files)[0]
+
+    def begin_once(
+        self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
+        files: Collection[JobFile] = (), once: IdempotentRequest | None = None,
+    ) -> tuple[Job, bool]:  # fmt: skip
+        """As `begin`, with a flag: True where `once` began it before, and it is told as it is.
+
+        Raises
+        ------
+        IdempotencyConflict : something else was asked with the key of `once`.
+        """
+        with self._store.database.write() as connection:
+            row = None if map_name is None else find_map(connection, map_name)
+            before = None if once is None else once.found(connection)
+            if before is not None:
+                with suppress(UnknownJob):  # its map may have been deleted and made anew
+                    there = find_job(connection, before["job_id"])
+                    return job_record(there, None, map_name), True
+            self._check(files)
+            number = None if row is None else row.number
+            job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
+            add_files(connection, job.number, files)
+            if once is not None:
+                once.keep(connection, {"job_id": job.id})
+        self._bell.ring()
+        return job_record(job, None, map_name), False
+
+    def run(
+        self,
+        task: LongJob,
+        lease_s: float,
+        longest_s: float,
+        broke: Callable[[], None] | None = None,
+    ) -> JobState | None:
+        """Do a slice of a claimed job; see `signature_job.run` for the rest."""
+        start, job = time.perf_counter(), task.claim.job
+        state: JobState | None
+        try:
+            longest_s = self.longest_s(job.kind, longest_s)
+            with renewed(self._store, task.claim, lease_s, longest_s):
+                handler = self._handlers.get(job.kind)
+                if handler is None:
+                    raise MissingDependency(
+                        f"This process cannot run jobs of kind {job.kind!r}. Run a worker with "
+                        "`sceneprint serve` or `sceneprint work`."
+                    )
+                outcome = handler(task, time.monotonic() + SLICE_S)
+                state = self._keep(task, outcome)
+        except LostLease as error:
+            log.warning("lease lost", extra=_about(task, error=str(error)))
+            return None
+        except HOPELESS as error:
+            state = self._fail(task, str(error))
+        except Swept:
+            self.put_back(task)
+            state = JobState.QUEUED
+        except UnusableStore:  # a full disk is no fault of the job's, and costs it no try
+            self.put_back(task, LEFT_S)
+            raise
+        except Exception as error:
+            state = self._break_down(task, error)
+            if broke is not None and not isinstance(error, SceneprintError):
+                broke()
+        milliseconds = round(1e3 * (time.perf_counter() - start), 1)
+        log.info("job %s", state, extra=_about(task, state=state, milliseconds=milliseconds))
+        return state
+
+    def put_back(self, task: LongJob, after_s: float = 0.0) -> None:
+        """Return a claimed job undone."""
+        with suppress(LostLease, UnusableStore), self._store.database.write() as connection:
+            queue.give_back(connection, task.claim, after_s)
+
+    def _keep(self, task: LongJob, outcome: SliceResult) -> JobState:
+        try:
+            gone = self._stored(task, outcome)
+        except Exception:  # nothing came to refer to them
+            collect_deleted_blobs(self._store, [one.blob for one in outcome.files])
+            raise
+        collect_deleted_blobs(self._store, gone)
+        if not outcome.over:
+            self._bell.ring()
+        return JobState.SUCCEEDED if outcome.over else JobState.QUEUED
+
+    def _stored(self, task: LongJob, outcome: SliceResult) -> list[str]:
+        """What a slice came to, in one commit; returns blobs that may be of no use any more."""
+        job = task.claim.job
+        with self._store.database.write() as connection:
+            if outcome.over:
+                queue.finish(
+                    connection, task.claim, JobState.SUCCEEDED, progress=outcome.progress,
+                    result=outcome.result,
+                )  # fmt: skip
+                if outcome.event is not None:
+                    name = None if task.map is None else map_of(connection, task.map.number).name
+                    record_event(
+                        connection, outcome.event, name, None, job.id, **(outcome.result or {})
+                    )
+            else:
+                queue.go_on(connection, task.claim, outcome.progress)
+            self._check(outcome.files)
+            # after the job: it may be gone, and nothing can be of one that is
+            append_items(connection, job.number, outcome.items)
+            before = files_of(connection, job.number)
+            add_files(connection, job.number, outcome.files)
+            gone = remove_parts(connection, job.number, items=False, files=outcome.drop)
+            return gone + [before[one.name].blob for one in outcome.files if one.name in before]
+
+    def _check(self, files: Collection[JobFile]) -> None:
+        """See that files are there, in the transaction that comes to refer to them."""
+        for one in files:
+            if not self._store.blobs.holds(one.blob):
+                raise Swept(
+                    f"A deletion elsewhere swept the same {one.name} before its job was stored."
+                )
+
+    def _fail(self, task: LongJob, reason: str) -> JobState | None:
+        try:
+            with self._store.database.write() as connection:
+                queue.finish(connection, task.claim, JobState.FAILED, reason)
+        except LostLease:
+            return None
+        return JobState.FAILED
+
+    def _break_down(self, task: LongJob, error: Exception) -> JobState | None:
+        known = isinstance(error, SceneprintError)
+        reason = str(error) if known else f"{type(error).__name__}: {error}"
+        trace = "".join(traceback.format_exception(error))
+        log.error("job raised an exception", extra=_about(task, error=reason, traceback=trace))
+        try:
+            with self._store.database.write() as connection:
+                return queue.fail(connection, task.claim, reason, trace)
+        except LostLease:
+            return None
+
+
+def _about(task: LongJob, **more: object) -> dict[str, object]:
+    """What a line of the log says of a job."""
+    job = task.claim.job
+    name = None if task.map is None else task.map.name
+    return {"job_id": job.id, "kind": job.kind, "map": name, "attempt": job.attempts, **more}

@@ -1,0 +1,1 @@
+"""Maps, their frames and their model."""

@@ -1,0 +1,628 @@
+"""What a map holds, for people and dashboards: frames by their metadata, sessions, trajectories.
+
+Each is read in one transaction, and a part at a time.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from sceneprint.engine.ingest.frame_decoder import read_stored
+from sceneprint.engine.models import Signers
+from sceneprint.engine.serializers import frame_records, model_label, sensor_of, tag_of, when
+from sceneprint.engine.upkeep.repair import resign_frames
+from sceneprint.errors import (
+    Busy,
+    DamagedBlob,
+    DamagedSignature,
+    InvalidRequest,
+    NotIndexed,
+    UnknownFrame,
+    UnreadableGeometry,
+)
+from sceneprint.formats.artifact import read_geometry
+from sceneprint.formats.dataset import trajectory_row, trajectory_text
+from sceneprint.formats.points.ply_export import points_of, write_ply
+from sceneprint.geometry.pose.rigid import moved
+from sceneprint.previews import depth_view, normals_view, onto, patches_view, picture, vista_of
+from sceneprint.signing import hierarchy_of, see
+from sceneprint.store import Store, frame_queries
+from sceneprint.store.frame_queries import Held, count_run, indexed_by_time, list_runs, poses_of_run
+from sceneprint.store.frames import find_frame
+from sceneprint.store.maps import count_frames, find_map, model_names
+from sceneprint.store.opaque_ids import START, Kind, OpaqueIds
+from sceneprint.store.signatures import PatchCounts, geometry_blobs, signature_sizes, stored_vector
+from sceneprint.store.tables import FrameRow, MapRow
+from sceneprint.types import Geometry, Hierarchy, Intrinsics, Ints32, Patches, Surface
+from sceneprint_client.api import Frame, FrameState, Page
+from sceneprint_client.api.listing import FrameListing, Run, Session, Trajectory
+from sceneprint_client.api.maps import By, Grown, Growth
+from sceneprint_client.api.results import CloudFrame, FramePatches, FrameSignature, PatchLevel, View
+
+# An indexed frame as it was found, with what its map's model made of it.
+
+#: Of all that is made of frames: raise it when the same frame comes to give other bytes.
+FORM = 1
+
+
+@dataclass(frozen=True, eq=False)
+class IndexedFrame:
+    """A frame that has been signed.
+
+    Parameters
+    ----------
+    row : its map
+    frame : see FrameRow
+    label : of the model
+    artifact : blob of its geometry
+    """
+
+    row: MapRow
+    frame: FrameRow
+    label: str
+    artifact: str
+
+    def tag(self, what: str, *options: object) -> str:
+        """An entity tag of something that is made of it."""
+        return tag_of(what, FORM, self.frame.content_id, self.row.model_id, *options)
+
+
+def find_indexed(store: Store, map_name: str, frame_id: str) -> IndexedFrame:
+    """The indexed frame of an id.
+
+    Raises
+    ------
+    UnknownMap, UnknownFrame : there is none, or it was deleted.
+    NotIndexed : nothing has been made of it, or not yet.
+    """
+    with store.database.read() as connection:
+        row = find_map(connection, map_name)
+        frame = living(row, find_frame(connection, row, frame_id))
+        artifacts = geometry_blobs(connection, [frame.number], row.model_id)
+        label = model_label(model_names(connection)[row.model_id], row.model_id)
+    if frame.state != FrameState.INDEXED or frame.number not in artifacts:
+        raise NotIndexed(
+            f"Frame {frame.id} is {frame.state}: {frame.state.sentence} Derived data is "
+            "available once the frame is indexed."
+        )
+    return IndexedFrame(row, frame, label, artifacts[frame.number])
+
+
+def living(row: MapRow, frame: FrameRow) -> FrameRow:
+    """The frame; UnknownFrame where it was deleted."""
+    if frame.state == FrameState.DELETED:
+        raise UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted.")
+    return frame
+
+
+def geometry_of(store: Store, found: IndexedFrame) -> Geometry:
+    """The geometry artifact of a frame; a damaged one is made again.
+
+    Raises
+    ------
+    DamagedBlob, UnreadableGeometry : it is lost or damaged.
+    UnknownFrame, NotIndexed, Busy : see `check_unchanged`.
+    """
+    try:
+        return read_geometry(store.blobs.get(found.artifact))
+    except (DamagedBlob, UnreadableGeometry):
+        check_unchanged(store, found)
+        resign_frames(store, found.row, [found.frame.number], found.row.model_id)
+        raise
+
+
+def check_unchanged(store: Store, found: IndexedFrame) -> None:
+    """See that a frame is still what it was when it was found.
+
+    Raises
+    ------
+    UnknownFrame, NotIndexed : it was deleted, or lost what was made of it.
+    Busy : its map came to have another model.
+    """
+    now = find_indexed(store, found.row.name, found.frame.id)
+    if (now.frame.number, now.artifact) != (found.frame.number, found.artifact):
+        raise Busy(
+            f"Frame {found.frame.id} was signed with another model in the meantime. Try again."
+        )
+
+
+# Cursors of pages: where a page ended, as those who read it are told.
+
+
+def row_of(cursor: str | None) -> int | None:
+    """The place that a cursor stands for in a list that is numbered by itself.
+
+    Raises
+    ------
+    InvalidRequest : it was not given out.
+    """
+    if cursor is None:
+        return None
+    if not (cursor.isascii() and cursor.isdigit() and len(cursor) < 19):
+        raise _not_given_out(cursor)
+    return int(cursor)
+
+
+def opened_cursor(seals: OpaqueIds, kind: Kind, cursor: str | None) -> int | None:
+    """The number of the row that a cursor stands for, where rows count over all maps.
+
+    Raises
+    ------
+    InvalidRequest : it was not given out.
+    """
+    if cursor is None:
+        return None
+    number = None if cursor == START else seals.open(kind, cursor)
+    if number is None:
+        raise _not_given_out(cursor)
+    return number
+
+
+def event_of(seals: OpaqueIds, given: str, place: str = "after") -> int:
+    """The number of the event that an id stands for; 0 for START, which is before all of them.
+
+    Parameters
+    ----------
+    seals : of the store
+    given : the id
+    place : where it was given
+
+    Raises
+    ------
+    InvalidRequest : it is the id of no event of this store.
+    """
+    number = seals.open("event", given)
+    if number is None:
+        raise InvalidRequest(
+            f"{given!r:.40} is not the id of an event here. Start again: with {START} for all "
+            "stored events, or without an id for new events only.",
+            ((place, "not the id of an event"),),
+        )
+    return number
+
+
+def _not_given_out(cursor: str) -> InvalidRequest:
+    return InvalidRequest(
+        f"The cursor {cursor!r:.40} is not valid. Use the `next_cursor` of a page.",
+        (("cursor", "not a cursor of this service"),),
+    )
+
+
+#: Most poses of one trajectory: more are asked for in parts.
+MOST_POSES = 100_000
+#: Most parent frames that are told of a session.
+_MOST_PARENTS = 20
+
+
+def list_frames(
+    store: Store, map_name: str, wanted: FrameListing, cursor: str | None, limit: int
+) -> Page[Frame]:
+    """Frames of a map in the order they came, or the newest first.
+
+    Raises
+    ------
+    UnknownMap : no such map.
+    InvalidRequest : a cursor that was not given out.
+    """
+    beyond = opened_cursor(store.seals, "frame", cursor)
+    with store.database.read() as connection:
+        row = find_map(connection, map_name)
+        found = frame_queries.list_frames(connection, row.number, beyond, limit + 1, wanted)
+        items = frame_records(connection, row, found[:limit])
+    more = store.seals.seal("frame", found[limit - 1].number) if len(found) > limit else None
+    return Page[Frame](items=items, next_cursor=more)
+
+
+def list_sessions(store: Store, map_name: str, cursor: str | None, limit: int) -> Page[Session]:
+    """Sessions of a map by their name and robot; frames that name none are one, the first.
+
+    Raises
+    ------
+    UnknownMap : no such map.
+    InvalidRequest : a cursor that was not given out.
+    """
+    after = None if cursor is None else _names_of(cursor)
+    with store.database.read() as connection:
+        row = find_map(connection, map_name)
+        found = list_runs(connection, row.number, after, limit + 1)
+    more = len(found) > limit
+    items = [_session(run) for run in found[:limit]]
+    return Page[Session](items=items, next_cursor=_cursor(found[limit - 1]) if more else None)
+
+
+def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
+    """The poses of one run in the order of time; of frames of one time the first that came.
+
+    Raises
+    ------
+    UnknownMap : no such map.
+    InvalidRequest : the session is of several robots, or its poses lead to several frames, and it
+        is not said which; or it has more than MOST_POSES.
+    """
+    with store.database.read() as connection:
+        row = find_map(connection, map_name)
+        counted = count_run(connection, row.number, run)
+        robot = _only("robot", run.robot, {one.robot for one in counted}, run.session)
+        parents = {one.parent for one in counted if one.parent is not None}
+        parent = _only("parent_frame", run.parent_frame, parents, run.session)
+        total = sum(one.count for one in counted)
+        if run.most is None and total > MOST_POSES:
+            raise InvalidRequest(
+                f"Session {run.session!r:.140} has {total} frames, but a trajectory has at most "
+                f"{MOST_POSES}. Limit it with `most`, or select a part with `captured_after` and "
+                "`captured_before`.",
+                (("session", "too long for one answer"),),
+            )
+        only = run.model_copy(update={"robot": robot, "parent_frame": parent})
+        kept, posed = ([], 0) if parent is None else poses_of_run(connection, row.number, only)
+    return Trajectory(
+        map=row.name,
+        session=run.session,
+        robot=robot,
+        parent_frame=parent,
+        frame_ids=[one.frame_id for one in kept],
+        poses=[trajectory_row(one.at, np.array(one.pose)) for one in kept],
+        posed=posed,
+        left_out=total - len(kept),
+    )
+
+
+def trajectory_file(told: Trajectory) -> str:
+    """A trajectory as a TUM file, which says in comments what its poses are of."""
+    robot = "" if told.robot is None else f", robot {told.robot}"
+    told_of = f"{len(told.poses)}"
+    if told.posed > len(told.poses):
+        told_of += f" of {told.posed}, evenly spaced"
+    comments = [
+        f"map {told.map}, session {told.session}{robot}",
+        f"poses of the sensors' frames in {told.parent_frame or 'no frame'}, metres",
+        f"poses: {told_of}; frames left out: {told.left_out}",
+        "t tx ty tz qx qy qz qw",
+    ]
+    return trajectory_text(told.poses, comments)
+
+
+def _only(what: str, asked: str | None, found: Iterable[str | None], session: str) -> str | None:
+    """The name that was asked for, or the only one that there is."""
+    if asked is not None:
+        return asked
+    names = sorted(set(found), key=lambda name: name or "")
+    if len(names) > 1:
+        told = ", ".join("none" if name is None else repr(name)[:60] for name in names[:5])
+        raise InvalidRequest(
+            f"Session {session!r:.140} has frames with {len(names)} values of `{what}` ({told}), "
+            f"but a trajectory covers one. Choose it with `{what}`.",
+            ((what, "required, as there are several"),),
+        )
+    return names[0] if names else None
+
+
+def _session(run: Held) -> Session:
+    return Session(
+        robot=run.robot,
+        session=run.session,
+        frames=dict(sorted(run.states.items())),
+        with_pose=run.posed,
+        first_captured_at=when(run.first),
+        last_captured_at=when(run.last),
+        parent_frames=[name for name, _ in run.parents.most_common(_MOST_PARENTS)],
+    )
+
+
+def _cursor(run: Held) -> str:
+    names = json.dumps([run.session or "", run.robot or ""])
+    return base64.urlsafe_b64encode(names.encode()).decode().rstrip("=")
+
+
+def _names_of(cursor: str) -> tuple[str, str]:
+    try:
+        names = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
+        session, robot = names
+        if isinstance(session, str) and isinstance(robot, str):
+            f"{session}{robot}".encode()  # half of a pair of surrogates is no text
+            return session, robot
+    except (ValueError, TypeError, RecursionError):  # whatever else somebody may think up
+        pass
+    raise InvalidRequest(
+        f"The cursor {cursor!r:.40} is not valid. Use the `next_cursor` of a page.",
+        (("cursor", "not a cursor of this service"),),
+    )
+
+
+# How a map grew: frames by the hour or the day in which they were indexed.
+
+WIDTHS_S: dict[By, float] = {"hour": 3600.0, "day": 86400.0}
+
+
+def growth(store: Store, map_name: str, by: By = "day", last: int = 30) -> Growth:
+    """How many of a map's frames were indexed in each of the last hours or days, of UTC.
+
+    Parameters
+    ----------
+    store : see Store
+    map_name : of the map
+    by : what is counted by
+    last : hours or days, with the one that is not over
+
+    Raises
+    ------
+    UnknownMap : no such map.
+    """
+    width = WIDTHS_S[by]
+    start = (time.time() // width - last + 1) * width
+    with store.database.read() as connection:
+        row = find_map(connection, map_name)
+        indexed = count_frames(connection, row.number).get(FrameState.INDEXED, 0)
+        counts = indexed_by_time(connection, row.number, start, width)
+    ahead = sum(n for place, n in counts.items() if place >= last)
+    counts[last - 1] += ahead  # by a clock that was set back since
+    total = before = indexed - sum(counts[place] for place in range(last))
+    buckets: list[Grown] = []
+    for place in range(last):
+        total += counts[place]
+        buckets.append(Grown(at=when(start + place * width), indexed=counts[place], total=total))
+    return Growth(map=row.name, by=by, indexed=indexed, before=before, buckets=buckets)
+
+
+# Something that can be made of a frame, and how it is told.
+#
+# patches --level_of--> JSON;  signature --npy_of--> NPY file;  upload --upload_type--> media type
+
+T = TypeVar("T")
+
+PLY, PNG, NPY, BYTES, JSON = (
+    "application/ply", "image/png", "application/x-npy", "application/octet-stream",
+    "application/json",
+)  # fmt: skip
+#: How uploads begin, their media types, and what their names end with.
+_UPLOADS = (
+    (b"\x89PNG", PNG, "png"), (b"\x93NUMPY", NPY, "npy"), (b"ply", PLY, "ply"),
+    (b"# .PCD", BYTES, "pcd"), (b"VERSION", BYTES, "pcd"), (b"LASF", BYTES, "las"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Output(Generic[T]):
+    """Something that can be made of a frame.
+
+    Parameters
+    ----------
+    tag : the same as long as what is made is the same, and another otherwise
+    make : makes it; takes some 100 ms at most
+    blob : that it is, where it is not made but lies in the store
+    """
+
+    tag: str
+    make: Callable[[], T]
+    blob: str | None = None
+
+
+def upload_type(data: bytes) -> tuple[str, str]:
+    """Media type of an upload, and what its name ends with."""
+    for magic, media_type, suffix in _UPLOADS:
+        if data.startswith(magic):
+            return media_type, suffix
+    return BYTES, "bin"
+
+
+def level_of(patches: Patches) -> PatchLevel:
+    """Patches as JSON tells them."""
+    return PatchLevel(
+        mean=[(x, y, z) for x, y, z in patches.means.round(4).tolist()],
+        normal=[(x, y, z) for x, y, z in patches.normals.round(4).tolist()],
+        area_m2=patches.areas.round(5).tolist(),
+        size=patches.sizes.tolist(),
+    )
+
+
+def npy_of(vector: bytes) -> bytes:
+    """Bytes as an NPY file of uint8."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.frombuffer(vector, np.uint8), allow_pickle=False)
+    return buffer.getvalue()
+
+
+# What a frame is made of, out of the store: cloud, picture, patches, signature, upload.
+#
+# frame  --Outputs-->  Output: a tag that stands for the content, and how to make it
+
+
+class FrameFiles:
+    """What frames are made of.
+
+    Parameters
+    ----------
+    store : see Store
+    signers : of the store's models
+    """
+
+    def __init__(self, store: Store, signers: Signers) -> None:
+        self._store, self._signers = store, signers
+
+    def cloud(self, map_name: str, frame_id: str, within: CloudFrame = "optical") -> Output[bytes]:
+        """Points and normals of a frame's surface as PLY.
+
+        Parameters
+        ----------
+        map_name, frame_id : of an indexed frame
+        within : the coordinates: of the camera, of the parent frame of its pose, of the robot's
+            base
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : there is none, or it was deleted.
+        NotIndexed : nothing has been made of it, or not yet.
+        InvalidRequest : its pose, or where the sensor sits on its base, is not known.
+        """
+        found = find_indexed(self._store, map_name, frame_id)
+        frame, optical = found.frame, sensor_of(found.frame)
+        name, matrix = placed(frame, within)
+        comments = [f"frame {name}", f"points of {optical} of map {found.row.name}, metres",
+                    f"model {found.label}"]  # fmt: skip
+
+        def make() -> bytes:
+            points, normals = points_of(geometry_of(self._store, found).surface)
+            if within == "optical":
+                return write_ply(points, normals, comments=comments)
+            to_name = np.array(matrix)
+            turned = normals.astype(np.float64) @ to_name[:3, :3].T
+            return write_ply(moved(to_name, points.astype(np.float64)), turned, comments=comments)
+
+        return Output(found.tag("cloud", frame.id, found.row.name, name, matrix), make)
+
+    def preview(
+        self, map_name: str, frame_id: str, view: View = "depth", width: int = 320
+    ) -> Output[bytes]:
+        """A picture of a frame as PNG; see `sceneprint.previews`. Errors as of `cloud`.
+
+        Raises
+        ------
+        DamagedBlob : for patches: the upload is lost.
+        """
+        found = find_indexed(self._store, map_name, frame_id)
+
+        def make() -> bytes:
+            if view == "patches":
+                colours, text = patches_view(self._labels(found))
+            else:
+                surface = geometry_of(self._store, found).surface
+                colours, text = (depth_view if view == "depth" else normals_view)(surface)
+            told = {"view": view, "frame": sensor_of(found.frame), "model": found.label}
+            return picture(colours, width, {**told, **text})
+
+        return Output(found.tag("preview", found.frame.id, view, width), make)
+
+    def patches(self, map_name: str, frame_id: str) -> Output[FramePatches]:
+        """The patches of a frame. Errors as of `preview`."""
+        found = find_indexed(self._store, map_name, frame_id)
+
+        def make() -> FramePatches:
+            return FramePatches(
+                frame_id=found.frame.id,
+                map=found.row.name,
+                frame=sensor_of(found.frame),
+                model=found.label,
+                levels=[level_of(one) for one in self._hierarchy(found)[1].levels],
+                validation=level_of(geometry_of(self._store, found).patches),
+            )
+
+        return Output(found.tag("patches", found.frame.id, found.row.name), make)
+
+    def signature(self, map_name: str, frame_id: str) -> Output[FrameSignature]:
+        """The signature of a frame. Errors as of `cloud`.
+
+        Raises
+        ------
+        DamagedSignature : its bytes are not those that were stored; it is made again.
+        """
+        found = find_indexed(self._store, map_name, frame_id)
+
+        def make() -> FrameSignature:
+            vector, sizes = self._signature(found)
+            return FrameSignature(
+                frame_id=found.frame.id,
+                map=found.row.name,
+                model=found.label,
+                model_id=found.row.model_id,
+                length=len(vector),
+                n_patches=list(sizes.n_patches),
+                n_pairs=list(sizes.n_pairs),
+                base64=base64.b64encode(vector).decode(),
+            )
+
+        return Output(found.tag("signature", found.frame.id, found.row.name), make)
+
+    def vector(self, map_name: str, frame_id: str, media_type: str = BYTES) -> Output[bytes]:
+        """The bytes of a signature, as they are or as an NPY file. Errors as of `signature`."""
+        found = find_indexed(self._store, map_name, frame_id)
+
+        def make() -> bytes:
+            vector, _ = self._signature(found)
+            return vector if media_type == BYTES else npy_of(vector)
+
+        return Output(found.tag("vector", media_type), make)
+
+    def upload(self, map_name: str, frame_id: str) -> Output[bytes]:
+        """A frame's upload, byte for byte as it came.
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : there is none, or it was deleted.
+        NotIndexed : it was not kept, as the map had its place.
+        DamagedBlob : it is lost.
+        """
+        with self._store.database.read() as connection:
+            row = find_map(connection, map_name)
+            frame = living(row, find_frame(connection, row, frame_id))
+        if frame.state == FrameState.REDUNDANT:
+            raise NotIndexed(
+                f"Frame {frame.id} is redundant, so its upload was not stored. "
+                f"{frame.reason or ''} Upload it without `if_novel` to store it."
+            )
+        blob = frame.blob
+        return Output(tag_of("upload", blob), lambda: self._store.blobs.get(blob), blob)
+
+    def _hierarchy(self, found: IndexedFrame) -> tuple[Surface, Hierarchy]:
+        """As it was signed: of the upload, as the artifact's points are rounded."""
+        p = self._signers(found.row.model_id).model.parameters
+        frame = read_stored(self._store.blobs.get(found.frame.blob), found.frame)
+        seen = see(frame, p)
+        return seen, hierarchy_of(seen, p, found.frame.id)
+
+    def _labels(self, found: IndexedFrame) -> Ints32:
+        """The finest patches as an image; those of a cloud are of points in no order."""
+        seen, hierarchy = self._hierarchy(found)
+        labels = hierarchy.labels[0]
+        if isinstance(seen.camera, Intrinsics):
+            return labels
+        drawn = geometry_of(self._store, found).surface
+        return onto(vista_of(drawn), drawn, seen.points.reshape(-1, 3), labels.ravel())
+
+    def _signature(self, found: IndexedFrame) -> tuple[bytes, PatchCounts]:
+        number, model_id = found.frame.number, found.row.model_id
+        try:
+            with self._store.database.read() as connection:
+                vector = stored_vector(connection, number, model_id)
+                sizes = signature_sizes(connection, number, model_id)
+        except DamagedSignature:
+            resign_frames(self._store, found.row, [number], model_id)
+            raise
+        if vector is None or sizes is None:
+            check_unchanged(self._store, found)
+            raise DamagedSignature(
+                f"The signature of frame {found.frame.id} is missing. Run `sceneprint fsck` to "
+                "find out why."
+            )
+        return vector, sizes
+
+
+def placed(frame: FrameRow, within: CloudFrame) -> tuple[str, list[list[float]]]:
+    """What some coordinates of a frame are called, and the (4, 4) that leads there from its
+    sensor's.
+
+    Raises
+    ------
+    InvalidRequest : its pose, or where the sensor sits on its base, is not known.
+    """
+    optical = sensor_of(frame)
+    name, matrix = {
+        "optical": (optical, np.eye(4).tolist()),
+        "parent": (frame.pose_parent, frame.pose),
+        "base": (frame.base_frame, frame.base),
+    }[within]
+    if matrix is None or name is None:
+        lacking = "pose" if within == "parent" else "T_base_sensor"
+        raise InvalidRequest(
+            f"Frame {frame.id} has no {lacking}, so its points are available only in {optical}. "
+            "Use frame=optical, or add one with PATCH.",
+            (("frame", f"it has no {lacking}"),),
+        )
+    return name, matrix

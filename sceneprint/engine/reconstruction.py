@@ -1,0 +1,454 @@
+"""Reconstructions: the accepted matches of an answer, fused to a surface by a worker.
+
+Kept, NewReconstruction  --begin-->  job
+job  --(in a worker) _fuse-->  mesh.ply, picture.png, Coverage
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from typing import Literal
+
+import numpy as np
+from sqlalchemy import Connection
+
+from sceneprint.engine.ingest.frame_decoder import read_stored
+from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
+from sceneprint.engine.maps.map_frames import living
+from sceneprint.engine.results.stored_results import ResultValidity, StoredResult
+from sceneprint.engine.serializers import when
+from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
+from sceneprint.errors import (
+    DamagedBlob,
+    FrameError,
+    InvalidRequest,
+    NotFound,
+    NotIndexed,
+    UnknownFrame,
+    UnknownJob,
+    UnreadableGeometry,
+    UselessFrame,
+)
+from sceneprint.formats.artifact import read_geometry
+from sceneprint.formats.points.ply_export import write_ply
+from sceneprint.fusion import BAND, FusionParameters, fuse, within
+from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.surface.coverage import added_areas, observed_volume, of_views, share_seen
+from sceneprint.geometry.surface.depth_image import doubled
+from sceneprint.libraries import open3d
+from sceneprint.rendering import PALETTE, reconstruction_picture
+from sceneprint.store import Store
+from sceneprint.store.associations import remove_job
+from sceneprint.store.frames import find_frame
+from sceneprint.store.maps import find_map
+from sceneprint.store.queue import JobFile, files_of, find_job, jobs_with_files, unknown_job
+from sceneprint.store.signatures import geometry_blobs
+from sceneprint.store.tables import JobRow
+from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics
+from sceneprint_client.api import JobState, Match
+from sceneprint_client.api.reconstructions import (
+    MOST_VIEWS,
+    Coverage,
+    FusedView,
+    LeftOut,
+    NewReconstruction,
+    Reconstruction,
+    ReconstructionFile,
+)
+
+# Views of an answer fused: their depth out of the store, the surface, its figures, its files.
+#
+# data of a job, geometry of the query  --fused-->  Fused
+
+Source = Literal["upload", "geometry"]
+Strength = Literal["strong", "weak"]
+
+
+@dataclass(frozen=True, eq=False)
+class JobView:
+    """A match that is to be fused, as it stands in a job's data.
+
+    Parameters
+    ----------
+    map, frame_id : of the match
+    rank, strength : of the answer; None of the query itself
+    transform : (4, 4) T_query_match
+    """
+
+    map: str
+    frame_id: str
+    rank: int | None
+    strength: Strength | None
+    transform: list[list[float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """What became of the views.
+
+    Parameters
+    ----------
+    coverage : see Coverage
+    ply : surface or cloud, in the query's camera frame, coloured by view
+    png : its picture
+    """
+
+    coverage: Coverage
+    ply: bytes
+    png: bytes
+
+
+def fused(
+    store: Store, views: Sequence[JobView], query: Geometry | None, own: JobView | None,
+    wanted: NewReconstruction, model_id: str, parent_frame: str, asked_at: float,
+) -> Fused:  # fmt: skip
+    """Fuse the matches of an answer, and what the query saw.
+
+    Parameters
+    ----------
+    store : with the matches' uploads and artifacts
+    views : at least one, in the order of the ranking
+    query : its own geometry; None where it is not known
+    own : the query, where it is a stored frame
+    wanted : see NewReconstruction
+    model_id : whose artifacts stand in for uploads that are lost
+    parent_frame : what the query's camera frame is called
+    asked_at : when the answer was given, seconds since 1970
+
+    Raises
+    ------
+    MissingDependency : Open3D cannot be loaded.
+    UselessFrame : no match is left, or their depth makes no surface.
+    InvalidRequest : voxels too small for memory.
+    """
+    # before all the reading: where it is missing, that is what is to be told
+    open3d("A reconstruction")
+    p = FusionParameters(voxel_m=wanted.voxel_m)
+    frames, told, left_out = list[DepthFrame](), list[FusedView](), list[LeftOut]()
+    # points of a cloud have no image that voxels could be carved with: it is explained, not fused
+    if query is not None and wanted.include_query and isinstance(query.surface.camera, Intrinsics):
+        frame, source = _own(store, query, own, model_id, asked_at)
+        frames.append(within(frame, p))
+        told.append(_fused_view(None, frames[-1], source))
+    for view in views:
+        try:
+            frame, source = _read(store, view, model_id, asked_at)
+        except (NotFound, FrameError, DamagedBlob, UnreadableGeometry) as error:
+            left_out.append(LeftOut(frame_id=view.frame_id, map=view.map, reason=str(error)))
+            continue
+        frames.append(within(frame, p))
+        told.append(_fused_view(view, frames[-1], source))
+    others = [frame for frame, one in zip(frames, told, strict=True) if one.frame_id is not None]
+    if not others:
+        raise UselessFrame(
+            f"None of the {len(views)} matches can be fused: {left_out[0].reason} Use another "
+            "answer."
+        )
+    mesh, voxel = fuse(frames, p)
+    first = of_views(mesh, frames, BAND * voxel)
+    added = added_areas(mesh, first, len(frames)).tolist()
+    volume, _ = observed_volume(frames)
+    as_mesh = wanted.output == "mesh"
+    coverage = Coverage(
+        views=[one.model_copy(update={"added_m2": a}) for one, a in zip(told, added, strict=True)],
+        left_out=left_out,
+        area_m2=float(sum(added)),
+        observed_volume_m3=volume,
+        query_explained=0.0 if query is None else share_seen(_points(query), others),
+        voxel_m=voxel,
+        points=len(mesh.points),
+        triangles=len(mesh.triangles) if as_mesh else 0,
+    )
+    # a cloud keeps the axes of its sensor, whichever they are
+    axes = ": x right, y down, z forward" if parent_frame.endswith(".optical") else ""
+    comment = f"frame {parent_frame}{axes}, metres"
+    colours = PALETTE[first % len(PALETTE)]
+    ply = write_ply(
+        mesh.points, mesh.normals, colours, mesh.triangles if as_mesh else None,
+        comments=(comment,),
+    )  # fmt: skip
+    named = f"{len(frames)} views, {coverage.area_m2:.1f} m², {volume:.1f} m³ observed"
+    explained = f"{coverage.query_explained:.0%} of the query explained"
+    title = named if query is None else f"{named}; {explained}"
+    return Fused(coverage, ply, reconstruction_picture(mesh, first, frames, added, title))
+
+
+def _own(
+    store: Store, query: Geometry, own: JobView | None, model_id: str, asked_at: float
+) -> tuple[DepthFrame, Source]:
+    """What the query saw, as fine as it is kept."""
+    if own is not None:
+        with suppress(NotFound, FrameError, DamagedBlob, UnreadableGeometry):
+            frame, source = _read(store, own, model_id, asked_at)
+            return replace(frame, name="query"), source
+    return doubled(_frame(query, "query", np.eye(4))), "geometry"
+
+
+def _read(store: Store, view: JobView, model_id: str, asked_at: float) -> tuple[DepthFrame, Source]:
+    """A match's depth as it was sent; where that is lost, as validation compares it.
+
+    Raises
+    ------
+    NotFound : its map or it is gone, whether or not another has its name.
+    DamagedBlob, UnreadableGeometry : both are lost.
+    FrameError : there is nothing in it.
+    """
+    with store.database.read() as connection:
+        row = find_map(connection, view.map)
+        frame = living(row, find_frame(connection, row, view.frame_id))
+        if frame.received_at > asked_at:
+            raise UnknownFrame(
+                f"Frame {frame.id} of map {row.name!r} was deleted, and a new frame has its id."
+            )
+        blob = geometry_blobs(connection, [frame.number], model_id).get(frame.number)
+    if frame.kind == "cloud":  # before five million points are unpacked, if they can be here
+        raise _no_image(view.frame_id)
+    T = np.array(view.transform)
+    try:
+        found = read_stored(store.blobs.get(frame.blob), frame)
+        assert isinstance(found, DepthFrame)
+        return DepthFrame(found.depth, found.intrinsics, view.frame_id, T), "upload"
+    except DamagedBlob:
+        if blob is None:
+            raise
+        return doubled(_frame(read_geometry(store.blobs.get(blob)), view.frame_id, T)), "geometry"
+
+
+def _frame(geometry: Geometry, name: str, T: Floats) -> DepthFrame:
+    """The depth that an artifact keeps, with a pose."""
+    surface = geometry.surface
+    if not isinstance(surface.camera, Intrinsics):
+        raise _no_image(name)
+    depth = np.where(surface.valid, surface.points[..., 2], np.float32(0))
+    return DepthFrame(np.ascontiguousarray(depth, np.float32), surface.camera, name, T)
+
+
+def _no_image(name: str) -> UselessFrame:
+    return UselessFrame(
+        f"{name} is a point cloud, but reconstruction fuses only depth images. Use overlay.ply "
+        "to view its points with the others."
+    )
+
+
+def _points(geometry: Geometry) -> Floats:
+    return geometry.surface.points[geometry.surface.valid].astype(np.float64)
+
+
+def _fused_view(view: JobView | None, frame: DepthFrame, source: Source) -> FusedView:
+    samples = int(np.count_nonzero(frame.depth))
+    return FusedView(
+        frame_id=None if view is None else view.frame_id,
+        map=None if view is None else view.map,
+        rank=None if view is None else view.rank,
+        strength=None if view is None else view.strength,
+        source=source,
+        samples=samples,
+        added_m2=0.0,
+    )
+
+
+KIND = "reconstruct"
+#: Files of such a job: what the query saw, until it is fused; and what is made.
+QUERY, MESH, PICTURE = "query.geometry", "mesh.ply", "picture.png"
+MEDIA_TYPES = {MESH: "application/ply", PICTURE: "image/png"}
+#: The query itself is where it is.
+_STILL = np.eye(4).tolist()
+
+
+class ReconstructionJobs:
+    """Begins reconstructions, does them, and hands out what they made.
+
+    Parameters
+    ----------
+    store, tasks : of the engine
+    """
+
+    def __init__(self, store: Store, tasks: Tasks) -> None:
+        self._store, self._tasks = store, tasks
+        tasks.register(KIND, self._fuse)
+
+    def begin(self, kept: StoredResult, wanted: NewReconstruction) -> Reconstruction:
+        """Queue a reconstruction. All that it needs of the answer is copied: that may expire.
+
+        Parameters
+        ----------
+        kept : the answer
+        wanted : which of its views, and to what
+
+        Raises
+        ------
+        InvalidRequest : the answer has no accepted match, or not the ones that are named.
+        UnknownMap : the map is gone.
+        """
+        chosen = _matches_to_fuse(kept.answer.matches, wanted)
+        views, own = [_view(match) for match in chosen], kept.answer.frame
+        maps = sorted({*(view.map for view in views), *([] if own is None else [own.map])})
+        data = {
+            "query_id": kept.answer.query_id,
+            "maps": maps,
+            "parent_frame": chosen[0].transform.child_frame if chosen[0].transform else "",
+            "model_id": kept.model_id,
+            "asked_at": kept.at,
+            "request": wanted.model_dump(mode="json"),
+            "views": [asdict(view) for view in views],
+            "own": None
+            if own is None
+            else asdict(JobView(own.map, own.frame_id, None, None, _STILL)),
+        }
+        # of several maps: the job's own page would tell who may read one of them of the others
+        of = maps[0] if len(maps) == 1 else None
+        self._store.database.require_writable()
+        while True:
+            files = []
+            if kept.geometry is not None:
+                blob = self._store.blobs.put(kept.geometry)
+                files = [JobFile(QUERY, blob, len(kept.geometry), "application/octet-stream")]
+            try:
+                job = self._tasks.begin(KIND, of, data, files=files)
+            except Swept:
+                continue
+            except BaseException:
+                collect_deleted_blobs(self._store, [one.blob for one in files])
+                raise
+            return self.find(job.job_id)
+
+    def find(self, job_id: str) -> Reconstruction:
+        """A reconstruction; UnknownJob where there is none."""
+        with self._store.database.read() as connection:
+            job = _find(connection, job_id)
+            return _reconstruction_record(job, files_of(connection, job.number))
+
+    def file(self, job_id: str, name: str) -> JobFile:
+        """A file that a reconstruction made.
+
+        Raises
+        ------
+        UnknownJob : there is no such reconstruction.
+        NotIndexed : it has not made it.
+        """
+        with self._store.database.read() as connection:
+            job = _find(connection, job_id)
+            found = files_of(connection, job.number).get(name)
+        if found is None or name not in MEDIA_TYPES:
+            why = f": {job.error}" if job.error else "."
+            raise NotIndexed(
+                f"Reconstruction {job_id} is {job.state}, and {name} exists once it has "
+                f"succeeded{why}"
+            )
+        return found
+
+    def delete(self, job_id: str) -> None:
+        """Remove a reconstruction, whatever has become of it; UnknownJob where there is none."""
+        with self._store.database.write() as connection:
+            blobs = remove_job(connection, _find(connection, job_id))
+        collect_deleted_blobs(self._store, blobs)
+
+    def forget(self, standing: ResultValidity) -> int:
+        """Remove those of which any view was deleted since: they show it; returns how many."""
+        with self._store.database.read() as connection:
+            found = jobs_with_files(connection, KIND)
+        gone = [job for job in found if not _stands(job, standing)]
+        for job in gone:
+            with suppress(UnknownJob):  # somebody else has
+                self.delete(job.id)
+        return len(gone)
+
+    def _fuse(self, task: LongJob, until: float) -> SliceResult:
+        """Do it, in one slice: at most 32 views of bounded size take seconds."""
+        del until
+        data = task.data
+        wanted = NewReconstruction.model_validate(data["request"])
+        views = [JobView(**view) for view in data["views"]]
+        own = None if data["own"] is None else JobView(**data["own"])
+        result = fused(
+            self._store, views, self._query_of(task), own, wanted, data["model_id"],
+            data["parent_frame"], data["asked_at"],
+        )  # fmt: skip
+        files = [
+            JobFile(name, self._store.blobs.put(content), len(content), MEDIA_TYPES[name])
+            for name, content in ((MESH, result.ply), (PICTURE, result.png))
+        ]
+        return SliceResult(
+            over=True,
+            progress={"done": len(views), "total": len(views)},
+            files=files,
+            result=result.coverage.model_dump(mode="json"),
+            drop=(QUERY,),
+        )
+
+    def _query_of(self, task: LongJob) -> Geometry | None:
+        """What the query saw; a reconstruction does without it where it is damaged."""
+        with self._store.database.read() as connection:
+            found = files_of(connection, task.claim.job.number).get(QUERY)
+        if found is not None:
+            with suppress(DamagedBlob, UnreadableGeometry):
+                return read_geometry(self._store.blobs.get(found.blob))
+        return None
+
+
+def _matches_to_fuse(matches: Sequence[Match], wanted: NewReconstruction) -> list[Match]:
+    """The matches to fuse, in the order of the ranking."""
+    accepted = [m for m in matches if m.validation.status == "accepted" and m.transform is not None]
+    if not accepted:
+        raise InvalidRequest(
+            "The answer has no accepted match, so there is nothing to fuse. Use an answer with "
+            "the status `found`."
+        )
+    if wanted.frames is not None:
+        known = {match.frame_id for match in accepted}
+        missing = [frame for frame in wanted.frames if frame not in known]
+        if missing:
+            raise InvalidRequest(
+                f"Frame {missing[0]!r:.80} is not an accepted match of the answer. Choose from "
+                f"{', '.join(sorted(known))}, or leave `frames` out.",
+                (("frames", "not an accepted match"),),
+            )
+        accepted = [match for match in accepted if match.frame_id in wanted.frames]
+    if wanted.strength == "strong":
+        accepted = [match for match in accepted if match.validation.strength == "strong"]
+        if not accepted:
+            raise InvalidRequest(
+                "No match is accepted with strength `strong`. Use `any`.",
+                (("strength", "leaves no match"),),
+            )
+    return sorted(accepted, key=lambda match: match.rank)[: MOST_VIEWS - 1]
+
+
+def _view(match: Match) -> JobView:
+    if match.transform is None:
+        raise ValueError(f"match {match.frame_id} has no transform")
+    T = inverse(np.array(match.transform.matrix))
+    return JobView(match.map, match.frame_id, match.rank, match.validation.strength, T.tolist())
+
+
+def _stands(job: JobRow, standing: ResultValidity) -> bool:
+    data = job.data or {}
+    views = [*data["views"], *([] if data["own"] is None else [data["own"]])]
+    return all(standing.frame(one["map"], one["frame_id"], data["asked_at"]) for one in views)
+
+
+def _find(connection: Connection, job_id: str) -> JobRow:
+    job = find_job(connection, job_id)
+    if job.kind != KIND:
+        raise unknown_job(job_id)
+    return job
+
+
+def _reconstruction_record(job: JobRow, files: dict[str, JobFile]) -> Reconstruction:
+    data, done = job.data or {}, job.state == JobState.SUCCEEDED
+    made = [files[name] for name in MEDIA_TYPES if name in files]
+    return Reconstruction(
+        job_id=job.id,
+        query_id=data["query_id"],
+        maps=data["maps"],
+        state=job.state,
+        error=job.error,
+        created_at=when(job.created_at),
+        finished_at=when(job.finished_at),
+        request=NewReconstruction.model_validate(data["request"]),
+        parent_frame=data["parent_frame"],
+        coverage=Coverage.model_validate(job.result) if done else None,
+        files=[ReconstructionFile.model_validate(asdict(one)) for one in made],
+    )

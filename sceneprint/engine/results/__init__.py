@@ -1,0 +1,1 @@
+"""Answers that are kept, inspected and computed again."""

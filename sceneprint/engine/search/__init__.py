@@ -1,0 +1,1 @@
+"""A query from its body to its answer."""

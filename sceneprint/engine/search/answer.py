@@ -1,0 +1,185 @@
+"""A query to its answer: R, C, C_vld, and the pose of the query.
+
+signature, Geometry, Places  --answer-->  Answer
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from sceneprint.engine.search.explanation import ExplainedQuery, explain, why
+from sceneprint.engine.search.response import Candidates, location_record, match_records
+from sceneprint.engine.search.retrieval import (
+    Deadline,
+    PreparedQuery,
+    Searched,
+    SearchedMap,
+    search_maps,
+)
+from sceneprint.engine.search.verification import Validated, validated, wanted_of
+from sceneprint.engine.serializers import query_sensor
+from sceneprint.engine.upkeep.repair import resign_frames
+from sceneprint.geometry.retrieval.distance import Ints64, pairwise_distances
+from sceneprint.geometry.retrieval.dpp import DiversityParameters, Selection, diversify
+from sceneprint.matches import PairMatch
+from sceneprint.models import Model
+from sceneprint.store import Store
+from sceneprint.store.frames import frames_of
+from sceneprint.store.postgres.replica import behind_s
+from sceneprint_client.api import Answer, AnswerStatus, Counts, FrameName, OfMap, Query
+
+
+@dataclass
+class _Clock:
+    """Milliseconds of each stage, one after the other."""
+
+    spent: dict[str, float]
+    _since: float = field(default_factory=time.perf_counter)
+
+    def stage(self, name: str) -> None:
+        now = time.perf_counter()
+        self.spent[name] = round(1e3 * (now - self._since), 2)
+        self._since = now
+
+
+def answer(
+    store: Store, places: Sequence[SearchedMap], model: Model, asked: PreparedQuery, query: Query,
+    deadline: Deadline,
+) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
+    """Ask maps; the answer, and the numbers of the frames of R.
+
+    Parameters
+    ----------
+    store : see Store
+    places : the maps, one or more of one model
+    model : of all of them
+    asked, query : what is sought, and how
+    deadline : see Deadline
+
+    Raises
+    ------
+    UnknownFrame : there is none of the id that is to be explained.
+    """
+    clock = _Clock({"prepare": round(asked.prepare_ms, 2)})
+    searched = search_maps(store, places, asked, query, model)
+    for place in places:
+        resign_frames(store, place.row, sorted(place.view.damaged), place.row.model_id)
+    ranking, wanted = searched.ranking, wanted_of(query)
+    clock.stage("retrieve")
+    among, selection, scales = _selection(searched, query, model, wanted)
+    clock.stage("diversify")
+    chosen = range(min(wanted, len(ranking))) if selection is None else selection.indices.tolist()
+    p = model.parameters.validation
+    tried = validated(store, searched, chosen, asked.geometry, query, deadline, p)
+    clock.stage("validate")
+    shown = range(len(ranking)) if query.explain else chosen
+    with store.queried.read() as connection:
+        rows = frames_of(connection, ranking.indices[list(shown)].tolist())
+    matches = [one for one in tried.matches if one.index in rows]  # the rest was deleted meanwhile
+    names = {place.row.number: place.row.name for place in places}
+    own = query_sensor(_name(asked), asked.kind, list(names.values()))
+    found = Candidates(
+        names, ranking, selection, rows, tried.unreadable, tried.untried, own, p.covariance,
+        asked.base,
+    )  # fmt: skip
+    explanations = explained = None
+    if query.explain:
+        explanations = explain(found, tried, among, scales)
+    if query.explain_frame is not None:
+        asking = ExplainedQuery(store, searched, asked, query, found, tried, model, deadline)
+        explained = why(asking, query.explain_frame)
+    if query.explain or explained is not None:
+        clock.stage("explain")
+    clock.spent["total"] = round(sum(clock.spent.values()), 2)
+    counts = [_counts(searched, i, found, tried, matches) for i in range(len(places))]
+    told = Answer(
+        query_id=uuid.uuid4().hex,
+        status=_status(matches, query, tried),
+        matches=match_records(found, chosen, matches),
+        location=location_record(found, matches),
+        seed=query.seed,
+        model=model.label,
+        index_generation=min(map(_generation, places)),
+        exact=searched.exact,
+        counts=_sum(counts),
+        milliseconds=clock.spent,
+        maps=[place.row.name for place in places],
+        frame=_name(asked),
+        kind=asked.kind,
+        per_map=_per_map(places, counts) if len(places) > 1 else None,
+        deadline_reached=tried.late,
+        replica_behind_s=behind_s(),
+        explanations=explanations,
+        explained_frame=explained,
+    )
+    return told, tuple(ranking.indices.tolist())
+
+
+def _selection(
+    searched: Searched, query: Query, model: Model, wanted: int
+) -> tuple[Ints64 | None, Selection | None, DiversityParameters | None]:
+    """C, with the distances within R and the scales that it was selected by; Sec. III-D."""
+    if "diversify" not in query.stages:
+        return None, None, None
+    scales = None
+    if query.diversity is not None:
+        scales = DiversityParameters(query.diversity.sigma, query.diversity.omega)
+    among = pairwise_distances(searched.signatures(), model.metric)
+    return among, diversify(searched.ranking.distances, among, wanted, scales), scales
+
+
+def _per_map(places: Sequence[SearchedMap], counts: Sequence[Counts]) -> dict[str, OfMap]:
+    return {
+        place.row.name: OfMap(index_generation=_generation(place), counts=own)
+        for place, own in zip(places, counts, strict=True)
+    }
+
+
+def _counts(
+    searched: Searched, i: int, found: Candidates, tried: Validated, matches: Sequence[PairMatch]
+) -> Counts:
+    """What each stage saw of one of the maps."""
+    part, hits = searched.parts[i], searched.hits[i]
+    number = part.place.row.number
+    statuses = [
+        one.validation.status for one in matches if found.rows[one.index].map_number == number
+    ]
+    own = searched.owners == i
+    return Counts(
+        map=part.size,
+        passed=part.passed,
+        compared=hits.compared,
+        ranked=int(own.sum()),
+        selected=0 if found.selection is None else int(own[list(tried.chosen)].sum()),
+        validated=len(statuses),
+        accepted=statuses.count("accepted"),
+    )
+
+
+def _sum(counts: Sequence[Counts]) -> Counts:
+    return Counts(**{name: sum(getattr(one, name) for one in counts)
+                     for name in Counts.model_fields})  # fmt: skip
+
+
+def _generation(place: SearchedMap) -> int:
+    return place.view.number
+
+
+def _name(asked: PreparedQuery) -> FrameName | None:
+    if asked.frame is None or asked.home is None:
+        return None
+    return FrameName(map=asked.home.name, frame_id=asked.frame[1])
+
+
+def _status(matches: Sequence[PairMatch], query: Query, tried: Validated) -> AnswerStatus:
+    statuses = [match.validation.status for match in matches]
+    if "accepted" in statuses:
+        return "found"
+    if "validate" not in query.stages:
+        return "unvalidated"
+    if "ambiguous" in statuses:
+        return "ambiguous"
+    return "unvalidated" if tried.late else "not_found"

@@ -1,0 +1,449 @@
+"""What queries search: each map's signatures, caught up with the database before every query.
+
+A `Reader` holds one map: the newest generation of its index, and the tail of frames indexed after
+it. What it hands out is a `View`, which never changes; catching up makes a new one beside it.
+A map of which a node would have to read much first is left to PostgreSQL, where that has vectors.
+Signatures compared by L1 have neither index nor vectors: they are all tail.
+"""
+
+from __future__ import annotations
+
+import logging
+import mmap
+import os
+import re
+import tempfile
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, select
+
+from sceneprint.engine.models import Signers
+from sceneprint.engine.search.index_view import IndexView, MapView
+from sceneprint.engine.search.pgvector_index import StoredMaps
+from sceneprint.engine.upkeep.vector_tables import READ_MOST, Setting
+from sceneprint.errors import UnusableStore
+from sceneprint.index import Generation, Tail, newest, newest_number
+from sceneprint.models import Model
+from sceneprint.store import Database
+from sceneprint.store.events import holds_anchor
+from sceneprint.store.maps import list_maps
+from sceneprint.store.postgres import vectors
+from sceneprint.store.postgres.replica import require_primary
+from sceneprint.store.signatures import SignatureChange, changes_since, count_indexed
+from sceneprint.store.tables import MapRow, maps
+from sceneprint.types import Bytes
+
+# The tail of a reader while it grows: appended to behind what has been handed out of it.
+
+#: Bytes of signatures up to which they are held in memory. More go to a file that has no name,
+#: whose pages the kernel drops and reads again as it likes: a map that has lost its index is
+#: scanned whole, and may be larger than the machine's memory.
+IN_MEMORY = 256 << 20
+
+
+class AppendBuffer:
+    """Signatures in the order of their revisions; what is handed out never changes.
+
+    Parameters
+    ----------
+    length : bytes of a signature
+    folder : where a file for many of them may be made; the system's for temporary files where
+        that one cannot be written
+    capacity : signatures to make room for at first
+    """
+
+    def __init__(self, length: int, folder: Path, capacity: int = 64) -> None:
+        self._folder, self._capacity = folder, max(capacity, 64)
+        self._keys: NDArray[np.int64] = np.empty(self._capacity, np.int64)
+        self._revisions: NDArray[np.int64] = np.empty(self._capacity, np.int64)
+        self._rows = self._room(self._capacity, length)
+        self._places: dict[int, int] = {}
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __contains__(self, key: int) -> bool:
+        return key in self._places
+
+    @property
+    def bytes_held(self) -> int:
+        """Memory that the signatures take and nobody but this process can give back."""
+        return self._rows.nbytes if self._rows.nbytes <= IN_MEMORY else 0
+
+    def reserve(self, more: int) -> None:
+        """Make room for that many more at once: growing step by step would copy all each time.
+
+        Raises
+        ------
+        UnusableStore : there is no room on the disk.
+        """
+        n = len(self)
+        if n + more > self._capacity:
+            length = self._rows.shape[1]
+            # twice as many, but no more than memory would be used for at once
+            step = min(self._capacity, max(IN_MEMORY // length, 64))
+            capacity = max(n + more, self._capacity + step)
+            rows = self._room(capacity, length)  # where this fails, all is as it was
+            rows[:n] = self._rows[:n]  # views keep the old arrays
+            new = np.empty(capacity - n, np.int64)
+            self._keys = np.concatenate([self._keys[:n], new])
+            self._revisions = np.concatenate([self._revisions[:n], new])
+            self._capacity, self._rows = capacity, rows
+
+    def append(self, change: SignatureChange, row: Bytes) -> None:
+        """Take the signature of a frame that is not there yet."""
+        self.reserve(1)
+        n = len(self)
+        self._keys[n], self._revisions[n], self._rows[n] = change.number, change.revision, row
+        self._places[change.number] = n
+
+    def after(self, revision: int) -> AppendBuffer:
+        """Those indexed after a revision, in arrays of their own."""
+        return self._only(self._revisions[: len(self)] > revision)
+
+    def without(self, keys: Collection[int]) -> AppendBuffer:
+        """All but some, in arrays of their own."""
+        return self._only(~np.isin(self._keys[: len(self)], list(keys)))
+
+    def _only(self, wanted: NDArray[np.bool_]) -> AppendBuffer:
+        places = np.flatnonzero(wanted)
+        n = len(places)
+        kept = AppendBuffer(self._rows.shape[1], self._folder, n)
+        kept._keys[:n], kept._revisions[:n] = self._keys[places], self._revisions[places]
+        np.take(self._rows, places, axis=0, out=kept._rows[:n], mode="clip")  # no copy beside
+        kept._places = {key: place for place, key in enumerate(kept._keys[:n].tolist())}
+        return kept
+
+    def revision_of(self, key: int) -> int:
+        """The revision with which the signature of a frame came; 0 where it is not there."""
+        place = self._places.get(key)
+        return 0 if place is None else int(self._revisions[place])
+
+    def tail(self) -> Tail:
+        """All that is there now."""
+        n = len(self)
+        return Tail(self._keys[:n], self._rows[:n])
+
+    def _room(self, capacity: int, length: int) -> Bytes:
+        size = capacity * length
+        if size <= IN_MEMORY:
+            return np.empty((capacity, length), np.uint8)
+        mapped = _nameless(self._folder, size)
+        return np.frombuffer(mapped, np.uint8).reshape(capacity, length)
+
+
+def _nameless(folder: Path, size: int) -> mmap.mmap:
+    """A file of that size, mapped, that the kernel removes with its last user."""
+    failed: OSError | None = None
+    for place in (folder, Path(tempfile.gettempdir())):
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=place) as file:
+                # set aside now: a page that has no room when it is written kills the process
+                os.posix_fallocate(file.fileno(), 0, size)
+                return mmap.mmap(file.fileno(), size)
+        except OSError as error:
+            failed = error
+    raise UnusableStore(
+        f"{folder}: no room for {size >> 20} MB of unindexed signatures "
+        f"({failed and failed.strerror}). Free some space, or let a worker publish an index."
+    ) from failed
+
+
+log = logging.getLogger(__name__)
+
+#: Memory of all tails above which maps that were not asked for long are forgotten.
+HELD_BYTES = 1 << 30
+#: Seconds between two looks for a newer generation, and until one that is damaged, or out of reach
+#: for a moment, is read again.
+_LOOK_S, _AGAIN_S = 1.0, 60.0
+#: Seconds between two looks for maps that are held and no longer there.
+_TIDY_S = 10.0
+
+
+def index_folder(indexes: Path, row: MapRow) -> Path:
+    """Where the index of a map is: never that of another map, which may have had its name.
+
+    And never that of another model, whose signatures are not comparable.
+    """
+    made = f"{row.number}-{round(1e6 * row.created_at):x}"
+    return indexes / f"{row.name}-{made}-{row.model_id[:12]}"
+
+
+def is_index_folder(name: str) -> bool:
+    """Whether a folder is called as `index_folder` calls them."""
+    return re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,62}-\d+-[0-9a-f]+(-[0-9a-f]{12})?", name) is not None
+
+
+def trusted(connection: Connection, row: MapRow, found: Generation | None) -> Generation | None:
+    """A generation, unless the database was put back to a state before it, and went on."""
+    if found is None:
+        return None
+    if found.revision <= row.revision and holds_anchor(connection, found.anchor):
+        return found
+    require_primary("the state of an index")
+    return None
+
+
+class Reader:
+    """One map, searched by many threads.
+
+    Parameters
+    ----------
+    connection : of the database
+    row : of the map
+    folder : of its index
+    model : of the map
+    """
+
+    def __init__(self, connection: Connection, row: MapRow, folder: Path, model: Model) -> None:
+        self._folder, self._model = folder, model
+        self._looked = time.monotonic()
+        self._lock = threading.Lock()
+        self._tail = AppendBuffer(model.signature_bytes, folder.parent)
+        self._dead: dict[int, int] = {}  # what was deleted after the generation, and when
+        self._damaged: set[int] = set()
+        self._unsound = 0, 0.0  # number of a generation that cannot be used, until the next try
+        found = self._newest(connection, row, None)
+        self._publish(found, 0 if found is None else found.revision)
+
+    @property
+    def bytes_held(self) -> int:
+        """Memory of the tail."""
+        return self._tail.bytes_held
+
+    def lacks(self, connection: Connection, row: MapRow) -> int | None:
+        """How many frames it has yet to read; None: with these it would hold too many."""
+        view = self._view
+        newer = max(row.revision - view.revision, 0)
+        if len(view.tail) + newer > READ_MOST:
+            newer = count_indexed(connection, row.number, view.revision, READ_MOST + 1)
+        return newer if len(view.tail) + newer <= READ_MOST else None
+
+    def is_outdated(self) -> bool:
+        """Whether there is an index that this reader does not use."""
+        number = newest_number(self._folder) if self._model.metric == "l2" else None
+        unsound, until = self._unsound
+        return number not in (None, self._view.number) and (
+            number != unsound or time.monotonic() > until
+        )
+
+    def view(self, connection: Connection, row: MapRow) -> IndexView:
+        """The map as of the row's revision, or later."""
+        behind = self._view.revision < row.revision
+        if self._view.revision > row.revision:
+            require_primary("what is held of a map")
+        # who only looks for a newer generation waits for nobody
+        if (behind or self._is_time()) and self._lock.acquire(blocking=behind):
+            try:
+                if self._view.revision < row.revision:
+                    self._catch_up(connection, row)
+                if self._is_time():
+                    self._swap(connection, row)
+            finally:
+                self._lock.release()
+        return self._view
+
+    def purge(self, connection: Connection, row: MapRow) -> None:
+        """Hold no signature of a deleted frame any more, but what the newest index has of it."""
+        with self._lock:
+            if self._view.revision < row.revision:
+                self._catch_up(connection, row)
+            self._swap(connection, row)
+            gone = {number for number in self._dead if number in self._tail}
+            if gone:
+                self._tail = self._tail.without(gone)
+                self._publish(self._view.generation, self._view.revision)
+
+    def _is_time(self) -> bool:
+        return time.monotonic() - self._looked >= _LOOK_S
+
+    def _catch_up(self, connection: Connection, row: MapRow) -> None:
+        view = self._view
+        self._tail.reserve(count_indexed(connection, row.number, view.revision))
+        for block in changes_since(connection, row, view.revision):
+            for change in block:
+                self._take(change)
+        self._publish(view.generation, row.revision)
+
+    def _take(self, change: SignatureChange) -> None:
+        self._damaged.discard(change.number)
+        if change.deleted:
+            self._dead[change.number] = change.revision  # a newer generation may hold it
+        elif change.vector is None:
+            # one frame must not cost the others; a worker's log says it too
+            log.error("damaged signature skipped", extra={"frame_id": change.frame_id})
+            self._damaged.add(change.number)
+        elif self._tail.revision_of(change.number) < change.revision:
+            # else an error ended the last time half way
+            if change.number in self._tail:  # signed anew, as it had been damaged
+                self._tail = self._tail.without({change.number})
+            self._tail.append(change, np.frombuffer(change.vector, np.uint8))
+            self._dead.pop(change.number, None)  # rejected by a model, and tried again by another
+
+    def _swap(self, connection: Connection, row: MapRow) -> None:
+        """Take another generation, if a worker has published one, and keep the rest as tail."""
+        self._looked = time.monotonic()
+        view = self._view
+        if not self.is_outdated():
+            return
+        found = self._newest(connection, row, view.generation)
+        since = 0 if view.generation is None else view.generation.revision
+        # one of the same revision stands for one that was found damaged
+        if (
+            found is None or found.number == view.number
+            or not since <= found.revision <= view.revision
+        ):  # fmt: skip
+            return
+        self._tail = self._tail.after(found.revision)
+        self._dead = {n: deleted for n, deleted in self._dead.items() if deleted > found.revision}
+        self._publish(found, view.revision)
+
+    def _newest(
+        self, connection: Connection, row: MapRow, known: Generation | None
+    ) -> Generation | None:
+        number = newest_number(self._folder) if self._model.metric == "l2" else None
+        if number is None:
+            return None
+        length = self._model.signature_bytes
+        found = newest(self._folder, row.model_id, length, known=known)
+        if found is None or found.number < number:
+            self._unsound = number, time.monotonic() + _AGAIN_S
+        return trusted(connection, row, found)
+
+    def _publish(self, generation: Generation | None, revision: int) -> None:
+        tail, both = self._tail.tail(), 0
+        deleted = np.fromiter(self._dead, np.int64, len(self._dead))
+        held = np.isin(deleted, tail.keys)
+        if generation is not None:
+            held |= generation.places.of(deleted) >= 0
+            both = int((generation.places.of(tail.keys) >= 0).sum())  # signed anew since
+        dead = frozenset(deleted[held].tolist())
+        size = len(generation or ()) + len(tail) - both - len(dead)
+        model, damaged = self._model, frozenset(self._damaged)
+        self._view = IndexView(
+            model.id, model.metric, revision, generation, tail, dead, size, damaged
+        )
+
+
+class Readers:
+    """The readers of all maps that were asked.
+
+    Parameters
+    ----------
+    signers : see Signers
+    indexes : folder of all indexes
+    setting : `local` never asks the database; `database` wherever it can; `auto` where much is
+        missing here
+    """
+
+    def __init__(self, signers: Signers, indexes: Path, setting: Setting = "local") -> None:
+        self._signers, self._indexes, self._setting = signers, indexes, setting
+        self._stored = StoredMaps()
+        self._database, self._history = signers.database, signers.database.history
+        self._lock = threading.Lock()
+        self._open: OrderedDict[str, tuple[tuple[int, str], Reader]] = OrderedDict()
+        self._tidied = time.monotonic()
+
+    def views(
+        self, connection: Connection, database: Database, rows: Sequence[MapRow]
+    ) -> list[MapView]:
+        """Maps of one model as of their rows' revisions, or later, each where it is searched best.
+
+        Parameters
+        ----------
+        connection : a reading transaction of `database`
+        rows : of the maps, one or more
+        """
+        model = self._signers(rows[0].model_id).model
+        found: dict[int, MapView] = {}
+        if model.metric == "l2" and model.signature_bytes in self._searched_there(connection):
+            others = self._others(connection, rows)
+            found.update(self._stored.views(connection, database, others, model))
+        return [found.get(row.number) or self.view(connection, row) for row in rows]
+
+    def asks_database(self, connection: Connection) -> bool:
+        """Whether the database searches, so that a query may name very many maps."""
+        return bool(self._searched_there(connection))
+
+    def _searched_there(self, connection: Connection) -> frozenset[int]:
+        if self._setting == "local":
+            return frozenset()
+        return vectors.complete_dimensions(connection)
+
+    def _others(self, connection: Connection, rows: Sequence[MapRow]) -> list[MapRow]:
+        """Maps of which this node would have to read much before it could search them."""
+        if self._setting == "database":
+            return list(rows)
+        others, left = [], READ_MOST
+        for row in rows:
+            reader = self._reader(connection, row)
+            lacking = reader.lacks(connection, row)
+            if lacking is None and reader.is_outdated():
+                self.forget(row.name)  # it was asked long ago: another begins with the newest index
+                lacking = self._reader(connection, row).lacks(connection, row)
+            if lacking is None or lacking > left:
+                others.append(row)
+            else:
+                left -= lacking
+        return others
+
+    def view(self, connection: Connection, row: MapRow) -> IndexView:
+        """A map as of the row's revision, or later, on this node."""
+        reader = self._reader(connection, row)
+        if time.monotonic() - self._tidied >= _TIDY_S:
+            self.tidy(connection)
+        return reader.view(connection, row)
+
+    def _reader(self, connection: Connection, row: MapRow) -> Reader:
+        with self._lock:
+            if self._history != self._database.history:  # revisions may be of other frames now
+                self._history = self._database.history
+                self._open.clear()
+            held, reader = self._open.get(row.name, (None, None))
+            wanted = (row.number, row.model_id)
+            if reader is None or held != wanted:  # made anew, or signed with another model
+                model = self._signers(row.model_id).model
+                reader = Reader(connection, row, index_folder(self._indexes, row), model)
+                self._open[row.name] = (wanted, reader)
+            self._open.move_to_end(row.name)
+            # the one that was asked longest ago first, and never the one that is asked now
+            held_bytes = sum(one.bytes_held for _, one in self._open.values())
+            while len(self._open) > 1 and held_bytes > HELD_BYTES:
+                _, (_, oldest) = self._open.popitem(last=False)
+                held_bytes -= oldest.bytes_held
+            return reader
+
+    def forget(self, name: str) -> None:
+        """Give up what is held of a map that was deleted."""
+        with self._lock:
+            self._open.pop(name, None)
+
+    def purge(self, connection: Connection) -> None:
+        """Hold nothing of deleted frames any more, beyond what the newest indexes have of them."""
+        self.tidy(connection)
+        with self._lock:
+            held = list(self._open.items())
+        rows = {row.name: row for row in list_maps(connection)}
+        for name, (wanted, reader) in held:
+            row = rows.get(name)
+            if row is not None and (row.number, row.model_id) == wanted:
+                reader.purge(connection, row)
+
+    def tidy(self, connection: Connection) -> None:
+        """Give up what is held of maps that another process deleted, or gave another model.
+
+        Their files are gone, but take room on the disk and a descriptor each while mapped.
+        """
+        asked = select(maps.c.name, maps.c.number, maps.c.model_id)
+        there = {row.name: (row.number, row.model_id) for row in connection.execute(asked)}
+        with self._lock:
+            self._tidied = time.monotonic()
+            for name in [name for name, (held, _) in self._open.items() if there.get(name) != held]:
+                del self._open[name]

@@ -1,0 +1,448 @@
+"""Queries of an engine: signed with the maps' model, and answered wholly with it.
+
+upload | stored frame, names of maps  -->  Answer
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from sceneprint.engine.models import Signers
+from sceneprint.engine.results.stored_results import StoredResult, StoredResults
+from sceneprint.engine.search.answer import answer
+from sceneprint.engine.search.local_index import Readers
+from sceneprint.engine.search.response import uncertainty_record, validation_record
+from sceneprint.engine.search.retrieval import (
+    Deadline,
+    PreparedQuery,
+    SearchedMap,
+    prepare_stored,
+    prepare_upload,
+)
+from sceneprint.engine.search.verification import thresholds
+from sceneprint.engine.serializers import model_label, sensor_frame, transform
+from sceneprint.errors import Busy, InvalidRequest, ModelMismatch, SceneprintError, UnknownMap
+from sceneprint.geometry.retrieval.distance import distances, similarity
+from sceneprint.geometry.validation.icp import PAIR_METHOD
+from sceneprint.models import PRESETS, read_model
+from sceneprint.pipeline import Signer, validate
+from sceneprint.store import Store
+from sceneprint.store.maps import find_maps, list_maps, model_names, unknown_map
+from sceneprint.store.postgres.replica import read_through
+from sceneprint.store.tables import MapRow
+from sceneprint_client.api import (
+    Answer,
+    Comparison,
+    FrameMeta,
+    FrameName,
+    Localization,
+    Match,
+    NamedFrame,
+    Query,
+    SeveralQuery,
+    Similarity,
+)
+from sceneprint_client.api.options import MOST_MAPS
+from sceneprint_client.api.query import LocalizationStatus
+
+# Queries that meet a map's switch to another model: answered wholly with one, or asked again.
+
+T = TypeVar("T")
+
+#: Times that a query is asked while its map switches from model to model.
+TRIES = 5
+
+
+def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]) -> T:
+    """Ask maps, and once more where one of them switched to another model meanwhile.
+
+    Parameters
+    ----------
+    store : see Store
+    maps : their names
+    ask : signs the query with the model of the rows, and answers it from maps of that model
+
+    Raises
+    ------
+    UnknownMap : one of them is none.
+    Busy : a map switched again and again.
+    """
+    with store.queried.read() as connection:
+        rows = find_maps(connection, maps)
+    for _ in range(TRIES):
+        try:
+            found = ask(rows)
+        except SceneprintError:
+            now = _other_models(store, rows)
+            if now is None:
+                raise
+        else:
+            # also where all went well: artifacts of the former model may have been missed
+            now = _other_models(store, rows)
+            if now is None:
+                return found
+        rows = now
+    raise Busy(
+        f"Map {', '.join(map(repr, maps))} kept changing its model during the query. Send the "
+        "query again."
+    )
+
+
+def check_model(one: str, other: str) -> None:
+    """See that signatures are of one model before they are compared.
+
+    Raises
+    ------
+    ModelMismatch : they are not.
+    """
+    if one != other:
+        raise ModelMismatch(
+            f"Signatures of two models cannot be compared: {one[:12]} and {other[:12]}. Send the "
+            "query again."
+        )
+
+
+def _other_models(store: Store, rows: Sequence[MapRow]) -> list[MapRow] | None:
+    """The maps where one of them has another model by now, or None."""
+    try:
+        with store.queried.read() as connection:
+            now = find_maps(connection, [row.name for row in rows])
+    except UnknownMap:
+        return None
+    pairs = list(zip(now, rows, strict=True))
+    if any(one.number != row.number for one, row in pairs):
+        return None
+    return now if any(one.model_id != row.model_id for one, row in pairs) else None
+
+
+# Two frames compared: their signatures, and whether they see one place.
+#
+# frame, frame  --compare-->  Similarity
+
+#: A frame that is stored, or sent: its bytes and what is known of it.
+Side = NamedFrame | tuple[bytes, FrameMeta]
+
+
+def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -> Similarity:
+    """Compare two frames; neither is kept.
+
+    Parameters
+    ----------
+    store, signers : of the engine
+    a, b : the frames
+    how : whether they are aligned, and with what; the frames it names are `a` and `b`
+
+    Raises
+    ------
+    UnknownMap, UnknownFrame : there is none.
+    FrameError : an upload that cannot be used.
+    InvalidRequest : a stored frame is not indexed, or the models differ.
+    """
+    sides = (a, b)
+    stages = ("retrieve", "validate") if how.aligned else ("retrieve",)
+    query = Query.model_validate({"stages": stages})
+
+    def ask(rows: list[MapRow]) -> Similarity:
+        signer = _signer(store, signers, rows, how)
+        ready = []
+        for side in sides:
+            if isinstance(side, NamedFrame):
+                ready.append(prepare_stored(store, side.map, side.frame_id, query))
+            else:
+                ready.append(prepare_upload(*side, signer, query))
+        check_model(ready[0].model_id, ready[1].model_id)
+        return _compared(ready[0], ready[1], signer, how)
+
+    names = [side.map for side in sides if isinstance(side, NamedFrame)]
+    maps = list(dict.fromkeys(names))
+    return read_through(store.replica, lambda: steadily(store, maps, ask))
+
+
+def _compared(a: PreparedQuery, b: PreparedQuery, signer: Signer, how: Comparison) -> Similarity:
+    start = time.perf_counter()
+    distance = distances(a.vector, b.vector[None], signer.model.metric)
+    made, T, p = None, None, signer.model.parameters.validation
+    if a.geometry is not None and b.geometry is not None:
+        found = validate(b.geometry, a.geometry, how.seed, *thresholds(how.validation, p))
+        made, T = found, found.T_match_query
+    spent = {
+        "prepare": round(a.prepare_ms + b.prepare_ms, 2),
+        "validate": round(1e3 * (time.perf_counter() - start), 2),
+    }
+    return Similarity(
+        distance=int(distance[0]),
+        similarity=float(similarity(distance, signer.model.unrelated_distance)[0]),
+        model=signer.model.label,
+        a=_name(a),
+        b=_name(b),
+        validation=None if made is None else validation_record(made),
+        uncertainty=(
+            None if made is None else uncertainty_record(made.covariance, PAIR_METHOD, p.covariance)
+        ),
+        transform=None if T is None else transform(T, *_cameras(a, b)),
+        seed=how.seed,
+        milliseconds={**spent, "total": round(sum(spent.values()), 2)},
+    )
+
+
+def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Comparison) -> Signer:
+    """What signs the uploads: with the model of the stored frames, if there are any."""
+    if not rows:
+        return signers.of(read_model(how.model or PRESETS[0]))
+    with store.queried.read() as connection:
+        names = model_names(connection)
+    told = [f"{row.name} has {model_label(names[row.model_id], row.model_id)}" for row in rows]
+    if len({row.model_id for row in rows}) > 1:
+        raise InvalidRequest(
+            f"Frames of two models cannot be compared: map {' and map '.join(told)}. Compare "
+            "frames of maps that share a model, or upload one of them.",
+            (("frame_a", told[0]), ("frame_b", told[1])),
+        )
+    if how.model is not None and read_model(how.model).id != rows[0].model_id:
+        raise InvalidRequest(
+            f"The stored frame is signed with another model than {how.model!r}: map {told[0]}. "
+            "Leave `model` out.",
+            (("model", f"map {told[0]}"),),
+        )
+    return signers(rows[0].model_id)
+
+
+def _name(asked: PreparedQuery) -> FrameName | None:
+    if asked.frame is None or asked.home is None:
+        return None
+    return FrameName(map=asked.home.name, frame_id=asked.frame[1])
+
+
+def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
+    """What the coordinates of both sensors are called; of one id in two maps, a and b."""
+    ids = [x if one.frame is None else one.frame[1] for x, one in (("a", a), ("b", b))]
+    if ids[0] == ids[1]:
+        ids = ["a", "b"]
+    return sensor_frame(ids[0], a.kind), sensor_frame(ids[1], b.kind)
+
+
+#: Maps that `*` asks at once where the database searches: by one statement, whatever their number.
+#: Otherwise this node holds what is asked, and there are MOST_MAPS.
+FLEET_MAPS = 1000
+
+
+class Queries:
+    """Asks one or more maps of one model.
+
+    Parameters
+    ----------
+    store, signers, readers : of the engine
+    kept : where answers are kept for a while
+    """
+
+    def __init__(
+        self, store: Store, signers: Signers, readers: Readers, kept: StoredResults
+    ) -> None:
+        self._store, self._signers, self._readers = store, signers, readers
+        self._kept = kept
+
+    def upload(
+        self, maps: Sequence[str], data: bytes, meta: FrameMeta, query: Query,
+        since: float | None = None,
+    ) -> Answer:  # fmt: skip
+        """Look a frame up that is not kept; see `prepare_upload`.
+
+        Parameters
+        ----------
+        maps : their names, each once
+        data, meta : the frame
+        query : how to ask
+        since : when the request came, by `time.perf_counter`; default: now
+
+        Raises
+        ------
+        UnknownMap : one of them is none.
+        InvalidRequest : they are of several models.
+        """
+        deadline = Deadline(query.deadline_ms, since)
+
+        def ask(rows: list[MapRow]) -> Answer:
+            self._check_models(rows)
+            signer = self._signers(rows[0].model_id)
+            return self.answer(rows, prepare_upload(data, meta, signer, query), query, deadline)
+
+        return read_through(self._store.replica, lambda: steadily(self._store, maps, ask))
+
+    def stored(
+        self, maps: Sequence[str], frame: NamedFrame, query: Query, since: float | None = None
+    ) -> Answer:
+        """Look a stored frame up, which does not find itself; see `prepare_stored` and `upload`."""
+        deadline = Deadline(query.deadline_ms, since)
+
+        def ask(rows: list[MapRow]) -> Answer:
+            self._check_models(rows)
+            self._signers(rows[0].model_id)  # while no connection is held: a crowd would hold all
+            ready = prepare_stored(self._store, frame.map, frame.frame_id, query)
+            return self.answer(rows[: len(maps)], ready, query, deadline)
+
+        home = [] if frame.map in maps else [frame.map]
+        names = [*maps, *home]
+        return read_through(self._store.replica, lambda: steadily(self._store, names, ask))
+
+    def answer(
+        self, asked_of: Sequence[MapRow], asked: PreparedQuery, query: Query, deadline: Deadline
+    ) -> Answer:
+        """Answer from the maps as they are now; ModelMismatch where one has switched meanwhile."""
+        database = self._store.queried
+        with database.read() as connection:
+            rows = find_maps(connection, [one.name for one in asked_of])
+            for row, one in zip(rows, asked_of, strict=True):
+                if row.number != one.number:
+                    raise UnknownMap(
+                        f"Map {row.name!r} was deleted and created again during the query. Send "
+                        "the query again."
+                    )
+                check_model(asked.model_id, row.model_id)
+            views = self._readers.views(connection, database, rows)
+        places = [SearchedMap(row, view) for row, view in zip(rows, views, strict=True)]
+        for place in places:
+            check_model(place.view.model_id, asked.model_id)
+        model = self._signers(asked.model_id).model
+        told, ranked = answer(self._store, places, model, asked, query, deadline)
+        if query.keep:
+            kept = StoredResult(
+                told, query, asked.model_id, asked.vector, asked.artifact, ranked,
+                taken=asked.taken, base=asked.base,
+            )  # fmt: skip
+            self._kept.keep(kept)
+        return told
+
+    def compare(self, a: Side, b: Side, how: Comparison) -> Similarity:
+        """Compare two frames; see `compare`."""
+        return compare(self._store, self._signers, a, b, how)
+
+    def maps_of(
+        self, query: SeveralQuery, may_read: Callable[[str], bool] = lambda _: True
+    ) -> list[str]:
+        """Names of the maps that a query asks, each once.
+
+        Parameters
+        ----------
+        query : with their names, or `*` for all that may be read
+        may_read : whether the caller may; what it may not is not there
+
+        Raises
+        ------
+        UnknownMap : one of them is not there, or none is.
+        InvalidRequest : they are more than may be asked at once.
+        """
+        if query.maps != "*":
+            for name in query.maps:
+                if not may_read(name):
+                    raise unknown_map(name)
+            return list(dict.fromkeys(query.maps))
+        with self._store.database.read() as connection:
+            names = [row.name for row in list_maps(connection) if may_read(row.name)]
+            most = MOST_MAPS
+            if len(names) > most and self._readers.asks_database(connection):
+                most = FLEET_MAPS
+        if not names:
+            raise UnknownMap("There is no map to search yet. Create one, or name an existing one.")
+        if len(names) > most:
+            raise InvalidRequest(
+                f"There are {len(names)} maps, but a query can search at most {most}. Name the "
+                "maps to search.",
+                (("maps", f"more than {most}"),),
+            )
+        return names
+
+    def _check_models(self, rows: Sequence[MapRow]) -> None:
+        if len({row.model_id for row in rows}) == 1:
+            return
+        with self._store.queried.read() as connection:
+            names = model_names(connection)
+        told = {row.name: model_label(names[row.model_id], row.model_id) for row in rows}
+        which = ", ".join(f"{name} has {model}" for name, model in told.items())
+        raise InvalidRequest(
+            f"One query cannot search maps with different models: {which}. Query the maps of one "
+            "model, or switch the others with `sceneprint reencode`.",
+            tuple((f"maps.{name}", f"has {model}") for name, model in told.items()),
+        )
+
+
+# An answer to the one thing a robot wants: where it is.
+#
+# Answer  --localization_of-->  Localization
+
+
+def check_localizes(query: Query) -> None:
+    """See that a query comes to a pose; InvalidRequest where it does not."""
+    if "validate" not in query.stages:
+        raise InvalidRequest(
+            "A pose needs validated matches. Leave `stages` out, or include `validate`.",
+            (("stages", "without validate"),),
+        )
+
+
+def localization_of(answer: Answer) -> Localization:
+    """Where the query was taken, and how sure that is.
+
+    Parameters
+    ----------
+    answer : of a query to one map, validated
+    """
+    accepted = [one for one in answer.matches if one.validation.status == "accepted"]
+    status: LocalizationStatus = "not_found"
+    if answer.status in ("found", "ambiguous"):
+        status = answer.status
+    strong = any(one.validation.strength == "strong" for one in accepted)
+    there = answer.location
+    return Localization(
+        status=status,
+        reason=_reason(answer, accepted),
+        map=answer.maps[0],
+        pose=None if there is None else there.pose,
+        support=0 if there is None else there.support,
+        votes=0 if there is None else there.votes,
+        spread_m=None if there is None else there.spread_m,
+        spread_deg=None if there is None else there.spread_deg,
+        uncertainty=None if there is None else there.uncertainty,
+        base=None if there is None else there.base,
+        strength=None if not accepted else "strong" if strong else "weak",
+        best=accepted[0] if accepted else None,
+        matches=[one.frame_id for one in accepted],
+        query_id=answer.query_id,
+        seed=answer.seed,
+        model=answer.model,
+        deadline_reached=answer.deadline_reached,
+        milliseconds=answer.milliseconds,
+    )
+
+
+def _reason(answer: Answer, accepted: list[Match]) -> str:
+    there, counts = answer.location, answer.counts
+    if there is not None:
+        return (
+            f"{there.support} of {there.votes} matches agree on the pose, within "
+            f"{there.spread_m:.2g} m and {there.spread_deg:.2g} deg"
+        )
+    if accepted:
+        return (
+            f"{len(accepted)} matches are accepted, but none has a pose in the map; `best` has "
+            "the transform to the first"
+        )
+    unsure = [one for one in answer.matches if one.validation.status == "ambiguous"]
+    if unsure:
+        return (
+            f"the best fit is not unique: {unsure[0].validation.reason} (frame "
+            f"{unsure[0].frame_id})"
+        )
+    if not counts.passed:
+        return "the map has no frame to compare" + (
+            ": no frame passes the filter" if counts.map else ""
+        )
+    if answer.deadline_reached:
+        return (
+            f"the deadline passed before a match was accepted: {counts.validated} of "
+            f"{len(answer.matches)} candidates were validated"
+        )
+    first = next((one for one in answer.matches if one.validation.status == "rejected"), None)
+    why = "" if first is None else f"; the nearest: {first.validation.reason}"
+    return f"none of {counts.validated} candidates was accepted{why}"

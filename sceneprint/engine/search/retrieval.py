@@ -1,0 +1,361 @@
+"""A query to R, one ranking over all maps that are asked: Sec. III-C.
+
+signature, Places  --search_maps-->  Searched
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.engine.ingest.frame_decoder import read_upload
+from sceneprint.engine.search.index_view import MapView
+from sceneprint.engine.search.pgvector_index import Stored, search_stored
+from sceneprint.engine.upkeep.repair import resign_frames
+from sceneprint.errors import (
+    DamagedBlob,
+    DamagedSignature,
+    InvalidRequest,
+    UnknownFrame,
+    UnreadableGeometry,
+)
+from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.geometry.retrieval.distance import Ranking, ranking_size, similarity
+from sceneprint.index import SearchHits
+from sceneprint.index.mapped_files import Keys
+from sceneprint.models import Model
+from sceneprint.pipeline import Signer, prepare, sign
+from sceneprint.store import Store
+from sceneprint.store.frame_queries import QueryOrigin, passing
+from sceneprint.store.frames import find_frame, refers_to
+from sceneprint.store.maps import find_map
+from sceneprint.store.signatures import geometry_blobs, stored_vector
+from sceneprint.store.tables import MapRow
+from sceneprint.types import Bytes, Floats, Geometry
+from sceneprint_client.api import Filter, FrameMeta, Query
+from sceneprint_client.api.frames import Kind
+
+# A query made ready: its signature and, for validation, its geometry.
+#
+# upload | frame of the map  --prepare_upload | prepare_stored-->  PreparedQuery
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedQuery:
+    """A query made ready.
+
+    Parameters
+    ----------
+    model_id : of the model that signed it
+    vector : (D,) its signature
+    geometry : its artifact; None where validation was not asked for
+    taken : by whom, in which run and when
+    frame : its number and id, if it is one of the map: it does not find itself
+    prepare_ms : what making it ready took
+    home : the map that frame is in
+    base : what the robot's base is called, and T_base_query (4, 4); None where it is not known
+    artifact : `geometry` as bytes
+    kind : of the frame
+    """
+
+    model_id: str
+    vector: Bytes
+    geometry: Geometry | None
+    taken: QueryOrigin
+    frame: tuple[int, str] | None
+    prepare_ms: float
+    home: MapRow | None = None
+    base: tuple[str, Floats] | None = None
+    artifact: bytes | None = None
+    kind: Kind = "depth"
+
+
+def prepare_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -> PreparedQuery:
+    """Make an uploaded frame ready.
+
+    Raises
+    ------
+    FrameError : see `read_upload`; UselessFrame where nothing in it can be signed; InvalidPose
+        where T_base_sensor is none.
+    InvalidRequest : the filter asks for distance from its session, and `meta` lacks it or a time;
+        or see `read_upload`.
+    """
+    start = time.perf_counter()
+    at = None if meta.captured_at is None else meta.captured_at.timestamp()
+    taken = check_taken(QueryOrigin(meta.robot, meta.session, at), query)
+    read = read_upload(data, meta)
+    kind, base = read.kind, read.base
+    if "validate" not in query.stages:
+        vector = sign(read.frame, signer).vector
+        return PreparedQuery(
+            signer.model.id, vector, None, taken, None, _since(start), base=base, kind=kind
+        )
+    signature, seen = prepare(read.frame, signer)
+    # as it would be read back: the same answer as when the frame is in the map
+    artifact = write_geometry(seen)
+    return PreparedQuery(
+        signature.model_id, signature.vector, read_geometry(artifact), taken, None, _since(start),
+        base=base, artifact=artifact, kind=kind,
+    )  # fmt: skip
+
+
+def prepare_stored(store: Store, map_name: str, frame_id: str, query: Query) -> PreparedQuery:
+    """Make a frame of the map ready.
+
+    Raises
+    ------
+    UnknownMap, UnknownFrame : there is none.
+    InvalidRequest : the frame has no signature, or not yet; or the filter asks for distance from
+        its session, and it has none, or no time.
+    DamagedSignature, DamagedBlob, UnreadableGeometry : what was made of it is damaged; it is made
+        again.
+    """
+    start = time.perf_counter()
+    try:
+        with store.queried.read() as connection:
+            row = find_map(connection, map_name)
+            frame = find_frame(connection, row, frame_id)
+            vector = stored_vector(connection, frame.number, row.model_id)
+            blobs = geometry_blobs(connection, [frame.number], row.model_id)
+    except DamagedSignature:
+        resign_frames(store, row, [frame.number], row.model_id)
+        raise
+    if vector is None:
+        raise InvalidRequest(
+            f"Frame {frame_id} is {frame.state}: {frame.state.sentence} Only an indexed frame "
+            "can be a query.",
+            (("frame_id", f"is {frame.state}"),),
+        )
+    taken = check_taken(QueryOrigin(frame.robot, frame.session, frame.captured_at), query)
+    geometry = artifact = base = None
+    if frame.base is not None:
+        base = str(frame.base_frame), np.array(frame.base)
+    if "validate" in query.stages:
+        try:
+            artifact = store.blobs.get(blobs[frame.number])
+            geometry = read_geometry(artifact)
+        except (DamagedBlob, UnreadableGeometry):
+            with store.queried.read() as connection:
+                if not refers_to(connection, blobs[frame.number]):
+                    raise UnknownFrame(
+                        f"Frame {frame_id} of map {map_name!r} was deleted during the query."
+                    ) from None
+            resign_frames(store, row, [frame.number], row.model_id)
+            raise
+    own = (frame.number, frame.id)
+    asked = np.frombuffer(vector, np.uint8)
+    return PreparedQuery(
+        row.model_id, asked, geometry, taken, own, _since(start), row, base, artifact, frame.kind
+    )
+
+
+def check_taken(taken: QueryOrigin, query: Query) -> QueryOrigin:
+    """What is known of a query, if it is enough for the filter."""
+    if query.filter is not None and query.filter.not_within_s is not None:
+        missing = [name for name in ("session", "captured_at") if getattr(taken, name) is None]
+        if missing:
+            raise InvalidRequest(
+                "The filter has `not_within_s`, but the query frame has no "
+                f"{' and no '.join(missing)}. Send the frame with both in its meta, or leave "
+                "`not_within_s` out.",
+                tuple((name, "needed by filter.not_within_s") for name in missing),
+            )
+    return taken
+
+
+def _since(start: float) -> float:
+    return 1e3 * (time.perf_counter() - start)
+
+
+# When a query must be answered, and whether there is time for one more candidate.
+
+#: Seconds that the first candidate is expected to take; the next ones, as long as the longest.
+FIRST_S = 0.03
+
+
+class Deadline:
+    """A point in time after which nothing more is begun.
+
+    Parameters
+    ----------
+    milliseconds : after `since`; None for no deadline
+    since : when the request came, by `time.perf_counter`; default: now
+    """
+
+    def __init__(self, milliseconds: int | None, since: float | None = None) -> None:
+        since = time.perf_counter() if since is None else since
+        self._ends = None if milliseconds is None else since + milliseconds / 1e3
+        self._longest, self._began = FIRST_S, 0.0
+        self.reached: bool | None = None if milliseconds is None else False
+
+    def allows(self) -> bool:
+        """Whether one more candidate would likely be over in time; ask before each."""
+        if self._ends is None:
+            return True
+        now = time.perf_counter()
+        if self._began:
+            self._longest = max(self._longest, now - self._began)
+        self._began = now
+        self.reached = now + self._longest > self._ends
+        return not self.reached
+
+
+@dataclass(frozen=True, eq=False)
+class SearchedMap:
+    """A map that is asked: its row, and its frames as of one revision."""
+
+    row: MapRow
+    view: MapView
+
+
+@dataclass(frozen=True, eq=False)
+class MapSearch:
+    """What is searched of one map.
+
+    Parameters
+    ----------
+    place : the map
+    dead : frames that may not be found: deleted ones, and the query itself
+    among : frames that pass the filter; None without one
+    size : frames that can be found
+    """
+
+    place: SearchedMap
+    dead: frozenset[int]
+    among: Keys | None
+    size: int
+
+    @property
+    def passed(self) -> int:
+        """How many pass the filter; all without one."""
+        return self.size if self.among is None else len(self.among)
+
+
+@dataclass(frozen=True, eq=False)
+class Searched:
+    """R, and where it is from.
+
+    Parameters
+    ----------
+    parts : of each map
+    hits : of each map, in the same order
+    ranking : R, of frame numbers
+    owners : (r,) which part each of R is of
+    size : that R was to have
+    """
+
+    parts: tuple[MapSearch, ...]
+    hits: tuple[SearchHits, ...]
+    ranking: Ranking
+    owners: NDArray[np.intp]
+    size: int
+
+    @property
+    def exact(self) -> bool:
+        """Every frame that passes was compared."""
+        return all(one.exact for one in self.hits)
+
+    def signatures(self) -> Bytes:
+        """Stored signatures (r, D) of R."""
+        keys = self.ranking.indices.astype(np.int64)
+        first = self.parts[0].place.view
+        if len(self.parts) == 1 or not len(keys):
+            return first.signatures(keys)
+        order = np.argsort(self.owners, kind="stable")
+        edges = np.searchsorted(self.owners[order], np.arange(len(self.parts) + 1))
+        found: list[Bytes] = [
+            self.parts[i].place.view.signatures(keys[order[a:b]])
+            for i, (a, b) in enumerate(pairwise(edges.tolist()))
+            if a < b
+        ]
+        rows = np.empty((len(keys), found[0].shape[1]), np.uint8)
+        rows[order] = np.concatenate(found)
+        return rows
+
+
+def search_maps(
+    store: Store, places: Sequence[SearchedMap], asked: PreparedQuery, query: Query, model: Model
+) -> Searched:
+    """The frames of all maps that are nearest to a query.
+
+    Parameters
+    ----------
+    store : see Store
+    places : the maps, one or more of one model
+    asked, query : what is sought, and how
+    model : of all of them
+    """
+    parts = tuple(_part(store, place, asked, query) for place in places)
+    size = ranking_size(sum(part.passed for part in parts))
+    hits = _searched(asked.vector, parts, size, query.exact)
+    keys = np.concatenate([one.keys for one in hits])
+    found = np.concatenate([one.distances for one in hits])
+    owners = np.repeat(np.arange(len(parts)), [len(one) for one in hits])
+    first = np.lexsort((keys, found))[:size]  # equal distances in the order in which frames came
+    distances = found[first]
+    shares = similarity(distances, model.unrelated_distance)
+    return Searched(parts, hits, Ranking(keys[first].astype(np.intp), distances, shares),
+                    owners[first], size)  # fmt: skip
+
+
+def rank_among_all(searched: Searched, asked: PreparedQuery, number: int, distance: int) -> int:
+    """The rank, from 1, of a distance among all frames that pass, each compared exactly."""
+    return 1 + sum(
+        part.place.view.nearer(asked.vector, number, distance, dead=part.dead, among=part.among)
+        for part in searched.parts
+    )
+
+
+def _searched(
+    vector: Bytes, parts: Sequence[MapSearch], size: int, exact: bool
+) -> tuple[SearchHits, ...]:
+    """Hits of each part: of those in the database by one statement for all."""
+    stored = [(part.place.view, part) for part in parts if isinstance(part.place.view, Stored)]
+    among = [part.among for _, part in stored if part.among is not None]
+    found = iter(
+        search_stored(
+            [view for view, _ in stored], vector, size,
+            dead=frozenset().union(*(part.dead for _, part in stored)),
+            among=among if among else None, exact=exact,
+        )
+        if stored else ()
+    )  # fmt: skip
+    return tuple(
+        _count_searched(next(found), part)
+        if isinstance(part.place.view, Stored)
+        else part.place.view.search(vector, size, dead=part.dead, among=part.among, exact=exact)
+        for part in parts
+    )
+
+
+def _count_searched(hits: SearchHits, part: MapSearch) -> SearchHits:
+    """The database counts the query itself, where it is of the map."""
+    return replace(hits, compared=min(hits.compared, part.passed))
+
+
+def _part(store: Store, place: SearchedMap, asked: PreparedQuery, query: Query) -> MapSearch:
+    view, own = place.view, asked.frame
+    dead = view.dead if own is None else view.dead | {own[0]}
+    itself = asked.home is not None and asked.home.number == place.row.number
+    size = max(view.size - itself, 0)  # it may just have been deleted
+    among = None
+    if query.filter is not None:
+        among = _among(store, place, dead, asked, query.filter)
+    return MapSearch(place, dead, among, size)
+
+
+def _among(
+    store: Store, place: SearchedMap, dead: frozenset[int], asked: PreparedQuery, wanted: Filter
+) -> Keys:
+    """Frames of a view that pass a filter; the database may be newer or older than the view."""
+    view = place.view
+    with store.queried.read() as connection:
+        numbers = passing(connection, place.row.number, wanted, asked.taken)
+    if isinstance(view, Stored):  # what passes is found, or was deleted since
+        return numbers[~np.isin(numbers, list(dead))]
+    return numbers[view.has(numbers) & ~np.isin(numbers, list(dead))]

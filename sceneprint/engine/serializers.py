@@ -1,0 +1,269 @@
+"""Rows of the store as JSON tells them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection
+
+from sceneprint.errors import InvalidPose, naming
+from sceneprint.formats.dataset import rigid_transform
+from sceneprint.geometry.pose.rigid import quaternion_of, rotation_of
+from sceneprint.store.deletion import DAY_S, count_old
+from sceneprint.store.maps import count_frames, model_names
+from sceneprint.store.model_switch import switch_progress
+from sceneprint.store.queue import jobs_of
+from sceneprint.store.tables import FrameRow, JobRow, MapRow
+from sceneprint.types import Floats
+from sceneprint_client.api import (
+    CameraIntrinsics,
+    Frame,
+    FrameName,
+    Job,
+    Map,
+    Progress,
+    Quaternion,
+    Reencoding,
+    Transform,
+    Vector,
+)
+from sceneprint_client.api.frames import GivenTransform, Kind
+
+# Entity tags: short texts that change when what they stand for does.
+
+#: Columns of a frame that can be edited.
+EDITABLE = (
+    "robot", "session", "captured_at", "tags", "pose_parent", "pose", "base_frame", "base",
+)  # fmt: skip
+
+
+def tag_of(*parts: object) -> str:
+    """32 digits of what can be told as JSON: the same for the same parts."""
+    told = json.dumps(parts, sort_keys=True)
+    return hashlib.sha256(told.encode()).hexdigest()[:32]
+
+
+def frame_tag(frame: FrameRow) -> str:
+    """Stands for all of a frame that can be edited."""
+    return tag_of("frame", [getattr(frame, name) for name in EDITABLE])
+
+
+def map_tag(row: MapRow) -> str:
+    """Stands for all of a map that can be edited."""
+    limits = row.quota_frames, row.quota_bytes, row.retention_days
+    # as it was where there are none: a tag that somebody holds outlives the upgrade
+    return tag_of("map", row.name, row.title, *(() if limits == (None,) * 3 else limits))
+
+
+# Transforms and poses between matrices and JSON.
+
+#: How far from 1 the length of a given quaternion may be.
+_TOLERANCE = 1e-2
+
+
+def transform(T: Floats, parent_frame: str, child_frame: str) -> Transform:
+    """T_parent_child (4, 4) as JSON tells it."""
+    x, y, z, w = quaternion_of(T[:3, :3]).tolist()
+    return Transform(
+        parent_frame=parent_frame,
+        child_frame=child_frame,
+        translation=Vector(x=T[0, 3], y=T[1, 3], z=T[2, 3]),
+        rotation=Quaternion(x=x, y=y, z=z, w=w),
+        matrix=T.tolist(),
+    )
+
+
+def pose_matrix(pose: GivenTransform, what: str = "") -> Floats:
+    """T_parent_sensor (4, 4) of a pose or another transform given either way.
+
+    Parameters
+    ----------
+    pose : see GivenTransform
+    what : to begin an error with, where it is no pose
+
+    Raises
+    ------
+    InvalidPose : not a rigid transform, or a quaternion that is not of unit length.
+    """
+    with naming(what):
+        return _matrix(pose)
+
+
+def _matrix(pose: GivenTransform) -> Floats:
+    if pose.matrix is not None:
+        return rigid_transform(np.array(pose.matrix))
+    t, r = pose.translation, pose.rotation
+    if t is None or r is None:  # the schema asks for both where there is no matrix
+        raise InvalidPose("The pose is incomplete. Give translation and rotation, or matrix.")
+    q = np.array([r.x, r.y, r.z, r.w])
+    length = float(np.linalg.norm(q))
+    if not abs(length - 1.0) <= _TOLERANCE:
+        raise InvalidPose(
+            f"The quaternion of the pose has length {length:.3g}, not 1. Give a unit quaternion "
+            "x, y, z, w."
+        )
+    T = np.eye(4)
+    T[:3, :3] = rotation_of(q / length)
+    T[:3, 3] = (t.x, t.y, t.z)
+    return rigid_transform(T)
+
+
+def when(seconds: float | None) -> Any:
+    """Seconds since 1970 as a time in UTC."""
+    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
+
+
+def model_label(name: str, model_id: str) -> str:
+    """As `Model.label`."""
+    return f"{name}-{model_id[:12]}"
+
+
+def sensor_frame(frame_id: str, kind: Kind) -> str:
+    """What the coordinates of a frame's sensor are called in transforms.
+
+    The optical ones of a camera; a cloud keeps the axes that its sensor has.
+    """
+    return f"{frame_id}.optical" if kind == "depth" else f"{frame_id}.sensor"
+
+
+def sensor_of(frame: FrameRow) -> str:
+    """What the coordinates of a stored frame's sensor are called in transforms."""
+    return sensor_frame(frame.id, frame.kind)
+
+
+def query_sensor(frame: FrameName | None, kind: Kind, maps: Sequence[str]) -> str:
+    """What the coordinates of a query's sensor are called.
+
+    By its id where it is a stored frame, asked of its own map alone: another map may have a frame
+    of the same id, and a transform leads from one frame to another.
+
+    Parameters
+    ----------
+    frame : that was asked for; None for an upload
+    kind : of it
+    maps : that were asked
+    """
+    alone = frame is not None and list(maps) == [frame.map]
+    return sensor_frame(frame.frame_id if frame is not None and alone else "query", kind)
+
+
+def map_record(connection: Connection, row: MapRow) -> Map:
+    """A map."""
+    names, coming = model_names(connection), None
+    if row.next_model_id is not None:
+        label = model_label(names[row.next_model_id], row.next_model_id)
+        now = switch_progress(connection, row)
+        coming = Reencoding(model=label, model_id=row.next_model_id, **asdict(now))
+    return Map(
+        name=row.name,
+        title=row.title,
+        model=model_label(names[row.model_id], row.model_id),
+        model_id=row.model_id,
+        reencoding=coming,
+        created_at=when(row.created_at),
+        revision=row.revision,
+        frames=count_frames(connection, row.number),
+        used_frames=row.used_frames,
+        used_bytes=row.used_bytes,
+        quota_frames=row.quota_frames,
+        quota_bytes=row.quota_bytes,
+        retention_days=row.retention_days,
+        overdue=None if row.retention_days is None else _overdue(connection, row),
+        etag=map_tag(row),
+    )
+
+
+def _overdue(connection: Connection, row: MapRow) -> int:
+    """Frames that a map has kept for longer than it should."""
+    before = time.time() - DAY_S * (row.retention_days or 0.0)
+    return count_old(connection, row.number, before)
+
+
+def frame_records(connection: Connection, row: MapRow, found: list[FrameRow]) -> list[Frame]:
+    """Frames of one map."""
+    jobs = jobs_of(connection, [frame.number for frame in found])
+    return [_frame(row, frame, jobs[frame.number]) for frame in found]
+
+
+def job_record(
+    job: JobRow, frame_id: str | None, map_name: str | None, followed_by: str | None = None
+) -> Job:
+    """A job, and the names of what it is about."""
+    progress = None
+    if job.progress is not None:
+        progress = Progress(done=job.progress.get("done", 0), total=job.progress.get("total"))
+    return Job(
+        job_id=job.id,
+        kind=job.kind,
+        state=job.state,
+        map=map_name,
+        frame_id=frame_id,
+        priority=job.priority,
+        attempts=job.attempts,
+        created_at=when(job.created_at),
+        started_at=when(job.started_at),
+        finished_at=when(job.finished_at),
+        error=job.error,
+        traceback=job.traceback,
+        progress=progress,
+        result=job.result,
+        followed_by=followed_by,
+    )
+
+
+def _frame(row: MapRow, frame: FrameRow, job: JobRow) -> Frame:
+    pose = None
+    if frame.pose is not None and frame.pose_parent is not None:
+        pose = transform(np.array(frame.pose), frame.pose_parent, sensor_of(frame))
+    base = None
+    if frame.base is not None and frame.base_frame is not None:
+        base = transform(np.array(frame.base), frame.base_frame, sensor_of(frame))
+    return Frame(
+        frame_id=frame.id,
+        map=row.name,
+        state=frame.state,
+        reason=frame.reason,
+        job_id=job.id,
+        content_id=frame.content_id,
+        bytes=frame.bytes,
+        **_sensor_record(frame),
+        robot=frame.robot,
+        session=frame.session,
+        captured_at=when(frame.captured_at),
+        received_at=when(frame.received_at),
+        indexed_at=when(frame.indexed_at),
+        pose=pose,
+        base_frame=frame.base_frame,
+        T_base_sensor=base,
+        tags=frame.tags,
+        etag=frame_tag(frame),
+    )
+
+
+def _sensor_record(frame: FrameRow) -> dict[str, Any]:
+    """How the samples or the points of a frame are read."""
+    if frame.cloud is None:
+        return {
+            "kind": "depth",
+            "intrinsics": CameraIntrinsics.model_validate(frame.intrinsics),
+            "depth_scale": frame.depth_scale,
+            "depth_along_ray": frame.depth_along_ray,
+        }
+    at = frame.cloud["viewpoint"]
+    return {
+        "kind": "cloud",
+        "intrinsics": None,
+        "depth_scale": None,
+        "depth_along_ray": None,
+        "points": frame.cloud["points"],
+        "viewpoint": None if at is None else Vector(**dict(zip("xyz", at, strict=True))),
+        "units_per_metre": frame.cloud["units_per_metre"],
+        "note": frame.cloud["note"],
+    }

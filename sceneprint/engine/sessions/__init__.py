@@ -1,0 +1,1 @@
+"""Sessions of robots associated with each other."""

@@ -1,0 +1,312 @@
+"""A session against another, or against itself, frame by frame: a job in slices.
+
+plan --> frame, frame, ... a slice at a time --> edges --conclude--> verdicts, joins
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.engine.jobs.tasks import LongJob, SliceResult
+from sceneprint.engine.models import Signers
+from sceneprint.engine.search.index_view import MapView
+from sceneprint.engine.search.local_index import Readers
+from sceneprint.engine.search.verification import thresholds
+from sceneprint.engine.serializers import transform
+from sceneprint.engine.sessions.associations import Plan, eligible, runs_of
+from sceneprint.engine.upkeep.repair import resign_frames
+from sceneprint.errors import DamagedBlob, UnreadableGeometry
+from sceneprint.formats.artifact import read_geometry
+from sceneprint.geometry.pose.loops import (
+    LoopEdges,
+    RobotPath,
+    Verdicts,
+    run_of,
+    verdicts,
+    votes_of,
+)
+from sceneprint.geometry.pose.session_join import join
+from sceneprint.geometry.retrieval.distance import (
+    Ranking,
+    pairwise_distances,
+    ranking_size,
+    similarity,
+)
+from sceneprint.geometry.retrieval.dpp import diversify
+from sceneprint.matches import PairMatch, associate
+from sceneprint.models import Model
+from sceneprint.store import Store
+from sceneprint.store.associations import PathFrame, stops_of
+from sceneprint.store.frames import frames_of
+from sceneprint.store.maps import find_map, unknown_map
+from sceneprint.store.queue import items_of
+from sceneprint.store.signatures import geometry_blobs, stored_signatures
+from sceneprint.store.tables import MapRow
+from sceneprint.types import Floats, Geometry
+from sceneprint_client.api.sessions import Join, NewAssociation
+
+# What all edges of an association say together: which to believe, and how sessions lie.
+#
+# edges, frames with poses  --conclude-->  verdicts, joins
+
+#: What a vote of a weak edge counts beside that of a strong one.
+_WEAK = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Conclusion:
+    """What is told when an association is over.
+
+    Parameters
+    ----------
+    verdicts : one of each edge, in their order, as items
+    counts : consistent, inconsistent, unchecked
+    joins : as JSON
+    """
+
+    verdicts: list[dict[str, Any]]
+    counts: dict[str, int]
+    joins: list[dict[str, Any]]
+
+
+def finish_association(
+    found: list[dict[str, Any]], source: list[int], target: list[int], stops: dict[int, PathFrame],
+    asked: NewAssociation,
+) -> Conclusion:  # fmt: skip
+    """Check edges against each other, and let those that stand vote.
+
+    Parameters
+    ----------
+    found : items of all edges
+    source, target : numbers of the frames of both runs, in the order of time
+    stops : what is known of them; deleted ones are missing
+    asked : see NewAssociation
+    """
+    named = sorted({stop.parent for stop in stops.values() if stop.parent is not None})
+    parents = {name: i for i, name in enumerate(named)}
+    runs = _run(source, stops, parents), _run(target, stops, parents)
+    places = [{number: i for i, number in enumerate(numbers)} for numbers in (source, target)]
+    edges = LoopEdges(
+        np.array([places[0][item["from"]] for item in found], np.int64),
+        np.array([places[1][item["to"]] for item in found], np.int64),
+        np.array([item["T"] for item in found], float).reshape(-1, 4, 4),
+        np.array([1.0 if item["strength"] == "strong" else _WEAK for item in found]),
+    )
+    judged = verdicts(edges, *runs)
+    confirmed = judged.kept & (judged.loops > 0)
+    counts = {
+        "consistent": int(confirmed.sum()), "inconsistent": int((~judged.kept).sum()),
+        "unchecked": int((judged.kept & ~confirmed).sum()),
+    }  # fmt: skip
+    told = [
+        {"consistent": bool(kept) if loops or not kept else None, "loops": loops, "closed": closed}
+        for kept, loops, closed in zip(
+            judged.kept.tolist(), judged.loops.tolist(), judged.closed.tolist(), strict=True
+        )
+    ]
+    return Conclusion(told, counts, _joins(found, edges, runs, judged, stops, asked))
+
+
+def _run(numbers: list[int], stops: dict[int, PathFrame], parents: dict[str, int]) -> RobotPath:
+    poses, owners = np.full((len(numbers), 4, 4), np.nan), np.full(len(numbers), -1, np.int64)
+    for i, number in enumerate(numbers):
+        stop = stops.get(number)
+        if stop is not None and stop.pose is not None and stop.parent is not None:
+            poses[i], owners[i] = stop.pose, parents[stop.parent]
+    return run_of(poses, owners)
+
+
+def _joins(
+    found: list[dict[str, Any]], edges: LoopEdges, runs: tuple[RobotPath, RobotPath], judged:
+Verdicts,
+    stops: dict[int, PathFrame], asked: NewAssociation,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """A consensus of each two parent frames that edges lead between."""
+    between: dict[tuple[str, str], list[int]] = {}
+    for i in np.flatnonzero(judged.kept).tolist():
+        ends = [stops.get(found[i][side]) for side in ("from", "to")]
+        here, there = (None if end is None or end.pose is None else end.parent for end in ends)
+        # loop closures within one frame correct its drift, and join nothing
+        if here is not None and there is not None and (len(asked.sessions) == 2 or here != there):
+            between.setdefault((here, there), []).append(i)
+    told = []
+    for (here, there), chosen in sorted(between.items()):
+        own: NDArray[np.intp] = np.array(chosen)
+        source, target = edges.source[own], edges.target[own]
+        poses: tuple[Floats, Floats] = (runs[0].poses[source], runs[1].poses[target])
+        votes = votes_of(edges.transforms[own], *poses, source, target, edges.weights[own])
+        one = join(votes, asked.seed)
+        first, second = (stops[found[chosen[0]][side]] for side in ("from", "to"))
+        told.append(
+            Join(
+                from_session=first.session or "", to_session=second.session or "",
+                from_robot=first.robot, to_robot=second.robot, from_parent=here, to_parent=there,
+                transform=None if one.T is None else transform(one.T, there, here),
+                strength=one.strength, support=one.support, votes=len(own), rival=one.rival,
+                spread_m=None if one.T is None else one.spread_m,
+                spread_deg=None if one.T is None else math.degrees(one.spread_rad),
+                reason=one.reason,
+            ).model_dump(mode="json")
+        )  # fmt: skip
+    return told
+
+
+#: Artifacts that a slice keeps opened, of some 600 kB each.
+_OPENED = 64
+
+
+class Associating:
+    """The handler of the jobs.
+
+    Parameters
+    ----------
+    store, signers, readers : of the engine
+    """
+
+    def __init__(self, store: Store, signers: Signers, readers: Readers) -> None:
+        self._store, self._signers, self._readers = store, signers, readers
+
+    def __call__(self, task: LongJob, until: float) -> SliceResult:
+        """A slice: at least one frame, or the conclusion."""
+        asked = NewAssociation.model_validate(task.data)
+        progress = dict(task.progress) or self._begin(task, asked)
+        plan = Plan(progress["source"], progress["target"], progress["taken"])
+        items: list[dict[str, Any]] = []
+        opened = _Opened(self._store)
+        while progress["done"] < len(plan.source):
+            edges, tried = self._frame(task, asked, plan, progress["done"], opened)
+            items += edges
+            progress["validated"] += tried or 0
+            progress["skipped"] += tried is None
+            progress["done"] += 1
+            if time.monotonic() >= until:
+                return SliceResult(False, progress, items)
+        with self._store.database.read() as connection:
+            found = items_of(connection, task.claim.job.number) + items
+            stops = stops_of(connection, {*plan.source, *plan.target})
+        end = finish_association(found, plan.source, plan.target, stops, asked)
+        result = {
+            "frames": len(plan.source), "skipped": progress["skipped"],
+            "validated": progress["validated"], "edges": len(found), **end.counts,
+            "joins": end.joins,
+        }  # fmt: skip
+        return SliceResult(
+            True, progress, items + end.verdicts, result=result, event="association.found"
+        )
+
+    def _begin(self, task: LongJob, asked: NewAssociation) -> dict[str, Any]:
+        runs = runs_of(self._store, task.of_map, asked)
+        source, target = runs[0], runs[-1]
+        return {
+            "done": 0, "total": len(source), "validated": 0, "skipped": 0,
+            "source": [stop.number for stop in source],
+            "target": [stop.number for stop in target],
+            "taken": [stop.captured_at for stop in source],
+        }  # fmt: skip
+
+    def _frame(
+        self, task: LongJob, asked: NewAssociation, plan: Plan, place: int, opened: _Opened
+    ) -> tuple[list[dict[str, Any]], int | None]:
+        """Edges of one frame, and how many candidates were tried; None where it is gone."""
+        number = plan.source[place]
+        among = eligible(asked, plan, place)
+        if not len(among):
+            return [], 0
+        row, model, view = self._view(task.of_map)
+        with self._store.database.read() as connection:
+            vectors = stored_signatures(connection, [number], row.model_id)
+            alive = number in frames_of(connection, [number])
+        geometry = opened.geometry(row, number)
+        if number not in vectors or not alive or geometry is None:
+            if alive:  # damaged, and made again behind this
+                resign_frames(self._store, row, [number], row.model_id)
+            return [], None
+        among = among[view.has(among)]
+        hits = view.search(
+            np.frombuffer(vectors[number], np.uint8), ranking_size(len(among)), dead=view.dead,
+            among=among, exact=True,
+        )  # fmt: skip
+        if not len(hits):
+            return [], 0
+        shares = similarity(hits.distances, model.unrelated_distance)
+        ranking = Ranking(hits.keys.astype(np.intp), hits.distances, shares)
+        distances = pairwise_distances(view.signatures(hits.keys), view.metric)
+        chosen = diversify(ranking.distances, distances, asked.candidates).indices.tolist()
+        matches = associate(
+            geometry, ranking, chosen, lambda key: opened.geometry(row, key), asked.k,
+            asked.seed, *thresholds(asked.validation, model.parameters.validation),
+        )  # fmt: skip
+        order = {number: i for i, number in enumerate(ranking.indices.tolist())}
+        accepted = sorted(
+            (one for one in matches if one.validation.status == "accepted"),
+            key=lambda one: order[one.index],
+        )
+        # a frame that is deleted from here on is left out where edges are told
+        edges = [
+            _item(number, one) for one in accepted if one.validation.overlap >= asked.min_overlap
+        ]
+        return edges, len(matches)
+
+    def _view(self, of: MapRow) -> tuple[MapRow, Model, MapView]:
+        """The map as it is now: frames of it may be deleted, and its model may change.
+
+        Raises
+        ------
+        UnknownMap : it was deleted, whether or not another has its name.
+        """
+        row = of
+        while True:  # its signer opened while no connection is held
+            model = self._signers(row.model_id).model
+            with self._store.database.read() as connection:
+                row = find_map(connection, of.name)
+                if row.number != of.number:
+                    raise unknown_map(of.name)
+                if row.model_id == model.id:
+                    views = self._readers.views(connection, self._store.database, [row])
+                    return row, model, views[0]
+
+
+class _Opened:
+    """Artifacts that were opened lately: frames near each other have the same candidates."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._held: OrderedDict[tuple[int, str], Geometry] = OrderedDict()
+
+    def geometry(self, row: MapRow, number: int) -> Geometry | None:
+        """The artifact of a frame; None where it is gone or damaged."""
+        key = (number, row.model_id)
+        if key not in self._held:
+            with self._store.database.read() as connection:
+                blob = geometry_blobs(connection, [number], row.model_id).get(number)
+            if blob is None:
+                return None
+            try:
+                self._held[key] = read_geometry(self._store.blobs.get(blob))
+            except (DamagedBlob, UnreadableGeometry):  # one frame must not cost the others
+                resign_frames(self._store, row, [number], row.model_id)
+                return None
+        self._held.move_to_end(key)
+        while len(self._held) > _OPENED:
+            self._held.popitem(last=False)
+        return self._held[key]
+
+
+def _item(number: int, match: PairMatch) -> dict[str, Any]:
+    """An edge as it is kept."""
+    v = match.validation
+    T = np.eye(4) if v.T_match_query is None else v.T_match_query  # an accepted one has one
+    return {
+        "from": number, "to": match.index, "T": T.ravel().tolist(),
+        "covariance": None if v.covariance is None else v.covariance.ravel().tolist(),
+        "overlap": v.overlap, "residual_m": v.residual_m,
+        "residual_deg": math.degrees(v.residual_rad), "strength": v.strength,
+        "inliers": v.inliers, "ambiguity": v.ambiguity, "similarity": match.similarity,
+    }  # fmt: skip

@@ -1,0 +1,344 @@
+"""Associations of sessions: begun, looked at, told as edges and graphs, and removed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection
+
+from sceneprint.engine.jobs.tasks import Tasks
+from sceneprint.engine.maps.map_frames import opened_cursor, row_of
+from sceneprint.engine.serializers import sensor_frame, transform, when
+from sceneprint.engine.sessions.pose_graph import graph_text, pose_graph
+from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
+from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
+from sceneprint.formats.pose_graph import information_of
+from sceneprint.index.mapped_files import Keys
+from sceneprint.store import Store
+from sceneprint.store.associations import (
+    ASSOCIATE,
+    PathFrame,
+    numbers_of_session,
+    remove_job,
+    stops_of,
+)
+from sceneprint.store.frame_queries import QueryOrigin, passing
+from sceneprint.store.maps import find_map
+from sceneprint.store.queue import find_job, items_of, list_jobs
+from sceneprint.store.tables import JobRow, MapRow
+from sceneprint_client.api import JobState, Page, Progress
+from sceneprint_client.api.base import Transform
+from sceneprint_client.api.sessions import (
+    APART,
+    Association,
+    AssociationResult,
+    Edge,
+    GraphFormat,
+    NewAssociation,
+)
+
+# Which frames an association goes through, and which each of them may be found to be near.
+
+#: Most frames of both sessions together: more are hours, and edges past what a page holds.
+MOST_FRAMES = 5000
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a job goes through, fixed when it begins.
+
+    Parameters
+    ----------
+    source, target : numbers of the frames, in the order of time; the same for loop closures
+    taken : when each of `source` was taken, seconds since 1970; None where that is not known
+    """
+
+    source: list[int]
+    target: list[int]
+    taken: list[float | None]
+
+
+def sessions_of(asked: NewAssociation) -> list[tuple[str, str | None]]:
+    """Session and robot of both sides; one for loop closures."""
+    robots: list[str | None] = [*(asked.robots or [])] or [None] * len(asked.sessions)
+    return list(zip(asked.sessions, robots, strict=True))
+
+
+def runs_of(store: Store, row: MapRow, asked: NewAssociation) -> list[list[PathFrame]]:
+    """Frames of each of the sessions that pass the filter, in the order of time.
+
+    Raises
+    ------
+    InvalidRequest : a session has no indexed frame, or frames of several robots; or there are too
+        many frames.
+    """
+    sides, found = sessions_of(asked), []
+    with store.database.read() as connection:
+        numbers = [numbers_of_session(connection, row.number, *side) for side in sides]
+        if asked.filter is not None:
+            passed = passing(connection, row.number, asked.filter, QueryOrigin(None, None, None))
+            kept = set(passed.tolist())
+            numbers = [[number for number in own if number in kept] for own in numbers]
+        if sum(map(len, numbers)) > MOST_FRAMES:
+            raise InvalidRequest(
+                f"The sessions have {sum(map(len, numbers))} frames, but an association takes at "
+                f"most {MOST_FRAMES}. Narrow them with `filter`, for example by captured_after "
+                "and captured_before.",
+                (("sessions", "too many frames"),),
+            )
+        for own in numbers:
+            stops = stops_of(connection, own)
+            found.append([stops[number] for number in own if number in stops])
+    for stops_found, (session, robot) in zip(found, sides, strict=True):
+        robots = sorted({stop.robot or "" for stop in stops_found})
+        if not robots:
+            whose = "" if robot is None else f" of robot {robot!r:.80}"
+            raise InvalidRequest(
+                f"Session {session!r:.80}{whose} has no indexed frame in map {row.name!r} that "
+                f"passes the filter. See GET /v1/maps/{row.name}/sessions.",
+                (("sessions", "no indexed frame"),),
+            )
+        if len(robots) > 1:
+            raise InvalidRequest(
+                f"Session {session!r:.80} exists for several robots: {', '.join(robots)!r:.200}. "
+                "Name one in `robots`.",
+                (("robots", "needed"),),
+            )
+    return found
+
+
+def eligible(asked: NewAssociation, plan: Plan, place: int) -> Keys:
+    """Frames that one may be found to be near, rising: of the other session, or before it."""
+    if len(asked.sessions) == 2:
+        return np.sort(np.array(plan.target, np.int64))
+    apart = asked.apart or (1 if asked.not_within_s is not None else APART)
+    before = np.array(plan.target[: max(place - apart + 1, 0)], np.int64)
+    if asked.not_within_s is not None:
+        taken = np.array(plan.taken, float)  # NaN where not known, which is before nothing
+        before = before[taken[: len(before)] < taken[place] - asked.not_within_s]
+    return np.sort(before)
+
+
+#: Edges that are read at once where few of them are wanted.
+_BLOCK = 500
+
+
+class AssociationJobs:
+    """Associations of the sessions of maps.
+
+    Parameters
+    ----------
+    store, tasks : of the engine
+    """
+
+    def __init__(self, store: Store, tasks: Tasks) -> None:
+        self._store, self._tasks = store, tasks
+
+    def begin(self, map_name: str, asked: NewAssociation) -> Association:
+        """Queue an association.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : a session without frames, of several robots, or with too many frames.
+        """
+        with self._store.database.read() as connection:
+            row = find_map(connection, map_name)
+        total = len(runs_of(self._store, row, asked)[0])
+        data = asked.model_dump(mode="json", exclude_unset=True)
+        job = self._tasks.begin(ASSOCIATE, map_name, data)
+        return Association(
+            association_id=job.job_id, map=map_name, asked=asked, state=job.state,
+            progress=Progress(done=0, total=total), result=None, error=None,
+            created_at=job.created_at, finished_at=None,
+        )  # fmt: skip
+
+    def list_all(
+        self, map_name: str, cursor: str | None = None, limit: int = 100
+    ) -> Page[Association]:
+        """Associations of a map, the newest first.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : a cursor that was not given out.
+        """
+        seals = self._store.seals
+        before = opened_cursor(seals, "job", cursor)
+        with self._store.database.read() as connection:
+            find_map(connection, map_name)
+            found = list_jobs(connection, before, limit + 1, None, ASSOCIATE, [map_name])
+        items = [_association_record(one.job, map_name) for one in found[:limit]]
+        more = seals.seal("job", found[limit - 1].job.number) if len(found) > limit else None
+        return Page[Association](items=items, next_cursor=more)
+
+    def get(self, map_name: str, job_id: str) -> Association:
+        """An association; UnknownMap or UnknownJob where there is none."""
+        with self._store.database.read() as connection:
+            return _association_record(_find(connection, map_name, job_id), map_name)
+
+    def remove(self, map_name: str, job_id: str) -> None:
+        """Forget an association with its edges; one that is not over is given up.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : there is none.
+        """
+        with self._store.database.write() as connection:
+            blobs = remove_job(connection, _find(connection, map_name, job_id))
+        collect_deleted_blobs(self._store, blobs)
+
+    def edges(
+        self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
+        min_overlap: float = 0.0, *, consistent: bool | None = None,
+    ) -> Page[Edge]:  # fmt: skip
+        """Edges in the order in which they were found, also while more are; of frames that are
+        there.
+
+        Parameters
+        ----------
+        map_name, job_id : of the association
+        cursor, limit : of the page
+        min_overlap : least overlap
+        consistent : those that loops confirm, or those that were outvoted; default: all
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : there is none.
+        InvalidRequest : a cursor that was not given out.
+        """
+        after = row_of(cursor)
+        at = 0 if after is None else after + 1
+        found: list[Edge] = []
+        with self._store.database.read() as connection:
+            job = _find(connection, map_name, job_id)
+            while len(found) <= limit:
+                block = _items(connection, job, at, _BLOCK)
+                stops = stops_of(connection, {item[s] for item in block for s in ("from", "to")})
+                found += [
+                    _edge(item, stops)
+                    for item in block
+                    if item["overlap"] >= min_overlap
+                    and consistent in (None, item["consistent"])
+                    and {item["from"], item["to"]} <= stops.keys()
+                ]
+                at += len(block)
+                if len(block) < _BLOCK:
+                    break
+        more = str(found[limit - 1].number) if len(found) > limit else None
+        return Page[Edge](items=found[:limit], next_cursor=more)
+
+    def graph(
+        self, map_name: str, job_id: str, kind: GraphFormat = "g2o", min_overlap: float = 0.0,
+        *, odometry: bool = False, consistent: bool = False,
+    ) -> str:  # fmt: skip
+        """The pose graph of an association that is over, as a file of a kind.
+
+        It has the edges of at least `min_overlap` that were not outvoted, or those alone that
+        loops confirm (`consistent`); and with `odometry` one between each two consecutive frames.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob, NotIndexed : there is none, or it did not succeed.
+        """
+        with self._store.database.read() as connection:
+            row = find_map(connection, map_name)
+            job = _find(connection, map_name, job_id)
+            if job.state != JobState.SUCCEEDED or job.result is None:
+                raise NotIndexed(
+                    f"Association {job.id} is {job.state}; its graph exists once it has "
+                    f"succeeded. See GET /v1/maps/{row.name}/associations/{job.id}."
+                )
+            items = _items(connection, job, 0, job.result["edges"])
+            progress = job.progress or {}
+            numbers = [progress["source"], progress["target"]]
+            stops = stops_of(connection, {number for run in numbers for number in run})
+        runs = [[stops[n] for n in run if n in stops] for run in _distinct(numbers)]
+        chosen = [
+            item
+            for item in items
+            if item["overlap"] >= min_overlap
+            and item["consistent"] is not False
+            and (item["consistent"] or not consistent)
+            and {item["from"], item["to"]} <= stops.keys()
+        ]
+        graph = pose_graph(runs, chosen, job.result["joins"], odometry=odometry)
+        return graph_text(graph, kind)
+
+
+def _distinct(runs: list[list[int]]) -> list[list[int]]:
+    return runs[:1] if runs[0] == runs[1] else runs
+
+
+def _find(connection: Connection, map_name: str, job_id: str) -> JobRow:
+    row = find_map(connection, map_name)
+    message = (
+        f"There is no association {job_id!r:.80} in map {row.name!r}. List them with "
+        f"GET /v1/maps/{row.name}/associations."
+    )
+    try:
+        job = find_job(connection, job_id)
+    except UnknownJob:
+        raise UnknownJob(message) from None
+    if job.kind != ASSOCIATE or job.map_number != row.number:
+        raise UnknownJob(message)
+    return job
+
+
+def _association_record(job: JobRow, map_name: str) -> Association:
+    progress = None
+    if job.progress is not None:
+        progress = Progress(done=job.progress["done"], total=job.progress["total"])
+    return Association(
+        association_id=job.id, map=map_name, asked=NewAssociation.model_validate(job.data or {}),
+        state=job.state, progress=progress,
+        result=None if job.result is None else AssociationResult.model_validate(job.result),
+        error=job.error, created_at=when(job.created_at), finished_at=when(job.finished_at),
+    )  # fmt: skip
+
+
+def _items(connection: Connection, job: JobRow, first: int, limit: int) -> list[dict[str, Any]]:
+    """Edges with their numbers, and with what was made of them when the association was over."""
+    unknown = {"consistent": None, "loops": None, "closed": None}
+    if job.result is None:
+        found = items_of(connection, job.number, first, limit)
+        return [unknown | item | {"number": first + i} for i, item in enumerate(found)]
+    # as many verdicts follow the edges
+    count = job.result["edges"]
+    limit = max(min(limit, count - first), 0)
+    found = items_of(connection, job.number, first, limit)
+    verdicts = items_of(connection, job.number, count + first, limit)
+    return [
+        item | verdict | {"number": first + i}
+        for i, (item, verdict) in enumerate(zip(found, verdicts, strict=True))
+    ]
+
+
+def _pose(stop: PathFrame) -> Transform | None:
+    if stop.pose is None or stop.parent is None:
+        return None
+    return transform(np.array(stop.pose), stop.parent, sensor_frame(stop.id, stop.kind))
+
+
+def _edge(item: dict[str, Any], stops: dict[int, PathFrame]) -> Edge:
+    here, there = stops[item["from"]], stops[item["to"]]
+    T, information = np.array(item["T"]).reshape(4, 4), None
+    if item["covariance"] is not None:
+        whole = information_of(np.array(item["covariance"]).reshape(6, 6), T)
+        information = whole.ravel().tolist()
+    same = (
+        "overlap", "residual_m", "residual_deg", "strength", "inliers", "ambiguity",
+        "similarity", "consistent", "loops", "closed",
+    )  # fmt: skip
+    return Edge(
+        from_pose=_pose(here), to_pose=_pose(there),
+        number=item["number"], from_frame=here.id, to_frame=there.id,
+        from_session=here.session, to_session=there.session,
+        from_robot=here.robot, to_robot=there.robot,
+        transform=transform(
+            T, sensor_frame(there.id, there.kind), sensor_frame(here.id, here.kind)
+        ),
+        information=information, **{name: item[name] for name in same},
+    )  # fmt: skip

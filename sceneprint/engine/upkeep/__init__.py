@@ -1,0 +1,1 @@
+"""What a worker does between jobs: publish, purge, repair."""

@@ -1,0 +1,383 @@
+"""Publishing indexes: a map whose tail has grown long gets a new generation."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection
+
+from sceneprint.engine.models import Signers
+from sceneprint.engine.search.local_index import index_folder, is_index_folder, trusted
+from sceneprint.engine.upkeep.repair import resign_frames
+from sceneprint.errors import BusyIndex, InvalidRequest, SceneprintError, UnknownMap
+from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.index import Generation, clear, manifests, newest, newest_number, publish, scrub
+from sceneprint.store import Store
+from sceneprint.store.events import anchor_of
+from sceneprint.store.maps import find_map, list_maps
+from sceneprint.store.model_switch import is_complete
+from sceneprint.store.postgres.connection import allow
+from sceneprint.store.signatures import changes_since, count_gone, count_indexed, deleted_since
+from sceneprint.store.tables import MapRow
+from sceneprint.types import Bytes
+
+# Reading the indexes of a machine again, a little at a time, and discarding what is damaged.
+
+#: Seconds of reading in one step: frames wait meanwhile.
+STEP_S = 0.25
+#: Its date is when the last round was begun, by whichever worker.
+_STAMP = ".scrubbed"
+
+
+class Scrubber:
+    """One round of all indexes after another, begun by one worker of the machine at a time.
+
+    Parameters
+    ----------
+    indexes : folder of all indexes
+    pause_s : seconds from the beginning of one round to that of the next
+    """
+
+    def __init__(self, indexes: Path, pause_s: float) -> None:
+        self._indexes, self._pause_s = indexes, pause_s
+        self._round: Iterator[Path | None] | None = None
+        self._looked = -pause_s
+
+    def step(self, folders: Sequence[Path]) -> Path | None:
+        """Go on for a moment; begin a round where it is time.
+
+        Parameters
+        ----------
+        folders : of the indexes that there are
+
+        Returns
+        -------
+        the folder of a file that was damaged and has been removed: its index must be made anew
+        """
+        if self._round is None:
+            if not self._is_time():
+                return None
+            self._round = _all(folders)
+        until = time.monotonic() + STEP_S
+        while time.monotonic() < until:
+            try:
+                damaged = next(self._round)
+            except StopIteration:
+                self._round = None
+                return None
+            if damaged is not None:
+                log.error("damaged index file removed", extra={"path": str(damaged)})
+                damaged.unlink(missing_ok=True)  # what names it is passed over from now on
+                return damaged.parent
+        return None
+
+    def _is_time(self) -> bool:
+        if time.monotonic() - self._looked < min(self._pause_s, 60):
+            return False
+        self._looked = time.monotonic()
+        stamp = self._indexes / _STAMP
+        try:
+            if time.time() - stamp.stat().st_mtime < self._pause_s:
+                return False
+        except OSError:
+            pass  # never yet
+        try:
+            self._indexes.mkdir(parents=True, exist_ok=True)
+            stamp.touch()
+        except OSError:
+            return False  # a cache that cannot be written cannot be healed either
+        return True
+
+
+def _all(folders: Sequence[Path]) -> Iterator[Path | None]:
+    for folder in folders:
+        yield from scrub(folder)
+
+
+log = logging.getLogger(__name__)
+
+#: A map is published when so large a share of it is new, or deleted: to publish writes all of it,
+#: so that what is written in all stays proportional to the map.
+SHARE = 1 / 16
+#: In the folder of an index: read from its times, when it was purged, and when it may be again.
+_REST = ".rest"
+
+
+class Upkeep:
+    """Keeps the indexes of one machine near the database.
+
+    Parameters
+    ----------
+    store, signers : see there
+    indexes : folder of all indexes
+    tail_frames : frames that a generation may lack, and deleted ones that it may hold; of a large
+        map SHARE of its frames
+    scrub_s : seconds after which all files are read again, to see that they are sound
+    """
+
+    def __init__(
+        self, store: Store, signers: Signers, indexes: Path, tail_frames: int, scrub_s: float
+    ) -> None:
+        self._store, self._signers = store, signers
+        self._indexes, self._tail_frames = indexes, tail_frames
+        # map and model: number of their index, revision, frames
+        self._published: dict[tuple[int, str], tuple[int, int, int]] = {}
+        self._metrics: dict[str, Metric | None] = {}
+        self._scrubber = Scrubber(indexes, scrub_s)
+
+    def run(self) -> int:
+        """Publish what is due, and verify a little; returns how many generations were published.
+
+        What goes wrong with one map's index is logged, and costs neither the others nor any
+        frame: queries read from the database what no index holds.
+        """
+        with self._store.database.read() as connection:
+            listed = list_maps(connection)
+        rows = [row for row in listed if self._metric(row.model_id) == "l2"]
+        with self._store.database.read() as connection:
+            due = [row for row in rows if self._due(connection, row)]
+        published = sum(self._tried(row) for row in due)
+        self._clean(listed)
+        damaged = self._scrubber.step([index_folder(self._indexes, row) for row in rows])
+        for row in rows:
+            if index_folder(self._indexes, row) == damaged:
+                published += self._tried(row, anyway=True)
+        return published
+
+    def rebuild(self, row: MapRow) -> Generation | None:
+        """Publish the index of a map from nothing; None where another process is building it.
+
+        Raises
+        ------
+        UnknownMap : the map is gone.
+        InvalidRequest : there is no indexed frame in it, or its model's signatures are psi itself.
+        OSError : it cannot be written; what was there stays.
+        """
+        if self._signers(row.model_id).model.metric != "l2":
+            raise InvalidRequest(
+                f"Map {row.name!r} has no index to rebuild: its model stores full Fisher "
+                "vectors, and queries compare all of them. If the map is too large for that, "
+                "switch its model with `sceneprint reencode`."
+            )
+        return self._publish(row, anyway=True, anew=True)
+
+    def ahead(self, row: MapRow) -> Generation | None:
+        """Publish the index of the model that a map is about to switch to, where that is due.
+
+        Where it cannot be written, that is logged, and the map has to do without.
+
+        Returns
+        -------
+        the newest generation of that model, if there is any; none of a model that has no index
+
+        Raises
+        ------
+        UnknownMap : the map is gone.
+        BusyIndex : another process is building it.
+        """
+        coming = _coming(row)
+        if self._signers(coming.model_id).model.metric != "l2":
+            return None
+        try:
+            if self._publish(coming) is None:
+                with self._store.database.read() as connection:
+                    if self._due(connection, coming):
+                        raise BusyIndex(
+                            f"Another process is building the index of map {row.name!r} for the "
+                            "model that it is switching to. Wait until the switch is done."
+                        )
+            length = self._signers(coming.model_id).model.signature_bytes
+            return newest(index_folder(self._indexes, coming), coming.model_id, length)
+        except (OSError, ValueError) as error:
+            log.error("index publication failed", extra={"map": row.name, "error": str(error)})
+            return None
+
+    def _tried(self, row: MapRow, *, anyway: bool = False) -> bool:
+        try:
+            return self._publish(row, anyway=anyway) is not None
+        except UnknownMap:
+            return False  # deleted in the meantime
+        except (OSError, SceneprintError, ValueError) as error:
+            log.error("index publication failed", extra={"map": row.name, "error": str(error)})
+            return False
+
+    def _metric(self, model_id: str) -> Metric | None:
+        """Of a model's signatures; None where another version made it, which looks after it."""
+        if model_id not in self._metrics:
+            try:
+                self._metrics[model_id] = self._signers(model_id).model.metric
+            except SceneprintError:
+                self._metrics[model_id] = None
+        return self._metrics[model_id]
+
+    def _due(self, connection: Connection, row: MapRow) -> bool:
+        number, since, frames = self._published.get((row.number, row.model_id), (None, 0, 0))
+        if newest_number(index_folder(self._indexes, row)) != number:
+            since = frames = 0  # published by another process, or removed: to be looked at
+        return self._is_long(connection, row, since, frames)
+
+    def _is_long(self, connection: Connection, row: MapRow, since: int, frames: int) -> bool:
+        """Whether a generation of that revision and size lacks, or holds too much, too many."""
+        most = max(self._tail_frames, int(SHARE * frames))
+        if row.revision - since <= most:  # spares the counting
+            return False
+        return count_indexed(connection, row.number, since) > most or (
+            count_gone(connection, row.number, since) > most
+        )
+
+    def purge(self, row: MapRow) -> bool:
+        """Leave no byte of a deleted frame in the index of a map; whether anything was done.
+
+        Raises
+        ------
+        UnknownMap : the map is gone, and with it soon its index.
+        BusyIndex : another process is building it, and may not know of the latest deletions.
+        OSError : it cannot be written; what was there stays.
+        """
+        folder = index_folder(self._indexes, row)
+        if self._metric(row.model_id) == "l1":  # version 0.1 may have left one
+            left = any(folder.glob("*.json"))
+            shutil.rmtree(folder, ignore_errors=True)
+            return left
+        listed = manifests(folder)
+        if not listed:
+            return False
+        model = self._signers(row.model_id).model
+        # before a connection waits for it
+        found = newest(folder, row.model_id, model.signature_bytes)
+        with self._store.database.read() as connection:
+            allow(connection, 0)
+            now = find_map(connection, row.name)
+            if now.number != row.number:
+                return False
+            gone = deleted_since(connection, row.number, 0 if found is None else found.revision)
+            empty = count_indexed(connection, row.number, 0) == 0
+            left = found is None or len(listed) > 1
+            older = left and count_gone(connection, row.number, 0) > 0
+        if empty or (found is None and older):
+            done = clear(folder)  # of what is damaged, nothing is read: it is made anew in time
+        elif found is None:
+            return False
+        else:
+            if (found.places.of(np.fromiter(gone, np.int64)) >= 0).any():
+                done = self._publish(row, anyway=True, clean=True) is not None
+            elif older:
+                done = clear(folder, but=found.number)
+            else:
+                return False
+        if not done:
+            raise BusyIndex(
+                f"Another process is building the index of map {row.name!r}, so it may still "
+                "contain bytes of deleted frames. Try again later."
+            )
+        return True
+
+    def rest(self, row: MapRow, seconds: float) -> None:
+        """Leave the index of a map in peace for so long, whichever process looks after it."""
+        now = time.time()
+        with suppress(OSError):  # removed meanwhile: then there is nothing to be left in peace
+            mark = index_folder(self._indexes, row) / _REST
+            mark.touch()
+            os.utime(mark, (now, now + seconds))
+
+    def is_rested(self, row: MapRow) -> bool:
+        """Whether that time is over."""
+        try:
+            found = (index_folder(self._indexes, row) / _REST).stat()
+        except OSError:
+            return True
+        return not found.st_atime <= time.time() < found.st_mtime  # nor has the clock been set back
+
+    def _publish(
+        self, row: MapRow, *, anyway: bool = False, anew: bool = False, clean: bool = False
+    ) -> Generation | None:
+        signer = self._signers(row.model_id)  # before a connection is held: it takes one itself
+        damaged: list[int] = []
+        with self._store.database.read() as connection:
+            allow(connection, 0)  # it does nothing itself, for as long as building takes
+            now = find_map(connection, row.name)
+            if row.model_id == now.next_model_id and is_complete(connection, now):
+                now = replace(now, model_id=row.model_id)  # about to be the map's own
+            if (now.number, now.model_id) != (row.number, row.model_id):
+                return None  # made anew, or signed anew, in the meantime; next time
+            folder = index_folder(self._indexes, now)
+            length = signer.model.signature_bytes
+            previous = None
+            if not anew:
+                previous = trusted(connection, now, newest(folder, now.model_id, length))
+            since = 0 if previous is None else previous.revision
+            if previous is not None:
+                self._note(now, previous)
+            if not anyway and not self._is_long(connection, now, since, len(previous or ())):
+                return None  # another worker was first
+            if previous is None and count_indexed(connection, now.number, 0) == 0:
+                if anew:
+                    raise InvalidRequest(
+                        f"Map {now.name!r} has no indexed frame, so there is nothing to build."
+                    )
+                return None
+            generation = publish(
+                folder,
+                model_id=now.model_id,
+                revision=now.revision,
+                blocks=_blocks(connection, now, since, damaged),
+                previous=previous,
+                drop=deleted_since(connection, now.number, since),
+                anchor=anchor_of(connection, now.name),
+                clean=clean,
+            )
+        resign_frames(self._store, now, damaged, now.model_id)
+        if generation is None:
+            return None
+        self._note(now, generation)
+        log.info(
+            "index published",
+            extra={"map": now.name, "generation": generation.number, "frames": len(generation)},
+        )
+        return generation
+
+    def _note(self, row: MapRow, found: Generation) -> None:
+        own = (found.number, found.revision, len(found))
+        self._published[row.number, row.model_id] = own
+
+    def _clean(self, rows: Sequence[MapRow]) -> None:
+        """Remove the indexes of maps that are no more, of models that they had, and of psi."""
+        if not self._indexes.is_dir():
+            return
+        with self._store.database.read() as connection:  # a map may have been made since
+            known = [*rows, *list_maps(connection)]
+        known += [_coming(row) for row in known if row.next_model_id is not None]
+        known = [row for row in known if self._metric(row.model_id) != "l1"]
+        kept = {index_folder(self._indexes, row).name for row in known}
+        for folder in self._indexes.iterdir():
+            if is_index_folder(folder.name) and folder.name not in kept:
+                shutil.rmtree(folder, ignore_errors=True)
+                log.info("index removed", extra={"folder": folder.name})
+
+
+def _coming(row: MapRow) -> MapRow:
+    """A map as it will be with the model that it is being signed with."""
+    if row.next_model_id is None:
+        raise ValueError(f"map {row.name} has no next model")
+    return replace(row, model_id=row.next_model_id)
+
+
+def _blocks(
+    connection: Connection, row: MapRow, since: int, damaged: list[int]
+) -> Iterator[tuple[NDArray[np.int64], Bytes]]:
+    """Keys and signatures of what was indexed after a revision; numbers of those left out."""
+    for block in changes_since(connection, row, since):
+        damaged += [one.number for one in block if one.vector is None and not one.deleted]
+        made = [(one.number, one.vector) for one in block if one.vector is not None]
+        if made:
+            rows = np.stack([np.frombuffer(vector, np.uint8) for _, vector in made])
+            yield np.array([number for number, _ in made], np.int64), rows

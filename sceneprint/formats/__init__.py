@@ -1,0 +1,1 @@
+"""Files and bytes that come from outside: images, clouds, archives, datasets."""

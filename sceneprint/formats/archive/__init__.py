@@ -1,0 +1,1 @@
+"""Frames in tar and zip files."""

@@ -1,0 +1,426 @@
+"""Members of a tar or a zip, by the standard library behind guards.
+
+file  --tar_entries, zip_entries-->  ArchiveEntry, ...  --read_entry-->  bytes
+name  --parts_of-->  parts of a relative path, or why there is none
+
+`tarfile` and `zipfile` believe the sizes that headers announce: here counts, bytes of headers and
+what becomes of a name are bounded.
+"""
+
+from __future__ import annotations
+
+import bz2
+import lzma
+import os
+import re
+import stat
+import struct
+import sys
+import tarfile
+import unicodedata
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import IO, Any, BinaryIO, Protocol, cast
+
+from sceneprint.errors import UnreadableArchive
+
+#: Members an archive may have: a hundred thousand files are a month of one robot.
+MOST_MEMBERS = 100_000
+#: Bytes of a member's name, and folders in it.
+LONGEST_NAME, DEEPEST = 1024, 16
+_LONGEST_PART = 200  #: bytes: no file system takes more than 255
+_ENCRYPTED = 0x1 | 0x40 | 0x2000  #: flags of a zip's member
+_UNIX = 3  #: system whose modes a zip's member may have
+#: What the standard library raises for malformed archives.
+_MALFORMED = (
+    tarfile.TarError, zipfile.BadZipFile, zlib.error, struct.error, EOFError, LookupError,
+    OverflowError, RuntimeError, ValueError,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ArchiveEntry:
+    """A member of an archive, not yet read.
+
+    Parameters
+    ----------
+    name : as the archive writes it; of no use as a path
+    size : of its content, bytes, as announced
+    start : where its bytes begin in a tar
+    packed : bytes that it takes there
+    open : its content, of a zip
+    trouble : why it cannot be read, or None
+    """
+
+    name: str
+    size: int = 0
+    start: int = 0
+    packed: int = 0
+    open: Callable[[], IO[bytes]] | None = None
+    trouble: str | None = None
+
+
+class OddName(Exception):
+    """A name that leads nowhere, or elsewhere; its text says why."""
+
+
+def parts_of(name: str) -> tuple[str, ...]:
+    """The parts of a member's name as a relative path.
+
+    Returns
+    -------
+    parts : none of them empty, `.`, `..`, or with a character that is not printed
+
+    Raises
+    ------
+    OddName : it is absolute, leads upwards, is too long or too deep, or cannot be printed.
+    """
+    text = name.replace("\\", "/")  # as some packers of Windows write them
+    if len(name.encode(errors="replace")) > LONGEST_NAME:
+        raise OddName(f"its name has more than {LONGEST_NAME} bytes")
+    if text.startswith("/") or re.match(r"[A-Za-z]:", text):
+        raise OddName("its name is absolute")
+    parts = tuple(part for part in text.split("/") if part not in ("", "."))
+    if ".." in parts:
+        raise OddName("its name leads out of the archive")
+    if not parts or not all(map(_is_plain, parts)):
+        raise OddName("its name is empty, or has a character that cannot be printed")
+    if len(parts) > DEEPEST:
+        raise OddName(f"it lies below more than {DEEPEST} folders")
+    if any(len(part.encode()) > _LONGEST_PART for part in parts):
+        raise OddName(f"a part of its name has more than {_LONGEST_PART} bytes")
+    return parts
+
+
+def printable_name(name: str) -> str:
+    """A member's name in a message: one line, of bounded length."""
+    text = name if name.isprintable() else ascii(name)[1:-1]
+    return text if len(text) <= 200 else f"{text[:120]}...{text[-60:]}"
+
+
+def _is_plain(part: str) -> bool:
+    # "C*": control, format, surrogate, private, unassigned
+    return not any(unicodedata.category(letter).startswith("C") for letter in part)
+
+
+#: Bytes of the headers of one member, and of a zip's directory: the standard library reads
+#: what they announce into memory.
+_MAXIMUM_HEADERS, _MAXIMUM_DIRECTORY = 65_536, 64 << 20
+_DIRECTORY_ENTRY = b"PK\x01\x02"
+BLOCK = tarfile.BLOCKSIZE
+PIECE = 1 << 20  #: bytes that are inflated at once
+_DAMAGED = "the tar is damaged after it, and the rest cannot be found"
+
+
+class _HeaderFile:
+    """A file of which the standard library may read `allowance` bytes more."""
+
+    def __init__(self, file: BinaryIO, allowance: int) -> None:
+        self.allowance = allowance
+        self.seek, self.tell, self._read = file.seek, file.tell, file.read
+
+    def read(self, size: int = -1) -> bytes:
+        data = self._read(size if 0 <= size <= self.allowance else self.allowance + 1)
+        self.allowance -= len(data)
+        if self.allowance < 0:
+            raise UnreadableArchive("The headers of the archive are too long. Pack it again.")
+        if data.count(_DIRECTORY_ENTRY) > MOST_MEMBERS:
+            raise _too_many()
+        return data
+
+    def seekable(self) -> bool:
+        return True
+
+
+def is_tar_header(block: bytes) -> bool:
+    """Whether a block is the header of a tar's member."""
+    try:
+        tarfile.TarInfo.frombuf(block[:BLOCK], "utf-8", "surrogateescape")
+    except tarfile.HeaderError:
+        return False
+    return True
+
+
+def tar_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
+    """Yield the members; folders are left out, and what is odd has `trouble`.
+
+    Where the tar is damaged or ends early, the last member says so: what comes before is sound.
+
+    Parameters
+    ----------
+    file : that can be sought in; not compressed
+
+    Raises
+    ------
+    UnreadableArchive : it has too many members, or not even the first one can be read.
+    """
+    end = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    headers, last = _HeaderFile(file, _MAXIMUM_HEADERS), ""
+    try:
+        # TarFile itself: its `open` reads on after an error
+        tar = tarfile.TarFile(fileobj=cast("BinaryIO", headers), encoding="utf-8")
+    except (UnreadableArchive, *_MALFORMED) as error:
+        raise UnreadableArchive("The tar is damaged at its start. Pack it again.") from error
+    for _ in range(2 * MOST_MEMBERS):
+        headers.allowance = _MAXIMUM_HEADERS
+        try:
+            info = tar.next()
+        except (UnreadableArchive, *_MALFORMED):
+            yield ArchiveEntry(last, trouble=_DAMAGED)
+            return
+        if info is None:  # the end, or no header that tarfile knows
+            file.seek(tar.offset)
+            if any(file.read(BLOCK)):
+                yield ArchiveEntry(last, trouble=_DAMAGED)
+            return
+        # it keeps all of them, and the headers for all that follow; typeshed does not know
+        cast("Any", tar).members.clear()
+        tar.pax_headers = {}
+        if info.size < 0:
+            yield ArchiveEntry(last, trouble=_DAMAGED)
+            return
+        last = info.name
+        cut = tar.offset > end < info.offset_data + info.size
+        if not info.isdir() and not last.endswith("/"):
+            trouble = "the archive ends within it" if cut else _tar_trouble(info)
+            yield ArchiveEntry(last, info.size, info.offset_data, info.size, trouble=trouble)
+        if cut:
+            return
+    raise _too_many()
+
+
+def _tar_trouble(info: tarfile.TarInfo) -> str | None:
+    if info.issym() or info.islnk():
+        return "it is a link"
+    if info.isdev():
+        return "it is a pipe" if info.isfifo() else "it is a device"
+    if info.issparse():
+        return "it is a file with holes"
+    return None if info.isreg() else "it is no plain file"
+
+
+def zip_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
+    """Yield the members; folders are left out, and what is odd has `trouble`.
+
+    Parameters
+    ----------
+    file : that can be sought in, and stays open
+
+    Raises
+    ------
+    UnreadableArchive : its directory is missing or damaged, or has too many entries.
+    """
+    end = file.seek(0, os.SEEK_END)
+    headers = _HeaderFile(file, _MAXIMUM_DIRECTORY)
+    try:
+        packed = _opened_zip(headers)
+    except _MALFORMED as error:
+        raise UnreadableArchive(
+            f"The zip is damaged, or ends early ({error}). Pack it again, or copy it once more."
+        ) from error
+    headers.allowance = sys.maxsize  # members are read in pieces
+    for info in packed.infolist():
+        mode = info.external_attr >> 16 if info.create_system == _UNIX else 0
+        if info.filename.endswith("/") or stat.S_ISDIR(mode):
+            continue
+        beyond = info.header_offset < 0 or info.header_offset + info.compress_size > end
+        yield ArchiveEntry(
+            info.filename, info.file_size, info.header_offset, info.compress_size,
+            partial(packed.open, info), _zip_trouble(info, mode, beyond),
+        )  # fmt: skip
+
+
+def _opened_zip(headers: _HeaderFile) -> zipfile.ZipFile:
+    file = cast("BinaryIO", headers)
+    try:  # most packers write UTF-8, whether they say so or not
+        return zipfile.ZipFile(file, metadata_encoding="utf-8")
+    except UnicodeDecodeError:
+        return zipfile.ZipFile(file)
+
+
+def _zip_trouble(info: zipfile.ZipInfo, mode: int, beyond: bool) -> str | None:
+    if info.flag_bits & _ENCRYPTED:
+        return "it is encrypted"
+    if stat.S_ISLNK(mode):
+        return "it is a link"
+    if stat.S_IFMT(mode) not in (0, stat.S_IFREG):
+        return "it is no plain file"
+    # LZMA is left out as well: its memory is what the file asks for
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        return (
+            f"it is packed by method {info.compress_type}, and only stored and deflated ones are "
+            "read"
+        )
+    return "it begins or ends beyond the archive" if beyond else None
+
+
+def read_entry(file: BinaryIO, entry: ArchiveEntry) -> bytes:
+    """The content of a member without `trouble`; of its size at most.
+
+    Raises
+    ------
+    UnreadableArchive : it is damaged, or of another size than announced.
+    """
+    if entry.open is None:
+        file.seek(entry.start)
+        return file.read(entry.size)
+    try:
+        with entry.open() as content:
+            data = b"".join(iter(partial(content.read, PIECE), b""))
+    except _MALFORMED as cause:
+        raise UnreadableArchive(f"it is damaged ({cause})") from cause
+    if len(data) != entry.size:
+        raise UnreadableArchive(
+            f"it is damaged (it has {len(data)} bytes, and announces {entry.size})"
+        )
+    return data
+
+
+def _too_many() -> UnreadableArchive:
+    return UnreadableArchive(
+        f"The archive has more than {MOST_MEMBERS} members. Pack fewer into one."
+    )
+
+
+# A compressed tar inflated while it is sent, as members are sought in afterwards, perhaps in an
+# object store. `gzip.open` and the like pull from a file, and chunks of a request are pushed: so
+# the decompressors are called here, and a bomb is refused while it bursts.
+#
+# chunks  --Inflater.pieces-->  bytes of a zip or of a plain tar
+
+#: How much more an archive may hold than it weighs, once it holds `FREE` bytes. Depth images are
+#: compressed already, and NPY files of noisy depth give a fifth.
+MOST_RATIO, FREE = 50, 64 << 20
+_MAXIMUM_STREAMS = 65_536  #: one after the other, as parallel packers write them
+_XZ_MEMORY = 192 << 20  #: as `xz -9` needs, and more
+
+_MAGIC = (b"PK\x03\x04", b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00")
+_KINDS = "a zip, or a tar (plain, .gz, .bz2 or .xz)"
+_NO_TAR = f"What is compressed here is no tar. Send {_KINDS}."
+
+
+class _Stream(Protocol):
+    @property
+    def eof(self) -> bool: ...
+
+    @property
+    def unused_data(self) -> bytes: ...
+
+    def decompress(self, data: bytes, max_length: int, /) -> bytes: ...
+
+
+def is_archive(head: bytes) -> bool:
+    """Whether a file that begins so is one of the archives read here; its content decides."""
+    return head.startswith(_MAGIC) or is_tar_header(head[:BLOCK])
+
+
+class Inflater:
+    """Takes an archive in chunks of any size, and gives it in pieces, compressed tars inflated.
+
+    Parameters
+    ----------
+    most_bytes : that it may give
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self._most = most_bytes
+        self._head: bytes | None = b""
+        self._packing: bytes | None = None  # magic of what packs the tar
+        self._stream: _Stream | None = None
+        self._streams = 0
+        self._start = b""  # of the tar
+        #: Bytes that came, and that were given.
+        self.taken, self.given = 0, 0
+
+    def pieces(self, chunk: bytes) -> Iterator[bytes]:
+        """What a chunk adds to the archive.
+
+        Raises
+        ------
+        UnreadableArchive : it is none, is damaged, or holds more than it may.
+        """
+        self.taken += len(chunk)
+        if self._head is not None:
+            self._head += chunk
+            if len(self._head) < BLOCK:
+                return
+            chunk, self._head = self._head, None
+            self._open(chunk)
+        yield from self._given(chunk)
+
+    def end(self) -> Iterator[bytes]:
+        """What is left when all has come; raises as `pieces`."""
+        if self._head is not None:  # all of it is shorter than a block: an empty zip, or nothing
+            chunk, self._head = self._head, None
+            self._open(chunk)
+            yield from self._given(chunk)
+        if self._stream is not None:
+            raise UnreadableArchive("The archive ends early. Copy or pack it again.")
+        if self._packing is not None and len(self._start) < BLOCK:
+            raise UnreadableArchive(_NO_TAR)
+
+    def _open(self, head: bytes) -> None:
+        if not is_archive(head):
+            raise UnreadableArchive(
+                f"This is no archive that is read. Send {_KINDS} of a sequence; one frame is sent "
+                "as a frame."
+            )
+        for magic in _MAGIC[1:]:
+            if head.startswith(magic):
+                self._packing, self._stream = magic, _open_entry(magic)
+
+    def _given(self, chunk: bytes) -> Iterator[bytes]:
+        for piece in [chunk] if self._packing is None else self._inflated(chunk):
+            self.given += len(piece)
+            if self.given > self._most or self.given > FREE + MOST_RATIO * self.taken:
+                raise UnreadableArchive(
+                    f"The archive holds more than {self._most} bytes, or {MOST_RATIO} times what "
+                    "it weighs, which no depth images do. Send it in parts, or packed less."
+                )
+            if self._packing is not None and len(self._start) < BLOCK:
+                self._start += piece[: BLOCK - len(self._start)]
+                if len(self._start) == BLOCK and not is_tar_header(self._start):
+                    raise UnreadableArchive(_NO_TAR)
+            yield piece
+
+    def _inflated(self, chunk: bytes) -> Iterator[bytes]:
+        data = chunk
+        while True:
+            if self._stream is None:  # between two, or behind the last one
+                data = data.lstrip(b"\0")
+                if not data:
+                    return
+                assert self._packing is not None
+                self._streams += 1
+                if self._streams > _MAXIMUM_STREAMS:
+                    raise UnreadableArchive(
+                        "The archive is packed in too many small parts. Pack it again, as one."
+                    )
+                self._stream = _open_entry(self._packing)
+            try:
+                piece = self._stream.decompress(data, PIECE)
+            except (zlib.error, OSError, EOFError, ValueError, lzma.LZMAError) as cause:
+                raise UnreadableArchive(
+                    f"The archive is damaged ({cause}). Copy or pack it again."
+                ) from cause
+            if piece:
+                yield piece
+            if self._stream.eof:
+                data, self._stream = self._stream.unused_data, None
+                continue
+            # zlib keeps what it has not taken beside itself, the others within
+            data = getattr(self._stream, "unconsumed_tail", b"")
+            if not data and len(piece) < PIECE:
+                return
+
+
+def _open_entry(magic: bytes) -> _Stream:
+    if magic == _MAGIC[1]:
+        return zlib.decompressobj(16 + zlib.MAX_WBITS)
+    if magic == _MAGIC[2]:
+        return bz2.BZ2Decompressor()
+    return lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY)

@@ -1,0 +1,375 @@
+"""Surfaces as 16-bit numbers, and back: what geometry artifacts hold of what a sensor saw.
+
+    Surface  --pack_*-->  (h, w, 3) or (N, 5) uint16        --unpack_*-->  Surface
+
+A pinhole's pixels are inverse depths (its steps are far below a sensor's noise), a sphere's are
+ranges, points in no order are offsets in a cube. A normal is 2 x 16 bits on an octahedron. Steps
+of range and offset are powers of two, so that to pack again what was unpacked changes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import InvalidIntrinsics, UnreadableGeometry
+from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.surface.camera import camera_of
+from sceneprint.geometry.surface.range_image import directions
+from sceneprint.geometry.validation.overlap import thinned
+from sceneprint.types import Bytes, Floats, Floats32, Geometry, Intrinsics, Patches, Sphere, Surface
+
+Packed = NDArray[np.uint16]
+MOST = 65535
+#: Least share of its largest coordinate that a step of 32 bits can tell.
+_TOLD = 2.0**-22
+
+
+@kernel
+def _to_octahedron(nx: float, ny: float, nz: float) -> tuple[int, int]:
+    total = abs(nx) + abs(ny) + abs(nz)
+    u, v = nx / total, ny / total
+    if nz > 0:  # normals face a depth sensor, -z: that half is the middle of the square
+        u, v = (
+            (1.0 - abs(v)) * (1.0 if u >= 0 else -1.0),
+            (1.0 - abs(u)) * (1.0 if v >= 0 else -1.0),
+        )
+    return round((u * 0.5 + 0.5) * 65535.0), round((v * 0.5 + 0.5) * 65535.0)
+
+
+@kernel
+def _of_octahedron(a: int, b: int) -> tuple[float, float, float]:
+    u, v = a / 65535.0 * 2.0 - 1.0, b / 65535.0 * 2.0 - 1.0
+    nz = -(1.0 - abs(u) - abs(v))
+    if nz > 0:
+        u, v = (
+            (1.0 - abs(v)) * (1.0 if u >= 0 else -1.0),
+            (1.0 - abs(u)) * (1.0 if v >= 0 else -1.0),
+        )
+    length = np.sqrt(u * u + v * v + nz * nz)
+    return u / length, v / length, nz / length
+
+
+@kernel
+def _pack_image(
+    points: Floats32, normals: Floats32, pinhole: bool, scale: float, out: Packed
+) -> None:
+    """Inverse depth or range, and normal, of every pixel; 0 where not valid: out (h, w, 3)."""
+    height, width = points.shape[0], points.shape[1]
+    for y in range(height):
+        for x in range(width):
+            z = float(points[y, x, 2])
+            if pinhole:
+                if z <= 0:
+                    continue
+                out[y, x, 0] = np.uint16(max(round(1.0 / (z * scale)), 1.0))
+            else:
+                a, b = float(points[y, x, 0]), float(points[y, x, 1])
+                away = np.sqrt(a * a + b * b + z * z)
+                if away <= 0:
+                    continue
+                out[y, x, 0] = np.uint16(min(max(round(away / scale), 1.0), 65535.0))
+            u, v = _to_octahedron(
+                float(normals[y, x, 0]), float(normals[y, x, 1]), float(normals[y, x, 2])
+            )
+            out[y, x, 1] = np.uint16(u)
+            out[y, x, 2] = np.uint16(v)
+
+
+@kernel
+def _unpack_pinhole(
+    packed: Packed, scale: float, camera: Floats, points: Floats32,
+    normals: Floats32, areas: Floats32, valid: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    height, width = packed.shape[0], packed.shape[1]
+    fx, fy, cx, cy = camera[2], camera[3], camera[4], camera[5]
+    for y in range(height):
+        yn = (y - cy) / fy
+        for x in range(width):
+            if packed[y, x, 0] == 0:
+                continue
+            xn = (x - cx) / fx
+            z = 1.0 / (packed[y, x, 0] * scale)
+            u, v, nz = _of_octahedron(packed[y, x, 1], packed[y, x, 2])
+            points[y, x, 0], points[y, x, 1], points[y, x, 2] = xn * z, yn * z, z
+            normals[y, x, 0], normals[y, x, 1], normals[y, x, 2] = u, v, nz
+            ray = np.sqrt(xn * xn + yn * yn + 1.0)
+            cosine = -(xn * u + yn * v + nz) / ray
+            areas[y, x] = z * z / (fx * fy * ray * max(cosine, 1e-3))
+            valid[y, x] = True
+
+
+@kernel
+def _unpack_sphere(
+    packed: Packed, scale: float, rays: Floats, solid: Floats, points: Floats32,
+    normals: Floats32, areas: Floats32, valid: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    height, width = packed.shape[0], packed.shape[1]
+    for y in range(height):
+        for x in range(width):
+            if packed[y, x, 0] == 0:
+                continue
+            away = packed[y, x, 0] * scale
+            a, b, c = rays[y, x, 0], rays[y, x, 1], rays[y, x, 2]
+            nx, ny, nz = _of_octahedron(packed[y, x, 1], packed[y, x, 2])
+            points[y, x, 0], points[y, x, 1], points[y, x, 2] = a * away, b * away, c * away
+            normals[y, x, 0], normals[y, x, 1], normals[y, x, 2] = nx, ny, nz
+            cosine = -(a * nx + b * ny + c * nz)
+            areas[y, x] = away * away * solid[y] / max(cosine, 1e-3)
+            valid[y, x] = True
+
+
+@kernel
+def _pack_normals(normals: Floats32, out: Packed) -> None:
+    for n in range(len(normals)):
+        u, v = _to_octahedron(float(normals[n, 0]), float(normals[n, 1]), float(normals[n, 2]))
+        out[n, 0] = np.uint16(u)
+        out[n, 1] = np.uint16(v)
+
+
+@kernel
+def _unpack_normals(packed: Packed, out: Floats32) -> None:
+    for n in range(len(packed)):
+        nx, ny, nz = _of_octahedron(packed[n, 0], packed[n, 1])
+        out[n, 0], out[n, 1], out[n, 2] = nx, ny, nz
+
+
+def _step(span: float) -> float:
+    """The power of two of which 65535 reach as far, but for what rounding may have added."""
+    return 2.0 ** math.ceil(math.log2(span / MOST) - 1e-4) if span > 0 else 1.0
+
+
+def pack_image(surface: Surface) -> tuple[Packed, float]:
+    """Pixels (h, w, 3) of a surface that a camera saw; and the inverse depth of 1 (of a pinhole),
+    or the range of 1 (of a sphere).
+    """
+    pinhole = isinstance(surface.camera, Intrinsics)
+    if pinhole:
+        z = surface.points[..., 2][surface.valid]
+        scale = 1.0 / (float(z.min()) * MOST) if z.size else 1.0
+    else:
+        seen = surface.points[surface.valid].astype(float)
+        scale = _step(float(np.linalg.norm(seen, axis=1).max(initial=0.0)))
+    packed = np.zeros((*surface.valid.shape, 3), np.uint16)
+    _pack_image(surface.points, surface.normals, pinhole, scale, packed)
+    return packed, scale
+
+
+def unpack_image(packed: Packed, scale: float, camera: Intrinsics | Sphere) -> Surface:
+    """The surface of `pack_image`."""
+    shape = (camera.height, camera.width)
+    points, normals = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
+    areas, valid = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
+    if isinstance(camera, Intrinsics):
+        of = camera_of(camera, 0.0)
+        _unpack_pinhole(packed, scale, of, points, normals, areas, valid)
+    else:
+        elevation = camera.top - camera.step * np.arange(camera.height)
+        solid = camera.step**2 * np.maximum(np.cos(elevation), 0.0)
+        _unpack_sphere(packed, scale, directions(camera), solid, points, normals, areas, valid)
+    return Surface(points, normals, valid, areas, camera)
+
+
+def pack_points(surface: Surface) -> tuple[Packed, Floats, float]:
+    """Points in no order as (N, 5): offsets and normal; the corner they are from, and a step."""
+    points, normals = surface.points[surface.valid], surface.normals[surface.valid]
+    packed = np.zeros((len(points), 5), np.uint16)
+    if not len(points):
+        return packed, np.zeros(3), 1.0
+    corner = points.min(axis=0).astype(float)
+    span = float(np.ptp(points.astype(float), axis=0).max())
+    step = _step(max(span, float(np.abs(points).max()) * _TOLD * MOST))
+    offsets = np.rint((points - corner) / step)
+    packed[:, :3] = np.clip(offsets, 0, MOST).astype(np.uint16)
+    _pack_normals(normals, packed[:, 3:])
+    return packed, corner, step
+
+
+def unpack_points(packed: Packed, corner: Floats, step: float) -> Surface:
+    """The surface of `pack_points`, a map of one row without areas."""
+    points = (packed[:, :3] * step + corner).astype(np.float32)
+    normals = np.zeros((len(packed), 3), np.float32)
+    _unpack_normals(packed[:, 3:], normals)
+    shape = (1, len(packed))
+    return Surface(
+        points[None], normals[None], np.ones(shape, np.bool_), np.zeros(shape, np.float32), None
+    )
+
+
+# Geometry artifacts as bytes: what is kept of a frame so that its upload is not read again.
+#
+#     Geometry  --write_geometry-->  bytes  --read_geometry-->  Geometry
+#
+# Little-endian, in this order: magic, schema, CRC-32 of all that follows, sizes and camera, id of
+# the model, then the arrays; those of the surface are as above. Depth images have schema 1,
+# clouds 2.
+
+MAGIC = b"SPGEO"
+#: Of the bytes and of what they mean, for depth images and for clouds. Raise it when either
+#: changes.
+SCHEMA_VERSION, CLOUD_SCHEMA = 1, 2
+#: magic, schema, checksum
+_HEAD = struct.Struct("<5sHI")
+#: Of a depth image: width, height, patches, bytes of a descriptor, fx, fy, cx, cy, inverse depth
+#: of 65535, model
+_DEPTH = struct.Struct("<HHHH5d32s")
+#: Of a cloud: width, height, patches, bytes of a descriptor, kind, pole, then step, left and top
+#: of a sphere or the corner of points in no order, then the step of 1, model
+_CLOUD = struct.Struct("<HHHHBB4d32s")
+_SPHERE, _POINTS = 1, 2
+#: Most points in no order that are kept: as many as pixels of a depth image.
+MAXIMUM_POINTS = 20_000
+#: Most patches and longest descriptor that are believed: validation compares all patches with all,
+#: and no model makes more of either.
+MAXIMUM_PATCHES, MAXIMUM_DESCRIPTOR = 4096, 1024
+#: Least and most of the nearest depth, metres: points and areas stay finite in 32 bits.
+NEAREST = (1e-6, 1e6)
+#: Least and most of a step of range or offset, metres.
+STEPS = (2.0**-40, 16.0)
+#: Farthest patch, metres, and largest, square metres, that are believed.
+FARTHEST, LARGEST = 1e9, 1e18
+#: Bytes of a patch beside its descriptor: mean, normal, area, coherence as float32, and its size.
+_PATCH = np.dtype(
+    [
+        ("mean", "<f4", 3), ("normal", "<f4", 3), ("area", "<f4"), ("coherence", "<f4"),
+        ("size", "<i4"),
+    ]
+)  # fmt: skip
+
+
+def write_geometry(geometry: Geometry) -> bytes:
+    """A geometry artifact as bytes, the same ones for the same artifact.
+
+    Parameters
+    ----------
+    geometry : see Geometry; its model id is 64 hexadecimal digits. Of points in no order at most
+        MAXIMUM_POINTS are kept
+    """
+    patches, camera = geometry.patches, geometry.surface.camera
+    model, sizes = bytes.fromhex(geometry.model_id), (len(patches), geometry.descriptors.shape[1])
+    if camera is None:
+        packed, corner, step = pack_points(thinned(geometry.surface, MAXIMUM_POINTS))
+        head = _CLOUD.pack(len(packed), 1, *sizes, _POINTS, 0, *corner, step, model)
+    else:
+        packed, scale = pack_image(geometry.surface)
+        size = camera.width, camera.height, *sizes
+        if isinstance(camera, Intrinsics):
+            head = _DEPTH.pack(*size, camera.fx, camera.fy, camera.cx, camera.cy, scale, model)
+        else:
+            turn = camera.step, camera.left, camera.top
+            head = _CLOUD.pack(*size, _SPHERE, camera.pole, *turn, scale, model)
+    rows = np.zeros(len(patches), _PATCH)
+    rows["mean"], rows["normal"], rows["area"] = patches.means, patches.normals, patches.areas
+    rows["coherence"], rows["size"] = patches.coherences, patches.sizes
+    body = b"".join(
+        [
+            head,
+            packed.astype("<u2").tobytes(),
+            rows.tobytes(),
+            np.ascontiguousarray(geometry.descriptors).tobytes(),
+        ]
+    )
+    schema = SCHEMA_VERSION if isinstance(camera, Intrinsics) else CLOUD_SCHEMA
+    return _HEAD.pack(MAGIC, schema, zlib.crc32(body)) + body
+
+
+def read_geometry(data: bytes) -> Geometry:
+    """A geometry artifact from its bytes.
+
+    Parameters
+    ----------
+    data : of `write_geometry`
+
+    Raises
+    ------
+    UnreadableGeometry : not an artifact, cut short, damaged, of another schema, or with numbers
+        that are no camera, no depth or no patches.
+    """
+    nothing = f"{len(data)} bytes are no geometry artifact."
+    if len(data) < _HEAD.size or data[: len(MAGIC)] != MAGIC:
+        _refuse(nothing)
+    _, schema, checksum = _HEAD.unpack_from(data)
+    if schema not in (SCHEMA_VERSION, CLOUD_SCHEMA):
+        _refuse(
+            f"The geometry artifact has schema {schema}, and this version reads "
+            f"{SCHEMA_VERSION} and {CLOUD_SCHEMA}."
+        )
+    body = memoryview(data)[_HEAD.size :]
+    layout = _DEPTH if schema == SCHEMA_VERSION else _CLOUD
+    if len(body) < layout.size:
+        _refuse(nothing)
+    width, height, count, length, *told, model = layout.unpack_from(body)
+    numbers = 5 if schema == CLOUD_SCHEMA and told[0] == _POINTS else 3
+    arrays = [width * height * 2 * numbers, count * _PATCH.itemsize, count * length]
+    ends = np.cumsum([layout.size, *arrays])
+    if len(body) != ends[-1] or zlib.crc32(body) != checksum:
+        _refuse("The geometry artifact is damaged: its checksum does not fit.")
+    packed = np.frombuffer(body[ends[0] : ends[1]], "<u2").reshape(height, width, numbers)
+    try:
+        surface = _depth(packed, *told) if schema == SCHEMA_VERSION else _cloud(packed, *told)
+    except InvalidIntrinsics as error:
+        raise UnreadableGeometry(f"The geometry artifact has no camera: {error}") from error
+    patches = _patches(np.frombuffer(body[ends[1] : ends[2]], _PATCH))
+    if count > MAXIMUM_PATCHES or length > MAXIMUM_DESCRIPTOR or not _sound(patches):
+        _refuse(
+            f"The geometry artifact's {count} patches with descriptors of {length} bytes are none "
+            "that a model makes."
+        )
+    descriptors: Bytes = np.frombuffer(body[ends[2] :], np.uint8).reshape(count, length)
+    return Geometry(surface, patches, descriptors, model.hex())
+
+
+def _refuse(why: str) -> NoReturn:
+    raise UnreadableGeometry(f"{why} Sign the frame again from its upload.")
+
+
+def _depth(
+    packed: NDArray[np.uint16], fx: float, fy: float, cx: float, cy: float, scale: float
+) -> Surface:
+    camera = Intrinsics(packed.shape[1], packed.shape[0], fx, fy, cx, cy)
+    # false for NaN as well
+    if not (scale > 0 and NEAREST[0] <= 1.0 / (scale * 65535.0) <= NEAREST[1]):
+        _refuse(f"The geometry artifact has {scale} for its scale of depth.")
+    return unpack_image(packed, scale, camera)
+
+
+def _cloud(
+    packed: NDArray[np.uint16], kind: int, pole: int, a: float, b: float, c: float, step: float
+) -> Surface:
+    if not STEPS[0] <= step <= STEPS[1]:
+        _refuse(f"The geometry artifact has {step} for its step of range.")
+    height, width = packed.shape[:2]
+    if kind == _SPHERE:
+        return unpack_image(packed, step, Sphere(width, height, a, b, c, pole))
+    near = all(abs(one) <= NEAREST[1] for one in (a, b, c))  # false for NaN
+    if kind != _POINTS or pole or height != 1 or width > MAXIMUM_POINTS or not near:
+        _refuse("The geometry artifact has points that no cloud has.")
+    return unpack_points(packed[0], np.array([a, b, c]), step)
+
+
+def _patches(rows: NDArray[np.void]) -> Patches:
+    with np.errstate(invalid="ignore"):  # a signalling NaN; `_sound` refuses it
+        return Patches(
+            means=rows["mean"].astype(float),
+            normals=rows["normal"].astype(float),
+            areas=rows["area"].astype(float),
+            sizes=rows["size"].astype(np.int32),
+            coherences=rows["coherence"].astype(float),
+        )
+
+
+def _sound(patches: Patches) -> bool:
+    """Whether the numbers are those of patches: comparisons with NaN are false."""
+    length = np.sqrt((patches.normals**2).sum(axis=1))
+    return bool(
+        (np.abs(patches.means) <= FARTHEST).all()
+        and (np.abs(length - 1.0) < 1e-3).all()
+        and ((patches.areas >= 0) & (patches.areas <= LARGEST)).all()
+        and ((patches.coherences >= 0) & (patches.coherences <= 1)).all()
+        and (patches.sizes >= 0).all()
+    )

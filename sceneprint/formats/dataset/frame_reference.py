@@ -1,0 +1,237 @@
+"""What a sequence of frames is, before any of its frames is read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from sceneprint.errors import DatasetError, InvalidPose, UnreadableCloud, naming
+from sceneprint.formats.image.depth_file import read_frame
+from sceneprint.formats.points import SUFFIXES, Scan, decode_scan
+from sceneprint.geometry.pose.rigid import rotation_of
+from sceneprint.types import AnyFrame, DepthFrame, Floats
+from sceneprint_client.file_formats import MAXIMUM_CLOUD_BYTES
+from sceneprint_client.files import data_lines, read_bytes, read_text
+from sceneprint_client.frame_files import FrameFile
+from sceneprint_client.sidecars import CloudSource
+
+# Trajectories with time stamps.
+#
+# text  --read_trajectory-->  Trajectory, stamps (M,)  --interpolate-->  M poses or None
+
+_TOLERANCE = 1e-2  #: how far a written quaternion may be from a true one
+_MAXIMUM_TRAJECTORY_BYTES = 2**26  # an hour at 200 Hz
+
+
+@dataclass(frozen=True, eq=False)
+class SensorTrajectory:
+    """Poses of a sensor over time.
+
+    Parameters
+    ----------
+    stamps : (N,) seconds, strictly increasing
+    positions : (N, 3) metres, of the sensor in the parent frame
+    quaternions : (N, 4) x, y, z, w of unit length, sensor to parent
+    """
+
+    stamps: Floats
+    positions: Floats
+    quaternions: Floats
+
+
+def read_trajectory(path: Path) -> SensorTrajectory:
+    """Return the poses of a TUM text file, lines `t tx ty tz qx qy qz qw`, # comments.
+
+    Lines are put in order of time; of equal stamps the first stays.
+
+    Raises
+    ------
+    InvalidPose : the file cannot be read, has no pose, or a line is not 8 finite numbers
+        with a quaternion of unit length to 1e-2; names file and line.
+    """
+    numbers, rows = [], []
+    for number, line in data_lines(read_text(path, _MAXIMUM_TRAJECTORY_BYTES, InvalidPose)):
+        words = line.replace(",", " ").split()
+        with naming(f"{path}, line {number}"):
+            if len(words) != 8:
+                raise InvalidPose(f"The line has {len(words)} words. Write t tx ty tz qx qy qz qw.")
+            rows.append(_numbers(words))
+        numbers.append(number)
+    if not rows:
+        raise InvalidPose(f"{path}: The file holds no pose. Remove it, or write some.")
+    table = np.array(rows)
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1.0)
+    bad = ~np.isfinite(table).all(axis=1) | ~(off < _TOLERANCE)
+    if bad.any():
+        raise InvalidPose(
+            f"{path}, line {numbers[int(np.argmax(bad))]}: The pose is not finite, or its "
+            "quaternion not of unit length. Write t tx ty tz qx qy qz qw, or leave the line out."
+        )
+    stamps, first = np.unique(table[:, 0], return_index=True)
+    quaternions = table[first, 4:]
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return SensorTrajectory(stamps, table[first, 1:4], quaternions)
+
+
+def interpolate(
+    trajectory: SensorTrajectory, stamps: Sequence[float], *, longest_gap: float = 0.1
+) -> list[Floats | None]:
+    """Return the poses at the stamps: positions linear, rotations by slerp.
+
+    Parameters
+    ----------
+    trajectory : N poses
+    stamps : M seconds, in any order
+    longest_gap : seconds between two poses beyond which nothing between them is known
+
+    Returns
+    -------
+    poses : M times T_parent_sensor (4, 4), or None before the first pose, after the last,
+        and within a longer gap
+    """
+    times = np.asarray(stamps, dtype=np.float64)
+    t, last = trajectory.stamps, len(trajectory.stamps) - 1
+    after = np.clip(np.searchsorted(t, times), 0, last)  # t[after - 1] < time <= t[after]
+    before = np.where(t[after] == times, after, np.maximum(after - 1, 0))
+    span = t[after] - t[before]
+    known = (t[before] <= times) & (times <= t[after]) & (span <= longest_gap)
+    w = np.where(span > 0.0, times - t[before], 0.0) / np.where(span > 0.0, span, 1.0)
+
+    positions = trajectory.positions[before]
+    positions = positions + w[:, None] * (trajectory.positions[after] - positions)
+    quaternions = _slerp(trajectory.quaternions[before], trajectory.quaternions[after], w)
+    return [
+        _transform(p, q) if ok else None
+        for p, q, ok in zip(positions, quaternions, known, strict=True)
+    ]
+
+
+def _slerp(q: Floats, other: Floats, w: Floats) -> Floats:
+    """Quaternions (M, 4) at the share w of the shorter arc from q to the other."""
+    cosine = np.sum(q * other, axis=1)
+    other = np.where(cosine[:, None] < 0.0, -other, other)  # q and -q are one rotation
+    angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
+    sine = np.sin(angle)
+    small = sine < 1e-6  # the arc is its chord there, and 0/0 is not
+    safe = np.where(small, 1.0, sine)
+    a = np.where(small, 1.0 - w, np.sin((1.0 - w) * angle) / safe)
+    b = np.where(small, w, np.sin(w * angle) / safe)
+    mixed: Floats = a[:, None] * q + b[:, None] * other
+    mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
+    return mixed
+
+
+def _transform(position: Floats, quaternion: Floats) -> Floats:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_of(quaternion)
+    pose[:3, 3] = position
+    return pose
+
+
+def _numbers(words: list[str]) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError as cause:
+        raise InvalidPose(f"A word is no number ({cause}). Write numbers only.") from cause
+
+
+def read_cloud(
+    path: Path, source: CloudSource, *, name: str = "", pose: Floats | None = None
+) -> Scan:
+    """Return the points of a file, and how they were read.
+
+    Raises
+    ------
+    UnreadableCloud : the file is absent or too large; and as `decode_scan`. Each error names the
+        file.
+    """
+    data = read_bytes(path, MAXIMUM_CLOUD_BYTES, UnreadableCloud)
+    told = source.file_format
+    if told is None and SUFFIXES.get(path.suffix.lower()) == "kitti":
+        told = "kitti"  # the one that its content does not tell
+    with naming(str(path)):
+        scan = decode_scan(
+            data,
+            file_format=told,
+            viewpoint=source.viewpoint,
+            units_per_metre=source.units_per_metre,
+            pose=pose,
+        )
+    return replace(scan, cloud=replace(scan.cloud, name=name))
+
+
+Split = Literal["train", "test"]
+
+
+class Layout(Enum):
+    """How the files of a sequence are named."""
+
+    #: `frame-%06d.depth.png`, each with `frame-%06d.pose.txt` where its pose is known.
+    SEVEN_SCENES = "7-Scenes"
+    #: `depth.txt` lists time stamps and files, `groundtruth.txt` poses at other stamps.
+    TUM = "TUM RGB-D"
+    #: Depth files of any name, PNG or NPY, in natural order; no poses.
+    PLAIN = "plain"
+    #: Files of points (PLY, PCD, KITTI .bin, LAS, LAZ) of any name, each with `NAME.pose.txt`
+    #: where its pose is known.
+    CLOUDS = "clouds"
+
+
+class FrameReference(FrameFile):
+    """One frame of a sequence, not yet read; `find_sequences` gives each a name of its own."""
+
+    def read(self) -> AnyFrame:
+        """Return the frame; raises as `read_frame`, `read_cloud` and `pose`."""
+        if self.cloud is None:
+            return self.read_depth()
+        return read_cloud(self.path, self.cloud, name=self.name, pose=self.pose).cloud
+
+    def read_depth(self) -> DepthFrame:
+        """Return the frame, where only a depth image will do; raises as `read_frame` and `pose`.
+
+        Raises
+        ------
+        DatasetError : it is a cloud.
+        """
+        if self.camera is None:
+            raise DatasetError(
+                f"{self.path}: This is a cloud, and a depth image is needed here. Name a folder or "
+                "file of depth images."
+            )
+        return read_frame(
+            self.path,
+            self.camera.intrinsics,
+            depth_scale=self.camera.depth_scale,
+            along_ray=self.camera.along_ray,
+            name=self.name,
+            pose=self.pose,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSequence:
+    """Frames of one run of a sensor, in order.
+
+    Parameters
+    ----------
+    name : unique in what `find_sequences` returned
+    folder : where its files are
+    layout : how they are named
+    parent_frame : name of the frame its poses lead to. Sequences with the same name share
+        it, and their poses can be compared; others cannot
+    split : what the scene's authors use it for, or None where they do not say
+    frames : at least one
+    """
+
+    name: str
+    folder: Path
+    layout: Layout
+    parent_frame: str
+    split: Split | None
+    frames: tuple[FrameReference, ...]

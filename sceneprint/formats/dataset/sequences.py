@@ -1,0 +1,443 @@
+"""From a path to the sequences below it.
+
+path  --find_sequences-->  Sequence, ...
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+from sceneprint.errors import DatasetError, SceneprintError
+from sceneprint.formats.dataset.frame_reference import (
+    FrameReference,
+    FrameSequence,
+    Layout,
+    Split,
+    interpolate,
+    read_trajectory,
+)
+from sceneprint_client.file_formats import is_cloud
+from sceneprint_client.files import data_lines, read_text
+from sceneprint_client.frame_files import SEVEN_SCENES, find_frame_file
+from sceneprint_client.sidecars import CLOUDS_FILE, find_camera, find_cloud_source
+
+# From a folder of known layout to the references of its frames; no frame is read.
+#
+# folder  --layout_of-->  Layout  --references-->  FrameReference, ...
+
+_DEPTH_LIST, _TRAJECTORY = "depth.txt", "groundtruth.txt"
+_MAXIMUM_LIST_BYTES = 2**26
+
+
+def list_folder(folder: Path) -> tuple[list[str], list[str]]:
+    """Return the names of the files and of the folders in it, hidden ones left out.
+
+    Both are in natural order: frame 9 before frame 10.
+
+    Raises
+    ------
+    DatasetError : it may not be read.
+    """
+    files: list[str] = []
+    folders: list[str] = []
+    try:
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                if not entry.name.startswith("."):
+                    (folders if _is_folder(entry) else files).append(entry.name)
+    except OSError as cause:
+        raise DatasetError(
+            f"{folder}: The folder cannot be read ({cause.strerror}). Check your rights."
+        ) from cause
+    return sorted(files, key=natural), sorted(folders, key=natural)
+
+
+def natural(name: str) -> tuple[list[tuple[int, str]], str]:
+    """Sort key that takes digits as numbers; the name itself decides between 1 and 01."""
+    parts = re.split(r"(\d+)", name, flags=re.ASCII)
+    # digits count by their length and then as text: no number is too long for that
+    key = [
+        (len(part.lstrip("0")), part.lstrip("0")) if i % 2 else (0, part)
+        for i, part in enumerate(parts)
+    ]
+    return key, name
+
+
+def layout_of(files: list[str]) -> Layout | None:
+    """Return the layout that these file names show, or None if they hold neither depth nor points.
+
+    Of depth images and points in one folder it is the images, unless clouds.json is there too.
+    """
+    if any(SEVEN_SCENES.fullmatch(file) for file in files):
+        return Layout.SEVEN_SCENES
+    if _DEPTH_LIST in files:
+        return Layout.TUM
+    if CLOUDS_FILE in files and any(map(_may_be_cloud, files)):
+        return Layout.CLOUDS
+    if any(map(_is_depth, files)):
+        return Layout.PLAIN
+    return Layout.CLOUDS if any(map(is_cloud, files)) else None
+
+
+def references(
+    folder: Path, files: list[str], layout: Layout, name: str
+) -> tuple[FrameReference, ...]:
+    """Return the frames of a folder.
+
+    Parameters
+    ----------
+    folder : with `intrinsics.json` in it or above it, if it holds depth images
+    files : names of the files to take, in order, as `list_folder` gives them
+    layout : of the folder
+    name : of the sequence; frames are named after it
+
+    Raises
+    ------
+    DatasetError : there is no intrinsics.json, depth.txt is damaged, or two frames would
+        have one name; or clouds.json says what it cannot.
+    InvalidIntrinsics : intrinsics.json describes no camera.
+    InvalidPose : groundtruth.txt holds a line that is no pose.
+    """
+    if layout is Layout.SEVEN_SCENES:
+        frames = _seven_scenes(folder, files, name)
+    elif layout is Layout.TUM:
+        frames = _tum(folder, files, name)
+    elif layout is Layout.CLOUDS:
+        frames = _clouds(folder, files, name)
+    else:
+        frames = _plain(folder, files, name)
+    first: dict[str, Path] = {}
+    for frame in frames:
+        if frame.name in first:
+            raise DatasetError(
+                f"{frame.path}: The frame would have the same name, {frame.name}, as "
+                f"{first[frame.name].name}. Rename or remove one of them."
+            )
+        first[frame.name] = frame.path
+    return frames
+
+
+def _seven_scenes(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
+    camera, present, frames = find_camera(folder), set(files), []
+    for file in files:
+        if SEVEN_SCENES.fullmatch(file):
+            stem = file.removesuffix(".depth.png")
+            pose = folder / f"{stem}.pose.txt" if f"{stem}.pose.txt" in present else None
+            frames.append(FrameReference(f"{name}/{stem}", folder / file, camera, pose_source=pose))
+    return tuple(frames)
+
+
+def _plain(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
+    camera = find_camera(folder)
+    return tuple(
+        FrameReference(f"{name}/{Path(file).stem}", folder / file, camera)
+        for file in files
+        if _is_depth(file)
+    )
+
+
+def _clouds(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
+    source, present = find_cloud_source(folder), set(files)
+    # beside clouds.json a .npy is of points
+    wanted = _may_be_cloud if CLOUDS_FILE in present else is_cloud
+    frames = []
+    for file in filter(wanted, files):
+        stem = Path(file).stem
+        pose = folder / f"{stem}.pose.txt" if f"{stem}.pose.txt" in present else None
+        frames.append(
+            FrameReference(f"{name}/{stem}", folder / file, None, pose_source=pose, cloud=source)
+        )
+    return tuple(frames)
+
+
+def _tum(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
+    camera = find_camera(folder)
+    listed = sorted(_depth_list(folder / _DEPTH_LIST))
+    stamps = [stamp for stamp, _ in listed]
+    if _TRAJECTORY in files:
+        poses = interpolate(read_trajectory(folder / _TRAJECTORY), stamps)
+    else:
+        poses = [None] * len(stamps)
+    return tuple(
+        FrameReference(f"{name}/{Path(file).stem}", folder / file, camera, stamp, pose)
+        for (stamp, file), pose in zip(listed, poses, strict=True)
+    )
+
+
+def _depth_list(path: Path) -> list[tuple[float, str]]:
+    """Return time stamp and file of each line of depth.txt."""
+    listed = []
+    for number, line in data_lines(read_text(path, _MAXIMUM_LIST_BYTES, DatasetError)):
+        place, words = f"{path}, line {number}", line.split(maxsplit=1)
+        try:
+            stamp, file = float(words[0]), words[1]
+        except (ValueError, IndexError) as cause:
+            raise DatasetError(
+                f"{place}: The line is no time stamp and file. Write them, a space between."
+            ) from cause
+        if not math.isfinite(stamp):
+            raise DatasetError(f"{place}: The time stamp is not finite. Write it in seconds.")
+        # a list from elsewhere must not make us read any file of this machine
+        if PurePosixPath(file).is_absolute() or ".." in re.split(r"[/\\]", file):
+            raise DatasetError(
+                f"{place}: The file lies outside the folder. List files below {path.parent}."
+            )
+        if not (path.parent / file).is_file():
+            raise DatasetError(
+                f"{place}: There is no file {file}. Unpack it, or take the line out."
+            )
+        listed.append((stamp, file))
+    if not listed:
+        raise DatasetError(f"{path}: The list is empty. List the depth images in it.")
+    return listed
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # a symlink to itself
+        return False
+
+
+def _may_be_cloud(file: str) -> bool:
+    return is_cloud(file) or file.lower().endswith(".npy")
+
+
+def _is_depth(file: str) -> bool:
+    lowered = file.lower()
+    return (
+        lowered.endswith((".png", ".npy"))
+        and not lowered.endswith(".color.png")
+        and "rgb" not in lowered
+    )
+
+
+_DEPTH = 4  #: folders below the one given that are looked into
+_MAXIMUM_FOLDERS = 10_000  #: that are looked into; more is no data set but a disk
+_MAXIMUM_SPLIT_BYTES = 65_536
+_SEQUENCE_FOLDER = re.compile(r"seq-?(\d+)", re.IGNORECASE | re.ASCII)
+_SPLIT_LINE = re.compile(r"(?:sequence|seq)[\s_-]*(\d{1,9})", re.IGNORECASE | re.ASCII)
+_SPLIT_FILES: tuple[tuple[str, Split], ...] = (
+    ("TrainSplit.txt", "train"),
+    ("TestSplit.txt", "test"),
+)
+_COLOUR_FOLDERS = ("rgb", "color", "colour")
+
+
+def find_sequences(path: Path | str) -> tuple[FrameSequence, ...]:
+    """Return the sequences at a path or up to 4 folders below it; no frame is read.
+
+    Understood are a 7-Scenes sequence or scene (with TrainSplit.txt, TestSplit.txt), a TUM
+    RGB-D folder, a folder of depth images (PNG or NPY; `*.color.png` and `*rgb*` are left
+    out), a folder of point clouds (PLY, PCD, KITTI .bin, LAS, LAZ; NPY beside a clouds.json),
+    one depth image or cloud, and folders of these. A sequence is named by its place below
+    the path, or by its own folder where that is the path.
+
+    Parameters
+    ----------
+    path : a folder or a file
+
+    Returns
+    -------
+    sequences : at least one, in natural order of their names
+
+    Raises
+    ------
+    DatasetError : nothing is there, there is no intrinsics.json for depth, a list names what is
+        not there, or two scenes have one name.
+    InvalidIntrinsics : an intrinsics.json describes no camera.
+    InvalidPose : a groundtruth.txt holds a line that is no pose.
+    """
+    # a name such as .. is none; a symlink's own name is what the user knows it by
+    path = Path(path)
+    root = path.resolve() if ".." in path.parts else path.absolute()
+    if root.is_file():
+        return (_single(root),)
+    if not root.is_dir():
+        raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
+    found = tuple(_sequence(*one, _name(one[0], root)) for one in _walk(root))
+    if not found:
+        raise DatasetError(
+            f"{path}: There is no depth image or cloud here or up to {_DEPTH} folders below. Name "
+            "a 7-Scenes scene or sequence (frame-000000.depth.png), a TUM RGB-D folder "
+            "(depth.txt), a folder of 16-bit PNG or float NPY depth images, one of PLY, PCD, "
+            "KITTI .bin, LAS or LAZ clouds, or one such file."
+        )
+    _check_parent_frames(found)
+    return found
+
+
+def find_each(
+    root: Path,
+) -> tuple[tuple[FrameSequence, ...], tuple[tuple[str, SceneprintError], ...]]:
+    """As `find_sequences`, where a sequence that is damaged must not cost the others.
+
+    Parameters
+    ----------
+    root : a folder, absolute
+
+    Returns
+    -------
+    sequences : that are sound; there may be none
+    refused : name of each other one, and why
+
+    Raises
+    ------
+    DatasetError : there are too many folders, or two scenes have one name.
+    """
+    found, refused = [], []
+    for one in _walk(root):
+        name = _name(one[0], root)
+        try:
+            found.append(_sequence(*one, name))
+        except SceneprintError as error:
+            refused.append((name, error))
+    sequences = tuple(found)
+    _check_parent_frames(sequences)
+    return sequences, tuple(refused)
+
+
+def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
+    """Yield the folders that are sequences, depth first in natural order."""
+    seen: set[Path] = set()  # resolved: a symlink back up is not entered twice
+    waiting = [(root, 0)]
+    while waiting:
+        folder, depth = waiting.pop()
+        try:
+            resolved = folder.resolve()
+        except (OSError, RuntimeError):  # a symlink to itself
+            continue
+        if resolved in seen:
+            continue
+        seen.add(resolved)
+        if len(seen) > _MAXIMUM_FOLDERS:
+            raise DatasetError(
+                f"{root}: There are more than {_MAXIMUM_FOLDERS} folders here. "
+                "Name the folder of the data set."
+            )
+        files, folders = list_folder(folder)
+        layout = layout_of(files)
+        # a scene may hold a picture or a mesh of itself beside its sequences
+        scene = any(_SEQUENCE_FOLDER.fullmatch(name) for name in folders) or (
+            layout is Layout.CLOUDS
+            and ("depth" in folders or _is_above_images(folder, files, folders, depth))
+        )
+        if layout is not None and not (layout in (Layout.PLAIN, Layout.CLOUDS) and scene):
+            yield folder, files, layout
+        elif depth < _DEPTH:
+            waiting += [
+                (folder / name, depth + 1) for name in reversed(folders) if not is_of_colour(name)
+            ]
+
+
+def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: int) -> bool:
+    """Whether points lie above folders of depth images whose camera is known, and nothing says
+    that they are frames: they are a mesh of what is below, and must not hide it.
+    """
+    if CLOUDS_FILE in files:
+        return False
+    waiting = [(folder / name, depth + 1) for name in folders]
+    looked = 0
+    while waiting and looked < _MAXIMUM_FOLDERS:
+        below, deep = waiting.pop()
+        looked += 1
+        if deep > _DEPTH or is_of_colour(below.name):
+            continue
+        try:
+            own, deeper = list_folder(below)
+            if layout_of(own) not in (None, Layout.CLOUDS):
+                find_camera(below)
+                return True
+        except DatasetError:  # colour images alone have no camera; others say why in their turn
+            continue
+        except SceneprintError:  # a camera that is none: whoever reads the images says why
+            return True
+        waiting += [(below / name, deep + 1) for name in deeper]
+    return False
+
+
+def is_of_colour(folder: str) -> bool:
+    """Whether a folder of that name is left out; rgbd_dataset_freiburg1_xyz is none of them."""
+    name = folder.lower().replace("rgbd", "")
+    return any(colour in name for colour in _COLOUR_FOLDERS)
+
+
+def _sequence(folder: Path, files: list[str], layout: Layout, name: str) -> FrameSequence:
+    return _sequence_of(folder, layout, name, references(folder, files, layout, name))
+
+
+def _sequence_of(
+    folder: Path, layout: Layout, name: str, frames: tuple[FrameReference, ...]
+) -> FrameSequence:
+    if layout is Layout.SEVEN_SCENES and _SEQUENCE_FOLDER.fullmatch(folder.name):
+        scene = folder.parent
+        return FrameSequence(name, folder, layout, scene.name, _split(folder), frames)
+    return FrameSequence(name, folder, layout, name, None, frames)
+
+
+def _single(file: Path) -> FrameSequence:
+    """Return a sequence of one frame."""
+    folder, frame = file.parent, FrameReference(**vars(find_frame_file(file)))
+    if frame.camera is not None and SEVEN_SCENES.fullmatch(file.name):
+        return _sequence_of(folder, Layout.SEVEN_SCENES, folder.name, (frame,))
+    layout = Layout.PLAIN if frame.cloud is None else Layout.CLOUDS
+    return FrameSequence(folder.name, folder, layout, folder.name, None, (frame,))
+
+
+def _split(folder: Path) -> Split | None:
+    """Return what the scene's split files use this sequence for."""
+    match = _SEQUENCE_FOLDER.fullmatch(folder.name)
+    number = int(match[1]) if match else -1
+    uses: list[Split] = []
+    for file, use in _SPLIT_FILES:
+        path = folder.parent / file
+        if path.is_file() and number in _split_numbers(path):
+            uses.append(use)
+    if len(uses) > 1:
+        raise DatasetError(
+            f"{folder.parent}: Sequence {number} is for training and for testing. "
+            "Take it out of TrainSplit.txt or TestSplit.txt."
+        )
+    return uses[0] if uses else None
+
+
+def _split_numbers(path: Path) -> set[int]:
+    """Return the sequences that a split file lists, each of which must be there."""
+    _, folders = list_folder(path.parent)
+    present = {int(m[1]) for name in folders if (m := _SEQUENCE_FOLDER.fullmatch(name))}
+    numbers = set()
+    for number, line in data_lines(read_text(path, _MAXIMUM_SPLIT_BYTES, DatasetError)):
+        match = _SPLIT_LINE.fullmatch(line)
+        if match is None:
+            raise DatasetError(
+                f"{path}, line {number}: This names no sequence. Write lines such as sequence1."
+            )
+        if int(match[1]) not in present:
+            # evaluating on part of a split in silence would be worse
+            raise DatasetError(
+                f"{path}, line {number}: There is no folder seq-{int(match[1]):02d}. "
+                "Unpack it, or take the line out."
+            )
+        numbers.add(int(match[1]))
+    return numbers
+
+
+def _name(folder: Path, root: Path) -> str:
+    return folder.name if folder == root else folder.relative_to(root).as_posix()
+
+
+def _check_parent_frames(sequences: tuple[FrameSequence, ...]) -> None:
+    """Two scenes of one name would pass for one place, and their poses for comparable."""
+    scenes: dict[str, Path] = {}
+    for sequence in sequences:
+        own = sequence.parent_frame == sequence.name
+        place = sequence.folder if own else sequence.folder.parent
+        if scenes.setdefault(sequence.parent_frame, place) != place:
+            raise DatasetError(
+                f"{place}: Another scene is called {sequence.parent_frame} too, "
+                f"{scenes[sequence.parent_frame]}. Rename one, or read them one at a time."
+            )

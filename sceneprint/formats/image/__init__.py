@@ -1,0 +1,1 @@
+"""Depth images: PNG and NPY."""

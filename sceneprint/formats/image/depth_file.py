@@ -1,0 +1,438 @@
+"""The door for frames: stored samples and a camera in, a `Frame` out.
+
+bytes  --decode_png | decode_npy-->  samples (H, W)  --make_frame-->  Frame
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import InvalidIntrinsics, UnreadableFrame, UselessFrame, naming
+from sceneprint.geometry.surface.rectification import ray_to_axis, undistort
+from sceneprint.types import MAXIMUM_SAMPLES, DepthFrame, Floats, Floats32, Intrinsics
+from sceneprint_client.file_formats import MAXIMUM_IMAGE_BYTES, NPY_SIGNATURE, NpyHeader, npy_header
+from sceneprint_client.files import read_bytes
+from sceneprint_client.sidecars import rigid_transform
+
+# 16-bit greyscale PNG, read so that no file can surprise.
+#
+#     bytes  --decode_png-->  samples (H, W) uint16
+#
+# Pillow takes a PNG whose data end early as an image with black rows, and does not look at
+# the check sums of the data. So the file is taken apart and checked here, and Pillow undoes
+# filters and interlacing of rows whose number is right.
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+#: Most bytes a frame may have: all samples as float64, and room for a header.
+_MAXIMUM_CHUNKS = 65_536  # 16 megapixels in pieces of 1 KB; each costs time even if empty
+_COLOURS = {2: "colour (RGB)", 3: "palette", 4: "greyscale with alpha", 6: "colour with alpha"}
+#: Adam7: first column and row of each pass, and its steps
+_PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2),
+           (0, 1, 1, 2))  # fmt: skip
+_TRUNCATED = "The PNG ends early. Copy or write the file again."
+
+
+def decode_png(data: bytes) -> NDArray[np.uint16]:
+    """Return the samples of a 16-bit greyscale PNG, in stored units.
+
+    Parameters
+    ----------
+    data : the whole file
+
+    Returns
+    -------
+    samples : (H, W) uint16
+
+    Raises
+    ------
+    UnreadableFrame : the file is empty, damaged, truncated, animated, too large, or has
+        another kind of pixels.
+    """
+    if not data:
+        raise UnreadableFrame("The file is empty. Copy or write it again.")
+    if len(data) > MAXIMUM_IMAGE_BYTES:
+        raise UnreadableFrame(
+            f"The file has {len(data)} bytes, the limit is {MAXIMUM_IMAGE_BYTES}. "
+            "Send the image at a lower resolution."
+        )
+    if not data.startswith(PNG_SIGNATURE):
+        raise UnreadableFrame("This is no PNG. Write the depth as a 16-bit greyscale PNG.")
+
+    header, pixels = b"", bytearray()
+    for kind, content in _chunks(data):
+        if not header and kind != b"IHDR":
+            raise UnreadableFrame("The PNG does not begin with its header. Write it again.")
+        if kind == b"IHDR":
+            if header:
+                raise UnreadableFrame("The PNG has two headers. Write it again.")
+            header = _checked_header(content)
+        elif kind == b"IDAT":
+            pixels += content
+        elif kind == b"acTL":
+            raise UnreadableFrame("The PNG is animated. Send one image per frame.")
+        elif kind != b"IEND" and kind[0:1].isupper():  # upper case: not to be ignored
+            raise UnreadableFrame(
+                f"The PNG has a {kind!r} chunk, which 16-bit greyscale has not. "
+                "Write it as a plain PNG."
+            )
+    return _samples(header, _inflate(bytes(pixels), header))
+
+
+def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
+    """Yield kind and content of each chunk up to IEND, check sums compared."""
+    view, position = memoryview(data), len(PNG_SIGNATURE)
+    for _ in range(_MAXIMUM_CHUNKS):
+        if position + 12 > len(data):
+            raise UnreadableFrame(_TRUNCATED)
+        (length,) = struct.unpack_from(">I", data, position)
+        end = position + 8 + length
+        if end + 4 > len(data):
+            raise UnreadableFrame(_TRUNCATED)
+        kind = data[position + 4 : position + 8]
+        if struct.unpack_from(">I", data, end)[0] != zlib.crc32(view[position + 4 : end]):
+            raise UnreadableFrame(
+                f"The PNG is damaged: the check sum of its {kind!r} chunk is wrong. "
+                "Copy or write the file again."
+            )
+        yield kind, view[position + 8 : end]
+        if kind == b"IEND":
+            return
+        position = end + 4
+    raise UnreadableFrame(
+        f"The PNG has more than {_MAXIMUM_CHUNKS} chunks. Write it with larger ones."
+    )
+
+
+def _checked_header(content: memoryview) -> bytes:
+    """Return the content of IHDR if it announces a 16-bit greyscale image of sane size."""
+    if len(content) != 13:
+        raise UnreadableFrame("The header of the PNG has a wrong length. Write it again.")
+    width, height, bits, colour, compression, filtering, interlace = struct.unpack(
+        ">IIBBBBB", content
+    )
+    if colour != 0 or bits != 16:
+        kind = _COLOURS.get(colour, "greyscale")
+        raise UnreadableFrame(
+            f"The PNG is {kind} with {bits} bits per sample, and depth is 16-bit greyscale. "
+            "Send the depth image itself, written from a uint16 array."
+        )
+    if width < 1 or height < 1 or width * height > MAXIMUM_SAMPLES:
+        raise UnreadableFrame(
+            f"The PNG announces {width} x {height} samples; 1 to {MAXIMUM_SAMPLES} are read. "
+            "Send the image at a lower resolution."
+        )
+    if compression or filtering or interlace > 1:
+        raise UnreadableFrame(
+            "The PNG uses a compression, filter or interlacing that PNG has not. Write it again."
+        )
+    return bytes(content)
+
+
+def _inflate(pixels: bytes, header: bytes) -> bytes:
+    """Return the filtered rows, exactly as many bytes as the header announces."""
+    width, height, interlaced = *struct.unpack_from(">II", header), header[12]
+    passes = _PASSES if interlaced else ((0, 0, 1, 1),)
+    expected = 0
+    for column, row, across, down in passes:
+        columns, rows = -(-(width - column) // across), -(-(height - row) // down)
+        if columns > 0 and rows > 0:  # an empty pass has no filter bytes either
+            expected += rows * (1 + 2 * columns)
+    stream = zlib.decompressobj()
+    try:
+        rows_bytes = stream.decompress(pixels, expected + 1)
+    except zlib.error as cause:
+        raise UnreadableFrame(
+            f"The PNG is damaged: its pixels do not decompress ({cause}). Write it again."
+        ) from cause
+    if len(rows_bytes) != expected or not stream.eof:
+        raise UnreadableFrame(
+            f"The PNG announces {width} x {height} samples and holds "
+            f"{'fewer' if len(rows_bytes) <= expected else 'more'}. Copy or write it again."
+        )
+    return rows_bytes
+
+
+def _samples(header: bytes, rows: bytes) -> NDArray[np.uint16]:
+    """Undo filters and interlacing: Pillow on a PNG of nothing but header and pixels."""
+    from PIL.PngImagePlugin import PngImageFile
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        check = zlib.crc32(content, zlib.crc32(kind))
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check)
+
+    plain = PNG_SIGNATURE + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows, 0))
+    try:
+        # not by Image.open, whose limit of pixels is the program's
+        with PngImageFile(io.BytesIO(plain + chunk(b"IEND", b""))) as image:
+            samples = np.asarray(image)
+    except (OSError, ValueError, SyntaxError) as cause:
+        raise UnreadableFrame(
+            f"The PNG is damaged: its rows do not decode ({cause}). Write it again."
+        ) from cause
+    return np.array(samples, dtype=np.uint16)  # some versions of Pillow give int32
+
+
+# NPY files of float metres, read without trusting their header.
+#
+# bytes  --decode_npy-->  samples (H, W) float32
+
+_TYPES = (
+    "depth is float32 in metres (float64 and float16 are taken too). Convert it, or send whole "
+    "numbers as a 16-bit PNG."
+)
+_SHAPES = (
+    "The shape of the NPY array is not that of an image, which has two dimensions. "
+    "Send one image of height x width."
+)
+
+
+def decode_npy(data: bytes) -> Floats32:
+    """Return the samples of an NPY file, in metres.
+
+    Parameters
+    ----------
+    data : the whole file: one two-dimensional array of float32, float64 or float16
+
+    Returns
+    -------
+    samples : (H, W) float32, with whatever NaN and infinities the file holds
+
+    Raises
+    ------
+    UnreadableFrame : the file is empty, no NPY, too large, of another type or shape, holds
+        Python objects, or its size contradicts its header.
+    """
+    if not data:
+        raise UnreadableFrame("The file is empty. Copy or write it again.")
+    if len(data) > MAXIMUM_IMAGE_BYTES:
+        raise UnreadableFrame(
+            f"The file has {len(data)} bytes, the limit is {MAXIMUM_IMAGE_BYTES}. "
+            "Send the image at a lower resolution."
+        )
+    if not data.startswith(NPY_SIGNATURE):
+        raise UnreadableFrame("This is no NPY file. Write the depth with numpy.save.")
+    header = _header(data)
+    height, width = header.shape
+    expected = height * width * header.dtype.itemsize
+    if len(data) - header.start != expected:
+        raise UnreadableFrame(
+            f"The NPY header announces {height} x {width} samples of {header.dtype.itemsize} bytes "
+            f"and {len(data) - header.start} of {expected} bytes follow. Copy or write the file "
+            "again."
+        )
+    numbers = np.frombuffer(data, header.dtype, offset=header.start)
+    samples = numbers.reshape(header.shape, order=header.order)
+    with np.errstate(all="ignore"):  # a float64 beyond float32 becomes inf: missing
+        return np.array(samples, dtype=np.float32, order="C")
+
+
+def image_size(head: bytes) -> tuple[int, int]:
+    """Width and height that the header of an NPY file tells; UnreadableFrame if it is none."""
+    height, width = _header(head).shape
+    return width, height
+
+
+def _header(data: bytes) -> NpyHeader:
+    header = npy_header(data, UnreadableFrame, _TYPES, _SHAPES)
+    height, width = header.shape
+    if not 1 <= height * width <= MAXIMUM_SAMPLES:
+        raise UnreadableFrame(
+            f"The NPY file announces no samples, or more than {MAXIMUM_SAMPLES}. "
+            "Send the image at a lower resolution."
+        )
+    return header
+
+
+#: What some sensors store, besides 0, where they measured nothing.
+_MISSING = 65_535
+
+
+def make_frame(
+    samples: NDArray[Any],
+    intrinsics: Intrinsics,
+    *,
+    depth_scale: float = 1000.0,
+    along_ray: bool = False,
+    name: str = "",
+    pose: Floats | None = None,
+) -> DepthFrame:
+    """Return the frame that the geometry reads: metres, z along the axis, no distortion.
+
+    Parameters
+    ----------
+    samples : (H, W) uint16 in stored units, 0 and 65535 where missing; or floating in
+        metres, NaN, infinite and <= 0 where missing
+    intrinsics : the camera that took the image, with its distortion
+    depth_scale : stored units per metre; floating samples are metres whatever it is
+    along_ray : the samples are ranges along the pixel's ray and not z
+    name : what to call the frame in lines and errors
+    pose : (4, 4) T_parent_sensor, or None where unknown
+
+    Returns
+    -------
+    frame : depth (H, W) float32, metres, 0 where missing
+
+    Raises
+    ------
+    UnreadableFrame : the samples are of another type or not two-dimensional.
+    InvalidIntrinsics : they do not fit the image, or the depth scale is no positive number.
+    InvalidPose : the pose is not a rigid transform.
+    UselessFrame : no sample remains.
+    """
+    with naming(name):
+        if not (math.isfinite(depth_scale) and depth_scale > 0):
+            raise InvalidIntrinsics(
+                f"The depth scale {depth_scale} is not a positive number. "
+                "Give the stored units per metre, 1000 for millimetres."
+            )
+        depth = _metres(samples, depth_scale)
+        height, width = depth.shape
+        if (width, height) != (intrinsics.width, intrinsics.height):
+            raise InvalidIntrinsics(
+                f"The image has {width} x {height} pixels, the intrinsics are of "
+                f"{intrinsics.width} x {intrinsics.height}. Give those of this image, as a "
+                "resized image has others."
+            )
+        # the ray of a sample is that of the distorted pixel, so before undistorting
+        if along_ray:
+            depth = ray_to_axis(depth, intrinsics)
+        if intrinsics.distortion:
+            depth = undistort(depth, intrinsics)
+        if not depth.any():
+            raise UselessFrame(
+                f"All {depth.size} samples are missing. Check that the sensor saw something "
+                "within its range."
+            )
+        return DepthFrame(
+            depth=depth,
+            intrinsics=intrinsics.without_distortion(),
+            name=name,
+            pose=None if pose is None else rigid_transform(pose),
+        )
+
+
+def read_frame(
+    path: Path,
+    intrinsics: Intrinsics,
+    *,
+    depth_scale: float = 1000.0,
+    along_ray: bool = False,
+    name: str = "",
+    pose: Floats | None = None,
+) -> DepthFrame:
+    """Return the frame of a PNG or NPY file; its content tells which, not its name.
+
+    Parameters
+    ----------
+    path : the file; the rest as for `make_frame`
+
+    Raises
+    ------
+    UnreadableFrame : the file is absent or too large; and as `decode_frame`. Each error names
+        the file.
+    """
+    data = read_bytes(path, MAXIMUM_IMAGE_BYTES, UnreadableFrame)
+    with naming(str(path)):
+        frame = decode_frame(
+            data, intrinsics, depth_scale=depth_scale, along_ray=along_ray, pose=pose
+        )
+    return replace(frame, name=name)
+
+
+def decode_frame(
+    data: bytes,
+    intrinsics: Intrinsics,
+    *,
+    depth_scale: float = 1000.0,
+    along_ray: bool = False,
+    name: str = "",
+    pose: Floats | None = None,
+) -> DepthFrame:
+    """Return the frame of the bytes of a PNG or NPY file.
+
+    Parameters
+    ----------
+    data : the whole file; the rest as for `make_frame`
+
+    Raises
+    ------
+    UnreadableFrame : neither PNG nor NPY; and as `decode_png`, `decode_npy` and `make_frame`.
+    """
+    with naming(name):
+        frame = make_frame(
+            _decode(data), intrinsics, depth_scale=depth_scale, along_ray=along_ray, pose=pose
+        )
+    return replace(frame, name=name)
+
+
+def _decode(data: bytes) -> NDArray[np.uint16] | Floats32:
+    if not data:
+        raise UnreadableFrame("The file is empty. Copy or write it again.")
+    if data.startswith(PNG_SIGNATURE):
+        return decode_png(data)
+    if data.startswith(NPY_SIGNATURE):
+        return decode_npy(data)
+    raise UnreadableFrame(
+        "This is neither PNG nor NPY. Write the depth as a 16-bit greyscale PNG, or as a "
+        "float32 array in metres with numpy.save."
+    )
+
+
+def _metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
+    """Return (H, W) float32 metres, 0 where missing."""
+    if not isinstance(samples, np.ndarray):
+        raise TypeError(f"samples must be a numpy array, not {type(samples).__name__}")
+    if samples.ndim != 2 or samples.size == 0:
+        raise UnreadableFrame(
+            f"The samples have shape {samples.shape}, and a depth image has two dimensions. "
+            "Send one image of height x width."
+        )
+    with np.errstate(all="ignore"):  # what overflows float32 is missing
+        if samples.dtype.kind == "u" and samples.dtype.itemsize == 2:
+            values = np.arange(_MISSING + 1, dtype=np.uint16)
+            if samples.size > values.size:  # fewer values than samples: each is divided once
+                return np.ascontiguousarray(_metres(values[None], depth_scale)[0][samples])
+            depth = (samples / depth_scale).astype(np.float32)
+            depth[samples == _MISSING] = 0.0
+        elif samples.dtype.kind == "f":
+            depth = np.array(samples, dtype=np.float32, order="C")
+        else:
+            raise UnreadableFrame(
+                f"The samples are {samples.dtype}, and depth is uint16 in stored units or "
+                "float32 in metres. Convert them."
+            )
+        depth[~(np.isfinite(depth) & (depth > 0.0))] = 0.0
+    return depth
+
+
+# The size of a depth image, by its header alone.
+#
+# first bytes  --size_of-->  width, height
+
+
+def size_of(head: bytes) -> tuple[int, int] | None:
+    """Width and height of the image of a PNG or NPY file, pixels; None where it is neither.
+
+    Parameters
+    ----------
+    head : first HEAD bytes of the file (sceneprint_client.file_formats): of a PNG 24 are enough
+    """
+    if head.startswith(PNG_SIGNATURE) and len(head) >= 24:
+        width, height = struct.unpack_from(">II", head, 16)
+        return width, height
+    if head.startswith(NPY_SIGNATURE):
+        try:
+            return image_size(head)
+        except UnreadableFrame:  # whoever decodes it says why
+            pass
+    return None

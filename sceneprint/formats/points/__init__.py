@@ -1,0 +1,22 @@
+"""Files of points in: PLY, PCD, KITTI, NPY, LAS and LAZ, read without trusting them.
+
+bytes  --decode_cloud-->  Cloud
+"""
+
+from sceneprint.formats.points.cloud import (
+    Scan,
+    decode_cloud,
+    decode_scan,
+)
+from sceneprint_client.file_formats import SUFFIXES, format_of
+from sceneprint_client.sidecars import UNSAID, Unsaid
+
+__all__ = [
+    "SUFFIXES",
+    "UNSAID",
+    "Scan",
+    "Unsaid",
+    "decode_cloud",
+    "decode_scan",
+    "format_of",
+]

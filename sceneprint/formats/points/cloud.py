@@ -1,0 +1,284 @@
+"""The door for points: the bytes of a file in, a `Cloud` out.
+
+bytes  --decode_scan-->  Scan: the cloud, and how it was read
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import UnreadableCloud, UselessFrame, naming
+from sceneprint.formats.points.float_rows import FilePoints
+from sceneprint.formats.points.las import read_las
+from sceneprint.formats.points.npy_points import read_kitti, read_npy
+from sceneprint.formats.points.pcd import read_pcd
+from sceneprint.formats.points.ply import read_ply
+from sceneprint.geometry.kernel import kernel
+from sceneprint.types import Cloud, Floats, Floats32
+from sceneprint_client.api.frames import CloudFormat
+from sceneprint_client.file_formats import MAXIMUM_CLOUD_BYTES, format_of
+from sceneprint_client.sidecars import UNSAID, Position, Unsaid, rigid_transform
+
+# Fewer points, one to a voxel.
+#
+# points (N, 3)  --thinned-->  points (n, 3), edge of the voxels
+
+#: Edge of the smallest voxels, metres: 2^21 of them are more than 20 km.
+_FINEST = 0.01
+
+Keys = NDArray[np.int64]
+
+
+def thinned(points: Floats32, most: int) -> tuple[Floats32, float]:
+    """At most so many of the points: of each voxel the first, in their order.
+
+    Voxels are the smallest of 1 cm, 1.4 cm, 2 cm, ... that leave no more.
+
+    Parameters
+    ----------
+    points : (N, 3) metres, none beyond 10 km
+    most : at least 8: so many voxels meet at the origin, of any size
+
+    Returns
+    -------
+    points : (n, 3)
+    edge : of the voxels, metres
+    """
+    slots = 1 << max(4, math.ceil(math.log2(1.5 * most)))
+    table, kept = np.empty(slots, np.int64), np.empty(most, np.int32)
+    # who knows the hash can write a file all of whose voxels share a slot; which point is kept
+    # does not depend on it
+    secret, step = secrets.randbits(62), 0
+    while True:
+        edge = _FINEST * math.sqrt(2.0) ** step
+        n = _firsts(points, 1.0 / edge, secret, table, kept)
+        if n >= 0:
+            return points[kept[:n]], edge
+        step += 1
+
+
+@kernel
+def _firsts(
+    points: Floats32, scale: float, secret: int, table: Keys, kept: NDArray[np.int32]
+) -> int:
+    """Indices of the first point of each voxel, and how many; -1 if more than there is room."""
+    table[:] = -1
+    mask, n = len(table) - 1, 0
+    for i in range(len(points)):
+        key = 0
+        for k in range(3):
+            key = (key << 21) | (math.floor(points[i, k] * scale) + (1 << 20))
+        h = (key ^ secret) * 0x9E3779B97F4A7C1
+        h ^= h >> 31
+        h *= 0x1D8E4E27C47D124F
+        slot = (h >> 20) & mask
+        while table[slot] >= 0 and table[slot] != key:
+            slot = (slot + 1) & mask
+        if table[slot] < 0:
+            if n == len(kept):
+                return -1
+            table[slot] = key
+            kept[n] = i
+            n += 1
+    return n
+
+
+#: Fewest and most points of a cloud; of more, one to a voxel is kept.
+FEWEST_POINTS, MOST_POINTS = 10, 5_000_000
+
+#: Farthest that a point may be from the viewpoint, metres.
+FARTHEST_M = 10_000.0
+
+#: Farthest that a viewpoint may be from the origin of its file, metres: half round the Earth.
+_FARTHEST_VIEWPOINT_M = 2e7
+
+_READERS = {
+    "ply": read_ply,
+    "pcd": read_pcd,
+    "kitti": read_kitti,
+    "npy": read_npy,
+    "las": read_las,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A cloud, and how it was read.
+
+    Parameters
+    ----------
+    cloud : its points, from the viewpoint
+    file_format : of the file
+    viewpoint : that was used, metres in the file's axes; None where there is none
+    given : how many points the file has, missing ones too
+    """
+
+    cloud: Cloud
+    file_format: CloudFormat
+    viewpoint: Position | None
+    given: int
+
+
+def decode_cloud(
+    data: bytes,
+    *,
+    file_format: CloudFormat | None = None,
+    viewpoint: Position | Unsaid | None = UNSAID,
+    units_per_metre: float = 1.0,
+    name: str = "",
+    pose: Floats | None = None,
+) -> Cloud:
+    """Return the cloud of a file's bytes; as `decode_scan`."""
+    return decode_scan(
+        data,
+        file_format=file_format,
+        viewpoint=viewpoint,
+        units_per_metre=units_per_metre,
+        name=name,
+        pose=pose,
+    ).cloud
+
+
+def decode_scan(
+    data: bytes,
+    *,
+    file_format: CloudFormat | None = None,
+    viewpoint: Position | Unsaid | None = UNSAID,
+    units_per_metre: float = 1.0,
+    name: str = "",
+    pose: Floats | None = None,
+) -> Scan:
+    """Return the cloud of the bytes of a PLY, PCD, KITTI, NPY, LAS or LAZ file.
+
+    Parameters
+    ----------
+    data : the whole file
+    file_format : of it; where None its first bytes tell, which those of a KITTI scan do not
+    viewpoint : where the sensor was, metres in the file's axes; None for points of many views;
+        nothing said: the VIEWPOINT of a PCD file, else the origin, as sensors write
+    units_per_metre : of the file's coordinates, 1000 for millimetres
+    name : what to call the frame in lines and errors
+    pose : (4, 4) T_parent_sensor, or None where unknown
+
+    Returns
+    -------
+    scan : points at the place of the viewpoint are at the origin, the axes stay; points that are
+        missing (NaN, infinite) are left out
+
+    Raises
+    ------
+    UnreadableCloud : the bytes are of no such format, or damaged; there are more than 20 million
+        points, or one is more than 10 km from the viewpoint.
+    UselessFrame : fewer than 10 points are there.
+    InvalidPose : the pose is not a rigid transform.
+    MissingDependency : the file is LAZ, and lazrs is not installed.
+    """
+    with naming(name):
+        _check_units(units_per_metre)
+        if len(data) > MAXIMUM_CLOUD_BYTES:
+            raise UnreadableCloud(
+                f"The file has {len(data)} bytes, the limit is {MAXIMUM_CLOUD_BYTES}. "
+                "Thin the cloud out, or send it in parts."
+            )
+        found = _format(data, file_format)
+        raw = _READERS[found](data)
+        place = _place(viewpoint, raw, units_per_metre)
+        # lengths are checked above: a header of twenty million points has bytes for them
+        points = _from(raw, place or (0.0, 0.0, 0.0), units_per_metre)
+        missing = raw.count - len(points)
+        if len(points) < FEWEST_POINTS:
+            raise UselessFrame(
+                f"{missing} of {raw.count} points are missing, and the {len(points)} left are "
+                f"fewer than {FEWEST_POINTS}. Check that the sensor saw something."
+            )
+        note = f"{missing} missing points left out" if missing else ""
+        if len(points) > MOST_POINTS:
+            before = len(points)
+            points, edge = thinned(points, MOST_POINTS)
+            told = f"thinned from {before} points to {len(points)}, one to {100 * edge:.1f} cm"
+            note = f"{note}; {told}" if note else told
+            if len(points) < FEWEST_POINTS:
+                raise UselessFrame(
+                    f"{before} points lie in {len(points)} places {100 * edge:.1f} cm apart or "
+                    f"more, fewer than {FEWEST_POINTS}. Check that the sensor saw something."
+                )
+        cloud = Cloud(
+            points,
+            has_viewpoint=place is not None,
+            name=name,
+            pose=None if pose is None else rigid_transform(pose),
+            note=note,
+        )
+        return Scan(cloud, found, place, raw.count)
+
+
+def _format(data: bytes, told: CloudFormat | None) -> CloudFormat:
+    found = format_of(data)
+    if told == "kitti" and found is not None:
+        raise UnreadableCloud(
+            f"This is no KITTI scan: it begins as a {found.upper()} file does. Say that, or "
+            "nothing, for its format."
+        )
+    if told is not None and told not in _READERS:
+        raise UnreadableCloud(
+            f"{told!r:.40} is no format of points. Known are {', '.join(_READERS)}."
+        )
+    if not data:
+        raise UnreadableCloud("The file is empty. Copy or write it again.")
+    if told is None and found is None:
+        raise UnreadableCloud(
+            "This is none of PLY, PCD, LAS, LAZ and NPY of shape (N, 3) or (N, 4), by its first "
+            "bytes. Write one of these; for a KITTI scan (.bin), say kitti as its format."
+        )
+    chosen = told or found
+    assert chosen is not None
+    return chosen
+
+
+def _check_units(units: float) -> None:
+    if not (math.isfinite(units) and 1e-6 <= units <= 1e9):
+        raise UnreadableCloud(
+            f"The units per metre are {units}, no such number. Say 1 for metres, 1000 for "
+            "millimetres."
+        )
+
+
+def _place(told: Position | Unsaid | None, raw: FilePoints, units: float) -> Position | None:
+    """Where the sensor was, metres; None where it was nowhere."""
+    if isinstance(told, Unsaid):
+        x, y, z = raw.viewpoint or (0.0, 0.0, 0.0)
+        told = (x / units, y / units, z / units)
+    if told is not None and not all(abs(value) <= _FARTHEST_VIEWPOINT_M for value in told):
+        raise UnreadableCloud(
+            f"The viewpoint {told} is not finite, or none on Earth. Give where the sensor was, in "
+            "metres along the axes of the points."
+        )
+    return told
+
+
+def _from(raw: FilePoints, place: Position, units: float) -> Floats32:
+    """Points (n, 3) from a place, metres, without those that are missing."""
+    points, n = np.empty((raw.count, 3), np.float32), 0
+    with np.errstate(all="ignore"):  # what overflows is no number, and so missing
+        for block in raw.blocks:
+            block /= units
+            block -= place
+            present = block[np.isfinite(block).all(axis=1)]
+            _check_reach(np.abs(present).max(initial=0.0))
+            points[n : n + len(present)] = present
+            n += len(present)
+    return points if n == raw.count else points[:n].copy()
+
+
+def _check_reach(far: float) -> None:
+    if far > FARTHEST_M:
+        raise UnreadableCloud(
+            f"A point lies {far:.6g} m from the viewpoint along an axis, and at most "
+            f"{FARTHEST_M:g} m is read. Say units_per_metre if these are no metres, and shift "
+            "coordinates of a map (UTM) to the sensor, or give the viewpoint in them."
+        )

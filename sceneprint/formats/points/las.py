@@ -1,0 +1,258 @@
+"""LAS files (ASPRS LAS 1.0 to 1.4), and LAZ by the package lazrs.
+
+bytes  --read_las-->  FilePoints
+
+Every point format begins with X, Y, Z as whole numbers, which a scale and an offset make lengths.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import MissingDependency, UnreadableCloud
+from sceneprint.formats.points.float_rows import FilePoints, check_count, steps
+from sceneprint.types import Floats
+from sceneprint_client.file_formats import LAS_SIGNATURE
+
+# The compressed points of LAZ files, by lazrs (Rust), which is an extra.
+#
+# bytes, header  --inflated_records-->  records, a block at a time
+#
+# lazrs takes memory as the file says, and a Rust program that gets none aborts: so all that it
+# allocates by is compared with the length of the file before it is called. Of the points that is
+# (M. Isenburg, LASzip 1.3 and 1.4): the kinds of values in a record, the number of chunks, and in
+# formats from 6 how long the layers of each chunk are.
+
+_VLR = 54  #: bytes of a record's own header
+_MAXIMUM_VLRS = 10_000
+_VARIABLE = 0xFFFFFFFF  #: chunk size that says each chunk has its own
+_MOST = 2 << 30  #: bytes of records, which are inflated block by block
+_MOST_RATIO, _FREE = 250, 64 << 20  #: how much more records are than their file, once beyond bytes
+
+#: Bytes of a value by its kind, where that is fixed; kinds from 10 are in layers, so many each.
+_ITEMS = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+_BYTES, _LAYERED_BYTES = 0, 14
+
+
+def inflated_records(
+    data: bytes, header: int, start: int, form: int, length: int, count: int, row: np.dtype[np.void]
+) -> Iterator[NDArray[np.void]]:
+    """Yield the records of a LAZ file.
+
+    Parameters
+    ----------
+    data : the file
+    header : bytes of its header
+    start : of its points
+    form : point format
+    length : bytes of a record
+    count : of the points
+    row : of a record
+
+    Raises
+    ------
+    MissingDependency : lazrs is not installed.
+    UnreadableCloud : the compressed points are not what the header says, or damaged.
+    """
+    lazrs = _lazrs()
+    vlr = _laszip_vlr(data, header, start)
+    compressor, coder, chunk, kinds = _described(vlr)
+    layered = compressor == 3
+    known = layered == (form >= 6) and coder == 0 and compressor in (2, 3)
+    if not known or not _fits(kinds, layered, length):
+        raise UnreadableCloud(
+            f"The LAZ file packs records of {length} bytes of format {form} as {kinds[:20]} by "
+            f"compressor {compressor}, which does not fit. {_AGAIN}"
+        )
+    if count * length > min(_MOST, _FREE + _MOST_RATIO * len(data)):
+        raise UnreadableCloud(
+            f"The LAZ file announces {count} points of {length} bytes in {len(data)} bytes, more "
+            f"than {_MOST_RATIO} times as much. {_AGAIN}"
+        )
+    _check_chunks(data, start, length, kinds, count, chunk)
+    return _records(lazrs, data, start, vlr, count, row)
+
+
+def _records(
+    lazrs: ModuleType, data: bytes, start: int, vlr: bytes, count: int, row: np.dtype[np.void]
+) -> Iterator[NDArray[np.void]]:
+    source = io.BytesIO(data)
+    source.seek(start)
+    wanted = lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL | lazrs.SELECTIVE_DECOMPRESS_Z
+    selection = lazrs.DecompressionSelection(wanted)
+    reader: Any = _guarded(lazrs.LasZipDecompressor, source, vlr, selection)
+    most = max(1, (4 << 20) // row.itemsize)
+    for _, n in steps(count):
+        table = np.empty(n, row)
+        for i in range(0, n, most):
+            part = bytearray(min(most, n - i) * row.itemsize)
+            _guarded(reader.decompress_many, part)
+            table[i : i + most] = np.frombuffer(part, row)
+        yield table
+
+
+def _guarded(function: Any, *given: Any) -> Any:
+    try:
+        return function(*given)
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as cause:  # a panic of Rust is no Exception
+        raise UnreadableCloud(
+            f"The compressed points of the LAZ file are damaged ({str(cause)[:80]}). {_AGAIN}"
+        ) from cause
+
+
+def _lazrs() -> ModuleType:
+    try:
+        import lazrs
+    except ImportError as cause:
+        raise MissingDependency(
+            "LAZ needs the package lazrs, which is not installed. Install sceneprint[las], or "
+            "send the points as LAS, which needs nothing."
+        ) from cause
+    module: ModuleType = lazrs
+    return module
+
+
+def _laszip_vlr(data: bytes, at: int, end: int) -> bytes:
+    """The record that tells how points are packed, of those between header and points."""
+    (count,) = struct.unpack_from("<I", data, 100)
+    for _ in range(min(count, _MAXIMUM_VLRS)):
+        if at + _VLR > end:
+            break
+        user, number, length = struct.unpack_from("<16sHH", data, at + 2)
+        if at + _VLR + length > end:
+            break
+        if user.rstrip(b"\0") == b"laszip encoded" and number == 22204:
+            return data[at + _VLR : at + _VLR + length]
+        at += _VLR + length
+    raise UnreadableCloud(f"The LAZ file does not tell how its points are packed. {_AGAIN}")
+
+
+def _described(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
+    """Compressor, coder, points of a chunk, and kind and size of each value."""
+    if len(vlr) >= 34:
+        compressor, coder = struct.unpack_from("<HH", vlr, 0)
+        (chunk,) = struct.unpack_from("<I", vlr, 12)
+        (items,) = struct.unpack_from("<H", vlr, 32)
+        if chunk and len(vlr) >= 34 + 6 * items:
+            kinds = [struct.unpack_from("<HH", vlr, 34 + 6 * i) for i in range(items)]
+            return compressor, coder, chunk, kinds
+    raise UnreadableCloud(f"The LAZ file does not tell how its points are packed. {_AGAIN}")
+
+
+def _fits(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:
+    """Whether these are the values of a record: the point first, then each kind at most once."""
+    names = [kind for kind, _ in kinds]
+    free = _LAYERED_BYTES if layered else _BYTES
+    return (
+        names[:1] == [10 if layered else 6]
+        and len(set(names)) == len(names)
+        and all(k == free or (k in _ITEMS and (k >= 10) == layered) for k in names)
+        and all(size == _ITEMS.get(kind, size) for kind, size in kinds)
+        and sum(size for _, size in kinds) == length
+    )
+
+
+def _check_chunks(
+    data: bytes, start: int, length: int, kinds: list[tuple[int, int]], count: int, chunk: int
+) -> None:
+    """Refuse chunks that are longer than their file, too many, or too few."""
+    lie = UnreadableCloud(f"The chunks of the LAZ file are not those of its points. {_AGAIN}")
+    if len(data) - start < 8:
+        raise lie
+    (table,) = struct.unpack_from("<q", data, start)
+    if table == -1:  # written to a pipe: its place is at the end
+        (table,) = struct.unpack_from("<q", data, len(data) - 8)
+    if not start + 8 <= table <= len(data) - 8:
+        raise lie
+    version, chunks = struct.unpack_from("<II", data, table)
+    # the first point of each is as it is
+    if version != 0 or chunks * length > len(data) or chunks > count:
+        raise lie
+    if chunk != _VARIABLE and chunks != -(-count // chunk):
+        raise lie
+    if kinds[0][0] != 10:
+        return
+    layers = sum(_LAYERS.get(kind, size) for kind, size in kinds)
+    at, points = start + 8, 0
+    while points < count:  # a last chunk may be empty
+        head = at + length
+        if head + 4 + 4 * layers > table:
+            raise lie
+        points += struct.unpack_from("<I", data, head)[0]
+        at = head + 4 + 4 * layers
+        at += sum(struct.unpack_from(f"<{layers}I", data, head + 4))
+    if points != count or at > table or (at < table and chunk != _VARIABLE):
+        raise lie
+
+
+_SMALLEST_HEADER = 227  #: bytes
+_AGAIN = "Copy or write the file again."
+
+#: Bytes of a record by point format.
+_RECORDS = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
+
+Records = NDArray[np.void]
+
+
+def read_las(data: bytes) -> FilePoints:
+    """The points of a LAS or LAZ file.
+
+    Raises
+    ------
+    UnreadableCloud : it is none, of an unknown format, or its header does not fit what follows it.
+    MissingDependency : it is LAZ, and lazrs is not installed.
+    """
+    if len(data) < _SMALLEST_HEADER or not data.startswith(LAS_SIGNATURE):
+        raise UnreadableCloud("This is no LAS file, or its header is cut off. Copy it again.")
+    minor, (header, start) = data[25], struct.unpack_from("<HI", data, 94)
+    form, length, count = struct.unpack_from("<BHI", data, 104)
+    packed, form = bool(form & 0x80), form & 0x3F
+    if data[24] != 1 or minor > 4 or form >= len(_RECORDS) or length < _RECORDS[form]:
+        raise UnreadableCloud(
+            f"The LAS header tells version {data[24]}.{minor}, point format {form} and records of "
+            f"{length} bytes, and known are versions up to 1.4, formats up to 10 and their sizes. "
+            f"{_AGAIN}"
+        )
+    if minor == 4 and len(data) >= 255 and header >= 375:
+        (count,) = struct.unpack_from("<Q", data, 247)  # beyond 32 bits, and for formats from 6
+    if not _SMALLEST_HEADER <= header <= start <= len(data):
+        raise UnreadableCloud(
+            f"The LAS header has {header} bytes, and points from byte {start} of {len(data)}. "
+            f"{_AGAIN}"
+        )
+    check_count(count)
+    transform = struct.unpack_from("<6d", data, 131)
+    if not all(map(math.isfinite, transform)) or 0.0 in transform[:3]:
+        raise UnreadableCloud(f"The scale of the LAS file is {transform[:3]}. {_AGAIN}")
+    row = np.dtype({"names": list("xyz"), "formats": ["<i4"] * 3, "offsets": [0, 4, 8],
+                    "itemsize": length})  # fmt: skip
+    if packed:
+        records = inflated_records(data, header, start, form, length, count, row)
+    else:
+        if count * length > len(data) - start:
+            raise UnreadableCloud(
+                f"The LAS header announces {count} points of {length} bytes, and "
+                f"{len(data) - start} of {count * length} bytes follow. {_AGAIN}"
+            )
+        table = np.frombuffer(data, row, count, start)
+        records = (table[i : i + n] for i, n in steps(count))
+    return FilePoints(count, _lengths(records, transform))
+
+
+def _lengths(records: Iterator[Records], transform: tuple[float, ...]) -> Iterator[Floats]:
+    for rows in records:
+        block = np.empty((len(rows), 3))
+        for k, name in enumerate("xyz"):
+            block[:, k] = rows[name]
+        yield block * transform[:3] + transform[3:]

@@ -1,0 +1,299 @@
+"""PCD files, those of the Point Cloud Library: ascii, binary and binary_compressed.
+
+bytes  --read_pcd-->  FilePoints
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneprint.errors import UnreadableCloud
+from sceneprint.formats.points.float_rows import (
+    MAXIMUM_INFLATED,
+    FilePoints,
+    check_count,
+    columns,
+    steps,
+)
+from sceneprint.formats.points.text_rows import check_room, parse_blocks
+from sceneprint.geometry.kernel import kernel
+from sceneprint.types import Bytes, Floats
+from sceneprint_client.file_formats import is_pcd
+from sceneprint_client.sidecars import Position
+
+# LZF, which binary_compressed PCD files are packed with (M. Lehmann's liblzf 3.6).
+#
+# packed, size  --inflate-->  bytes
+#
+# A control byte below 32 is followed by so many bytes and one more, as they are. Any other has, in
+# its upper three bits, how many bytes to repeat beyond two (7: and a byte more of them follows),
+# and in its lower five the upper part of how far back they begin.
+
+#: Most bytes that one packed byte can become: three of a repetition tell 264.
+MOST_RATIO = 88
+
+
+def inflate(packed: Bytes, size: int) -> Bytes:
+    """The bytes that were packed.
+
+    Parameters
+    ----------
+    packed : (n,)
+    size : how many there must be; the caller has made sure that so many are wanted
+
+    Raises
+    ------
+    UnreadableCloud : there are more, fewer, or the packed ones make no sense.
+    """
+    if size > MOST_RATIO * len(packed):  # before anything is allocated
+        raise UnreadableCloud(
+            f"The file announces {size} bytes packed into {len(packed)}, and LZF packs at most "
+            f"{MOST_RATIO} into one. Copy or write the file again."
+        )
+    out = np.empty(size, np.uint8)
+    if _inflate(packed, out) != size:
+        raise UnreadableCloud(
+            f"The compressed points are damaged: they do not become {size} bytes. "
+            "Copy or write the file again."
+        )
+    return out
+
+
+@kernel
+def _inflate(packed: Bytes, out: Bytes) -> int:
+    """Fill `out`, and return how many bytes there were; -1 where there are more, or none."""
+    i, o, size, room = 0, 0, len(packed), len(out)
+    while i < size:
+        control = int(packed[i])
+        i += 1
+        if control < 32:
+            length = control + 1
+            if i + length > size or o + length > room:
+                return -1
+            for k in range(length):
+                out[o + k] = packed[i + k]
+            i += length
+        else:
+            length = control >> 5
+            if length == 7:
+                if i >= size:
+                    return -1
+                length += int(packed[i])
+                i += 1
+            if i >= size:
+                return -1
+            length += 2
+            back = o - ((control & 31) << 8) - int(packed[i]) - 1
+            i += 1
+            if back < 0 or o + length > room:
+                return -1
+            for k in range(length):  # one by one: what is repeated may overlap itself
+                out[o + k] = out[back + k]
+        o += length
+    return o
+
+
+#: How a PCD file begins: comments, then one of the first entries. Nothing is taken back (*+): a
+#: file of empty lines would cost memory for each.
+_MAXIMUM_HEADER = 65_536  #: bytes
+_MAXIMUM_FIELDS = 1000
+_MAXIMUM_COUNT = 65_536  #: values of a field
+_AGAIN = "Copy or write the file again."
+_XYZ = ("x", "y", "z")
+_TYPES = {
+    "F4": "<f4", "F8": "<f8", "I1": "<i1", "I2": "<i2", "I4": "<i4", "I8": "<i8",
+    "U1": "<u1", "U2": "<u2", "U4": "<u4", "U8": "<u8",
+}  # fmt: skip
+_ENTRIES = (
+    "VERSION", "FIELDS", "COLUMNS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT",
+    "POINTS", "DATA",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Field:
+    """So many values of one type in each row."""
+
+    name: str
+    kind: str  #: of numpy
+    count: int
+
+    @property
+    def size(self) -> int:
+        """Bytes of it in a row."""
+        return self.count * np.dtype(self.kind).itemsize
+
+
+def read_pcd(data: bytes) -> FilePoints:
+    """The points of a PCD file, and the place of its VIEWPOINT where that is not the origin.
+
+    Raises
+    ------
+    UnreadableCloud : it is none, its points lack x, y or z, or its header does not fit what
+        follows it.
+    """
+    entries, start = _header(data)
+    fields, count = _fields(entries), _points(entries)
+    names = [field.name for field in fields]
+    wrong = [k for k in _XYZ if names.count(k) != 1 or fields[names.index(k)].count != 1]
+    if wrong:
+        raise UnreadableCloud(
+            f"The points of the PCD file have no single {' or '.join(wrong)}. "
+            "Write each point's x, y and z."
+        )
+    check_count(count)
+    form = " ".join(entries["DATA"])
+    width = sum(field.size for field in fields)
+    if form == "ascii":
+        blocks = _written_out(data, start, count, fields)
+    elif form == "binary":
+        if len(data) - start != count * width:
+            raise UnreadableCloud(
+                f"The PCD header announces {count} points of {width} bytes, and "
+                f"{len(data) - start} of {count * width} bytes follow. {_AGAIN}"
+            )
+        before = np.cumsum([0] + [field.size for field in fields]).tolist()
+        where = [names.index(k) for k in _XYZ]
+        row = np.dtype(
+            {
+                "names": _XYZ,
+                "formats": [fields[i].kind for i in where],
+                "offsets": [before[i] for i in where],
+                "itemsize": width,
+            }
+        )
+        blocks = columns(np.frombuffer(data, row, count, start), _XYZ)
+    elif form == "binary_compressed":
+        blocks = _compressed(data, start, count, fields)
+    else:
+        raise UnreadableCloud(
+            f"The PCD file has DATA {form!r:.40}, and known are ascii, binary and "
+            f"binary_compressed. {_AGAIN}"
+        )
+    return FilePoints(count, blocks, _viewpoint(entries.get("VIEWPOINT")))
+
+
+def _written_out(data: bytes, start: int, count: int, fields: list[Field]) -> Iterator[Floats]:
+    text, counts = np.frombuffer(data, np.uint8), [field.count for field in fields]
+    width = sum(counts)
+    if not count:  # a header alone must not ask for room for its columns
+        return iter(())
+    check_room(text, start, count, width)
+    column = [_XYZ.index(field.name) if field.name in _XYZ else -1 for field in fields]
+    wanted = np.repeat(np.array(column, np.int8), counts)
+    return parse_blocks(text, start, count, wanted, np.zeros(width, np.bool_))
+
+
+def _compressed(data: bytes, start: int, count: int, fields: list[Field]) -> Iterator[Floats]:
+    """Field after field, each of all points."""
+    size = count * sum(field.size for field in fields)
+    if len(data) - start < 8:
+        raise UnreadableCloud(f"The PCD file ends before its compressed points. {_AGAIN}")
+    packed, inflated = struct.unpack_from("<II", data, start)
+    if inflated != size or packed != len(data) - start - 8:
+        raise UnreadableCloud(
+            f"The PCD header announces {size} bytes of points, and {inflated} packed into "
+            f"{packed} follow, of which {len(data) - start - 8} are there. {_AGAIN}"
+        )
+    if size > MAXIMUM_INFLATED:
+        raise UnreadableCloud(
+            f"The compressed points are {size} bytes, and at most {MAXIMUM_INFLATED} are "
+            "inflated. Write x, y and z alone."
+        )
+    everything = inflate(np.frombuffer(data, np.uint8, packed, start + 8), size)
+    begins, found = 0, dict[str, np.ndarray[tuple[int], np.dtype[np.number]]]()
+    for field in fields:
+        if field.name in _XYZ:
+            found[field.name] = everything[begins : begins + count * field.size].view(field.kind)
+        begins += count * field.size
+    return (np.stack([found[k][i : i + n] for k in _XYZ], axis=1, dtype=np.float64)
+            for i, n in steps(count))  # fmt: skip
+
+
+def _header(data: bytes) -> tuple[dict[str, list[str]], int]:
+    """Entries by their names, and where the points begin."""
+    if not is_pcd(data):
+        raise UnreadableCloud("This is no PCD file: it does not begin with VERSION or FIELDS.")
+    entries, start, head = dict[str, list[str]](), 0, data[:_MAXIMUM_HEADER]
+    while "DATA" not in entries:
+        end = head.find(b"\n", start)
+        if end < 0:
+            raise UnreadableCloud(
+                f"The PCD header has no line DATA in its first {_MAXIMUM_HEADER} bytes. {_AGAIN}"
+            )
+        line = head[start:end].decode("latin-1").strip()
+        start = end + 1
+        if not line or line.startswith("#"):
+            continue
+        name, *words = line.split()
+        if name not in _ENTRIES or name in entries:
+            raise UnreadableCloud(f"The PCD header has a line {line!r:.60}. {_AGAIN}")
+        entries[name] = words
+    return entries, start
+
+
+def _fields(entries: dict[str, list[str]]) -> list[Field]:
+    names = entries.get("FIELDS", entries.get("COLUMNS", []))
+    kinds, sizes = entries.get("TYPE", []), entries.get("SIZE", [])
+    counts = entries.get("COUNT", ["1"] * len(names))
+    if not 1 <= len(names) <= _MAXIMUM_FIELDS or not len(names) == len(kinds) == len(sizes) == len(
+        counts
+    ):
+        raise UnreadableCloud(
+            f"The PCD header has {len(names)} FIELDS, {len(sizes)} SIZE, {len(kinds)} TYPE and "
+            f"{len(counts)} COUNT, which must be as many. {_AGAIN}"
+        )
+    fields = []
+    for name, kind, size, count in zip(names, kinds, sizes, counts, strict=True):
+        known, values = _TYPES.get(f"{kind}{size}"), _whole("COUNT", count)
+        if known is None or values > _MAXIMUM_COUNT:
+            raise UnreadableCloud(
+                f"The PCD field {name!r:.40} is {count} of TYPE {kind!r:.20} and SIZE {size!r:.20},"
+                f" and known are F of 4 and 8 bytes, I and U of 1 to 8. {_AGAIN}"
+            )
+        fields.append(Field(name, known, values))
+    return fields
+
+
+def _points(entries: dict[str, list[str]]) -> int:
+    """How many points there are, told once or twice."""
+    told = []
+    if "POINTS" in entries:
+        told.append(_whole("POINTS", " ".join(entries["POINTS"])))
+    if "WIDTH" in entries:
+        rows = _whole("HEIGHT", " ".join(entries.get("HEIGHT", ["1"])))
+        told.append(_whole("WIDTH", " ".join(entries["WIDTH"])) * rows)
+    if not told or told[0] != told[-1]:
+        raise UnreadableCloud(
+            f"The PCD header must say in POINTS, or in WIDTH and HEIGHT, how many points there "
+            f"are, and says {' and '.join(map(str, told)) or 'nothing'}. {_AGAIN}"
+        )
+    return told[0]
+
+
+def _whole(name: str, word: str) -> int:
+    if not (word.isascii() and word.isdigit() and len(word) <= 18):
+        raise UnreadableCloud(f"The PCD header has {name} {word!r:.40}. {_AGAIN}")
+    return int(word)
+
+
+def _viewpoint(words: list[str] | None) -> Position | None:
+    """Translation of the entry; its rotation is that of the sensor, which nothing here needs."""
+    if words is None:
+        return None
+    try:
+        x, y, z, *rotation = (float(word) for word in words)
+    except ValueError:
+        x = y = z = math.nan
+        rotation = []
+    if len(rotation) not in (0, 4) or not all(map(math.isfinite, (x, y, z))):
+        raise UnreadableCloud(
+            f"The PCD header has VIEWPOINT {' '.join(words)!r:.80}, which is no x y z and "
+            f"quaternion. {_AGAIN}"
+        )
+    return (x, y, z) if (x, y, z) != (0.0, 0.0, 0.0) else None

@@ -1,0 +1,298 @@
+"""PLY files: what they are made of, and the points among it.
+
+bytes  --read_ply-->  FilePoints
+
+Nothing is allocated that the header alone asks for: each element must fit into what follows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import UnreadableCloud
+from sceneprint.formats.points.float_rows import FilePoints, check_count, columns, steps
+from sceneprint.formats.points.text_rows import check_room, parse_blocks, skip_lines
+from sceneprint.geometry.kernel import kernel
+from sceneprint.types import Bytes, Floats
+
+# Binary rows that hold lists, as PLY has them: each has a length of its own.
+#
+# bytes, start, count, kinds  --skip_rows-->  place behind them
+#                             --list_blocks-->  three of their values (n, 3)
+
+Places = NDArray[np.int64]
+
+#: Type of each value, of numpy, and of a list's length before it.
+Kinds = Sequence[tuple[str, str | None]]
+
+
+def skip_rows(view: Bytes, start: int, count: int, kinds: Kinds, order: str) -> int:
+    """Where so many rows end.
+
+    Raises
+    ------
+    UnreadableCloud : the bytes end before.
+    """
+    end = start
+    for _, behind in _walked(view, start, count, kinds, (0, 0, 0), order):
+        end = behind
+    return end
+
+
+def list_blocks(
+    view: Bytes, start: int, count: int, kinds: Kinds, picked: tuple[int, int, int], order: str
+) -> Iterator[Floats]:
+    """Yield three of the values of each row, (n, 3) each; raises as `skip_rows`."""
+    for places, _ in _walked(view, start, count, kinds, picked, order):
+        block = np.empty((len(places), 3))
+        for k, value in enumerate(picked):
+            kind = np.dtype(order + kinds[value][0])
+            gathered = view[places[:, k, None] + np.arange(kind.itemsize)]
+            block[:, k] = np.ascontiguousarray(gathered).view(kind)[:, 0]
+        yield block
+
+
+def _walked(
+    view: Bytes, start: int, count: int, kinds: Kinds, picked: tuple[int, int, int], order: str
+) -> Iterator[tuple[Places, int]]:
+    """Yield where the picked values of each row are, and where its block ends."""
+    sizes = np.array([np.dtype(kind).itemsize for kind, _ in kinds])
+    lengths = np.array([np.dtype(length).itemsize if length else 0 for _, length in kinds])
+    signed = np.array([length is not None and length[0] == "i" for _, length in kinds])
+    wanted = np.array(picked)
+    for first, n in steps(count):
+        places = np.zeros((n, 3), np.int64)
+        start, rows = _walk(view, start, places, sizes, lengths, signed, wanted, order == "<")
+        if rows < n:
+            raise UnreadableCloud(
+                f"The file ends in row {first + rows + 1} of {count}, whose lists have more in "
+                "them than is left. Copy or write the file again."
+            )
+        yield places, start
+
+
+@kernel
+def _walk(
+    view: Bytes, start: int, places: Places, sizes: Places, lengths: Places,
+    signed: NDArray[np.bool_], wanted: Places, little: bool,
+) -> tuple[int, int]:  # fmt: skip
+    """Fill the places; return the one behind the last whole row, and how many there were."""
+    at, end = start, len(view)
+    for row in range(len(places)):
+        for p in range(len(sizes)):
+            for k in range(3):
+                if wanted[k] == p:
+                    places[row, k] = at
+            repeats = 1
+            if lengths[p] > 0:
+                if lengths[p] > end - at:
+                    return at, row
+                repeats = 0
+                for b in range(lengths[p]):
+                    byte = int(view[at + (lengths[p] - 1 - b if little else b)])
+                    if b == 0 and signed[p] and byte > 127:  # fewer than none
+                        return at, row
+                    repeats = 256 * repeats + byte
+                at += lengths[p]
+            if sizes[p] * repeats > end - at:
+                return at, row
+            at += sizes[p] * repeats
+    return at, len(places)
+
+
+_MAXIMUM_HEADER = 65_536  #: bytes
+_MAXIMUM_PROPERTIES = 1000  #: of an element, and elements of a file
+_AGAIN = "Copy or write the file again."
+_XYZ = ("x", "y", "z")
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
+    "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True)
+class Property:
+    """One value of an element, or a list of values with its length before it."""
+
+    name: str
+    kind: str  #: of numpy, without byte order
+    length: str | None = None  #: type of a list's length
+
+
+@dataclass(frozen=True)
+class Element:
+    """So many rows of the same properties."""
+
+    name: str
+    count: int
+    properties: tuple[Property, ...]
+
+    @property
+    def least(self) -> int:
+        """Bytes that a binary row takes at least; all of them where it has no list."""
+        return sum(np.dtype(p.length or p.kind).itemsize for p in self.properties)
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether rows differ in length."""
+        return any(p.length for p in self.properties)
+
+
+def read_ply(data: bytes) -> FilePoints:
+    """The vertices of a PLY file; all else in it is passed over.
+
+    Raises
+    ------
+    UnreadableCloud : it is none, its vertices lack x, y or z, or its header does not fit what
+        follows it.
+    """
+    order, elements, start = _header(data)
+    names = [element.name for element in elements]
+    if names.count("vertex") != 1:
+        raise UnreadableCloud(
+            f"The PLY file has {names.count('vertex')} elements called vertex, and points are in "
+            "one. Write them as one element vertex with properties x, y, z."
+        )
+    at = names.index("vertex")
+    vertex = elements[at]
+    own = [p.name for p in vertex.properties]
+    wrong = [name for name in _XYZ if own.count(name) != 1]
+    if wrong or any(p.name in _XYZ and p.length for p in vertex.properties):
+        raise UnreadableCloud(
+            f"The vertices of the PLY file have no single {' or '.join(wrong or _XYZ)}. "
+            "Write each point's x, y and z."
+        )
+    check_count(vertex.count)
+    if order == "":
+        return FilePoints(vertex.count, _written_out(data, start, elements[: at + 1]))
+    view, begins = np.frombuffer(data, np.uint8), 0
+    for i, element in enumerate(elements):
+        begins = start if i == at else begins
+        start = _behind(data, start, element, order)
+    if data[start:].strip(b"\r\n"):  # else a type or a count is not what the header says
+        raise UnreadableCloud(
+            f"{len(data) - start} bytes follow what the PLY header announces. {_AGAIN}"
+        )
+    if vertex.has_lists:
+        kinds = [(p.kind, p.length) for p in vertex.properties]
+        picked = (own.index("x"), own.index("y"), own.index("z"))
+        return FilePoints(
+            vertex.count, list_blocks(view, begins, vertex.count, kinds, picked, order)
+        )
+    offsets = np.cumsum([0] + [np.dtype(p.kind).itemsize for p in vertex.properties]).tolist()
+    where = [own.index(name) for name in _XYZ]
+    row = np.dtype(
+        {
+            "names": _XYZ,
+            "formats": [order + vertex.properties[i].kind for i in where],
+            "offsets": [offsets[i] for i in where],
+            "itemsize": vertex.least,
+        }
+    )
+    table = np.frombuffer(data, row, vertex.count, begins)
+    return FilePoints(vertex.count, columns(table, _XYZ))
+
+
+def _behind(data: bytes, start: int, element: Element, order: str) -> int:
+    """Where a binary element ends."""
+    left = len(data) - start
+    if element.count * element.least > left:
+        raise UnreadableCloud(
+            f"The PLY header announces {element.count} rows of {element.name}, at least "
+            f"{element.count * element.least} bytes, and {left} are left. {_AGAIN}"
+        )
+    if not element.has_lists:
+        return start + element.count * element.least
+    kinds = [(p.kind, p.length) for p in element.properties]
+    return skip_rows(np.frombuffer(data, np.uint8), start, element.count, kinds, order)
+
+
+def _written_out(data: bytes, start: int, elements: list[Element]) -> Iterator[Floats]:
+    """The blocks of the last of some elements of an ascii file."""
+    *before, vertex = elements
+    text = np.frombuffer(data, np.uint8)
+    for element in before:
+        start = skip_lines(text, start, element.count)
+    check_room(text, start, vertex.count, len(vertex.properties))
+    wanted = np.array(
+        [_XYZ.index(p.name) if p.name in _XYZ else -1 for p in vertex.properties], np.int8
+    )
+    lists = np.array([p.length is not None for p in vertex.properties])
+    return parse_blocks(text, start, vertex.count, wanted, lists)
+
+
+def _header(data: bytes) -> tuple[str, list[Element], int]:
+    """Byte order ("" for ascii), elements, and where the rows begin."""
+    head = data[:_MAXIMUM_HEADER]
+    old = head[3:4] == b"\r" and head[4:5] != b"\n"  # ends of lines of an old Macintosh
+    ending = b"\r" if old else b"\n"
+    lines, start = [], 0
+    while True:
+        end = head.find(ending, start)
+        if end < 0:
+            raise UnreadableCloud(
+                f"The PLY header has no end_header in its first {_MAXIMUM_HEADER} bytes. {_AGAIN}"
+            )
+        line = head[start:end].decode("latin-1").strip()
+        start = end + 1
+        if line == "end_header":
+            break
+        lines.append(line)
+    if not lines or lines[0] != "ply":
+        raise UnreadableCloud("This is no PLY file: it does not begin with a line ply.")
+    return *_described(lines[1:]), start
+
+
+def _described(lines: list[str]) -> tuple[str, list[Element]]:
+    order, elements = None, list[Element]()
+    for line in lines:
+        word, *rest = line.split() or ["comment"]
+        if word in ("comment", "obj_info"):
+            continue
+        if word == "format" and len(rest) == 2 and rest[0] in _ORDERS and order is None:
+            order = _ORDERS[rest[0]]
+        elif word == "element" and len(rest) == 2 and len(elements) < _MAXIMUM_PROPERTIES:
+            elements.append(Element(rest[0], _count(rest[1]), ()))
+        elif word == "property" and elements:
+            last = elements[-1]
+            if len(last.properties) == _MAXIMUM_PROPERTIES:
+                raise UnreadableCloud(
+                    f"{last.name!r:.40} has more than {_MAXIMUM_PROPERTIES} properties. {_AGAIN}"
+                )
+            elements[-1] = Element(last.name, last.count, (*last.properties, _property(rest)))
+        else:
+            raise UnreadableCloud(f"The PLY header has a line {line!r:.60}. {_AGAIN}")
+    if order is None:
+        raise UnreadableCloud(f"The PLY header does not say which format follows. {_AGAIN}")
+    for element in elements:
+        if element.count and not element.properties:
+            raise UnreadableCloud(
+                f"The PLY header announces {element.count} rows of {element.name!r:.40} with "
+                f"nothing in them. {_AGAIN}"
+            )
+    return order, elements
+
+
+def _property(words: list[str]) -> Property:
+    if len(words) == 2 and words[0] in _TYPES:
+        return Property(words[1], _TYPES[words[0]])
+    if len(words) == 4 and words[0] == "list" and words[1] in _TYPES and words[2] in _TYPES:
+        length = _TYPES[words[1]]
+        if length[0] != "f":
+            return Property(words[3], _TYPES[words[2]], length)
+    raise UnreadableCloud(
+        f"The PLY header has a property {' '.join(words)!r:.60}, and known are numbers of the "
+        f"types {', '.join(list(_TYPES)[:8])}, and lists of them. {_AGAIN}"
+    )
+
+
+def _count(word: str) -> int:
+    if not (word.isascii() and word.isdigit() and len(word) <= 18):
+        raise UnreadableCloud(f"The PLY header has a count {word!r:.40}. {_AGAIN}")
+    return int(word)

@@ -1,0 +1,210 @@
+"""Numbers written out, a row to a line, of which three columns are wanted.
+
+text, start  --parse_rows-->  coordinates (n, 3), place after them, what is wrong
+
+Python's own `float` would take a minute for the largest file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import UnreadableCloud
+from sceneprint.formats.points.float_rows import steps
+from sceneprint.geometry.kernel import kernel
+from sceneprint.types import Bytes, Floats
+
+GOOD, ENDS, FEW, MANY, NO_NUMBER = 0, 1, 2, 3, 4
+
+_SAID = {
+    ENDS: "the file ends before it",
+    FEW: "it has fewer values than the header announces",
+    MANY: "it has more values than the header announces",
+    NO_NUMBER: "one of its values is no number",
+}
+
+#: Powers of ten that float64 holds exactly.
+_TENS = np.array([float(f"1e{k}") for k in range(23)])
+
+
+def parse_blocks(
+    text: Bytes, start: int, count: int, wanted: NDArray[np.int8], lists: NDArray[np.bool_]
+) -> Iterator[Floats]:
+    """Yield the coordinates of so many rows, (n, 3) each; see `parse_rows`.
+
+    Raises
+    ------
+    UnreadableCloud : a row is missing or is none; names it.
+    """
+    for first, n in steps(count):
+        block = np.full((n, 3), np.nan)
+        start, rows, state = parse_rows(text, start, block, wanted, lists)
+        if state != GOOD:
+            raise UnreadableCloud(
+                f"Row {first + rows + 1} of {count} cannot be read: {_SAID[state]}. "
+                "Copy or write the file again."
+            )
+        yield block
+
+
+def skip_lines(text: Bytes, start: int, count: int) -> int:
+    """Where the line after so many begins, empty ones not counted.
+
+    Raises
+    ------
+    UnreadableCloud : there are not so many.
+    """
+    place, lines = _skip(text, start, count)
+    if lines < count:
+        raise UnreadableCloud(
+            f"The file ends after {lines} of {count} rows before its points. "
+            "Copy or write the file again."
+        )
+    return place
+
+
+def check_room(text: Bytes, start: int, count: int, columns: int) -> None:
+    """Refuse a header that announces more rows than can be written into what follows."""
+    if count * columns * 2 - 1 > len(text) - start:  # a digit and a space each
+        raise UnreadableCloud(
+            f"The header announces {count} rows of {columns} values, and {len(text) - start} "
+            "bytes follow. Copy or write the file again."
+        )
+
+
+@kernel
+def parse_rows(
+    text: Bytes, start: int, out: Floats, wanted: NDArray[np.int8], lists: NDArray[np.bool_]
+) -> tuple[int, int, int]:
+    """Read as many rows as `out` has; empty lines are passed over.
+
+    Parameters
+    ----------
+    text : (N,) bytes
+    start : where the first row begins
+    out : (n, 3), filled
+    wanted : (c,) column of `out` that each value goes to, or -1
+    lists : (c,) whether this is the length of a list that follows on the same line
+
+    Returns
+    -------
+    place after the last row, rows that were read, and why there are no more
+    """
+    i, size = start, len(text)
+    for row in range(len(out)):
+        while i < size and text[i] <= 32 and text[i] >= 9:
+            i += 1
+        if i >= size:
+            return i, row, ENDS
+        for c in range(len(wanted)):
+            first, i = _word(text, i)
+            if first == i:  # a line's end, or a sign that belongs in no text
+                return i, row, FEW
+            if lists[c]:
+                value, good = number(text, first, i)
+                if not good or not (0.0 <= value < 2147483648.0) or value != int(value):
+                    return i, row, NO_NUMBER
+                for _ in range(int(value)):
+                    first, i = _word(text, i)
+                    if first == i:
+                        return i, row, FEW
+            elif wanted[c] >= 0:
+                value, good = number(text, first, i)
+                if not good:
+                    return i, row, NO_NUMBER
+                out[row, wanted[c]] = value
+        first, i = _word(text, i)
+        if first != i:
+            return i, row, MANY
+        if i < size and text[i] != 10 and text[i] != 13:
+            return i, row, NO_NUMBER
+    return i, len(out), GOOD
+
+
+@kernel
+def _skip(text: Bytes, start: int, count: int) -> tuple[int, int]:
+    i, size = start, len(text)
+    for line in range(count):
+        while i < size and (text[i] == 10 or text[i] == 13):
+            i += 1
+        if i >= size:
+            return i, line
+        while i < size and text[i] != 10 and text[i] != 13:
+            i += 1
+    return i, count
+
+
+@kernel
+def _word(text: Bytes, start: int) -> tuple[int, int]:
+    """Where the next word of this line begins and ends; of no length where there is none."""
+    first = start
+    while first < len(text) and (text[first] == 32 or text[first] == 9):
+        first += 1
+    end = first
+    while end < len(text) and text[end] > 32:
+        end += 1
+    return first, end
+
+
+@kernel
+def number(text: Bytes, start: int, end: int) -> tuple[float, bool]:
+    """The number of a word, to the last bit but one, and whether it is one; NaN for any NaN or
+    infinity, as printf writes them anywhere.
+    """
+    i = start
+    negative = i < end and text[i] == 45
+    if i < end and (text[i] == 45 or text[i] == 43):
+        i += 1
+    if end - i >= 3:
+        a, b, c = text[i] | 32, text[i + 1] | 32, text[i + 2] | 32
+        if (a == 110 and b == 97 and c == 110) or (a == 105 and b == 110 and c == 102):
+            return np.nan, True
+    mantissa, taken, digits, exponent, point = 0, 0, 0, 0, False
+    while i < end:
+        sign = text[i]
+        if 48 <= sign <= 57:
+            digits += 1
+            if taken < 18:  # more digits than a float64 tells apart
+                mantissa = 10 * mantissa + (int(sign) - 48)
+                if mantissa > 0:
+                    taken += 1
+                if point:
+                    exponent -= 1
+            elif not point:
+                exponent += 1
+        elif sign == 46 and not point:
+            point = True
+        elif sign == 35 and point:  # 1.#QNAN, of Windows
+            return np.nan, True
+        else:
+            break
+        i += 1
+    if digits == 0:
+        return 0.0, False
+    if i < end and (text[i] | 32) == 101:
+        i += 1
+        down = i < end and text[i] == 45
+        if i < end and (text[i] == 45 or text[i] == 43):
+            i += 1
+        first, power = i, 0
+        while i < end and 48 <= text[i] <= 57:
+            power = min(10 * power + (int(text[i]) - 48), 100_000)
+            i += 1
+        if i == first:
+            return 0.0, False
+        exponent += -power if down else power
+    if i < end:
+        return 0.0, False
+    value = float(mantissa)
+    if mantissa > 0:
+        left = min(max(exponent, -400), 400)
+        while left > 0:
+            value *= _TENS[min(left, 22)]
+            left -= min(left, 22)
+        while left < 0:
+            value /= _TENS[min(-left, 22)]
+            left += min(-left, 22)
+    return (-value if negative else value), True

@@ -1,0 +1,1 @@
+"""Rigid transforms: averaging, loops, sessions joined."""

@@ -1,0 +1,1 @@
+"""Signatures to rankings and diverse selections."""

@@ -1,0 +1,1 @@
+"""Surfaces to patches, pairs of patches and signatures."""

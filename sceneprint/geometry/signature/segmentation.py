@@ -1,0 +1,313 @@
+"""Sec. III-F, segmentation: a surface map to smooth, compact patches that respect edges.
+
+    Surface (h, w)  --segment-->  labels (h, w)  --patches_of-->  Patches (P)
+
+SLIC over position and normal, started from a grid in the image. No pixel term: two pixels
+belong together when their points are near and their normals agree, so that patches end at
+creases and at depth edges alike.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.geometry.kernel import kernel
+from sceneprint.types import Floats, Floats32, Hierarchy, Intrinsics, Ints32, Patches, Surface
+
+
+@dataclass(frozen=True)
+class SegmentationParameters:
+    """The numbers of the finest segmentation."""
+
+    n_patches: int = 1000  #: grid seeds of a full image
+    iterations: int = 5  #: rounds of assignment and update
+    normal_weight: float = 6.0  #: of 1 - cos(normals), beside squared seed spacings
+    minimum_size: float = 0.15  #: patches below this share of a grid cell are dropped
+    minimum_pixels: int = 4  #: and those below so many pixels
+
+
+@kernel
+def _assign(
+    points: Floats32, normals: Floats32, valid: NDArray[np.bool_], centres: Floats32,
+    spacing: float, normal_weight: np.float32, columns: int, labels: Ints32,
+) -> None:  # fmt: skip
+    """Give every pixel the nearest of the centres seeded in the nine cells around it."""
+    height, width = valid.shape
+    rows = len(centres) // columns
+    for y in range(height):
+        cell_y = min(int(y / spacing), rows - 1)
+        for x in range(width):
+            labels[y, x] = -1
+            if not valid[y, x]:
+                continue
+            cell_x = min(int(x / spacing), columns - 1)
+            px, py, pz = points[y, x, 0], points[y, x, 1], points[y, x, 2]
+            nx, ny, nz = normals[y, x, 0], normals[y, x, 1], normals[y, x, 2]
+            best = np.float32(np.inf)
+            for cy in range(max(cell_y - 1, 0), min(cell_y + 2, rows)):
+                for cx in range(max(cell_x - 1, 0), min(cell_x + 2, columns)):
+                    k = cy * columns + cx
+                    scale = centres[k, 6]  # (1 / metric seed spacing)^2; 0 for a dead centre
+                    if scale <= 0:
+                        continue
+                    dx, dy, dz = px - centres[k, 0], py - centres[k, 1], pz - centres[k, 2]
+                    cosine = nx * centres[k, 3] + ny * centres[k, 4] + nz * centres[k, 5]
+                    distance = (dx * dx + dy * dy + dz * dz) * scale + normal_weight * (
+                        np.float32(1.0) - cosine
+                    )
+                    if distance < best:
+                        best = distance
+                        labels[y, x] = k
+
+
+@kernel
+def _sums(
+    points: Floats32, normals: Floats32, weights: Floats32, labels: Ints32, n: int
+) -> NDArray[np.float64]:
+    """Per label: weight, weighted point (3), weighted normal (3), pixels."""
+    height, width = labels.shape
+    sums = np.zeros((n, 8))
+    for y in range(height):
+        for x in range(width):
+            k = labels[y, x]
+            if k < 0:
+                continue
+            w = weights[y, x]
+            sums[k, 0] += w
+            for d in range(3):
+                sums[k, 1 + d] += w * points[y, x, d]
+                sums[k, 4 + d] += w * normals[y, x, d]
+            sums[k, 7] += 1.0
+    return sums
+
+
+def _centres(sums: NDArray[np.float64], spacing: float, focal_length: float) -> Floats32:
+    alive = sums[:, 0] > 0
+    weight = np.where(alive, sums[:, 0], 1.0)[:, None]
+    mean, normal = sums[:, 1:4] / weight, sums[:, 4:7] / weight
+    length = np.linalg.norm(normal, axis=1)
+    alive &= length > 1e-6
+    normal = normal / np.where(alive, length, 1.0)[:, None]
+    z = np.where(alive, mean[:, 2], 1.0)
+    scale = np.where(alive, (focal_length / (spacing * z)) ** 2, 0.0)
+    return np.column_stack([mean, normal, scale]).astype(np.float32)
+
+
+def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
+    """Assign every valid pixel to a patch.
+
+    Patches below either limit of the parameters are dropped (their pixels get -1):
+    their normals would be noise, and in an image of a thousand patches they hold under
+    one per cent of the surface.
+
+    Parameters
+    ----------
+    surface : (h, w) points in metres and normals
+    p : see SegmentationParameters
+
+    Returns
+    -------
+    labels : (h, w) int32, 0 to P - 1 in the order of the image; -1 for none
+    """
+    height, width = surface.valid.shape
+    assert isinstance(surface.camera, Intrinsics)
+    spacing = max(math.sqrt(height * width / p.n_patches), 1.0)
+    rows, columns = max(round(height / spacing), 1), max(round(width / spacing), 1)
+    focal_length = math.sqrt(surface.camera.fx * surface.camera.fy)
+    y, x = np.mgrid[:height, :width]
+    cell_y = np.minimum((y / spacing).astype(np.int32), rows - 1)
+    cell_x = np.minimum((x / spacing).astype(np.int32), columns - 1)
+    labels: Ints32 = np.where(surface.valid, cell_y * columns + cell_x, -1).astype(np.int32)
+    ones = np.ones((height, width), np.float32)
+    n = rows * columns
+    for _ in range(p.iterations):
+        centres = _centres(
+            _sums(surface.points, surface.normals, ones, labels, n), spacing, focal_length
+        )
+        _assign(
+            surface.points, surface.normals, surface.valid, centres,
+            spacing, np.float32(p.normal_weight), columns, labels,
+        )  # fmt: skip
+    smallest = max(p.minimum_pixels, p.minimum_size * spacing * spacing)
+    return compact_labels(labels, np.bincount(labels[labels >= 0], minlength=n) >= smallest)
+
+
+def compact_labels(labels: Ints32, keep: NDArray[np.bool_]) -> Ints32:
+    """Renumber labels without gaps, those not kept becoming -1.
+
+    Parameters
+    ----------
+    labels : (h, w) int32, -1 for none
+    keep : (n,) bool
+    """
+    renumbered = np.where(keep, np.cumsum(keep) - 1, -1).astype(np.int32)
+    result: Ints32 = np.where(labels >= 0, renumbered[labels], -1).astype(np.int32)
+    return result
+
+
+def patches_of(surface: Surface, labels: Ints32) -> Patches:
+    """Means, normals and areas of labelled pixels, each pixel weighing its surface area.
+
+    Parameters
+    ----------
+    surface : (h, w)
+    labels : (h, w) int32, 0 to P - 1; -1 for none
+
+    Returns
+    -------
+    patches : P of them, in the order of the labels
+    """
+    n = int(labels.max(initial=-1)) + 1
+    sums = _sums(surface.points, surface.normals, surface.areas, labels, n)
+    area = sums[:, 0]
+    normal = sums[:, 4:7]
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return Patches(
+        means=sums[:, 1:4] / area[:, None],
+        normals=normal / length,
+        areas=area,
+        sizes=sums[:, 7].astype(np.int32),
+        coherences=np.minimum(length[:, 0] / area, 1.0),
+    )
+
+
+# Sec. III-F, hierarchy: the finest patches to H levels, each fewer by a constant factor.
+#
+#     Surface, labels (h, w)  --hierarchy-->  Hierarchy (H levels)
+#
+# Agglomerative K-Means over the finest patches in position and normal, weighted by area,
+# seeded near-uniformly over the surface by farthest-point sampling.
+
+
+@dataclass(frozen=True)
+class HierarchyParameters:
+    """The numbers of the hierarchy."""
+
+    n_levels: int = 4  #: H
+    factor: float = 2.0**0.5  #: each level has fewer patches by this factor
+    iterations: int = 4  #: of K-Means
+    normal_weight: float = 3.0  #: of 1 - cos(normals), beside squared patch diameters
+
+
+@kernel
+def _nearer(
+    patches: Floats, centre: Floats, scale: float, weight: float, c: int,
+    distance: Floats, nearest: Floats, labels: Ints32,
+) -> None:  # fmt: skip
+    """Move to cluster `c` all patches that are nearer to its centre than to their own."""
+    x, y, z, nx, ny, nz = (
+        patches[0], patches[1], patches[2], patches[3], patches[4], patches[5]
+    )  # fmt: skip
+    for k in range(len(labels)):
+        dx, dy, dz = x[k] - centre[0], y[k] - centre[1], z[k] - centre[2]
+        cosine = nx[k] * centre[3] + ny[k] * centre[4] + nz[k] * centre[5]
+        distance[k] = (dx * dx + dy * dy + dz * dz) * scale + weight * (1.0 - cosine)
+    for k in range(len(labels)):
+        labels[k] = c if distance[k] < nearest[k] else labels[k]
+    for k in range(len(labels)):
+        nearest[k] = min(distance[k], nearest[k])
+
+
+@kernel
+def _k_means(
+    patches: Floats, areas: Floats, n_clusters: int, scale: float, weight: float, iterations: int
+) -> Ints32:
+    """Labels of (6, P) positions and normals; clusters that end empty are numbered still."""
+    n = patches.shape[1]
+    centres = np.empty((n_clusters, 6))
+    distance, nearest = np.empty(n), np.full(n, np.inf)
+    labels = np.zeros(n, np.int32)
+    chosen = int(np.argmax(areas))
+    for c in range(n_clusters):  # farthest-point sampling
+        centres[c] = patches[:, chosen]
+        _nearer(patches, centres[c], scale, weight, c, distance, nearest, labels)
+        chosen = int(np.argmax(nearest))
+    for _ in range(iterations):
+        sums = np.zeros((n_clusters, 7))
+        for k in range(n):
+            for d in range(6):
+                sums[labels[k], d] += areas[k] * patches[d, k]
+            sums[labels[k], 6] += areas[k]
+        nearest[:] = np.inf
+        for c in range(n_clusters):
+            if sums[c, 6] > 0:
+                length = np.sqrt(sums[c, 3] ** 2 + sums[c, 4] ** 2 + sums[c, 5] ** 2)
+                for d in range(3):
+                    centres[c, d] = sums[c, d] / sums[c, 6]
+                    if length > 1e-9:
+                        centres[c, 3 + d] = sums[c, 3 + d] / length
+            _nearer(patches, centres[c], scale, weight, c, distance, nearest, labels)
+    return labels
+
+
+def _coarser(patches: Patches, n_clusters: int, p: HierarchyParameters) -> Ints32:
+    """Index of each patch's parent among at most `n_clusters`, numbered without gaps."""
+    scale = n_clusters / float(patches.areas.sum())
+    joined = np.ascontiguousarray(np.concatenate([patches.means, patches.normals], axis=1).T)
+    labels = _k_means(joined, patches.areas, n_clusters, scale, p.normal_weight, p.iterations)
+    _, parents = np.unique(labels, return_inverse=True)
+    numbered: Ints32 = parents.astype(np.int32)
+    return numbered
+
+
+def hierarchy(surface: Surface, finest: Ints32, p: HierarchyParameters) -> Hierarchy:
+    """The levels {X_h}: every level is clustered from the finest patches.
+
+    Parameters
+    ----------
+    surface : (h, w) points in metres and normals
+    finest : (h, w) int32 labels of the finest level
+    p : see HierarchyParameters
+
+    Returns
+    -------
+    hierarchy : `n_levels` levels, finest first; each holds 1 / factor of the patches of the
+        one before it, and never fewer than one
+    """
+    levels, labels = [patches_of(surface, finest)], [finest]
+    for h in range(1, p.n_levels):
+        n_clusters = max(round(len(levels[0]) / p.factor**h), 1)
+        parents = _coarser(levels[0], n_clusters, p)
+        coarse = np.where(finest >= 0, parents[finest], -1).astype(np.int32)
+        levels.append(patches_of(surface, coarse))
+        labels.append(coarse)
+    return Hierarchy(tuple(levels), tuple(labels))
+
+
+# How much a patch has to say: size and flatness to a weight, and of two patches to a pair's.
+#
+#     Patches (P)  --patch_weights-->  (P,)
+#
+# The paper counts every pair once. Then where the segmentation happens to cut decides how much
+# a surface counts, and a chair's leg, whose one patch bends round it, counts like a square of
+# floor. Weighting by size makes the statistics depend on the surface rather than on its cuts;
+# weighting by coherence keeps normals that are means of unlike normals from being believed.
+
+
+@dataclass(frozen=True)
+class WeightParameters:
+    """The numbers of the weights; both 0 give the paper's equal pairs."""
+
+    size_exponent: float = 0.5  #: of the share of the image that a patch covers
+    coherence_exponent: float = 20.0  #: of the length of the mean of its pixels' normals
+
+
+def patch_weights(patches: Patches, p: WeightParameters) -> Floats:
+    """Weight of each patch; a pair weighs the product of its two.
+
+    Parameters
+    ----------
+    patches : P of them
+    p : see WeightParameters
+
+    Returns
+    -------
+    weights : (P,) positive, of mean 1
+    """
+    weights = patches.sizes**p.size_exponent * patches.coherences**p.coherence_exponent
+    result: Floats = weights / weights.mean()
+    return result

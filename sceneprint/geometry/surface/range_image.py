@@ -1,0 +1,309 @@
+"""A cloud as its viewpoint saw it: a range image, and the plane seen in each pixel.
+
+    points (N, 3)  --range_image-->  Surface (h, w) with camera Sphere
+
+On the sphere about the viewpoint the inverse range of a plane is linear in the direction u:
+1/r = a . u. A least-squares fit of a over a window gives normal and denoised point at once,
+always facing the viewpoint, as `normals.py` does in the image of a depth sensor.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.errors import UselessFrame
+from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.surface.cloud import CloudParameters, within_range
+from sceneprint.geometry.surface.planes import solve
+from sceneprint.types import Cloud, Floats, Floats32, Sphere, Surface
+
+# The camera of a range image: which pole, how wide, and where its pixels look.
+#
+# points (N, 3)  --angles_of-->  azimuth, elevation, range  --framed-->  Sphere
+
+#: Closer to an axis than this a point is near its poles: cosine of 30 degrees.
+_NEAR_POLE = math.cos(math.radians(30.0))
+#: An empty wedge of fewer pixels does not end the image.
+_WEDGE_PX = 8
+
+
+def directions(camera: Sphere) -> Floats:
+    """Unit vectors (h, w, 3) through the centres of the pixels, in the sensor's axes."""
+    azimuth = camera.left + camera.step * np.arange(camera.width)
+    elevation = camera.top - camera.step * np.arange(camera.height)
+    rays = np.empty((camera.height, camera.width, 3))
+    a, b = (camera.pole + 1) % 3, (camera.pole + 2) % 3
+    rays[..., a] = np.cos(elevation)[:, None] * np.cos(azimuth)
+    rays[..., b] = np.cos(elevation)[:, None] * np.sin(azimuth)
+    rays[..., camera.pole] = np.sin(elevation)[:, None]
+    return rays
+
+
+def pole_of(points: Floats32) -> int:
+    """The axis, z, y, x where they tie, that the fewest points are near."""
+    lengths = np.linalg.norm(points, axis=1)
+    near = [int(np.count_nonzero(np.abs(points[:, c]) > _NEAR_POLE * lengths)) for c in range(3)]
+    return min((2, 1, 0), key=lambda axis: near[axis])
+
+
+@kernel
+def to_angles(points: Floats32, pole: int, out: Floats) -> None:
+    """Azimuth, elevation and range of each point."""
+    first, second = (pole + 1) % 3, (pole + 2) % 3
+    for i in range(len(points)):
+        a, b = float(points[i, first]), float(points[i, second])
+        c = float(points[i, pole])
+        flat = a * a + b * b
+        out[i, 0] = np.arctan2(b, a)
+        out[i, 1] = np.arctan2(c, np.sqrt(flat))
+        out[i, 2] = np.sqrt(flat + c * c)
+
+
+def framed(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
+    """The camera that shows all points, of steps so long that it has pixels for them."""
+    low, high = float(angles[:, 1].min()), float(angles[:, 1].max())
+    step = p.image_angle
+    while True:
+        around = math.ceil(2 * math.pi / step)
+        column = ((angles[:, 0] + math.pi) * (around / (2 * math.pi))).astype(np.int64) % around
+        seen = np.flatnonzero(np.bincount(column, minlength=around))
+        ends = np.append(seen, seen[0] + around)
+        widest = int(np.diff(ends).argmax())
+        unit = 2 * math.pi / around
+        height = max(math.ceil((high - low) / unit), 1)
+        top = (high + low) / 2 + (height - 1) / 2 * unit
+        if ends[widest + 1] - ends[widest] <= _WEDGE_PX:
+            first, width = 0, around
+        else:  # the image begins where the widest wedge without points ends
+            first = int(ends[widest + 1])
+            width = max(int(ends[widest]) + around - first + 1, 2)
+        if width * height <= p.maximum_pixels:
+            left = math.remainder(-math.pi + (first + 0.5) * unit, 2 * math.pi)
+            return Sphere(width, height, unit, left, top, pole)
+        step *= max(math.sqrt(width * height / p.maximum_pixels), 1.01)
+
+
+#: Steps of a number from 0 to 1 in sums: those of 5 million points stay below 2^63.
+_STEPS = 2.0**38
+#: A window is at most so much wider than high.
+_WIDEST = 8.0
+
+
+def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
+    """What is seen from the viewpoint of a cloud, as an ordered map of points and normals.
+
+    A pixel shows the nearest surface in its direction. Small gaps, as between the rings of a
+    spinning sensor, are closed where both sides lie on one plane.
+
+    Parameters
+    ----------
+    cloud : with a viewpoint
+    p : see CloudParameters
+
+    Returns
+    -------
+    surface : its camera is a Sphere, cropped to what is seen, whose pole is the axis (z, y, x
+        where they tie) that the fewest points are near
+
+    Raises
+    ------
+    UselessFrame : fewer than `minimum_points` points are within range, or pixels show one.
+    """
+    points = within_range(cloud, p)
+    pole = pole_of(points)
+    angles = np.empty((len(points), 3))
+    to_angles(points, pole, angles)
+    camera = framed(angles, pole, p)
+    q, u = _averaged(angles, camera, p)
+    if int(np.count_nonzero(q)) < p.minimum_points:
+        raise UselessFrame(
+            f"{cloud.name or 'The cloud'}: {np.count_nonzero(q)} pixels of "
+            f"{math.degrees(camera.step):.2g} degrees show all its points, too few for a "
+            "surface. Send a cloud that sees more of the scene, or check its viewpoint."
+        )
+    gates = np.array([p.range_gate, p.noise_gate, p.plane_gate])
+    limits = np.array([p.minimum_samples, p.minimum_spread * camera.step**4])
+    planes = np.zeros((camera.height, camera.width, 3))
+    flat = np.cos(camera.top - camera.step * np.arange(camera.height))
+    _fit(q, u, p.image_radius_px, camera.is_closed, flat, gates, limits, planes)
+    rays = directions(camera)
+    closed = planes.copy()
+    for view, target, ray, shown in (
+        (planes, closed, rays, q),
+        (_turned(planes), _turned(closed), _turned(rays), q.T),
+    ):
+        _close(view, target, ray, shown, p.gap_px, gates, p.gap_cosine)
+    return _lifted(closed, rays, camera, p)
+
+
+def _turned(maps: Floats) -> Floats:
+    return maps.transpose(1, 0, 2)
+
+
+@kernel
+def _nearest(angles: Floats, frame: Floats, pixel: NDArray[np.int64], nearest: Floats) -> None:
+    """Pixel of each point, and the nearest range in each pixel."""
+    height, width = nearest.shape
+    step, left, top = frame[0], frame[1], frame[2]
+    for i in range(len(angles)):
+        turn, around = (angles[i, 0] - left) / step + 0.5, 2 * np.pi / step
+        if turn < 0:
+            turn += around
+        x = int(turn)
+        if x >= width:  # by rounding: just behind the last column, or just before the first
+            x = 0 if turn > (width + around) / 2 else width - 1
+        y = min(max(int((top - angles[i, 1]) / step + 0.5), 0), height - 1)
+        pixel[i] = y * width + x
+        nearest[y, x] = min(nearest[y, x], angles[i, 2])
+
+
+@kernel
+def _sum(
+    angles: Floats, pixel: NDArray[np.int64], nearest: Floats, frame: Floats, share: float,
+    pole: int, sums: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """Points on the nearest surface: their number, inverse ranges and directions."""
+    first, second = (pole + 1) % 3, (pole + 2) % 3
+    least, steps = frame[3], frame[4]
+    for i in range(len(angles)):
+        k = pixel[i]
+        r = angles[i, 2]
+        if r > nearest[k] * (1.0 + share):
+            continue
+        flat = np.cos(angles[i, 1])
+        sums[k, 0] += 1
+        sums[k, 1] += np.int64(np.rint(least / r * steps))
+        sums[k, 2 + first] += np.int64(np.rint(flat * np.cos(angles[i, 0]) * steps))
+        sums[k, 2 + second] += np.int64(np.rint(flat * np.sin(angles[i, 0]) * steps))
+        sums[k, 2 + pole] += np.int64(np.rint(np.sin(angles[i, 1]) * steps))
+
+
+def _averaged(angles: Floats, camera: Sphere, p: CloudParameters) -> tuple[Floats, Floats]:
+    """Inverse range (h, w) of the nearest surface in each pixel, 0 for none, and the direction
+    (h, w, 3) it is the mean of: where 1/r = a . u, so are the means.
+    """
+    shape = (camera.height, camera.width)
+    least = max(p.minimum_range, 1e-9)
+    frame = np.array([camera.step, camera.left, camera.top, least, _STEPS])
+    pixel, nearest = np.empty(len(angles), np.int64), np.full(shape, np.inf)
+    _nearest(angles, frame, pixel, nearest)
+    sums = np.zeros((nearest.size, 5), np.int64)
+    _sum(angles, pixel, nearest.reshape(-1), frame, p.same_surface, camera.pole, sums)
+    means = sums[:, 1:] / np.maximum(sums[:, :1], 1) / _STEPS
+    return (means[:, 0] / least).reshape(shape), means[:, 1:].reshape(*shape, 3)
+
+
+@kernel
+def _fit(
+    q: Floats,
+    u: Floats,
+    radius: int,
+    closed: bool,
+    flat: Floats,
+    gates: Floats,
+    limits: Floats,
+    planes: Floats,
+) -> None:
+    """a of 1/r = a . u around every pixel that shows something; left 0 where nothing fixes it.
+
+    Two passes: what is near in range, then what is near the plane. flat: cosine of each row's
+    elevation; towards the poles pixels are narrow, and windows of more columns.
+    """
+    height, width = q.shape
+    b, a = np.zeros(3), np.zeros(3)
+    for y in range(height):
+        wide = min(int(radius / max(flat[y], 1.0 / _WIDEST) + 0.5), (width - 1) // 2)
+        for x in range(width):
+            centre = q[y, x]
+            if centre <= 0:
+                continue
+            for turn in range(2):
+                n = 0
+                xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                b[:] = 0.0
+                gate = gates[0] * centre if turn == 0 else gates[1] + gates[2] * centre
+                for line in range(max(y - radius, 0), min(y + radius + 1, height)):
+                    for column in range(x - wide, x + wide + 1):
+                        if closed:
+                            column = column % width
+                        elif column < 0 or column >= width:
+                            continue
+                        there = q[line, column]
+                        if there <= 0:
+                            continue
+                        ux, uy, uz = u[line, column, 0], u[line, column, 1], u[line, column, 2]
+                        expected = centre
+                        if turn == 1:
+                            expected = a[0] * ux + a[1] * uy + a[2] * uz
+                        if not abs(there - expected) < gate:
+                            continue
+                        n += 1
+                        xx += ux * ux
+                        xy += ux * uy
+                        xz += ux * uz
+                        yy += uy * uy
+                        yz += uy * uz
+                        zz += uz * uz
+                        b[0] += ux * there
+                        b[1] += uy * there
+                        b[2] += uz * there
+                det = solve(xx, xy, xz, yy, yz, zz, b, a)
+                if n < limits[0] or det < limits[1] * float(n) ** 3:
+                    break
+                if turn == 1:
+                    planes[y, x] = a
+
+
+@kernel
+def _close(
+    planes: Floats, out: Floats, rays: Floats, q: Floats, longest: int, gates: Floats,
+    cosine: float,
+) -> None:  # fmt: skip
+    """Fill gaps of each column whose two sides are planes that agree across it.
+
+    Not where something else was seen, as a wire before a wall: nobody saw through it.
+    """
+    height, width = planes.shape[0], planes.shape[1]
+    for x in range(width):
+        last = -1
+        for y in range(height):
+            b = planes[y, x]
+            bb = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
+            if bb <= 0:
+                continue
+            gap = y - last - 1
+            if last >= 0 and 0 < gap <= longest:
+                a = planes[last, x]
+                aa = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
+                ab = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+                if ab > cosine * np.sqrt(aa * bb):
+                    for k in range(last + 1, y):
+                        ray = rays[k, x]
+                        above = a[0] * ray[0] + a[1] * ray[1] + a[2] * ray[2]
+                        below = b[0] * ray[0] + b[1] * ray[1] + b[2] * ray[2]
+                        if abs(above - below) < gates[1] + gates[2] * max(above, below):
+                            share = (k - last) / (y - last)
+                            there = (1.0 - share) * above + share * below
+                            if q[k, x] > 0 and abs(q[k, x] - there) >= gates[1] + gates[2] * there:
+                                continue
+                            for d in range(3):
+                                out[k, x, d] = (1.0 - share) * a[d] + share * b[d]
+            last = y
+
+
+def _lifted(planes: Floats, rays: Floats, camera: Sphere, p: CloudParameters) -> Surface:
+    inverse = (planes * rays).sum(axis=2)
+    length = np.linalg.norm(planes, axis=2)
+    cosine = inverse / np.where(length > 0, length, 1.0)
+    seen = (inverse * p.maximum_range * 2 > 1) & (inverse * p.minimum_range < 2)
+    valid = (length > 0) & (cosine >= p.minimum_cosine) & seen
+    inverse, length = np.where(valid, inverse, 1.0), np.where(valid, length, 1.0)
+    points = np.where(valid[..., None], rays / inverse[..., None], 0.0).astype(np.float32)
+    normals = np.where(valid[..., None], -planes / length[..., None], 0.0).astype(np.float32)
+    flat = np.cos(camera.top - camera.step * np.arange(camera.height))[:, None]
+    solid = camera.step**2 * np.maximum(flat, 0.0) / inverse**2
+    areas = np.where(valid, solid / np.where(valid, cosine, 1.0), 0.0).astype(np.float32)
+    return Surface(points, normals, valid, areas, camera)

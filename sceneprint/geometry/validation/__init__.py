@@ -1,0 +1,1 @@
+"""Two frames to a transform, and whether to believe it."""

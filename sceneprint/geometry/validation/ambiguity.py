@@ -1,0 +1,181 @@
+"""Sec. III-E, ambiguity: other transforms that would explain the same two frames.
+
+    T, hypotheses, planes  --best_alternative-->  ambiguity, T_alternative
+
+A lone box looks the same from its four sides, a corridor the same at every door. Two frames of
+such a place agree perfectly under a wrong transform, and nothing in the residual, the overlap or
+the free space shows it. What does show is that *another* transform is not refuted either. So
+rivals are looked for: the other hypotheses that correspondences voted for, and the transform
+found, turned by quarter turns about the normals of the main planes or shifted along them, which
+is how rooms and what stands in them repeat.
+
+What a rival agrees on counts by planes (`planes.py`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.validation.icp import COARSE, QUICK, RefinementParameters, refined_all
+from sceneprint.geometry.validation.overlap import (
+    OverlapParameters,
+    PlaneParameters,
+    PlaneView,
+    explained,
+)
+from sceneprint.types import Floats, Patches
+
+
+@dataclass(frozen=True)
+class AmbiguityParameters:
+    """The numbers of the search for rivals."""
+
+    n_axes: int = 2  #: directions that most surface faces
+    n_planes: int = 3  #: planes across each, by area
+    same_direction: float = math.radians(12.0)  #: normals this near are parallel
+    shift: float = 0.5  #: steps along a corridor, metres: what refinement can bridge
+    n_shifts: int = 6  #: each way
+    least_crossing: float = 0.5  #: sine of the angle between the main families of planes
+    planes: PlaneParameters = field(default_factory=PlaneParameters)
+    first: RefinementParameters = QUICK  #: of all
+    hopeful_share: float = 0.04  #: after it, those that explain less are dropped
+    hopeful_violations: float = 0.15  #: and those that violate more
+    then: RefinementParameters = COARSE  #: of the rest
+    refuted: float = 0.02  #: violations from which on a rival is none
+    rival_m: float = 0.25  #: a rival differs by this, metres
+    rival_rad: float = math.radians(15.0)  #: or by this
+
+
+def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
+    """Motions that leave main planes of the patches in themselves.
+
+    Turns by 90, 180 and 270 degrees about the middle of each plane; and shifts along the direction
+    in which the two main families of planes both run, as a corridor does.
+
+    Parameters
+    ----------
+    patches : P of one frame
+    p : see AmbiguityParameters
+
+    Returns
+    -------
+    (n, 4, 4) with n at most 3 n_axes n_planes + 2 n_shifts
+    """
+    left = patches.areas.copy()
+    mass = np.empty(len(patches))
+    found: list[Floats] = []
+    axes: list[Floats] = []
+    for _ in range(p.n_axes):
+        _facing(patches.normals, left, math.cos(p.same_direction), mass)
+        most = int(np.argmax(mass))
+        if left[most] <= 0:
+            break
+        cosines = (patches.normals * patches.normals[most]).sum(axis=1)
+        across = np.abs(cosines) > math.cos(p.same_direction)
+        signed = np.sign(cosines) * patches.areas * across
+        axis = (patches.normals * signed[:, None]).sum(axis=0)
+        axis /= np.linalg.norm(axis)
+        axes.append(axis)
+        middles = _middles(patches, axis, np.where(across, left, 0.0), p)
+        found += [_turn(axis, middle, k) for middle in middles for k in (1, 2, 3)]
+        left = np.where(across, 0.0, left)
+    if len(axes) > 1:
+        along = np.cross(axes[0], axes[1])
+        length = float(np.linalg.norm(along))
+        if length > p.least_crossing:
+            steps = p.shift * np.arange(1, p.n_shifts + 1)
+            found += [_shift(along / length * s) for s in np.concatenate([steps, -steps])]
+    return np.array(found).reshape(-1, 4, 4)
+
+
+def _middles(patches: Patches, axis: Floats, area: Floats, p: AmbiguityParameters) -> list[Floats]:
+    """Middles of the largest planes across an axis, of the patches that have an area."""
+    offsets, mass = (patches.means * axis).sum(axis=1), np.empty(len(patches))
+    middles: list[Floats] = []
+    for _ in range(p.n_planes):
+        _level(offsets, area, p.planes.same_plane, mass)
+        best = int(np.argmax(np.where(area > 0, mass, 0.0)))
+        if area[best] <= 0:
+            break
+        on_plane = (np.abs(offsets - offsets[best]) < p.planes.same_plane) & (area > 0)
+        middles.append(np.average(patches.means[on_plane], axis=0, weights=area[on_plane]))
+        area = np.where(on_plane, 0.0, area)
+    return middles
+
+
+@kernel
+def _facing(normals: Floats, areas: Floats, cosine: float, mass: Floats) -> None:
+    """Area of the patches that face the way of each, or away from it."""
+    for i in range(len(normals)):
+        a, b, c = normals[i, 0], normals[i, 1], normals[i, 2]
+        total = 0.0
+        for j in range(len(normals)):
+            if abs(normals[j, 0] * a + normals[j, 1] * b + normals[j, 2] * c) > cosine:
+                total += areas[j]
+        mass[i] = total
+
+
+@kernel
+def _level(offsets: Floats, areas: Floats, apart: float, mass: Floats) -> None:
+    """Area of the patches whose offset is near that of each."""
+    for i in range(len(offsets)):
+        total = 0.0
+        for j in range(len(offsets)):
+            if abs(offsets[j] - offsets[i]) < apart:
+                total += areas[j]
+        mass[i] = total
+
+
+def _shift(by: Floats) -> Floats:
+    result = np.eye(4)
+    result[:3, 3] = by
+    return result
+
+
+def _turn(axis: Floats, middle: Floats, quarters: int) -> Floats:
+    cosine, sine = (0.0, -1.0, 0.0)[quarters - 1], (1.0, 0.0, -1.0)[quarters - 1]
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    result = np.eye(4)
+    result[:3, :3] = cosine * np.eye(3) + sine * cross + (1 - cosine) * np.outer(axis, axis)
+    result[:3, 3] = middle - result[:3, :3] @ middle
+    return result
+
+
+def far_from(T: Floats, others: Floats, p: AmbiguityParameters) -> Floats:
+    """Those of the others (n, 4, 4) that differ from T enough to be another answer."""
+    metres = np.linalg.norm(others[:, :3, 3] - T[:3, 3], axis=1)
+    cosines = (np.einsum("nij,ij->n", others[:, :3, :3], T[:3, :3]) - 1.0) / 2.0
+    far: Floats = others[(metres > p.rival_m) | (cosines < math.cos(p.rival_rad))]
+    return far
+
+
+def best_alternative(
+    query: PlaneView, match: PlaneView, T: Floats, voted: Floats, p: AmbiguityParameters,
+    agreement_p: OverlapParameters,
+) -> tuple[float, Floats | None]:  # fmt: skip
+    """How far the best rival of T explains the frames, 0 to 1, and that rival: Sec. III-E.
+
+    Parameters
+    ----------
+    query, match : of `plane_view`
+    T : (4, 4) T_match_query
+    voted : (n, 4, 4) other hypotheses, refined
+    p, agreement_p : see there
+    """
+    moved = np.concatenate([symmetries(match.patches, p) @ T, T @ symmetries(query.patches, p)])
+    near = far_from(T, refined_all(query.surface, match.surface, moved, p.first), p)
+    seen = explained(query, match, near, agreement_p)
+    hopeful = near[(seen.share > p.hopeful_share) & (seen.violations < p.hopeful_violations)]
+    rivals = np.concatenate([voted, refined_all(query.surface, match.surface, hopeful, p.then)])
+    rivals = far_from(T, rivals, p)
+    seen = explained(query, match, rivals, agreement_p)
+    share = np.where(seen.violations < p.refuted, seen.share, 0.0)
+    if not (share > 0).any():
+        return 0.0, None
+    best = int(np.argmax(share))
+    return float(share[best]), rivals[best]

@@ -1,0 +1,482 @@
+"""Sec. III-E, refinement: a transform to the one near it that lays two surfaces together.
+
+    points of the source, surface of the target, T  --refine-->  T, information
+
+Projective point-to-plane alignment: every point is compared with the plane that the target saw in
+its direction. Depth errors of structured-light sensors grow with z^2, so far points weigh less.
+Where the target has no viewpoint, a point is compared with the plane of the nearest one that faces
+the same way; all else is the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.pose.average import PoseAverage
+from sceneprint.geometry.pose.rigid import rotation_angle, solve_positive, turned
+from sceneprint.geometry.surface.camera import PINHOLE, depth_at, depth_of, grown, kind_of, project
+from sceneprint.geometry.validation.overlap import LookupTarget, nearest_alike, sampled, target_of
+from sceneprint.types import Floats, Floats32, Ints32, Surface
+
+
+@dataclass(frozen=True)
+class RefinementParameters:
+    """The numbers of one refinement."""
+
+    stride: int  #: of the source's pixels
+    iterations: int
+    first_gate: float  #: farther from the plane a point is forgotten, metres, at first
+    last_gate: float  #: and at last
+    normal_cosine: float = 0.7  #: of the angle between normals that may belong together
+    reference_depth: float = 5.0**0.5  #: gates grow by max(1, (z / this)^growth)
+    minimum_points: int = 20  #: fewer fix no transform
+    growth: int = 2  #: 2 as a depth sensor's noise, 1 or 0 as a scanner's
+    weight_depth: float = 1.0  #: where weights begin to fall as 1 / z^4, metres
+    nearest: float = 0.1  #: points this near the target's camera are not compared, metres
+    reach: float = 0.25  #: to a point of a target in no order, metres
+
+
+#: To see whether it leads anywhere.
+QUICK = RefinementParameters(10, 4, 0.25, 0.15)
+#: For hypotheses: few points, wide gates.
+COARSE = RefinementParameters(5, 8, 0.25, 0.08)
+#: For the best of them.
+FINE = RefinementParameters(2, 8, 0.08, 0.03)
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """What a refinement came to.
+
+    Parameters
+    ----------
+    T : (4, 4) T_target_source
+    information : (6, 6) J^T W J per point used: turn (radians), then shift (metres), about the
+        target's origin
+    points : that took part in the last step
+    mean_square : weighted square of their residuals, per point used: the noise of this very pair,
+        in the weights of `information`
+    """
+
+    T: Floats
+    information: Floats
+    points: int
+    mean_square: float
+
+
+@kernel
+def _nearest_pixel(
+    camera: Floats, points: Floats32, u: int, v: int, x: float, y: float, z: float
+) -> tuple[int, int, float]:
+    """Of the 3 x 3 pixels about (u, v), the one whose point is nearest: column, row, squared."""
+    column, row, nearest = -9, -1, 1e9
+    for line in range(v - 1, v + 2):
+        for place in range(u - 1, u + 2):
+            ex, ey, ez = (
+                x - points[line, place, 0], y - points[line, place, 1],
+                z - points[line, place, 2],
+            )  # fmt: skip
+            square = ex * ex + ey * ey + ez * ez
+            if square < nearest and depth_at(camera, points, line, place) > 0:
+                nearest, column, row = square, place, line
+    return column, row, nearest
+
+
+@kernel
+def _add(
+    A: Floats, g: Floats, row: Floats, x: float, y: float, z: float,
+    mx: float, my: float, mz: float, residual: float, weight: float,
+) -> None:  # fmt: skip
+    """One point's share of the normal equations: (x, y, z) moved, on a plane with that normal."""
+    row[0], row[1], row[2] = y * mz - z * my, z * mx - x * mz, x * my - y * mx
+    row[3], row[4], row[5] = mx, my, mz
+    for a in range(6):
+        wa = weight * row[a]
+        g[a] -= wa * residual
+        for b in range(a + 1):
+            A[a, b] += wa * row[b]
+
+
+@kernel
+def _accumulate(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
+    gate: float, numbers: Floats, A: Floats, g: Floats,
+) -> tuple[int, float]:  # fmt: skip
+    """Normal equations of one Gauss-Newton step; returns how many points took part, and the sum
+    of their weighted squares.
+    """
+    height, width = points.shape[0], points.shape[1]
+    least_cosine, reference, kind, per_depth = numbers[3], numbers[4], numbers[8], numbers[7]
+    # on a closed sphere the first column has a neighbour before it: the last
+    edge = 0.0 if camera[0] == 1 and camera[6] > 0 else 1.0
+    row = np.zeros(6)
+    used, squares = 0, 0.0
+    for i in range(len(source)):
+        px, py, pz = source[i, 0], source[i, 1], source[i, 2]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        column, line, depth = project(camera, x, y, z)
+        if not (column >= edge and line >= 1 and column < width - edge and line < height - 1):
+            continue
+        u = int(column)
+        if u == width - 1:  # of a closed sphere; negative columns count from the last
+            u -= width
+        u, v, square = _nearest_pixel(camera, points, u, int(line), x, y, z)
+        if v < 0:
+            continue
+        mx, my, mz = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
+        residual = (
+            (x - points[v, u, 0]) * mx + (y - points[v, u, 1]) * my + (z - points[v, u, 2]) * mz
+        )
+        limit = gate * grown(depth, reference, numbers[6])
+        if abs(residual) > limit or square > 9.0 * limit * limit:
+            continue
+        nx, ny, nz = source[i, 3], source[i, 4], source[i, 5]
+        cosine = (
+            (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz) * mx
+            + (T[1, 0] * nx + T[1, 1] * ny + T[1, 2] * nz) * my
+            + (T[2, 0] * nx + T[2, 1] * ny + T[2, 2] * nz) * mz
+        )
+        if cosine < least_cosine:
+            continue
+        tukey = 1.0 - (residual / limit) ** 2
+        near, far = np.float32(depth_of(kind, px, py, pz) * per_depth), depth * per_depth
+        weight = tukey * tukey / (0.25 + (near**4 + far**4) * 0.125)
+        _add(A, g, row, x, y, z, mx, my, mz, residual, weight)
+        squares += weight * residual * residual
+        used += 1
+    return used, squares
+
+
+@kernel
+def _accumulate_near(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
+    chain: Ints32, T: Floats, gate: float, numbers: Floats, A: Floats, g: Floats,
+) -> tuple[int, float]:  # fmt: skip
+    """As `_accumulate`, on a target whose points are in no order."""
+    least_cosine, kind, per_depth = numbers[3], numbers[8], numbers[7]
+    row, at, facing = np.zeros(6), np.empty(3), np.empty(3)
+    used, squares = 0, 0.0
+    for i in range(len(source)):
+        for a in range(3):
+            at[a] = T[a, 3]
+            facing[a] = 0.0
+            for b in range(3):
+                at[a] += T[a, b] * source[i, b]
+                facing[a] += T[a, b] * source[i, 3 + b]
+        n, _ = nearest_alike(points, normals, camera, heads, chain, at, facing, least_cosine)
+        if n < 0:
+            continue
+        mx, my, mz = normals[0, n, 0], normals[0, n, 1], normals[0, n, 2]
+        residual = (
+            (at[0] - points[0, n, 0]) * mx + (at[1] - points[0, n, 1]) * my
+            + (at[2] - points[0, n, 2]) * mz
+        )  # fmt: skip
+        if abs(residual) > gate:
+            continue
+        tukey = 1.0 - (residual / gate) ** 2
+        near = np.float32(depth_of(kind, source[i, 0], source[i, 1], source[i, 2]) * per_depth)
+        weight = tukey * tukey / (0.25 + near**4 * 0.25)
+        _add(A, g, row, at[0], at[1], at[2], mx, my, mz, residual, weight)
+        squares += weight * residual * residual
+        used += 1
+    return used, squares
+
+
+@kernel
+def refine_in_place(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats,
+    heads: Ints32, chain: Ints32, T: Floats, numbers: Floats, information: Floats,
+) -> tuple[int, float]:  # fmt: skip
+    """Gauss-Newton on T; the points that took part in the last step, 0 where it was lost, and
+    their mean weighted square before it.
+    """
+    iterations, minimum = int(numbers[0]), int(numbers[5])
+    A, g, step = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    before, turn = np.zeros((3, 3)), np.zeros((3, 3))
+    used, squares = 0, 0.0
+    for iteration in range(iterations):
+        share = iteration / max(iterations - 1, 1)
+        gate = numbers[1] * (numbers[2] / numbers[1]) ** share
+        A[:] = 0.0
+        g[:] = 0.0
+        if camera[0] == 2:
+            used, squares = _accumulate_near(
+                source, points, normals, camera, heads, chain, T, gate, numbers, A, g
+            )
+        else:
+            used, squares = _accumulate(source, points, normals, camera, T, gate, numbers, A, g)
+        for a in range(6):
+            for b in range(a):
+                A[b, a] = A[a, b]
+        if used < minimum:
+            return 0, 0.0
+        for a in range(6):
+            for b in range(6):
+                information[a, b] = A[a, b] / used
+            # a little damping: a direction that no point holds does not move
+            A[a, a] += 1e-6 * used
+        if not solve_positive(A, g, step):
+            return 0, 0.0
+        for a in range(3):
+            for b in range(3):
+                before[a, b] = T[a, b]
+        turned(before, step[:3], turn)
+        for a in range(3):
+            for b in range(3):
+                T[a, b] = turn[a, b]
+        turned(np.eye(3), step[:3], turn)
+        x, y, z = T[0, 3], T[1, 3], T[2, 3]
+        for a in range(3):
+            T[a, 3] = turn[a, 0] * x + turn[a, 1] * y + turn[a, 2] * z + step[3 + a]
+    return used, squares / max(used, 1)
+
+
+def numbers_of(p: RefinementParameters, kind: int) -> Floats:
+    """The parameters as the kernel takes them, and the kind of the source's camera."""
+    return np.array(
+        [p.iterations, p.first_gate, p.last_gate, p.normal_cosine, p.reference_depth,
+         p.minimum_points, p.growth, 1.0 / p.weight_depth, kind],
+        float,
+    )  # fmt: skip
+
+
+def compared(surface: Surface, p: RefinementParameters) -> LookupTarget:
+    """A surface made ready for `refine_in_place`."""
+    return target_of(surface, p.nearest, p.reach)
+
+
+def refine(
+    source: Floats32, target: Surface, T_target_source: Floats, p: RefinementParameters,
+    kind: int = PINHOLE,
+) -> Refined | None:  # fmt: skip
+    """Lay a source's points onto the target's surface, from a transform near by: Sec. III-E.
+
+    Parameters
+    ----------
+    source : (N, 6) float32 points and normals, of `overlap.sampled` with the stride of `p`
+    target : (h, w) surface, or points in no order
+    T_target_source : (4, 4) where to start
+    p : see RefinementParameters
+    kind : of the source's camera, `camera.kind_of`: by what its points weigh
+
+    Returns
+    -------
+    refined : or None where fewer than `minimum_points` stay within the gates, or they fix no step
+    """
+    T, information = np.array(T_target_source, float), np.zeros((6, 6))
+    t = compared(target, p)
+    used, mean_square = refine_in_place(
+        source, t.points, t.normals, t.camera, t.heads, t.chain, T, numbers_of(p, kind), information
+    )
+    return Refined(T, information, used, mean_square) if used else None
+
+
+def refined_all(
+    source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
+) -> Floats:
+    """Each of the hypotheses (n, 4, 4) refined; those that lose the surface are left out."""
+    points, t = sampled(source, p.stride), compared(target, p)
+    numbers, information = numbers_of(p, kind_of(source.camera)), np.zeros((6, 6))
+    kept = []
+    for hypothesis in hypotheses:
+        T = hypothesis.copy()
+        used, _ = refine_in_place(
+            points, t.points, t.normals, t.camera, t.heads, t.chain, T, numbers, information
+        )
+        if used:
+            kept.append(T)
+    return np.array(kept).reshape(-1, 4, 4)
+
+
+# How sure a transform is: what the last refinement knows, scaled to the errors that are made.
+#
+#     Refined there, Refined back, T  --pair_covariance-->  covariance (6, 6)
+#     covariance  --free_directions-->  Free: along what the surfaces can slide
+#     covariance, R, lever  --transported-->  covariance told in another frame
+#
+# The error of T_parent_child is (x, y, z, rx, ry, rz): what must be added to its translation,
+# metres along the parent's axes, and the rotation vector, radians about the parent's axes, that
+# must be put before its rotation, T_true = [exp(r) R, t + x]. It is what ROS means in
+# PoseWithCovariance. Errors are small: what is of second order in them is left out.
+#
+# The inverse of Gauss-Newton's information alone is no covariance: neighbouring pixels err
+# together, so thousands of them say no more than a few. How many: docs/uncertainty.md.
+
+Method = Literal["information-scaled", "votes-and-spread"]
+#: What made a pair's covariance, and what a place's.
+PAIR_METHOD: Method = "information-scaled"
+PLACE_METHOD: Method = "votes-and-spread"
+
+#: Of turn, then shift, as refinement orders them, to shift, then turn.
+_SHIFT_FIRST = [3, 4, 5, 0, 1, 2]
+
+
+@dataclass(frozen=True)
+class CovarianceParameters:
+    """The numbers of covariances; how they were chosen: docs/uncertainty.md."""
+
+    independent: float = 5.3  #: points per direction that err independently, however many there are
+    least_square: float = 1e-7  #: of the mean weighted square: no sensor is surer
+    most: float = 10.0  #: deviation of what nothing holds, metres and radians
+    lever: float = 1.0  #: a radian counts as much as this many metres
+    free: float = 30.0  #: times the least deviation, from which on a direction is free
+
+
+@dataclass(frozen=True, eq=False)
+class Free:
+    """A direction along which a transform is hardly held.
+
+    Parameters
+    ----------
+    translation, rotation : (3,) each, together of length 1: the error, metres and radians,
+        along this direction
+    deviation : standard deviation along it, metres where it shifts, radians where it turns
+    """
+
+    translation: Floats
+    rotation: Floats
+    deviation: float
+
+
+def crossing(v: Floats) -> Floats:
+    """[v]x (3, 3): crossing(v) @ u = v x u."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def adjoint(R: Floats, lever: Floats) -> Floats:
+    """How an error (x, r) is told elsewhere: (6, 6).
+
+    Parameters
+    ----------
+    R : (3, 3) old parent's axes in the new one's
+    lever : (3,) from the old child's origin to the new one's, along the new axes
+    """
+    result = np.zeros((6, 6))
+    result[:3, :3], result[3:, 3:] = R, R
+    result[:3, 3:] = -crossing(lever) @ R  # what turns moves all that is away from the origin
+    return result
+
+
+def transported(covariance: Floats, R: Floats, lever: Floats) -> Floats:
+    """A covariance told in other axes and of another point of the same body: A S A^T.
+
+    Of T_a_b with rotation R and translation t, and transforms without error beside it:
+
+    * T_c_a T_a_b: (R_c_a, 0)
+    * T_a_b T_b_d, as of a robot's base: (identity, R t_b_d)
+    * the inverse T_b_a: (R^T, -R^T t)
+
+    Parameters
+    ----------
+    covariance : (6, 6)
+    R, lever : see `adjoint`
+    """
+    A = adjoint(R, lever)
+    moved: Floats = A @ covariance @ A.T
+    return (moved + moved.T) / 2
+
+
+def pair_covariance(
+    there: Refined | None, back: Refined | None, T: Floats, p: CovarianceParameters | None = None
+) -> Floats | None:
+    """Covariance of a transform that lies halfway between two refinements: Sec. III-E.
+
+    Parameters
+    ----------
+    there, back : the last refinement of each direction, or None where it was lost
+    T : (4, 4) T_match_query
+    p : see CovarianceParameters
+
+    Returns
+    -------
+    (6, 6) of T, or None where both were lost
+    """
+    p = p or CovarianceParameters()
+    information, squares = [], []
+    if there is not None:  # its error is of the match's origin, which is not where the query is
+        informed = there.information[np.ix_(_SHIFT_FIRST, _SHIFT_FIRST)]
+        onward = adjoint(np.eye(3), -T[:3, 3])
+        information.append(onward.T @ informed @ onward)
+        squares.append(there.mean_square)
+    if back is not None:  # told in the query's axes; that it is the inverse's changes the sign
+        informed = back.information[np.ix_(_SHIFT_FIRST, _SHIFT_FIRST)]
+        onward = adjoint(T[:3, :3].T, np.zeros(3))
+        information.append(onward.T @ informed @ onward)
+        squares.append(back.mean_square)
+    if not information:
+        return None
+    noise = max(float(np.mean(squares)), p.least_square) / p.independent
+    scale = _scale(p)
+    held = np.mean(information, axis=0) * np.outer(1 / scale, 1 / scale) / noise
+    values, vectors = np.linalg.eigh((held + held.T) / 2)
+    variances = 1 / np.maximum(values, 1 / p.most**2)
+    result: Floats = (vectors * variances) @ vectors.T * np.outer(1 / scale, 1 / scale)
+    return (result + result.T) / 2
+
+
+def free_directions(covariance: Floats, p: CovarianceParameters | None = None) -> tuple[Free, ...]:
+    """Directions whose deviation is far above the least one, the freest first.
+
+    A lone plane has three: two shifts within it, and the turn about its normal; a corridor has
+    one, along it; a corner none.
+
+    Parameters
+    ----------
+    covariance : (6, 6)
+    p : see CovarianceParameters
+    """
+    p = p or CovarianceParameters()
+    scale = _scale(p)
+    values, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
+    deviations = np.sqrt(np.maximum(values, 0.0))
+    found = []
+    for i in range(5, 0, -1):
+        if deviations[i] > p.free * deviations[0]:
+            towards = vectors[:, i] / scale
+            length = float(np.linalg.norm(towards))
+            towards = towards / length * np.sign(towards[np.abs(towards).argmax()])
+            found.append(Free(towards[:3], towards[3:], float(deviations[i]) * length))
+    return tuple(found)
+
+
+def place_covariance(average: PoseAverage, poses: Floats, covariances: Floats) -> Floats:
+    """Covariance of an averaged pose, from its votes' covariances and how far they lie apart.
+
+    Two frames make each vote, and one of them, the query, is the same for all: half of the mean
+    of their covariances is kept whole, the other half divided by their number, as is what they
+    differ by, which holds the errors of the map's poses.
+
+    Parameters
+    ----------
+    average : of `average_poses`
+    poses : (n, 4, 4) that were averaged
+    covariances : (n, 6, 6) of each
+    """
+    own: Floats = covariances[average.members].mean(axis=0)
+    n = len(average.members)
+    if n == 1:
+        return own
+    apart = np.array([error_of(average.T, one) for one in poses[average.members]])
+    result: Floats = own * (0.5 + 0.5 / n) + apart.T @ apart / (n * (n - 1))
+    return result
+
+
+def error_of(T: Floats, true: Floats) -> Floats:
+    """(x, y, z, rx, ry, rz) by which a transform (4, 4) is off; see the module."""
+    turn = true[:3, :3] @ T[:3, :3].T
+    axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    sine = float(np.linalg.norm(axis))  # twice that of the angle
+    angle = rotation_angle(turn)
+    rotation = axis / 2 if sine < 1e-9 else axis / sine * angle
+    return np.concatenate([true[:3, 3] - T[:3, 3], rotation])
+
+
+def _scale(p: CovarianceParameters) -> Floats:
+    """What makes metres of an error's six numbers."""
+    return np.array([1.0, 1.0, 1.0, p.lever, p.lever, p.lever])

@@ -1,0 +1,301 @@
+"""A query validated against its candidates, and judged by the true poses.
+
+Task  --judge-->  Judged: pairs, averaged poses
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint.geometry.pose.average import average_poses
+from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.retrieval.distance import (
+    Ints64,
+    Metric,
+    cross_distances,
+    pairwise_distances,
+    ranking_size,
+)
+from sceneprint.geometry.retrieval.dpp import diversify
+from sceneprint.geometry.validation.acceptance import Mode
+from sceneprint.geometry.validation.association import voters
+from sceneprint.geometry.validation.sequence_alignment import Matching
+from sceneprint.geometry.validation.validation import ValidationParameters, refined_at
+from sceneprint.lab.evaluation.protocol import (
+    VIEWS,
+    Error,
+    FrameStore,
+    ValidatedPair,
+    Watch,
+    in_preferred_order,
+    pose_error,
+    unwatched,
+)
+from sceneprint.pipeline import validate
+from sceneprint.types import Bytes, Floats, Geometry
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A database frame that a query is to be validated against.
+
+    Parameters
+    ----------
+    match : its index in the database
+    number : of its files in the store
+    scene, pose : as in Member
+    overlap_mean, overlap_least : with the query
+    """
+
+    match: int
+    number: int
+    scene: str
+    pose: Floats
+    overlap_mean: float
+    overlap_least: float
+
+
+@dataclass(frozen=True, eq=False)
+class QueryTask:
+    """One query with its candidates.
+
+    Parameters
+    ----------
+    number : of the query's files in the store
+    scene, pose : of the query
+    ranking : database indices of the first of R, in order
+    selection : those of C, in order
+    candidates : all of both, each once
+    """
+
+    number: int
+    scene: str
+    pose: Floats
+    ranking: list[int]
+    selection: list[int]
+    candidates: tuple[Candidate, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What came of a task; fields as in Outcome."""
+
+    pairs: dict[int, ValidatedPair]
+    average: Error
+    average_of_ranking: Error
+    average_bound: Error
+    milliseconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """What a process needs to validate.
+
+    Parameters
+    ----------
+    geometry : gives that of a frame by its number in the store
+    mode : see `validate`
+    seed : of every pair, as a service has one for all that it validates
+    p : of the model
+    matching : see `validate`
+    """
+
+    geometry: Callable[[int], Geometry]
+    mode: Mode
+    seed: int
+    p: ValidationParameters = field(default_factory=ValidationParameters)
+    matching: Matching = "histograms"
+
+
+def open_judge(
+    store: FrameStore,
+    mode: Mode,
+    seed: int,
+    p: ValidationParameters,
+    matching: Matching = "histograms",
+) -> Judge:
+    """Make ready to validate frames of a store."""
+    # neighbouring queries have many candidates in common
+    return Judge(lru_cache(128)(store.geometry), mode, seed, p, matching)
+
+
+def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
+    """The first accepted views of the scene with most accepted views, strong ones first.
+
+    Poses are comparable within one scene only; see `voters`.
+
+    Parameters
+    ----------
+    pairs : of a query, in the order of R
+    """
+    believed = in_preferred_order(pairs)
+    sure = [pair.validation.strength == "strong" for pair in believed]
+    return [believed[i] for i in voters([p.scene for p in believed], sure, VIEWS)]
+
+
+def judge(judging: Judge, task: QueryTask) -> Judged:
+    """Validate a query against each candidate, average its pose, and say how far off all are.
+
+    Where refinement from the true pose leads is worked out for the first answer and for the
+    averaged views of C: the bound that registration of these pairs can reach.
+    """
+    of = {c.match: c for c in task.candidates}
+    pairs = {c.match: validated(judging, task, c) for c in task.candidates}
+    selected = [pairs[match] for match in task.selection]
+    views = views_to_average(selected)
+    start = time.perf_counter()
+    average = _average(task, of, {p.match: p.validation.T_match_query for p in views})
+    spent = 1e3 * (time.perf_counter() - start)
+    refined = {
+        pair.match: refined_from_truth(judging, task, of[pair.match])
+        for pair in (*in_preferred_order(selected)[:1], *views)
+        if pair.same_scene
+    }
+    for match, T in refined.items():
+        bound = Error() if T is None else pose_error(T, true_transform(task, of[match]))
+        pairs[match] = replace(pairs[match], bound=bound)
+    ranked = views_to_average([pairs[match] for match in task.ranking])
+    return Judged(
+        pairs,
+        average,
+        _average(task, of, {p.match: p.validation.T_match_query for p in ranked}),
+        _average(task, of, {p.match: refined.get(p.match) for p in views}),
+        spent,
+    )
+
+
+def true_transform(task: QueryTask, candidate: Candidate) -> Floats:
+    """T_match_query by the true poses."""
+    T: Floats = inverse(candidate.pose) @ task.pose
+    return T
+
+
+def validated(judging: Judge, task: QueryTask, candidate: Candidate) -> ValidatedPair:
+    """What validation makes of a query and one candidate, and how far off it is."""
+    query, match = judging.geometry(task.number), judging.geometry(candidate.number)
+    start = time.perf_counter()
+    validation = validate(query, match, judging.seed, judging.p, judging.mode, judging.matching)
+    spent = 1e3 * (time.perf_counter() - start)
+    same, T = candidate.scene == task.scene, validation.T_match_query
+    return ValidatedPair(
+        match=candidate.match,
+        scene=candidate.scene,
+        validation=validation,
+        same_scene=same,
+        error=pose_error(T, true_transform(task, candidate)) if same and T is not None else Error(),
+        bound=None,
+        overlap_mean=candidate.overlap_mean,
+        overlap_least=candidate.overlap_least,
+        milliseconds=spent,
+    )
+
+
+def refined_from_truth(judging: Judge, task: QueryTask, candidate: Candidate) -> Floats | None:
+    """Where refinement ends that is started at the true pose; see `refined_at`."""
+    query, match = judging.geometry(task.number), judging.geometry(candidate.number)
+    return refined_at(query, match, true_transform(task, candidate), judging.p.alignment.fine)
+
+
+def _average(
+    task: QueryTask, of: dict[int, Candidate], transforms: dict[int, Floats | None]
+) -> Error:
+    """Error of the pose averaged over views of one scene; infinite without views."""
+    poses = [of[match].pose @ T for match, T in transforms.items() if T is not None]
+    if not poses or any(of[match].scene != task.scene for match in transforms):
+        return Error()
+    return pose_error(average_poses(np.stack(poses)).T, task.pose)
+
+
+# R and C of every query, by stored signatures alone.
+#
+# signatures, allowed  --rank-->  Ranked: R and C of each query
+
+#: Queries scanned at once.
+BLOCK = 64
+#: Queries whose distances within R are worked out anew, to time what a service would do.
+TIMED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Ranked:
+    """R and C of one query.
+
+    Parameters
+    ----------
+    ranking : R, database indices, nearest first
+    distances : (|R|,) of R, as of `cross_distances`
+    selection : C, in the order of R
+    milliseconds : of `rank` (scan and sort) and `diversify`, and of `compare_ranking` where it
+        was timed
+    """
+
+    ranking: list[int]
+    distances: Ints64
+    selection: list[int]
+    milliseconds: dict[str, float]
+
+
+def rank(
+    queries: Bytes,
+    database: Bytes,
+    allowed: NDArray[np.bool_],
+    *,
+    metric: Metric,
+    candidates: int = 10,
+    watch: Watch = unwatched,
+) -> list[Ranked]:
+    """Rank the database for each query and select from the ranking.
+
+    Parameters
+    ----------
+    queries : (Q, n) uint8
+    database : (N, n) uint8
+    allowed : (Q, N), which frames a query may find
+    metric : l1 or l2
+    candidates : size of C
+    watch : told of each query
+
+    Returns
+    -------
+    ranked : Q; empty lists where nothing is allowed
+    """
+    size = max((ranking_size(int(n)) for n in allowed.sum(axis=1)), default=0)
+    # every pair of the database once, or the pairs within each ranking anew: whichever is less
+    whole = len(database) ** 2 <= len(queries) * size**2
+    among = pairwise_distances(database, metric) if whole and len(queries) else None
+    rows = _rows(queries, database, metric)
+    found = []
+    for i, (row, spent) in enumerate(watch(rows, "rank", len(queries))):
+        start = time.perf_counter()
+        index = np.flatnonzero(allowed[i])
+        order = np.argsort(row[index], kind="stable")  # ties by index
+        ranking = index[order[: ranking_size(len(index))]]
+        ms = {"rank": spent + 1e3 * (time.perf_counter() - start)}
+        start = time.perf_counter()
+        if among is None or i < TIMED:
+            within = pairwise_distances(database[ranking], metric)
+            ms["compare_ranking"] = 1e3 * (time.perf_counter() - start)
+        else:
+            within = among[np.ix_(ranking, ranking)]
+        start = time.perf_counter()
+        selection = diversify(row[ranking], within, candidates)
+        ms["diversify"] = 1e3 * (time.perf_counter() - start)
+        chosen = ranking[selection.indices]
+        found.append(Ranked(ranking.tolist(), row[ranking], chosen.tolist(), ms))
+    return found
+
+
+def _rows(queries: Bytes, database: Bytes, metric: Metric) -> Iterable[tuple[Ints64, float]]:
+    """Distances of each query to the database, and the milliseconds they took."""
+    for begin in range(0, len(queries), BLOCK):
+        start = time.perf_counter()
+        block = cross_distances(queries[begin : begin + BLOCK], database, metric)
+        spent = 1e3 * (time.perf_counter() - start) / len(block)
+        for row in block:
+            yield row, spent

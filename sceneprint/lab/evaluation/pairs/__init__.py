@@ -1,0 +1,1 @@
+"""Pairs of frames, drawn by overlap and judged."""

@@ -1,0 +1,642 @@
+"""The figures of pairs of frames, ready for JSON.
+
+PairEvaluation  --pair_figures-->  dict
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sceneprint.geometry.pose.average import levelling
+from sceneprint.geometry.pose.rigid import inverse, moved
+from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Evidence
+from sceneprint.geometry.validation.validation import PairValidation
+from sceneprint.lab.evaluation.measures import (
+    CONFIDENCE,
+    Figures,
+    accuracy,
+    roc,
+    upper_bound,
+    validation_of,
+)
+from sceneprint.lab.evaluation.pairs.pair_run import BINS, METHODS, PairEvaluation, Tried, points_of
+from sceneprint.lab.evaluation.plots import (
+    RIGHT,
+    UNDECIDED,
+    WRONG,
+    depth_colours,
+    merged,
+    new_figure,
+    rendered,
+    save_figure,
+    turns,
+)
+from sceneprint.lab.evaluation.plots import PatchCloud as Merged
+from sceneprint.lab.evaluation.protocol import Error, FrameStore, ValidatedPair
+from sceneprint.lab.evaluation.report import without_infinities
+from sceneprint.lab.evaluation.run import PLANAR
+from sceneprint.types import AnyFrame, Bytes, Cloud, DepthFrame, Floats
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# The figures of pairs as lines to read in a terminal.
+#
+# figures  --pair_table-->  lines
+
+_COLUMNS = ("within_5cm_5deg", "right")
+_LIMITS = "within 5 cm / right"
+_HEAD = f"{'':24}" + "".join(f"{name + ' %':>16}" for name in BINS)
+
+
+def pair_table(found: dict[str, Any]) -> list[str]:
+    """Bins, negatives, statistics and baselines; figures as `pair_report.pair_figures` has them."""
+    lines: list[str] = []
+    for scene, own in found.get("scenes", {}).items():
+        lines += [f"{scene}, alone", *_bins(own), ""]
+    if lines:
+        lines.append("all scenes")
+    lines += [*_bins(found), ""]
+    if "baselines" in found:
+        lines += [*_baselines(found), ""]
+    lines += [*_negatives(found["negatives"]), "", *_statistics(found["roc"]), ""]
+    v = found["validation"]
+    lines.append(
+        f"acceptance    precision {_number(v['precision'])}, recall {_number(v['recall'])}, where "
+        f"overlap is 30 % {_number(v['recall_overlap_30'])}; {v['accepted']} of {v['pairs']} pairs "
+        f"accepted, {v['accepted_strong']} strong"
+    )
+    kinds = [one["what"] for one in found["failures"]]
+    counts = [f"{kinds.count(kind)} {kind.replace('_', ' ')}" for kind in dict.fromkeys(kinds)]
+    lines.append(f"failures      {', '.join(counts) or 'none'}")
+    times = found["milliseconds"]
+    lines.append(
+        f"milliseconds  prepare {_number(times['prepare'], 1)}, validate "
+        f"{_number(times['validate'], 1)} (medians)"
+    )
+    return lines
+
+
+def _bins(found: dict[str, Any]) -> list[str]:
+    of = found["bins"]
+    rows: list[tuple[str, Callable[[dict[str, Any]], str]]] = [
+        ("pairs", lambda one: str(one["pairs"])),
+        (_LIMITS, lambda one: _two(one["success"])),
+        ("  from the true pose", lambda one: _two(one["bound"])),
+        ("accepted", lambda one: str(one["validation"]["accepted"])),
+        ("  precision", lambda one: _number(one["validation"]["precision"])),
+        ("  recall", lambda one: _number(one["validation"]["recall"])),
+    ]
+    lines = [_HEAD]
+    for name, cell in rows:
+        lines.append(f"{name:24}" + "".join(f"{cell(of[b]):>16}" for b in BINS))
+    v = found["validation"]
+    if "same_scene" in found:
+        same = found["same_scene"]
+        lines.append(
+            f"with {same['pairs']} pairs of it that see nothing of each other: precision "
+            f"{_number(v['precision'])}, recall {_number(v['recall'])}, where overlap is 30 % "
+            f"{_number(v['recall_overlap_30'])}"
+        )
+    return lines
+
+
+def _baselines(found: dict[str, Any]) -> list[str]:
+    of = found["baselines"]
+    lines = [f"beside Open3D, {of['pairs']} pairs, {_LIMITS}", _HEAD]
+    lines.append(f"{'ours':24}" + "".join(f"{_two(found['bins'][b]['success']):>16}" for b in BINS))
+    for method, own in of["methods"].items():
+        for step, name in (("start", ""), ("icp", " + ICP"), ("ours", " + ours")):
+            cells = [_two(own["bins"][b][step]) for b in BINS]
+            lines.append(f"{method + name:24}" + "".join(f"{cell:>16}" for cell in cells))
+    times = [
+        f"{method} + ICP {_number(own['milliseconds'], 0)} (ours / it {_number(own['time_ratio'])})"
+        for method, own in of["methods"].items()
+    ]
+    lines.append(
+        f"milliseconds  ours {_number(of['milliseconds'], 0)}, {', '.join(times)}; medians, one "
+        "thread, features of both frames counted"
+    )
+    return lines
+
+
+def _negatives(found: dict[str, Any]) -> list[str]:
+    names = {
+        "same scene, no overlap": found["same_scene"],
+        "two scenes": found["cross_scene"],
+        "  a frame planar": found["cross_scene_planar"],
+        **{f"  {name}": own for name, own in found["by_scenes"].items()},
+    }
+    lines = [f"{'negatives':36}{'pairs':>8}{'accepted':>10}{'strong':>8}{'at most':>10}"]
+    for name, own in names.items():
+        if own["pairs"]:
+            lines.append(
+                f"{name:36}{own['pairs']:>8}{own['accepted']:>10}{own['accepted_strong']:>8}"
+                f"{_number(own['upper'], 5):>10}"
+            )
+    lines.append(
+        f"(at most: the rate, with {found['confidence']:.0%} confidence, were pairs independent)"
+    )
+    return lines
+
+
+def _statistics(found: dict[str, Any]) -> list[str]:
+    lines = [f"{'decides alone':16}{'area':>8}{'right at no wrong':>20}{'at 1 %':>8}{'at 5 %':>8}"]
+    for name, own in found.items():
+        at = own["right_at"]
+        lines.append(
+            f"{name:16}{_number(own['area']):>8}{_number(at['0']):>20}{_number(at['0.01']):>8}"
+            f"{_number(at['0.05']):>8}"
+        )
+    return lines
+
+
+def _two(shares: dict[str, float | None]) -> str:
+    return " / ".join(_number(shares[name]) for name in _COLUMNS)
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+# What is told of a transform, and how well each number would decide alone.
+#
+# Pair, ...  --curves-->  figures
+
+#: Shares of wrong pairs at which a curve is read off.
+FALSE_RATES = (0.0, 0.01, 0.05)
+
+
+def evidence(v: PairValidation, p: AcceptanceParameters) -> float:
+    """For less against, as acceptance weighs it; without its stiffness, which is not told."""
+    told = Evidence(
+        v.residual_m, v.residual_rad, v.overlap, v.plane_overlap, v.violations, math.inf
+    )
+    return told.total(p)
+
+
+def residual(v: PairValidation, p: AcceptanceParameters) -> float:
+    """Of the two directions: the greater of metres and radians, each over its own limit."""
+    return max(v.residual_m / p.residual_m, v.residual_rad / p.residual_rad)
+
+
+#: What is told of a transform, each so that more speaks for it; None where it is not known.
+STATISTICS: dict[str, Callable[[PairValidation, AcceptanceParameters], float | None]] = {
+    "residual": lambda v, p: -residual(v, p),
+    "overlap": lambda v, _: v.overlap,
+    "plane_overlap": lambda v, _: v.plane_overlap,
+    "violations": lambda v, _: None if v.violations is None else -v.violations,
+    "evidence": evidence,
+    "ambiguity": lambda v, _: -v.ambiguity,
+    "inliers": lambda v, _: v.inliers,
+}
+
+
+def curves(pairs: Sequence[ValidatedPair], p: AcceptanceParameters) -> dict[str, Any]:
+    """The receiver operating characteristic of each statistic, were it to decide alone.
+
+    A pair is right where its transform is, whatever was decided. One without a transform, or of
+    which a statistic is not known, has nothing to say for it. Of `ambiguity` only pairs are
+    counted for which rivals were looked for. `curve` has (share of wrong ones, share of right
+    ones, threshold); thresholds of statistics that should be small are negative.
+    """
+    found = {}
+    for name, told in STATISTICS.items():
+        own = [pair for pair in pairs if name != "ambiguity" or _ambiguity_was_tested(pair)]
+        values = [
+            told(one.validation, p) if one.validation.T_match_query is not None else None
+            for one in own
+        ]
+        right = np.array([pair.right for pair in own], bool)
+        curve = roc(np.array([-math.inf if v is None else v for v in values], float), right)
+        found[name] = {
+            "right": int(right.sum()),
+            "wrong": int((~right).sum()),
+            "area": None if curve is None else curve.area,
+            "right_at": {
+                f"{share:g}": None if curve is None else curve.true_at(share)
+                for share in FALSE_RATES
+            },
+            "curve": [] if curve is None else curve.thinned(),
+        }
+    return found
+
+
+def _ambiguity_was_tested(pair: ValidatedPair) -> bool:
+    return pair.accepted or pair.validation.ambiguity > 0
+
+
+#: Of JSON: raised when a key changes its meaning.
+SCHEMA_VERSION = 1
+
+
+def pair_figures(evaluation: PairEvaluation, settings: dict[str, Any]) -> dict[str, Any]:
+    """Every figure of an evaluation of pairs.
+
+    Parameters
+    ----------
+    evaluation : see PairEvaluation
+    settings : all that is needed to repeat it
+    """
+    members, tried = evaluation.members, evaluation.tried
+    scenes = list(dict.fromkeys(member.scene for member in members))
+    scene_of = [member.scene for member in members]
+    found: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "settings": settings}
+    found["counts"] = {
+        "frames": {scene: scene_of.count(scene) for scene in scenes},
+        "planar": {
+            scene: sum(
+                own == scene and bool(share >= PLANAR)
+                for own, share in zip(scene_of, evaluation.planes, strict=True)
+            )
+            for scene in scenes
+        },
+        "left_out": len(evaluation.left_out),
+        "pairs": len(tried),
+    }
+    found["left_out"] = [{"name": n, "reason": why} for n, why in evaluation.left_out]
+    limits = evaluation.limits
+    found["bins"] = bins(tried, limits)
+    found["negatives"] = negatives(evaluation)
+    found["validation"] = validation_of([one.pair for one in tried])
+    if len(scenes) > 1:
+        found["scenes"] = {
+            scene: _of_scene([one for one in tried if _within(one, scene, scene_of)], limits)
+            for scene in scenes
+        }
+    found["roc"] = curves([one.pair for one in tried], evaluation.acceptance)
+    found["milliseconds"] = {
+        "prepare": evaluation.prepare_ms,
+        "validate": _median([one.pair.milliseconds for one in tried]),
+    }
+    if any(one.others is not None for one in tried):
+        found["baselines"] = baselines(tried, limits)
+    found["failures"] = failures(evaluation)
+    cleaned: dict[str, Any] = without_infinities(found)
+    return cleaned
+
+
+def _within(one: Tried, scene: str, scene_of: Sequence[str]) -> bool:
+    return scene_of[one.drawn.query] == scene_of[one.drawn.match] == scene
+
+
+def _of_scene(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, Any]:
+    """Figures of the pairs of one scene, its negatives among them."""
+    return {
+        "bins": bins(tried, limits),
+        "same_scene": rate([one for one in tried if one.drawn.kind == "same_scene"]),
+        "validation": validation_of([one.pair for one in tried]),
+    }
+
+
+def bins(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, dict[str, Any]]:
+    """By true overlap: how often the transform is right, accepted or not, and whether believed.
+
+    `success`: of the transform that validation found; `right`: to the limits of the evaluation.
+    `bound`: of refinement started at the true pose. Without a transform a pair is a failure.
+    `validation`: see `measures.validation`.
+    """
+    found = {}
+    for name in BINS:
+        own = [one.pair for one in tried if one.drawn.bin == name]
+        found[name] = {
+            "pairs": len(own),
+            "success": _shares([pair.error for pair in own], limits),
+            "bound": _shares([pair.bound or Error() for pair in own], limits),
+            "validation": validation_of(own),
+        }
+    return found
+
+
+def _shares(errors: Sequence[Error], limits: tuple[float, float]) -> Figures:
+    figures = accuracy(errors)
+    right = sum(e.within(*limits) for e in errors) / len(errors) if errors else None
+    return {
+        "within_5cm_5deg": figures["within_5cm_5deg"],
+        "within_10cm_10deg": figures["within_10cm_10deg"],
+        "right": right,
+    }
+
+
+def negatives(evaluation: PairEvaluation) -> dict[str, Any]:
+    """How many pairs that see nothing of each other were accepted, and how many may be.
+
+    `planar`: the pairs of two scenes of which a frame is planar. `by_scenes`: of every two.
+    """
+    tried, members = evaluation.tried, evaluation.members
+    same = [one for one in tried if one.drawn.kind == "same_scene"]
+    cross = [one for one in tried if one.drawn.kind == "cross_scene"]
+    couples: dict[str, list[Tried]] = {}
+    for one in cross:
+        a, b = members[one.drawn.query].scene, members[one.drawn.match].scene
+        couples.setdefault(f"{a} | {b}", []).append(one)
+    return {
+        "same_scene": rate(same),
+        "cross_scene": rate(cross),
+        "cross_scene_planar": rate([one for one in cross if one.drawn.planar]),
+        "by_scenes": {name: rate(own) for name, own in couples.items()},
+        "confidence": CONFIDENCE,
+    }
+
+
+def rate(tried: Sequence[Tried]) -> dict[str, float | int | None]:
+    """Of pairs that ought not to be accepted: how many are; `upper`: see `upper_bound`."""
+    accepted = [one.pair for one in tried if one.pair.accepted]
+    return {
+        "pairs": len(tried),
+        "planar": sum(one.drawn.planar for one in tried),
+        "accepted": len(accepted),
+        "accepted_strong": sum(pair.validation.strength == "strong" for pair in accepted),
+        "upper": upper_bound(len(accepted), len(tried)),
+    }
+
+
+def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, Any]:
+    """Success of others by bin on the same pairs, and what ours costs beside them.
+
+    `start`: before refinement; `icp`: after their own; `ours`: after our refinement in its place.
+    `time_ratio`: median over pairs of our time over theirs, features of both frames counted.
+    """
+    beside = [one for one in tried if one.others is not None]
+    found: dict[str, Any] = {"pairs": len(beside), "methods": {}}
+    found["milliseconds"] = _median([one.milliseconds for one in beside if one.milliseconds])
+    for method in METHODS:
+        by_bin = {}
+        for name in BINS:
+            own = [(one.others or {}).get(method) for one in beside if one.drawn.bin == name]
+            by_bin[name] = {
+                "start": _shares([one.start if one else Error() for one in own], limits),
+                "icp": _shares([one.icp if one else Error() for one in own], limits),
+                "ours": _shares([one.ours if one else Error() for one in own], limits),
+            }
+        both = [
+            (one.milliseconds, one.others[method].milliseconds)
+            for one in beside
+            if one.milliseconds and one.others and method in one.others
+        ]
+        found["methods"][method] = {
+            "bins": by_bin,
+            "milliseconds": _median([theirs for _, theirs in both]),
+            "time_ratio": _median([ours / theirs for ours, theirs in both]),
+        }
+    return found
+
+
+def why(one: Tried) -> str | None:
+    """What went wrong with a pair, None where nothing did.
+
+    `wrongly_accepted`; `not_believed`: a right transform that was not accepted; `near`: off by
+    up to twice the limits, and not accepted; `not_found`: farther off or without a transform,
+    though the two overlap.
+    """
+    pair = one.pair
+    if pair.accepted:
+        return None if pair.right else "wrongly_accepted"
+    if pair.right:
+        return "not_believed"
+    if one.drawn.kind != "overlapping":
+        return None
+    metres, degrees = pair.limits
+    return "near" if pair.error.within(2 * metres, 2 * degrees) else "not_found"
+
+
+def failures(evaluation: PairEvaluation) -> list[dict[str, Any]]:
+    """Every pair that went wrong, the worst kind first, and all that was told of it."""
+    order = ("wrongly_accepted", "not_believed", "near", "not_found")
+    listed = [(why(one), number, one) for number, one in enumerate(evaluation.tried)]
+    wrong = [(kind, number, one) for kind, number, one in listed if kind is not None]
+    wrong.sort(key=lambda entry: (order.index(entry[0]), entry[1]))
+    return [
+        {
+            "number": number,
+            "what": kind,
+            "query": evaluation.members[one.drawn.query].name,
+            "match": evaluation.members[one.drawn.match].name,
+            "kind": one.drawn.kind,
+            "planar": one.drawn.planar,
+            "true_overlap": one.drawn.overlap_least,
+            **_pair_record(one.pair, evaluation.acceptance),
+            "bound": None if one.pair.bound is None else _off(one.pair.bound),
+        }
+        for kind, number, one in wrong
+    ]
+
+
+def _pair_record(pair: ValidatedPair, p: AcceptanceParameters) -> dict[str, Any]:
+    v = pair.validation
+    return {
+        **_off(pair.error),
+        "status": v.status,
+        "strength": v.strength,
+        "reason": v.reason,
+        "residual_m": v.residual_m,
+        "residual_deg": math.degrees(v.residual_rad),
+        "overlap": v.overlap,
+        "plane_overlap": v.plane_overlap,
+        "violations": v.violations,
+        "evidence": evidence(v, p),
+        "ambiguity": v.ambiguity,
+        "inliers": v.inliers,
+    }
+
+
+def _off(error: Error) -> dict[str, float]:
+    return {"translation_m": error.metres, "rotation_deg": math.degrees(error.radians)}
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if len(values) else None
+
+
+# Pictures of pairs: how well each statistic decides, and the pairs that went wrong.
+#
+# PairEvaluation, figures  --save_pair_pictures-->  PNG files
+
+#: Failures that are drawn, and points of a cloud at the most.
+DRAWN, POINTS = 8, 50_000
+_COLOURS = ("#2b6cb0", "#d9772b", "#2f9e63", "#c8372d", "#111111", "#a050aa", "#8a8f98")
+
+
+def save_pair_pictures(
+    folder: Path, evaluation: PairEvaluation, figures: dict[str, Any], store: FrameStore
+) -> list[Path]:
+    """Draw curves, bars of success, and some failures of each kind, the worst kind first.
+
+    Parameters
+    ----------
+    folder : must exist
+    evaluation : see PairEvaluation
+    figures : as `pair_figures` gives them
+    store : of the evaluation's frames
+
+    Returns
+    -------
+    paths : of the files written; there is none of failures where nothing went wrong
+    """
+    drawn = {"roc.png": curves_figure(figures), "success.png": success_figure(figures)}
+    if figures["failures"]:
+        drawn["failures.png"] = failures_figure(
+            evaluation, some_of_each(figures["failures"]), store
+        )
+    for name, figure in drawn.items():
+        save_figure(figure, folder / name)
+    return [folder / name for name in drawn]
+
+
+def curves_figure(figures: dict[str, Any]) -> Figure:
+    """Share of right and of wrong pairs that pass, for each statistic alone."""
+    figure = new_figure(6.4, 5.2)
+    axes = figure.subplots()
+    for (name, own), colour in zip(figures["roc"].items(), _COLOURS, strict=True):
+        if own["curve"]:
+            false, true = np.array([row[:2] for row in own["curve"]]).T
+            label = f"{name.replace('_', ' ')} {own['area']:.3f}"
+            axes.plot(100 * false, true, color=colour, lw=1.8, label=label)
+    axes.set(xlim=(-0.5, 25), ylim=(0, 1.02), xlabel="wrong pairs that pass, %")
+    axes.set_ylabel("right pairs that pass")
+    axes.set_title("Each statistic deciding alone, and area under it", loc="left", fontsize=11)
+    axes.spines[["top", "right"]].set_visible(False)
+    if axes.lines:
+        axes.legend(frameon=False, loc="lower right")
+    return figure
+
+
+def success_figure(figures: dict[str, Any]) -> Figure:
+    """Right transforms by true overlap: ours, from the true pose, and of others."""
+    rows = {"ours": [figures["bins"][b]["success"] for b in BINS]}
+    rows["from the true pose"] = [figures["bins"][b]["bound"] for b in BINS]
+    for method, own in figures.get("baselines", {}).get("methods", {}).items():
+        rows[f"{method} + ICP"] = [own["bins"][b]["icp"] for b in BINS]
+        rows[f"{method} + ours"] = [own["bins"][b]["ours"] for b in BINS]
+    figure = new_figure(11.0, 3.9)
+    metres, degrees = figures["settings"]["right"]
+    keys = {
+        "within_5cm_5deg": "5 cm, 5 degrees",
+        "right": f"{100 * metres:g} cm, {degrees:g} degrees",
+    }
+    width = 0.84 / len(rows)
+    for panel, (key, title) in zip(figure.subplots(1, 2), keys.items(), strict=True):
+        for place, (name, shares) in enumerate(rows.items()):
+            at = np.arange(len(BINS)) - 0.42 + (place + 0.5) * width
+            values = [share[key] or 0.0 for share in shares]
+            panel.bar(at, values, width, color=_COLOURS[place], label=name)
+        counts = [figures["bins"][b]["pairs"] for b in BINS]
+        names = [f"{b} %\n{n} pairs" for b, n in zip(BINS, counts, strict=True)]
+        panel.set_xticks(range(len(BINS)), names)
+        panel.set(ylim=(0, 1.02))
+        panel.set_title(f"right to {title}", loc="left", fontsize=11)
+        panel.spines[["top", "right"]].set_visible(False)
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center",
+                  ncols=min(3, len(rows)), frameon=False)  # fmt: skip
+    return figure
+
+
+def some_of_each(failures: Sequence[dict[str, Any]], most: int = DRAWN) -> list[dict[str, Any]]:
+    """Failures of every kind, as many of each as there are and places for, evenly spread.
+
+    Neighbours in the list are of neighbouring frames, and the first of it all alike.
+
+    Parameters
+    ----------
+    failures : of `pair_figures`, by kind
+    most : of them
+    """
+    kinds: dict[str, list[dict[str, Any]]] = {}
+    for failure in failures:
+        kinds.setdefault(failure["what"], []).append(failure)
+    taken = dict.fromkeys(kinds, 0)
+    for _ in range(min(most, len(failures))):
+        fewest = min(
+            (what for what in kinds if taken[what] < len(kinds[what])), key=taken.__getitem__
+        )
+        taken[fewest] += 1
+    return [
+        own[i * len(own) // taken[what]] for what, own in kinds.items() for i in range(taken[what])
+    ]
+
+
+def failures_figure(
+    evaluation: PairEvaluation, failures: list[dict[str, Any]], store: FrameStore
+) -> Figure:
+    """Of each pair both depths, and both frames laid together as found and as they are.
+
+    Seen from above, the query grey; empty where there is no transform, or no truth.
+    """
+    figure = new_figure(10.0, 2.5 * len(failures))
+    rows = np.array(figure.subfigures(len(failures), 1, squeeze=False)).ravel()
+    for row, failure in zip(rows, failures, strict=True):
+        row.suptitle(_headed(failure), x=0.01, ha="left", fontsize=8, parse_math=False)
+        pictures = _pictures(evaluation, evaluation.tried[failure["number"]], store)
+        line = row.subplots(1, len(pictures))
+        for cell, (name, picture) in zip(line, pictures.items(), strict=True):
+            cell.set(xticks=[], yticks=[])
+            cell.set_xlabel(name, fontsize=8)
+            cell.spines[:].set(color=_colour(failure["what"]), linewidth=2)
+            if picture is not None:
+                cell.imshow(picture)
+            else:
+                why = "no transform" if name == "as found" else "they are of two scenes"
+                cell.text(0.5, 0.5, why, ha="center", va="center", fontsize=8)
+    return figure
+
+
+def _headed(failure: dict[str, Any]) -> str:
+    off = failure["translation_m"]
+    how_far = "nothing to compare with" if off is None else f"{off:.2f} m off"
+    return (
+        f"{failure['what'].replace('_', ' ')}: {failure['query']} to {failure['match']}\n"
+        f"overlap {failure['true_overlap']:.2f}, {how_far}: {failure['reason']}"
+    )
+
+
+def _pictures(evaluation: PairEvaluation, one: Tried, store: FrameStore) -> dict[str, Bytes | None]:
+    query, match = (evaluation.members[i] for i in (one.drawn.query, one.drawn.match))
+    frames = store.frame(query), store.frame(match)
+    true = inverse(match.pose) @ query.pose if one.pair.same_scene else None
+    found = one.pair.validation.T_match_query
+    return {
+        "query": depth_colours(frames[0]),
+        "match": depth_colours(frames[1]),
+        "as found": None if found is None else _together(one, frames, found),
+        "as it is": None if true is None else _together(one, frames, true),
+    }
+
+
+def _together(one: Tried, frames: tuple[AnyFrame, AnyFrame], T: Floats) -> Bytes | None:
+    """Both frames from above, the query laid on the match by a transform."""
+    query, match = frames
+    if isinstance(query, DepthFrame) and isinstance(match, DepthFrame):
+        laid = replace(one.pair, validation=replace(one.pair.validation, T_match_query=T))
+        cloud = merged(query, [laid], lambda _: match)
+        turned = turns()["from above"] @ levelling(cloud.normals)
+    else:
+        its = moved(inverse(T), _points(match))
+        cloud = _unshaded(_points(query), its)
+        turned = np.diag([1.0, -1.0, -1.0])  # scanners stand upright, z up
+    return rendered(cloud, turned, cloud.points) if len(cloud.points) else None
+
+
+def _points(frame: AnyFrame) -> Floats:
+    """Some of its points, (N, 3) metres, in the frame's own axes."""
+    every = (
+        frame.points.astype(np.float64)
+        if isinstance(frame, Cloud)
+        else points_of(frame, 1e-3, np.inf)
+    )
+    return every[:: max(-(-len(every) // POINTS), 1)].astype(np.float64)
+
+
+def _unshaded(query: Floats, match: Floats) -> Merged:
+    points = np.concatenate([query, match])
+    of = np.repeat([0, 1], [len(query), len(match)])
+    return Merged(points, np.zeros_like(points), of, 1)
+
+
+def _colour(what: str) -> str:
+    return {"wrongly_accepted": WRONG, "not_believed": RIGHT}.get(what, UNDECIDED)

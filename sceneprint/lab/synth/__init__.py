@@ -1,0 +1,51 @@
+"""Synthetic depth frames of furnished rooms and laser scans of large sites, with exact poses.
+
+    seed, index  --synthesise_room-->  frames        seed, index  --synthesise_survey-->  clouds
+
+Nothing here reads or writes files.
+"""
+
+from sceneprint.lab.synth.dataset import (
+    KINECT,
+    Survey,
+    SynthRoom,
+    render,
+    synthesise_room,
+    synthesise_survey,
+    take,
+)
+from sceneprint.lab.synth.large_scenes import corridor, symmetric_box
+from sceneprint.lab.synth.rooms import Room, make_room
+from sceneprint.lab.synth.sensors import (
+    KINECT_V1,
+    Caster,
+    KinectNoise,
+    Spinning,
+    cast_depth,
+    kinect_noise,
+    scan,
+)
+from sceneprint.lab.synth.trajectories import scattered_poses, trajectory
+
+__all__ = [
+    "KINECT",
+    "KINECT_V1",
+    "Caster",
+    "KinectNoise",
+    "Room",
+    "Spinning",
+    "Survey",
+    "SynthRoom",
+    "cast_depth",
+    "corridor",
+    "kinect_noise",
+    "make_room",
+    "render",
+    "scan",
+    "scattered_poses",
+    "symmetric_box",
+    "synthesise_room",
+    "synthesise_survey",
+    "take",
+    "trajectory",
+]

@@ -1,0 +1,1 @@
+"""The database, blobs and indexes checked against each other, and repaired."""

@@ -1,0 +1,182 @@
+"""A check of a whole data folder: what is lost, damaged or left over, and its repair.
+
+    Settings  --fsck-->  Outcomes, as they are found
+
+Without repair nothing at all is written. With it each finding is repaired as it comes, in a
+transaction that looks again first: services and workers may be at work meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import select
+
+from sceneprint.errors import SceneprintError, UnusableStore
+from sceneprint.maintenance.fsck.blobs import (
+    check_artifacts,
+    check_files,
+    check_products,
+    check_signatures,
+    check_tables,
+    check_uploads,
+)
+from sceneprint.maintenance.fsck.database import (
+    FATAL,
+    check_counts,
+    check_database,
+    check_models,
+    check_rows,
+    damaged_database,
+)
+from sceneprint.maintenance.fsck.findings import Finding, Folder, Progress, is_of_rows
+from sceneprint.maintenance.fsck.indexes import check_indexes
+from sceneprint.maintenance.fsck.repair import opened_blobs, require_folder
+from sceneprint.settings import Settings
+from sceneprint.store import Blobs, Database, Store, open_store
+from sceneprint.store.maps import find_map
+from sceneprint.store.read_only import look_at
+from sceneprint.store.tables import frames
+from sceneprint_client.api import FrameState
+
+#: Seconds in which a file that nothing refers to may be part of an upload that goes on.
+GRACE_S = 3600.0
+
+_CHECKS: tuple[Callable[[Folder], Iterator[Finding]], ...] = (
+    check_database, check_models, check_rows, check_counts, check_signatures, check_uploads,
+    check_artifacts, check_products, check_files, check_indexes, check_tables,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class FindingOutcome:
+    """What became of a finding.
+
+    Parameters
+    ----------
+    finding : see Finding
+    done : what the repair did; None where none was asked for, or there is none
+    error : why it could not be repaired
+    """
+
+    finding: Finding
+    done: str | None = None
+    error: str | None = None
+
+    @property
+    def left(self) -> bool:
+        """Whether something is still to be done."""
+        return self.finding.severity != "note" and self.done is None
+
+
+def fsck(
+    settings: Settings, *, map_name: str | None = None, repair: bool = False, quick: bool = False,
+    grace_s: float = GRACE_S, progress: Progress | None = None, counts: Counter[str] | None = None,
+) -> Iterator[FindingOutcome]:  # fmt: skip
+    """Check a data folder; the service may run.
+
+    Parameters
+    ----------
+    settings : that name the folder
+    map_name : the map to check; None: all of them, and what belongs to none
+    repair : whether to repair what is found; else nothing is changed
+    quick : look only at what is there, and read nothing large
+    grace_s : see GRACE_S
+    progress : see Progress
+    counts : filled with how much was looked at
+
+    Yields
+    ------
+    what was found, as it is found
+
+    Raises
+    ------
+    UnusableStore, NewerSchema : there is no such folder, or it cannot be read.
+    UnknownMap : no such map.
+    ValueError : a quick look, and a repair: what has not been read is not to be relied upon.
+    """
+    if quick and repair:
+        raise ValueError("a quick look cannot repair")
+    with _open_store(settings, repair=repair) as store:
+        folder = Folder(
+            settings, store, map_name, quick, grace_s, progress or (lambda *_: None),
+            Counter() if counts is None else counts,
+        )  # fmt: skip
+        if map_name is not None:
+            with store.database.read() as connection:
+                find_map(connection, map_name)
+        trusted = True
+        for check in _CHECKS:
+            for finding in _findings_of(check, folder):
+                trusted &= finding.kind not in FATAL
+                yield _outcome(finding, repair, trusted)
+
+
+def _findings_of(check: Callable[[Folder], Iterator[Finding]], folder: Folder) -> Iterator[Finding]:
+    """What a check finds; that the database cannot be read on is a finding too."""
+    try:
+        yield from check(folder)
+    except UnusableStore as error:
+        if not is_of_rows(error):
+            raise
+        yield damaged_database(str(error))
+    except (ValueError, TypeError, KeyError) as error:
+        yield damaged_database(f"{type(error).__name__}: {error}")
+
+
+def _outcome(finding: Finding, repair: bool, trusted: bool) -> FindingOutcome:
+    if not repair or finding.repair is None:
+        return FindingOutcome(finding)
+    if not trusted:
+        return FindingOutcome(
+            finding, error="the database itself is damaged: restore a snapshot first"
+        )
+    try:
+        return FindingOutcome(finding, done=finding.repair())
+    except SceneprintError as error:
+        return FindingOutcome(finding, error=str(error))
+    except OSError as error:
+        return FindingOutcome(
+            finding, error=f"{error.filename or 'a file'}: {error.strerror or error}"
+        )
+
+
+@contextmanager
+def _open_store(settings: Settings, *, repair: bool) -> Iterator[Store]:
+    # before anything is made: a disk that is not mounted is not a folder that has lost all
+    if isinstance(settings.blobs, Path):
+        require_folder(settings.blobs)
+    # a repair makes no database
+    with look_at(settings.database) as database, opened_blobs(settings, database) as blobs:
+        if not repair:
+            yield Store(database, blobs)
+            return
+        _check_blobs(database, blobs, settings.blobs)
+    store = open_store(settings.database, settings.blobs)
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+def _check_blobs(database: Database, blobs: Blobs, place: Path | str) -> None:
+    """See that a folder without a single blob is not taken for the loss of all.
+
+    Raises
+    ------
+    UnusableStore : frames refer to blobs, and there is none.
+    """
+    with database.read() as connection:
+        kept = FrameState.DELETED, FrameState.REDUNDANT
+        refers = select(frames.c.number).where(frames.c.state.not_in(kept)).limit(1)
+        if connection.execute(refers).first() is None:
+            return
+    if next(blobs.digests(), None) is None:
+        raise UnusableStore(
+            f"{place}: not one upload is there, and nothing was changed. See that its "
+            "disk is mounted, or restore a snapshot."
+        )

@@ -1,0 +1,422 @@
+"""A snapshot put into the store of a fleet: PostgreSQL for the rows, and wherever blobs are kept.
+
+archive  --restore_to_fleet-->  an empty database with all rows, and every blob
+
+All is verified before anything is written; blobs are durable before the first row, and the rows
+are one transaction. Whoever is killed half way leaves an empty database, which is restored into
+again.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import closing, contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import (
+    JSON,
+    URL,
+    BigInteger,
+    Boolean,
+    Column,
+    Connection,
+    Float,
+    Integer,
+    LargeBinary,
+    String,
+    Text,
+)
+from sqlalchemy.dialects.postgresql import dialect
+
+from sceneprint.atomic_files import make_folder
+from sceneprint.errors import DamagedSnapshot, SnapshotError
+from sceneprint.maintenance.snapshot.creation import Progress, Snapshot
+from sceneprint.maintenance.snapshot.database_copy import (
+    Form,
+    Row,
+    Sum,
+    open_copy,
+    referred,
+    rows_of_file,
+    rows_of_server,
+)
+from sceneprint.maintenance.snapshot.files import full_disk_explained, staging
+from sceneprint.maintenance.snapshot.format import DATABASE
+from sceneprint.maintenance.snapshot.restoration import blobs_of, unpack
+from sceneprint.settings import Settings
+from sceneprint.store import Blobs, open_blobs
+from sceneprint.store.blobs.object_client import open_objects
+from sceneprint.store.blobs.object_store import BucketOwner
+from sceneprint.store.database import Database, open_database, reach_database
+from sceneprint.store.opaque_ids import OpaqueIds
+from sceneprint.store.postgres.connection import allow
+from sceneprint.store.postgres.vectors import drop_tables
+from sceneprint.store.tables import metadata, secrets
+
+# A SQLite file written into the empty database of a fleet, in one transaction.
+#
+# file  --copy_into-->  PostgreSQL: the same rows, the same numbers, the same next numbers
+
+#: What a database of which nobody has made use holds: its secret, and what a service counts.
+_OF_ITSELF = ("secrets", "samples")
+
+
+def copy_into(connection: Connection, file: sqlite3.Connection) -> None:
+    """Write all rows of a file; each table is read again and compared.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    file : of the schema of this version
+
+    Raises
+    ------
+    SnapshotError : the database holds something, or did not keep what was written.
+    """
+    allow(connection, 0)
+    check_empty(connection)
+    drop_tables(connection)  # of vectors, which a copy of signatures does not make
+    for name in _OF_ITSELF:
+        connection.exec_driver_sql(f"DELETE FROM {name}")
+    # foreign keys ask for the order
+    for table in metadata.sorted_tables:
+        form = Form(table)
+        written = Sum(form)
+        _write(connection, form, written.over(rows_of_file(file, form)))
+        found = Sum(form)
+        for row in rows_of_server(connection, form, hashed=True):
+            found.add(row)
+        if found.told != written.told:
+            raise SnapshotError(
+                f"Table {table.name} holds {found.told[0]} rows that are not the "
+                f"{written.told[0]} that were written. Nothing was restored; see the "
+                "server's log."
+            )
+    # anybody may write anything there
+    asked = "SELECT name, seq FROM sqlite_sequence WHERE typeof(seq) = 'integer'"
+    given = dict(file.execute(asked))
+    for table in metadata.sorted_tables:
+        if Form(table).counts:
+            _count_on(connection, table.name, given.get(table.name, 0))
+
+
+def take_secrets(connection: Connection, file: sqlite3.Connection) -> None:
+    """Let an empty database have the secrets of a file."""
+    connection.exec_driver_sql("DELETE FROM secrets")
+    form = Form(secrets)
+    _write(connection, form, rows_of_file(file, form))
+
+
+def check_empty(connection: Connection) -> None:
+    """See that a database of our schema, or of none, holds nothing that would be lost.
+
+    Raises
+    ------
+    SnapshotError : it does.
+    """
+    for table in metadata.sorted_tables:
+        if table.name in _OF_ITSELF:
+            continue
+        if connection.exec_driver_sql(f"SELECT to_regclass('{table.name}')").scalar() is None:
+            continue
+        if connection.exec_driver_sql(f"SELECT 1 FROM {table.name} LIMIT 1").first() is not None:
+            raise SnapshotError(
+                f"The database has rows in its table {table.name}, and nothing is overwritten. "
+                "Make an empty one (CREATE DATABASE), and name it in SCENEPRINT_DATABASE_URL."
+            )
+
+
+def _write(connection: Connection, form: Form, rows: Iterator[Row]) -> None:
+    driver: Any = connection.connection.cursor()
+    with driver as cursor, cursor.copy(f"COPY {form.table.name} ({form.names}) FROM STDIN") as copy:
+        for row in rows:
+            copy.write_row(form.for_server(row))
+
+
+def _count_on(connection: Connection, name: str, given: int) -> None:
+    """Let the next number be one that was never given out."""
+    asked = f"SELECT coalesce(max(number), 0) FROM {name}"
+    last = max(given, int(connection.exec_driver_sql(asked).scalar_one()))
+    connection.exec_driver_sql(
+        f"SELECT setval(pg_get_serial_sequence('{name}', 'number'), {max(last, 1)}, "
+        f"{'true' if last else 'false'})"
+    )
+
+
+# What of an embedded store PostgreSQL would refuse, found before anything is moved.
+#
+# SQLite keeps what it is given: a text that is longer than its column, a zero byte in it, a number
+# where a text should be. What comes in through the service today is refused there; files of earlier
+# versions, or that somebody has edited, may hold such rows all the same.
+
+#: Rows that are named one by one.
+_SHOWN = 6
+_SMALL, _LARGE_DATABASE = 1 << 31, 1 << 63
+#: What is wrong with a value; None where nothing is.
+_Look = Callable[[Any], str | None]
+
+
+def check_acceptable(file: sqlite3.Connection) -> None:
+    """See that PostgreSQL takes every row of a database.
+
+    Parameters
+    ----------
+    file : of the schema of this version; texts that are no UTF-8 are read all the same here
+
+    Raises
+    ------
+    SnapshotError : it does not; names rows, and why.
+    """
+    before, file.text_factory = file.text_factory, _text
+    try:
+        every = (told for table in metadata.sorted_tables for told in _refused(file, Form(table)))
+        refused, others = [*islice(every, _SHOWN)], sum(1 for _ in every)
+    finally:
+        file.text_factory = before
+    if refused:
+        more = f"; and {others} more values" if others else ""
+        raise SnapshotError(
+            f"PostgreSQL cannot hold {'; '.join(refused)}{more}. Nothing was restored: "
+            "restore it to a folder, delete or mend these there, and take another snapshot."
+        )
+
+
+def _refused(file: sqlite3.Connection, form: Form) -> Iterator[str]:
+    looks = [_look(column) for column in form.table.columns]
+    # the bytes of a signature need not be read to see that they are bytes
+    told = ", ".join(
+        f'typeof("{one.name}")' if isinstance(one.type, LargeBinary) else f'"{one.name}"'
+        for one in form.table.columns
+    )
+    with closing(file.execute(f"SELECT {told} FROM {form.table.name}")) as cursor:
+        for row in cursor:
+            for column, look, value in zip(form.table.columns, looks, row, strict=True):
+                if value is None:
+                    wrong = None if column.nullable else "nothing, where something has to be"
+                else:
+                    wrong = look(value)
+                if wrong is not None:
+                    yield f"{column.name} of {form.key(row)} ({wrong})"
+
+
+def _look(column: Column[Any]) -> _Look:
+    kind = column.type
+    if isinstance(kind, LargeBinary):
+        return lambda value: None if value in ("blob", "null") else f"{value} where bytes should be"
+    if isinstance(kind, JSON):
+        return _look_at_document
+    if isinstance(kind, Boolean):
+        return lambda value: None if value in (0, 1) else "neither true nor false"
+    if isinstance(kind, Float):
+        return lambda value: None if isinstance(value, float | int) else "no number"
+    if isinstance(kind, Integer):
+        there = kind.dialect_impl(dialect())  # type: ignore[no-untyped-call]
+        most = _LARGE_DATABASE if isinstance(there, BigInteger) else _SMALL
+        return lambda value: (
+            None if isinstance(value, int) and -most <= value < most else "no such whole number"
+        )
+    if isinstance(kind, String | Text):
+        longest = kind.length
+        return lambda value: _look_at_text(value, longest)
+    raise TypeError(f"{column}: nobody has said what PostgreSQL takes of {kind!r}")
+
+
+def _look_at_text(value: Any, longest: int | None) -> str | None:
+    if not isinstance(value, str):
+        return "no text"
+    if "\0" in value:
+        return "a zero byte in a text"
+    if longest is not None and len(value) > longest:
+        return f"{len(value)} characters, where {longest} have room"
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        return "no UTF-8"
+    return None
+
+
+def _look_at_document(value: Any) -> str | None:
+    if isinstance(value, int | float):
+        return None if abs(value) < float("inf") else "no JSON"
+    wrong = _look_at_text(value, None)
+    if wrong is not None:
+        return wrong
+    try:
+        json.loads(value, parse_constant=_refuse)
+    except (ValueError, RecursionError):
+        return "no JSON"
+    return None
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(constant)  # NaN and the infinities are Python's, not JSON's
+
+
+def _text(data: bytes) -> str:
+    return data.decode("utf-8", "surrogateescape")
+
+
+#: Blobs that are written at once, and bytes above which one goes alone and in parts.
+_AT_ONCE, _LARGE = 8, 8 << 20
+_STAGING = ".restoring-"
+
+
+def restore_to_fleet(
+    archive: Path, settings: Settings, progress: Progress | None = None
+) -> Snapshot:
+    """Put all of a snapshot into an empty database and where blobs are kept, or no row of it.
+
+    Parameters
+    ----------
+    archive : of `take_snapshot`
+    settings : whose database is PostgreSQL; its schema is made where there is none
+    progress : told of bytes done and bytes in all; the archive is read twice
+
+    Raises
+    ------
+    SnapshotError : the archive is none, or damaged; the database holds something or is in use; or
+        there is something in the archive that PostgreSQL cannot hold.
+    UnusableStore : database or blobs cannot be reached or written.
+    NewerSchema : a later version wrote the archive, or made the database.
+    """
+    tell: Progress = progress or (lambda _done, _total: None)
+    _check_folder(settings)
+    before = reach_database(settings.database)
+    try:
+        _check_target(before)
+    finally:
+        before.close()
+    make_folder(settings.data_dir)
+    with full_disk_explained(settings.data_dir), staging(settings.data_dir, _STAGING) as made:
+        snapshot = unpack(
+            archive, made, lambda done, total: tell(done, 2 * total), with_blobs=False
+        )
+        path = made / DATABASE
+        _bring_here(path)
+        with open_copy(path) as file:
+            check_acceptable(file)
+        owner = _owner_of(path)
+        with open_copy(path) as file:
+            database = open_database(settings.database)
+            try:
+                with _marked(settings, database, owner):
+                    _fill(
+                        database, file, settings, snapshot,
+                        lambda done, total: tell(total + done, 2 * total),
+                    )  # fmt: skip
+            finally:
+                database.close()
+    return snapshot
+
+
+def _check_folder(settings: Settings) -> None:
+    """See that the folder of blobs is not that of an embedded store.
+
+    Either would remove blobs that only the other refers to.
+    """
+    if not isinstance(settings.blobs, Path):
+        return  # it is marked with whose it is
+    path = settings.blob_dir.with_name(DATABASE)
+    if path.exists():
+        raise SnapshotError(
+            f"{path} is the database of another store, whose blobs lie beside it. Name another "
+            "folder with --data."
+        )
+
+
+def _check_target(database: Database) -> None:
+    """See that the database holds nothing, and that nobody has it open, as far as it can tell."""
+    with database.read() as connection:
+        check_empty(connection)
+        others = connection.exec_driver_sql(
+            "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database()"
+            " AND application_name = 'sceneprint' AND pid <> pg_backend_pid()"
+        ).scalar_one()
+    if others:
+        raise SnapshotError(
+            f"{database.shown} is in use: {others} connections of sceneprint. Stop its services "
+            "and workers, and try again."
+        )
+
+
+def _bring_here(path: Path) -> None:
+    """Bring a database of an earlier version to the schema of this one."""
+    url = URL.create("sqlite", database=str(path))
+    open_database(url.render_as_string(hide_password=False)).close()
+
+
+def _owner_of(path: Path) -> str:
+    """What the store is called whose database it is."""
+    url = URL.create("sqlite", database=str(path))
+    with closing(reach_database(url.render_as_string(hide_password=False))) as database:
+        return OpaqueIds(database).owner
+
+
+@contextmanager
+def _marked(settings: Settings, database: Database, owner: str) -> Iterator[None]:
+    """Have the prefix of an object store to oneself while blobs are put there.
+
+    The store that the snapshot was taken of has the same name: what it keeps must not be shared.
+    """
+    if isinstance(settings.blobs, Path):
+        yield
+        return
+    mark = BucketOwner(open_objects(settings.blobs))
+    with database.read() as connection:
+        check_empty(connection)  # so what a service has marked with its name is nobody's
+    mark.begin(owner, OpaqueIds(database).owner)
+    yield
+    mark.end(owner)
+
+
+def _fill(
+    database: Database, file: sqlite3.Connection, settings: Settings, snapshot: Snapshot,
+    tell: Progress,
+) -> None:  # fmt: skip
+    with database.write() as connection:  # who keeps the blobs may ask whose they are
+        check_empty(connection)
+        take_secrets(connection, file)
+    blobs = open_blobs(settings.blobs, database, make=True)
+    with closing(blobs), blobs.kept():
+        lost = {one.digest for one in snapshot.damaged}
+        wanted = (digest for digest in referred(file) if digest not in lost)
+        _put_all(blobs, snapshot.path, wanted, tell)
+        with database.write() as connection:
+            copy_into(connection, file)
+
+
+def _put_all(blobs: Blobs, archive: Path, wanted: Iterable[str], tell: Progress) -> None:
+    """Keep all blobs, a few at once: each waits for its disk, or for the network.
+
+    The archive may have been changed, or be another one, since it was verified.
+    """
+    waiting: dict[Future[str], str] = {}
+
+    def require(same: bool) -> None:
+        if not same:
+            raise DamagedSnapshot(f"{archive} was changed while it was restored. Try again.")
+
+    def kept(done: Iterable[Future[str]]) -> None:
+        for one in [*done]:
+            require(one.result() == waiting.pop(one))
+
+    left = iter(wanted)
+    with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="put") as pool:
+        for digest, size, chunks in blobs_of(archive, tell):
+            require(digest == next(left, None))
+            if size > _LARGE:
+                with blobs.incoming() as blob:
+                    for chunk in chunks:
+                        blob.write(chunk)
+                    require(blob.keep() == digest)
+                continue
+            waiting[pool.submit(blobs.put, b"".join(chunks))] = digest
+            if len(waiting) >= 2 * _AT_ONCE:
+                kept(wait(waiting, return_when=FIRST_COMPLETED).done)
+        require(next(left, None) is None)
+        kept(waiting)

@@ -1,0 +1,389 @@
+"""Snapshots put back: every byte is verified before anything of it gets its name.
+
+archive  --verify_snapshot-->  Snapshot
+archive  --restore_snapshot-->  data folder
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import sqlite3
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from pydantic import ValidationError
+
+from sceneprint.atomic_files import make_folder, sync_folder
+from sceneprint.errors import DamagedSnapshot, SnapshotError
+from sceneprint.maintenance.snapshot import database_copy
+from sceneprint.maintenance.snapshot.creation import Progress, Snapshot
+from sceneprint.maintenance.snapshot.files import (
+    DurableFiles,
+    check_room,
+    full_disk_explained,
+    left_behind,
+    put_new,
+    staging,
+)
+from sceneprint.maintenance.snapshot.format import (
+    BLOBS,
+    DAMAGED,
+    DATABASE,
+    LONGEST,
+    MANIFEST,
+    ArchiveReader,
+    LostBlob,
+    SnapshotManifest,
+    read_manifest,
+)
+from sceneprint.store.blobs.folder import is_digest
+
+# An archive read once from end to end, each part of it checked against all others.
+#
+# The manifest vouches for the database, the database names the blobs, their names are checksums.
+# So nothing in the archive chooses where anything is written: what is not expected is refused.
+
+
+def unpack(archive: Path, folder: Path, progress: Progress | None, *, with_blobs: bool) -> Snapshot:
+    """Verify an archive, and write what is in it into a folder, durable.
+
+    Parameters
+    ----------
+    archive : of `take_snapshot`
+    folder : empty; where this raises, what is in it is of no use
+    progress : told of bytes done and bytes in all
+    with_blobs : whether to write them; they are verified all the same
+
+    Raises
+    ------
+    SnapshotError : it is none, of a later version, or damaged; or there is no room.
+    NewerSchema : a later version wrote its database.
+    """
+    if not archive.is_file():
+        raise SnapshotError(f"{archive}: there is no such file. Name a snapshot.")
+    with archive.open("rb") as file:
+        total = os.fstat(file.fileno()).st_size
+        reader = ArchiveReader(
+            file, archive, lambda done: None if progress is None else progress(done, total)
+        )
+        manifest = _manifest(reader, archive)
+        wanted = manifest.database.bytes + (manifest.blobs.bytes if with_blobs else 0)
+        check_room(folder.parent, wanted, "what is in the snapshot")
+        _write_database(reader, manifest, folder / DATABASE)
+        with _checked(reader, manifest, archive, folder / DATABASE) as copy:
+            missing = _blobs(reader, manifest, copy, folder / BLOBS if with_blobs else None)
+            damaged = _damaged(reader, manifest, missing)
+        if reader.next() is not None:
+            raise reader.damaged("a member follows the last one")
+    sync_folder(folder)
+    return Snapshot(archive, manifest, damaged)
+
+
+def blobs_of(archive: Path, progress: Progress) -> Iterator[tuple[str, int, Iterator[bytes]]]:
+    """The blobs in an archive that `unpack` has verified: digest, size, and bytes in parts.
+
+    Parameters
+    ----------
+    archive : see `unpack`
+    progress : told of bytes done and bytes in all
+
+    Raises
+    ------
+    DamagedSnapshot : it is not what was verified.
+    """
+    with archive.open("rb") as file:
+        total = os.fstat(file.fileno()).st_size
+        reader = ArchiveReader(file, archive, lambda done: progress(done, total))
+        while (member := reader.next()) is not None:
+            name, size = member
+            chunks = reader.content(size)
+            if name.startswith(BLOBS):
+                yield name.removeprefix(BLOBS), size, chunks
+            for _ in chunks:  # to its end, whoever has read how much
+                pass
+
+
+def _manifest(reader: ArchiveReader, archive: Path) -> SnapshotManifest:
+    try:
+        member = reader.next()
+    except DamagedSnapshot:
+        member = None
+    if member is None or member[0] != MANIFEST or member[1] > LONGEST:
+        raise DamagedSnapshot(
+            f"{archive}: no snapshot of sceneprint, or damaged at its start. Name another file, "
+            "or take another copy of it."
+        )
+    manifest = read_manifest(b"".join(reader.content(member[1])), str(archive))
+    if reader.size != manifest.bytes:
+        raise reader.damaged(f"it has {reader.size} bytes, where {manifest.bytes} were written")
+    if manifest.database.bytes + manifest.blobs.bytes + manifest.damaged.bytes > reader.size:
+        raise reader.damaged("its manifest promises more than it holds")
+    return manifest
+
+
+def _write_database(reader: ArchiveReader, manifest: SnapshotManifest, path: Path) -> None:
+    if reader.next() != (DATABASE, manifest.database.bytes):
+        raise reader.damaged("its database is not where it should be")
+    hashed = hashlib.sha256()
+    with path.open("xb") as file:
+        for chunk in reader.content(manifest.database.bytes):
+            hashed.update(chunk)
+            file.write(chunk)
+        file.flush()
+        os.fsync(file.fileno())
+    if hashed.hexdigest() != manifest.database.sha256:
+        raise reader.damaged("the bytes of its database are not those that were written")
+
+
+@contextmanager
+def _checked(
+    reader: ArchiveReader, manifest: SnapshotManifest, archive: Path, path: Path
+) -> Iterator[sqlite3.Connection]:
+    """The database, after it has been looked through: one that is whole may not be sound."""
+    told = {"maps": manifest.maps, "frames": manifest.frames, "signatures": manifest.signatures}
+    with database_copy.open_copy(path) as copy:
+        try:
+            wrong = database_copy.check_plain(copy)
+            if wrong is not None:
+                raise reader.damaged(f"its database is none of sceneprint's ({wrong})")
+            revision = database_copy.check_schema(copy, str(archive))
+            wrong = database_copy.check_copy(copy)
+            if wrong is not None:
+                raise reader.damaged(f"its database is not sound ({wrong})")
+            if revision != manifest.schema_revision or database_copy.counts(copy) != told:
+                raise reader.damaged("its database is another than its manifest says")
+            yield copy
+        except sqlite3.Error as error:
+            raise reader.damaged(f"its database cannot be read ({error})") from error
+
+
+def _blobs(
+    reader: ArchiveReader, manifest: SnapshotManifest, copy: sqlite3.Connection, folder: Path | None
+) -> list[str]:
+    """Take the blobs that the database refers to, in its order; returns those that are missing."""
+    missing, count, size = [], 0, 0
+    with DurableFiles(folder) as files:
+        member = reader.next()
+        for digest in database_copy.referred(copy):
+            # what is no digest would choose where it is written: nothing is there for it
+            if member is None or member[0] != f"{BLOBS}{digest}" or not is_digest(digest):
+                missing.append(digest)
+                if len(missing) > manifest.damaged.count:
+                    raise reader.damaged("a blob is missing, or another one is there")
+                continue
+            path = Path(digest[:2], digest)
+            if files.write(path, reader.content(member[1])) != digest:
+                raise reader.damaged(f"the blob {digest[:12]} has other bytes than were written")
+            count, size = count + 1, size + member[1]
+            member = reader.next()
+    if member != (DAMAGED, manifest.damaged.bytes):
+        raise reader.damaged("a blob is there that nothing refers to")
+    if (count, size) != (manifest.blobs.count, manifest.blobs.bytes):
+        raise reader.damaged("its blobs are others than its manifest says")
+    return missing
+
+
+def _damaged(
+    reader: ArchiveReader, manifest: SnapshotManifest, missing: list[str]
+) -> list[LostBlob]:
+    """What the archive says of the blobs that are not in it: these, and no others."""
+    data = b"".join(reader.content(manifest.damaged.bytes))
+    if hashlib.sha256(data).hexdigest() != manifest.damaged.sha256:
+        raise reader.damaged("its list of damaged blobs is not the one that was written")
+    try:
+        lost = [LostBlob.model_validate_json(line) for line in data.splitlines()]
+    except ValidationError as error:
+        raise reader.damaged("its list of damaged blobs is none") from error
+    if [one.digest for one in lost] != missing:
+        raise reader.damaged("other blobs are missing than it says")
+    return lost
+
+
+# Where a snapshot is restored to: nothing is overwritten, and nothing is removed.
+
+_STAGING, _ASIDE = ".restoring-", ".before-"
+#: Where SQLite keeps the locks of its readers, in a file that never is so long: whoever has the
+#: database open holds one of them. Offset and bytes; part of its file format.
+_READERS = (0x40000002, 510)
+
+
+class RestoreTarget:
+    """A data folder to be made.
+
+    Parameters
+    ----------
+    folder : missing or empty
+    replace : it may hold something, which is moved aside
+
+    Raises
+    ------
+    SnapshotError : it holds something, or is in use, or is no folder.
+    """
+
+    def __init__(self, folder: Path, *, replace: bool) -> None:
+        self._folder = Path(os.path.realpath(folder))  # a link stays one
+        self._exists = self._folder.is_dir()
+        self._replaced = False
+        if not self._exists and os.path.lexists(self._folder):
+            raise SnapshotError(f"{folder} is no folder. Name another with --data.")
+        found = self._contents()
+        if not found:
+            return
+        if not replace:
+            raise SnapshotError(
+                f"{folder} holds {_named(found)}, and nothing is overwritten. Name another folder "
+                "with --data; with --replace what is there is moved aside and kept."
+            )
+        if os.path.ismount(self._folder):
+            raise SnapshotError(
+                f"{folder} is a mount of its own and cannot be moved aside. Move away what is in "
+                f"it ({_named(found)}), or name a folder in it with --data."
+            )
+        self._check_unused()
+        self._replaced = True
+
+    @contextmanager
+    def staging(self) -> Iterator[Path]:
+        """A folder on the same file system to unpack into; it is gone at the end."""
+        inside = self._exists and not self._replaced
+        parent = self._folder if inside else self._folder.parent
+        make_folder(parent)
+        prefix = _STAGING if inside else f"{self._folder.name}{_STAGING}"
+        with staging(parent, prefix) as folder:
+            yield folder
+
+    def put(self, made: Path, *, blobs: str, database: str) -> Path | None:
+        """Let what was made be the target, in one step as far as anybody can see.
+
+        Parameters
+        ----------
+        made : of `staging`
+        blobs, database : what is in it
+
+        Returns
+        -------
+        aside : where the folder is now that was there
+        """
+        if self._exists and not self._replaced:  # it may be a mount, or another user's: it stays
+            self._fill(made, blobs, database)
+            return None
+        folder = self._folder
+        aside = folder.with_name(f"{folder.name}{_ASIDE}{datetime.now(UTC):%Y%m%dT%H%M%S%fZ}")
+        try:
+            if self._replaced:
+                self._check_unused()  # it may have come to be used
+                made.chmod(stat.S_IMODE(folder.stat().st_mode))
+                folder.rename(aside)
+            made.rename(folder)  # fails where somebody has put something there
+        except BaseException as error:
+            if aside.exists() and not folder.exists():
+                aside.rename(folder)
+            if isinstance(error, OSError):
+                raise self._overtaken(error) from error
+            raise
+        sync_folder(folder.parent)
+        return aside if self._replaced else None
+
+    def _fill(self, made: Path, blobs: str, database: str) -> None:
+        """The database comes last: without it a service would take the folder for an empty one."""
+        try:
+            (made / blobs).rename(self._folder / blobs)
+            try:
+                put_new(made / database, self._folder / database)
+            except OSError:
+                (self._folder / blobs).rename(made / blobs)
+                raise
+        except OSError as error:
+            raise self._overtaken(error) from error
+
+    def _contents(self) -> list[str]:
+        """What is in the folder but for what killed restores have left there."""
+        if not self._exists:
+            return []
+        ours = {*left_behind(self._folder, _STAGING)}
+        if os.path.ismount(self._folder):
+            ours.add("lost+found")
+        return sorted(set(os.listdir(self._folder)) - ours)  # noqa: PTH208
+
+    def _check_unused(self) -> None:
+        """See that nobody has the database open, as far as this machine can tell.
+
+        Not for a process that has it open itself: its own locks would be gone.
+        """
+        path = self._folder / DATABASE
+        if not path.is_file():
+            return
+        with path.open("r+b") as file:
+            try:
+                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, _READERS[1], _READERS[0])
+            except (BlockingIOError, PermissionError) as error:
+                raise SnapshotError(
+                    f"{self._folder} is in use. Stop its service, its workers, and whatever else "
+                    "has it open, and try again."
+                ) from error
+
+    def _overtaken(self, error: OSError) -> SnapshotError:
+        return SnapshotError(
+            f"{self._folder}: the snapshot cannot be put there ({error.strerror}). Nothing was "
+            "changed; see what has come to be there, and its permissions."
+        )
+
+
+def _named(names: list[str]) -> str:
+    shown = ", ".join(names[:3])
+    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"
+
+
+def verify_snapshot(archive: Path, progress: Progress | None = None) -> Snapshot:
+    """Read all of an archive and check it; its database is unpacked in a temporary folder.
+
+    Parameters
+    ----------
+    archive : of `take_snapshot`
+    progress : told of bytes done and bytes in all
+
+    Raises
+    ------
+    SnapshotError : it is none, of a later version, or damaged; or there is no room to check it.
+    NewerSchema : a later version wrote its database.
+    """
+    with TemporaryDirectory(prefix="sceneprint-verify-") as name:
+        folder = Path(name)
+        with full_disk_explained(folder):
+            return unpack(archive, folder, progress, with_blobs=False)
+
+
+def restore_snapshot(
+    archive: Path, folder: Path, *, replace: bool = False, progress: Progress | None = None
+) -> tuple[Snapshot, Path | None]:
+    """Make a data folder of an archive, all of it or nothing.
+
+    Parameters
+    ----------
+    archive : of `take_snapshot`
+    folder : to be made, or empty
+    replace : move what is there aside; it is never removed
+    progress : told of bytes done and bytes in all
+
+    Returns
+    -------
+    snapshot : what was restored
+    aside : where the folder is now that was there
+
+    Raises
+    ------
+    SnapshotError : as for `verify_snapshot`; or the folder holds something that is to be kept, or
+        is in use.
+    NewerSchema : a later version wrote its database.
+    OSError : the folder cannot be made.
+    """
+    target = RestoreTarget(folder, replace=replace)
+    with full_disk_explained(folder), target.staging() as made:
+        snapshot = unpack(archive, made, progress, with_blobs=True)
+        return snapshot, target.put(made, blobs=BLOBS.rstrip("/"), database=DATABASE)

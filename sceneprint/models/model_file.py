@@ -1,0 +1,339 @@
+"""Model files: safetensors with a JSON header; no pickle, nothing executed."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sceneprint.atomic_files import write_whole
+from sceneprint.errors import UnreadableModel
+from sceneprint.geometry.signature.mixture import Mixture
+from sceneprint.geometry.signature.pair_features import (
+    FEATURE_DIMENSION,
+    PROPERTY_DIMENSION,
+    Projection,
+)
+from sceneprint.geometry.signature.whitening import Whitening
+from sceneprint.geometry.surface.cloud import CloudParameters
+from sceneprint.geometry.validation.patch_descriptors import Compression
+from sceneprint.models.model import (
+    PSI_SCHEMA_VERSION,
+    SCHEMA_VERSION,
+    Model,
+    ModelParameters,
+    parameters_of,
+)
+
+# What a model may ask for: no frame takes unbounded memory or time with it.
+
+#: Most components: the pair table names them in 16 bits.
+MAXIMUM_COMPONENTS = 2**15 - 1
+#: Least and most of what decides how much memory and time a frame takes.
+BOUNDS = {
+    "bins of the table": (1, 4_000_000),
+    "levels": (1, 16),
+    "patches": (1, 10_000),
+    "pixels": (64, 1 << 20),
+    "iterations": (0, 1000),
+    "window": (1, 16),
+    "patches for validation": (1, 2_000),
+    "iterations for validation": (0, 1000),
+    "bins of the surroundings": (1, 10_000),
+    "bytes of a descriptor": (1, 1024),
+    "pixels of a cloud": (64, 1 << 20),
+    "fewest points of a cloud": (1, 1_000_000),
+    "window of a cloud": (1, 16),
+    "patches of a cloud": (1, 10_000),
+    "patches of a cloud for validation": (1, 2_000),
+    "gap of a cloud": (0, 1000),
+    "neighbours in a cloud": (1, 1 << 27),
+    "hypotheses": (1, 1000),
+    "correspondences": (1, 10_000),
+    "rivals": (0, 100),
+    "iterations of a refinement": (0, 1000),
+    "stride": (1, 1000),
+    "pixels about an edge": (0, 100),
+    "rounds of a hypothesis": (0, 1000),
+    "neighbours in a sequence": (1, 1000),
+    "correspondences of sequences": (1, 10_000),
+}
+
+
+#: Most bytes of a whitened signature.
+MAXIMUM_DIMENSION = 1024
+
+
+def check_whitening(levels: tuple[object, ...], n_levels: int, dimension: int) -> None:
+    """See that a whitening is of levels that there are, and short.
+
+    Raises
+    ------
+    ValueError : it is not.
+    """
+    known = [level for level in range(n_levels) if level in levels]
+    if not known or list(levels) != known or any(isinstance(level, bool) for level in levels):
+        raise ValueError(f"a whitening of levels {list(levels)} of {n_levels}")
+    if not 1 <= dimension <= MAXIMUM_DIMENSION:
+        raise ValueError(f"{dimension} bytes of a signature are not from 1 to {MAXIMUM_DIMENSION}")
+
+
+def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> None:
+    """See that no frame can take unbounded memory or time with these parameters.
+
+    Parameters
+    ----------
+    p : as read from a file
+    n_components : of the mixture
+    n_compressed : bytes of a descriptor
+
+    Raises
+    ------
+    ValueError : a number is out of its bounds.
+    """
+    if n_components > MAXIMUM_COMPONENTS:
+        raise ValueError(f"{n_components} components are more than {MAXIMUM_COMPONENTS}")
+    t = p.table
+    if min(t.distance_bins, t.angle_bins, t.dihedral_bins) < 1:
+        raise ValueError("every axis of the table should have bins")
+    if not (p.surroundings.scales >= 1e-3).all():
+        raise ValueError("every scale of the surroundings should have a radius and bins")
+    _check_cloud(p.cloud)
+    alignment, rivals = p.validation.alignment, p.validation.rivals
+    sequence = alignment.sequence
+    refinements = (alignment.coarse, alignment.fine, rivals.first, rivals.then)
+    strides = [p.validation.agreement.stride, *(one.stride for one in refinements)]
+    counts = {
+        "bins of the table": t.n_bins,
+        "levels": p.hierarchy.n_levels,
+        "patches": p.segmentation.n_patches,
+        "pixels": p.depth.maximum_pixels,
+        "iterations": max(p.segmentation.iterations, p.hierarchy.iterations),
+        "window": p.normals.radius_px,
+        "patches for validation": p.validation_segmentation.n_patches,
+        "iterations for validation": p.validation_segmentation.iterations,
+        "bins of the surroundings": p.surroundings.dimension,
+        "bytes of a descriptor": n_compressed,
+        "pixels of a cloud": p.cloud.maximum_pixels,
+        "fewest points of a cloud": p.cloud.minimum_points,
+        "window of a cloud": max(p.cloud.radius_px, p.cloud.image_radius_px),
+        "patches of a cloud": p.cloud.maximum_patches,
+        "patches of a cloud for validation": p.cloud.maximum_validation_patches,
+        "gap of a cloud": p.cloud.gap_px,
+        "neighbours in a cloud": p.cloud.maximum_pixels * (2 * p.cloud.radius_px + 1) ** 2,
+        "hypotheses": max(alignment.n_refined, alignment.consensus.n_seeds),
+        "correspondences": alignment.matching.n_sources * alignment.matching.n_nearest,
+        "rivals": max(rivals.n_axes, rivals.n_planes, rivals.n_shifts),
+        "iterations of a refinement": max(one.iterations for one in refinements),
+        "stride": min(strides),
+        "pixels about an edge": p.validation.agreement.edge_px,
+        "rounds of a hypothesis": alignment.consensus.rounds,
+        "neighbours in a sequence": sequence.n_neighbours,
+        "correspondences of sequences": sequence.n_sources * sequence.n_nearest,
+    }
+    for what, (least, most) in BOUNDS.items():
+        if not least <= counts[what] <= most:
+            raise ValueError(f"{what}: {counts[what]} is not from {least} to {most}")
+
+
+def _check_cloud(p: CloudParameters) -> None:
+    """See that voxels and pixels have a size, and the range has points."""
+    if not 1e-4 <= p.minimum_range < p.maximum_range <= 1e6:
+        raise ValueError("the range of a cloud should begin above 0 and before it ends")
+    if not (p.voxel_size > 0 and min(p.voxel_angle, p.image_angle) >= 1e-4):
+        raise ValueError("voxels and pixels of a cloud should have a size")
+    if not max(p.voxel_angle, p.image_angle) <= 0.1 or not p.same_surface > 0:
+        raise ValueError("voxels and pixels of a cloud should be small, and not flat")
+    if not min(p.seed_px, p.validation_seed_px) >= 1:
+        raise ValueError("seeds of a cloud should be as far apart as voxels")
+    if not 0 < p.range_gate <= 1:  # of 1, neighbours are as far as e times the range
+        raise ValueError("neighbours in a cloud should be in some range of each other")
+
+
+#: Names of the models that ship with the package, the default first.
+PRESETS = ("depth", "lidar", "paper")
+#: Presets of earlier versions, and what takes their place.
+FORMER_PRESETS = {"compact": "depth"}
+#: A model of the most components fits; a larger file is refused unread.
+MAXIMUM_BYTES = 16 << 20
+
+
+def write_model(model: Model) -> bytes:
+    """A model as the bytes of its file."""
+    from safetensors.numpy import save
+
+    header = model.header | {
+        "id": model.id,
+        "name": model.name,
+        "provenance": dict(model.provenance),
+    }
+    return bytes(save(model.tensors, {"sceneprint": json.dumps(header, sort_keys=True)}))
+
+
+def save_model(model: Model, path: Path) -> None:
+    """Write a model to a file, whole or not at all.
+
+    Parameters
+    ----------
+    model : see Model
+    path : of the file; its folder must exist
+    """
+    data = write_model(model)
+    parse_model(data, str(path))  # what cannot be read back is not written
+    write_whole(path, data)
+
+
+def read_model(model: str | Path) -> Model:
+    """Read a preset by its name, or a model file by its path.
+
+    Parameters
+    ----------
+    model : one of PRESETS, or a path
+
+    Raises
+    ------
+    UnreadableModel : no such preset or file, not a model, another schema, or content that
+        does not give the id in its header.
+    """
+    if str(model) in PRESETS:
+        source = resources.files("sceneprint") / "presets" / f"{model}.safetensors"
+        return parse_model(source.read_bytes(), f"preset {model}")
+    path = Path(model)
+    if str(model) in FORMER_PRESETS and not path.exists():
+        raise UnreadableModel(
+            f"There is no preset {model!r} any more. Use {FORMER_PRESETS[str(model)]!r} instead. "
+            "Maps made with it are still served, and `sceneprint reencode` moves them."
+        )
+    try:
+        if path.stat().st_size > MAXIMUM_BYTES:
+            raise UnreadableModel(
+                f"{path}: {path.stat().st_size} bytes are more than any model has. "
+                "Give the path of a file that `sceneprint train` wrote."
+            )
+        data = path.read_bytes()
+    except OSError as error:
+        raise UnreadableModel(
+            f"{path}: cannot be read ({error.strerror or error}). Give one of the presets "
+            f"({', '.join(PRESETS)}), or the path of a file that `sceneprint train` wrote."
+        ) from error
+    return parse_model(data, str(path))
+
+
+def parse_model(data: bytes, name: str) -> Model:
+    """Read a model from the bytes of its file.
+
+    Parameters
+    ----------
+    data : the file
+    name : of the file, for errors
+
+    Raises
+    ------
+    UnreadableModel : see `read_model`.
+    """
+    from safetensors.numpy import load
+
+    try:
+        length = int.from_bytes(data[:8], "little")
+        metadata = json.loads(data[8 : 8 + length])["__metadata__"]
+        header: dict[str, Any] = dict(json.loads(metadata["sceneprint"]))
+        tensors = load(data)
+    except Exception as error:  # safetensors raises its own, json and Python theirs
+        raise UnreadableModel(
+            f"{name}: not a model file ({type(error).__name__}: {error}). "
+            "Give the path of a file that `sceneprint train` wrote."
+        ) from error
+    schema = SCHEMA_VERSION if "whitening" in header else PSI_SCHEMA_VERSION
+    if header.get("schema_version") != schema:
+        raise UnreadableModel(
+            f"{name}: schema {header.get('schema_version')} is not {schema}, the one this version "
+            "of sceneprint reads. Train it again, or use the version that wrote it."
+        )
+    try:
+        model, given = _assemble(header, tensors), str(header["id"])
+    except UnreadableModel as error:
+        raise UnreadableModel(f"{name}: {error}") from error
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        raise UnreadableModel(
+            f"{name}: a part of the model is missing or misshapen ({error}). "
+            "Fetch or train it again."
+        ) from error
+    if model.id != given:
+        raise UnreadableModel(
+            f"{name}: its content gives the id {model.id[:12]}, its header says "
+            f"{given[:12]}: the file was damaged. Fetch or train it again."
+        )
+    return model
+
+
+def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
+    g = len(tensors["mixture.weights"])
+    shapes = {
+        "projection.mean": (PROPERTY_DIMENSION,),
+        "projection.matrix": (FEATURE_DIMENSION, PROPERTY_DIMENSION),
+        "mixture.weights": (g,),
+        "mixture.means": (g, FEATURE_DIMENSION),
+        "mixture.variances": (g, FEATURE_DIMENSION),
+    }
+    parameters = parameters_of(header["parameters"])
+    check_bounds(parameters, g, len(tensors["compression.matrix"]))
+    bins = parameters.surroundings.dimension
+    shapes["compression.mean"] = (bins,)
+    shapes["compression.matrix"] = (len(tensors["compression.matrix"]), bins)
+    for name, shape in shapes.items():
+        tensor, kind = tensors[name], "float32" if name.startswith("compression") else "float64"
+        if tensor.shape != shape or tensor.dtype != kind or not np.isfinite(tensor).all():
+            raise ValueError(f"{name} should be finite {kind} {shape}")
+    if (
+        g < 1
+        or (tensors["mixture.weights"] <= 0).any()
+        or (tensors["mixture.variances"] <= 0).any()
+    ):
+        raise ValueError("weights and variances should be positive")
+    step, d0 = float(header["quantiser_step"]), float(header["unrelated_distance"])
+    if not (math.isfinite(step) and step > 0 and math.isfinite(d0) and d0 > 0):
+        raise ValueError("quantiser step and unrelated distance should be positive")
+    if not re.fullmatch(r"[\w.-]{1,64}", str(header["name"]), re.ASCII):
+        raise ValueError("a name is up to 64 letters, digits, dots and dashes")
+    return Model(
+        name=str(header["name"]),
+        parameters=parameters,
+        projection=Projection(tensors["projection.mean"], tensors["projection.matrix"]),
+        mixture=Mixture(
+            tensors["mixture.weights"], tensors["mixture.means"], tensors["mixture.variances"]
+        ),
+        compression=Compression(tensors["compression.mean"], tensors["compression.matrix"]),
+        quantiser_step=step,
+        psi_unrelated_distance=d0,
+        provenance=dict(header["provenance"]),
+        whitening=_whitening(header, tensors, 25 * g, parameters.hierarchy.n_levels),
+    )
+
+
+def _whitening(
+    header: dict[str, Any], tensors: dict[str, np.ndarray], level_length: int, n_levels: int
+) -> Whitening | None:
+    """The whitening of a file; None of a model that has none."""
+    if "whitening" not in header:
+        return None
+    told, basis = header["whitening"], tensors["whitening.basis"]
+    levels, d0 = tuple(told["levels"]), float(told["unrelated_distance"])
+    check_whitening(levels, n_levels, len(basis))
+    shapes = {
+        "basis": ("int8", (len(basis), level_length * len(levels))),
+        "scales": ("float64", (len(basis),)),
+        "offsets": ("float64", (len(basis),)),
+    }
+    for name, (kind, shape) in shapes.items():
+        tensor = tensors[f"whitening.{name}"]
+        if tensor.shape != shape or tensor.dtype != kind or not np.isfinite(tensor).all():
+            raise ValueError(f"whitening.{name} should be finite {kind} {shape}")
+    if not (math.isfinite(d0) and d0 > 0):
+        raise ValueError("the unrelated distance of the whitening should be positive")
+    scales, offsets = tensors["whitening.scales"], tensors["whitening.offsets"]
+    return Whitening(levels, basis, scales, offsets, d0)

@@ -1,0 +1,541 @@
+"""Blobs in a folder: written, synced and renamed, so that they survive the loss of power."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import os
+import re
+import secrets
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+from typing import BinaryIO, Literal, Protocol
+
+from sceneprint.atomic_files import make_folder, sync_folder, write_durable
+from sceneprint.errors import DamagedBlob, UnusableStore
+from sceneprint.store.database_errors import unusable
+
+# Who needs blobs kept, and who may remove some: one lock for all processes that share them.
+#
+# The lock of a process that dies is free at once: the kernel releases that of a file, and the
+# server that of a connection.
+
+
+class Locks(Protocol):
+    """The lock of some blobs; see `Blobs.kept` and `Blobs.removing`."""
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """Hold it with others who need all blobs kept."""
+
+    @contextmanager
+    def removing(self) -> Iterator[bool]:
+        """Hold it alone, if that can be had at once."""
+
+    def removals(self) -> int | None:
+        """A number that any removal changes; None where it cannot be told, or one is under way."""
+
+    def close(self) -> None:
+        """Give back what it holds open."""
+
+
+class FileLocks:
+    """Of the processes of one machine: the lock of a folder, or of a file that is made.
+
+    Parameters
+    ----------
+    path : of it
+    make : make a file there where there is none
+    """
+
+    def __init__(self, path: Path, *, make: bool = False) -> None:
+        self._path = path
+        self._flags = os.O_RDWR | os.O_CREAT if make else os.O_RDONLY | os.O_DIRECTORY
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """See `Locks`; UnusableStore where it cannot be locked."""
+        try:
+            descriptor = self._lock(fcntl.LOCK_SH)
+        except OSError as error:
+            kind = "folder" if self._flags & os.O_DIRECTORY else "file"
+            raise UnusableStore(
+                f"{self._path}: the {kind} cannot be locked ({error.strerror}). Stop the "
+                "service and copy the data folder as it is."
+            ) from error
+        try:
+            yield
+        finally:
+            os.close(descriptor)
+
+    @contextmanager
+    def removing(self) -> Iterator[bool]:
+        """See `Locks`."""
+        try:
+            descriptor = self._lock(fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:  # held by another, or there are no locks: what stays does no harm
+            yield False
+            return
+        try:
+            yield True
+        finally:
+            os.close(descriptor)
+
+    def removals(self) -> int | None:
+        """It is not told."""
+        return None
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def _lock(self, how: int) -> int:
+        # of this call alone: flock then keeps out other threads as well as other processes
+        descriptor = os.open(self._path, self._flags | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(descriptor, how)
+        except BaseException:
+            os.close(descriptor)
+            raise
+        return descriptor
+
+
+# Blobs: bytes kept under the SHA-256 of their content, durable before anything refers to them.
+#
+# bytes  --put-->  digest  --get-->  the same bytes, or an error
+#
+# In a folder (folder.py), or in an object store (object_store.py).
+
+# A blob that comes in parts, such as one that does not fit into memory.
+
+
+class IncomingBlob:
+    """A blob that comes in parts; see `Blobs.incoming`.
+
+    Parameters
+    ----------
+    file : that it is written to
+    what : to say where that fails
+    keep : makes it durable under its digest
+    """
+
+    def __init__(self, file: BinaryIO | FileIO, what: str, keep: Callable[[str], None]) -> None:
+        self._file, self._what, self._keep = file, what, keep
+        self._hashed = hashlib.sha256()
+        #: Bytes so far.
+        self.size = 0
+
+    def write(self, data: bytes) -> None:
+        """Add to it."""
+        try:
+            left = memoryview(data)
+            while left:  # a file without a buffer may take a part alone
+                left = left[self._file.write(left) or 0 :]
+        except OSError as error:
+            raise unusable(self._what, error) from error
+        self._hashed.update(data)
+        self.size += len(data)
+
+    def keep(self) -> str:
+        """End it; when this returns it survives the loss of power. Returns its digest."""
+        digest = self._hashed.hexdigest()
+        try:
+            self._keep(digest)
+        except OSError as error:
+            raise unusable(self._what, error) from error
+        return digest
+
+
+#: What a blob is found to be.
+Condition = Literal["sound", "missing", "damaged"]
+DIGEST = re.compile(r"[0-9a-f]{64}")
+
+
+def is_digest(given: object) -> bool:
+    """Whether it is the name of a blob, whatever of."""
+    return isinstance(given, str) and DIGEST.fullmatch(given) is not None
+
+
+def require_digest(given: str) -> None:
+    """ValueError for what is no digest: it must not become part of a path or a key."""
+    if not DIGEST.fullmatch(given):
+        raise ValueError(f"{given!r} is no digest")
+
+
+@dataclass(frozen=True)
+class BlobEntry:
+    """What lies where blobs are kept.
+
+    Parameters
+    ----------
+    place : file or key, for people
+    digest : of the blob that it is; None where it is none
+    changed_at : seconds since 1970
+    unfinished : whether a writer writes it, or has left it
+    """
+
+    place: str
+    digest: str | None
+    changed_at: float
+    unfinished: bool = False
+
+
+class Blobs(Protocol):
+    """Where blobs are kept; safe to share between threads."""
+
+    def put(self, data: bytes) -> str:
+        """Keep bytes; when this returns nothing that the store promises to survive loses them.
+
+        Returns
+        -------
+        digest : 64 hexadecimal digits
+
+        Raises
+        ------
+        StoreFull : there is no room; nothing is left behind.
+        UnusableStore : it may not be written, or is not there.
+        """
+
+    def incoming(self) -> AbstractContextManager[IncomingBlob]:
+        """Take a blob in parts, such as one that does not fit into memory.
+
+        What is not kept by the end of it is removed.
+
+        Raises
+        ------
+        StoreFull, UnusableStore : as `put`, also from `write` and `keep`.
+        """
+
+    def get(self, digest: str) -> bytes:
+        """The bytes of a digest, checked against it.
+
+        Raises
+        ------
+        DamagedBlob : they are missing, or others than were stored.
+        UnusableStore : the store is away.
+        """
+
+    def open(self, digest: str) -> BinaryIO:
+        """A blob as a file that can be sought in, unchecked; FileNotFoundError where it is missing.
+
+        Raises
+        ------
+        OSError, UnusableStore : it cannot be read, now or later.
+        """
+
+    def holds(self, digest: str) -> bool:
+        """Whether there is a blob of that digest."""
+
+    def size(self, digest: str) -> int | None:
+        """Bytes of a blob as it lies there, unchecked; None where it is missing."""
+
+    def kept(self) -> AbstractContextManager[None]:
+        """See that no blob is removed meanwhile; waits for who is removing some.
+
+        The lock of a process that dies is free at once, however it dies.
+
+        Raises
+        ------
+        UnusableStore : it cannot be locked.
+        """
+
+    def removing(self) -> AbstractContextManager[bool]:
+        """Hold the right to remove blobs; False where somebody needs them kept, or removes some.
+
+        Ask for it within a writing transaction: removers then come one after the other, and leave
+        room between them for who waits in `kept`.
+        """
+
+    def remove(self, digest: str) -> None:
+        """Forget a blob that nothing refers to; only within `removing`."""
+
+    def condition(self, digest: str, *, quick: bool = False) -> Condition:
+        """Whether a blob is as it was stored; read in parts, so that memory is bounded.
+
+        Parameters
+        ----------
+        digest : of the blob; what is no digest names none
+        quick : see only whether it is there
+
+        Raises
+        ------
+        UnusableStore : it may not be read by this user, or the store is away.
+        """
+
+    def quarantine(self, digest: str, folder: Path) -> Path | None:
+        """Move what lies under a digest out of the way, durably; None where there is nothing.
+
+        Parameters
+        ----------
+        digest : of a blob that was found damaged; only within `removing`
+        folder : to move it to; made where missing
+        """
+
+    def place(self, digest: str) -> str:
+        """Where a blob lies, for people to look at."""
+
+    def digests(self) -> Iterator[str]:
+        """All blobs, in no order."""
+
+    def entries(self) -> Iterator[BlobEntry]:
+        """All that lies where blobs are kept, in no order."""
+
+    def check(self) -> None:
+        """See that a store on the network answers, or did two seconds ago; a folder has nothing
+        to be asked.
+
+        Raises
+        ------
+        UnusableStore : it does not.
+        """
+
+    def close(self) -> None:
+        """Give back what it holds open."""
+
+
+#: What a writer that was killed leaves behind.
+PART = re.compile(r"\.[0-9a-f]{12}\.part")
+
+
+class FolderBlobs:
+    """A folder of blobs, in 256 folders by their first two digits.
+
+    Parameters
+    ----------
+    folder : made where missing
+    make : whether it is
+
+    Raises
+    ------
+    UnusableStore : it cannot be made.
+    """
+
+    def __init__(self, folder: Path, *, make: bool = True) -> None:
+        self._folder = folder
+        # the folder itself is the lock, so that there is none to make or to clear away
+        self._locks = FileLocks(folder)
+        self._durable: set[str] = set()  # folders in it that this process has synced it for
+        try:
+            if make:
+                make_folder(folder)
+        except OSError as error:
+            raise unusable(f"{folder}: the folder cannot be made", error) from error
+
+    def put(self, data: bytes) -> str:
+        """Keep bytes; when this returns they survive the loss of power.
+
+        Returns
+        -------
+        digest : 64 hexadecimal digits
+
+        Raises
+        ------
+        StoreFull : the disk is full; nothing is left behind.
+        UnusableStore : it may not be written, or is not there.
+        """
+        digest = hashlib.sha256(data).hexdigest()
+        path = self._path(digest)
+        try:  # also where it is there: that one may be damaged, not yet durable, or being removed
+            new = self._made(path.parent)
+            write_durable(path, data, folder_is_new=new)
+        except OSError as error:
+            raise unusable(f"{self._folder}: a blob cannot be written", error) from error
+        self._durable.add(path.parent.name)
+        return digest
+
+    @contextmanager
+    def incoming(self) -> Iterator[IncomingBlob]:
+        """Take a blob in parts, such as one that does not fit into memory.
+
+        What is not kept by the end of it is removed.
+
+        Raises
+        ------
+        StoreFull, UnusableStore : as `put`, also from `write` and `keep`.
+        """
+        part = self._folder / f".{secrets.token_hex(6)}.part"
+        what = f"{self._folder}: a blob cannot be written"
+        try:
+            file = part.open("xb", buffering=0)
+        except OSError as error:
+            raise unusable(what, error) from error
+        try:
+            with file:
+                yield IncomingBlob(file, what, lambda digest: self._keep(file, part, digest))
+        finally:
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+
+    def _keep(self, file: FileIO, part: Path, digest: str) -> None:
+        """Sync a file that is written, and give it the name of its content."""
+        os.fsync(file.fileno())
+        path = self._path(digest)
+        self._made(path.parent)
+        os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
+        sync_folder(path.parent)
+        sync_folder(self._folder)
+
+    def _made(self, folder: Path) -> bool:
+        """See that a folder is there; whether it may not be durable yet."""
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            return folder.name not in self._durable
+        return True
+
+    def get(self, digest: str) -> bytes:
+        """The bytes of a digest, checked against it.
+
+        Raises
+        ------
+        DamagedBlob : they are missing, or others than were stored.
+        """
+        try:
+            data = self._path(digest).read_bytes()
+        except OSError as error:
+            raise DamagedBlob(
+                f"The blob {digest[:12]} cannot be read ({error.strerror}). Restore the data "
+                "folder from a copy, or delete the frame and upload it again."
+            ) from error
+        if hashlib.sha256(data).hexdigest() != digest:
+            raise DamagedBlob(
+                f"The blob {digest[:12]} is damaged: its content has another hash. Restore the "
+                "data folder from a copy, or delete the frame and upload it again."
+            )
+        return data
+
+    def holds(self, digest: str) -> bool:
+        """Whether there is a blob of that digest."""
+        return self._path(digest).exists()
+
+    def size(self, digest: str) -> int | None:
+        """Bytes of a blob as it lies there, unchecked; None where it is missing."""
+        try:
+            return self._path(digest).stat().st_size
+        except OSError:
+            return None
+
+    def open(self, digest: str) -> BinaryIO:
+        """A blob as a file that can be sought in, unchecked; FileNotFoundError where it is missing.
+
+        Raises
+        ------
+        OSError : it cannot be read.
+        """
+        return self._path(digest).open("rb")
+
+    def kept(self) -> AbstractContextManager[None]:
+        """See that no blob is removed meanwhile; waits for who is removing some.
+
+        Raises
+        ------
+        UnusableStore : the folder cannot be locked.
+        """
+        return self._locks.kept()
+
+    def removing(self) -> AbstractContextManager[bool]:
+        """Hold the right to remove blobs; see `Blobs.removing`."""
+        return self._locks.removing()
+
+    def remove(self, digest: str) -> None:
+        """Forget a blob that nothing refers to; only within `removing`."""
+        self._path(digest).unlink(missing_ok=True)
+
+    def condition(self, digest: str, *, quick: bool = False) -> Condition:
+        """Whether a blob is as it was stored; read in parts, so that memory is bounded.
+
+        Parameters
+        ----------
+        digest : of the blob; what is no digest names none
+        quick : see only whether it is there
+
+        Raises
+        ------
+        UnusableStore : it may not be read by this user.
+        """
+        if not DIGEST.fullmatch(digest):
+            return "missing"
+        try:
+            with self._path(digest).open("rb") as file:
+                if quick or hashlib.file_digest(file, "sha256").hexdigest() == digest:
+                    return "sound"
+        except FileNotFoundError:
+            return "missing"
+        except PermissionError as error:
+            raise UnusableStore(
+                f"{self._path(digest)}: may not be read. Run it as the user who owns the data "
+                "folder."
+            ) from error
+        except OSError:  # the disk cannot read it, or a folder has its name
+            pass
+        return "damaged"
+
+    def quarantine(self, digest: str, folder: Path) -> Path | None:
+        """Move what lies under a digest out of the way, durably; None where there is nothing.
+
+        Parameters
+        ----------
+        digest : of a blob that was found damaged; only within `removing`
+        folder : to move it to; made where missing
+        """
+        path, place = self._path(digest), folder / f"blob-{digest}"
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            os.replace(path, place)  # noqa: PTH105  (the one call that is atomic by contract)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            if error.errno != errno.EXDEV:
+                raise
+            write_durable(place, path.read_bytes())
+            path.unlink()
+        for each in (folder, folder.parent, path.parent):
+            sync_folder(each)
+        return place
+
+    def path(self, digest: str) -> Path:
+        """Where a blob lies, for people to look at."""
+        return self._folder / digest[:2] / digest
+
+    def place(self, digest: str) -> str:
+        """As `path`, whatever keeps the blobs."""
+        return str(self.path(digest))
+
+    def digests(self) -> Iterator[str]:
+        """All blobs, in no order."""
+        for folder in self._folder.iterdir():
+            if folder.is_dir():
+                for name in os.listdir(folder):  # noqa: PTH208  (a path for each would cost)
+                    if DIGEST.fullmatch(name):
+                        yield name
+
+    def entries(self) -> Iterator[BlobEntry]:
+        """All files below the folder, in no order; those that vanish meanwhile are left out."""
+        folders = [self._folder]
+        while folders:
+            with os.scandir(folders.pop()) as found:
+                for one in found:
+                    path = Path(one.path)
+                    if one.is_dir(follow_symlinks=False):
+                        folders.append(path)
+                        continue
+                    try:
+                        changed_at = one.stat(follow_symlinks=False).st_mtime
+                    except FileNotFoundError:
+                        continue
+                    own = DIGEST.fullmatch(one.name) and self.path(one.name) == path
+                    part = PART.fullmatch(one.name) is not None
+                    yield BlobEntry(one.path, one.name if own else None, changed_at, part)
+
+    def check(self) -> None:
+        """There is nothing to be asked."""
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def _path(self, digest: str) -> Path:
+        require_digest(digest)
+        return self._folder / digest[:2] / digest

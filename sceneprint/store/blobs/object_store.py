@@ -1,0 +1,440 @@
+"""Blobs in an object store that a fleet shares.
+
+    PREFIX/blobs/ab/abcdef...   a blob under its digest
+    PREFIX/sceneprint.json      the database they belong to
+
+A blob is put in one step, or in parts that are not there before the last: what was not
+acknowledged leaves nothing behind that could be read. It is put also where one is there, which may
+be damaged, or about to be removed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import tempfile
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from sceneprint.atomic_files import sync_folder
+from sceneprint.errors import DamagedBlob, UnusableStore
+from sceneprint.store.blobs.folder import (
+    DIGEST,
+    BlobEntry,
+    Condition,
+    IncomingBlob,
+    Locks,
+    require_digest,
+)
+from sceneprint.store.blobs.object_client import Objects
+from sceneprint.store.database_errors import unusable
+
+# Whose a prefix of an object store is: two databases on one would sweep each other's blobs.
+#
+#     PREFIX/sceneprint.json   {"store": name of the store, "restoring": while one is restored
+#     there}
+#
+# The name goes with the database's secret, so a restored store has that of the one that the
+# snapshot
+# was taken of: a restore therefore takes no prefix that is in use, were it by its own name.
+
+#: Under the prefix.
+MARK = "sceneprint.json"
+
+
+class BucketOwner:
+    """The mark of a prefix.
+
+    Parameters
+    ----------
+    objects : of the prefix
+
+    Every method raises UnusableStore where the prefix is another's, or cannot be used.
+    """
+
+    def __init__(self, objects: Objects) -> None:
+        self._objects = objects
+
+    def claim(self, owner: str, *, anew: bool) -> bool:
+        """See that the prefix is a store's; whether it is marked so now.
+
+        Parameters
+        ----------
+        owner : the store
+        anew : mark it where it is nobody's yet
+        """
+        for _ in range(2):  # another process may be the first
+            found = self._found()
+            if found is None:
+                if not anew:
+                    return False
+                if self._put(owner, create=True):
+                    return True
+                continue
+            if found.get("store") != owner:
+                raise self._of_another("another database")
+            return True
+        return False
+
+    def begin(self, owner: str, before: str) -> None:
+        """Take the prefix for a store that is to be restored there.
+
+        Parameters
+        ----------
+        owner : the store
+        before : name of the empty database that it is restored to: what a service has marked so,
+            and never used, is free
+        """
+        found = self._found()
+        free = found is not None and before != owner and found.get("store") == before
+        if found is None or free:
+            if not self._put(owner, create=found is None, restoring=True):
+                raise self._of_another("another database")  # at the same time
+        elif found.get("store") != owner:
+            raise self._of_another("another database")
+        elif found.get("restoring") is not True:
+            raise self._of_another("the store that the snapshot was taken of, or its copy")
+
+    def end(self, owner: str) -> None:
+        """Say that it is restored."""
+        self._put(owner)
+
+    def _found(self) -> dict[str, Any] | None:
+        """What is there; None where nothing is."""
+        try:
+            found = json.loads(self._objects.get(MARK))
+        except FileNotFoundError:
+            return None
+        except (ValueError, RecursionError):
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    def _put(self, owner: str, *, create: bool = False, restoring: bool = False) -> bool:
+        record = {"kind": "sceneprint blobs", "store": owner}
+        more = {"restoring": True} if restoring else {}
+        return self._objects.put(MARK, json.dumps(record | more).encode(), create=create)
+
+    def _of_another(self, whose: str) -> UnusableStore:
+        return UnusableStore(
+            f"{self._objects.url}: the blobs there are of {whose}, which would lose them to this "
+            "one. Give each database a prefix of its own in SCENEPRINT_BLOB_URL. If that database "
+            f"is gone for good, remove {MARK} there."
+        )
+
+
+# Blobs that were read lately, in memory: a query reads ten artifacts, each a request otherwise.
+
+#: Bytes of all together, and the most of one.
+MOST, LARGEST = 64 << 20, 2 << 20
+
+
+class Recent:
+    """Bounded in bytes and in age; safe to share between threads.
+
+    Parameters
+    ----------
+    seconds : after which nothing is left of one, whether it is asked for or not: what was deleted
+        elsewhere must go here too
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._lock = threading.Lock()
+        self._held: OrderedDict[str, tuple[float, bytes]] = OrderedDict()  # the oldest first
+        self._bytes = 0
+        self._timer: threading.Timer | None = None
+
+    def get(self, digest: str) -> bytes | None:
+        """The bytes, where they are held."""
+        with self._lock:
+            found = self._held.get(digest)
+        return None if found is None or found[0] <= time.monotonic() else found[1]
+
+    def put(self, digest: str, data: bytes) -> None:
+        """Hold them; the oldest go."""
+        if len(data) > LARGEST:
+            return
+        with self._lock:
+            self._remove(digest)
+            self._held[digest] = (time.monotonic() + self._seconds, data)
+            self._bytes += len(data)
+            while self._bytes > MOST:
+                self._remove(next(iter(self._held)))
+            self._wind()
+
+    def remove(self, digest: str) -> None:
+        """Hold them no more."""
+        with self._lock:
+            self._remove(digest)
+
+    def close(self) -> None:
+        """Hold nothing."""
+        with self._lock:
+            self._held.clear()
+            self._bytes = 0
+            if self._timer is not None:
+                self._timer.cancel()
+                self._timer = None
+
+    def _remove(self, digest: str) -> None:
+        found = self._held.pop(digest, None)
+        if found is not None:
+            self._bytes -= len(found[1])
+
+    def _wind(self) -> None:
+        if self._timer is None and self._held:
+            until, _ = next(iter(self._held.values()))
+            self._timer = threading.Timer(max(until - time.monotonic(), 0.01), self._expire)
+            self._timer.daemon = True
+            self._timer.start()
+
+    def _expire(self) -> None:
+        with self._lock:
+            self._timer = None
+            now = time.monotonic()
+            while self._held and next(iter(self._held.values()))[0] <= now:
+                self._remove(next(iter(self._held)))
+            self._wind()
+
+
+#: Under the prefix: the blobs.
+FOLDER = "blobs/"
+#: Blobs that this process has put last, of which it knows whether any can have been removed since.
+_KNOWN = 4_096
+#: Seconds for which `check` tells what it found last.
+CHECK_S = 2.0
+
+
+class ObjectBlobs:
+    """Blobs under the prefix of an object store.
+
+    Parameters
+    ----------
+    objects : of the prefix
+    locks : of all that share it
+    owner : tells what the store is called that they belong to
+    purge_s : seconds after which nothing is left in memory of what another process removed
+    """
+
+    def __init__(
+        self, objects: Objects, locks: Locks, owner: Callable[[], str], purge_s: float = 3600.0
+    ) -> None:
+        self.objects = objects
+        self._recent = Recent(purge_s)
+        self._locks, self._owner = locks, owner
+        self._claimed = False
+        self._put: OrderedDict[str, int] = OrderedDict()  # removals until then, by digest
+        self._lock = threading.Lock()
+        self._asking = threading.Lock()  # for `check`, and what it found when
+        self._wrong: UnusableStore | None = None
+        self._answered = -math.inf
+
+    def claim(self, *, anew: bool = True) -> None:
+        """See that the prefix is this store's, and mark it where it is nobody's yet.
+
+        Parameters
+        ----------
+        anew : mark it
+
+        Raises
+        ------
+        UnusableStore : it is another's, or the object store cannot be used.
+        """
+        if not self._claimed:
+            self._claimed = BucketOwner(self.objects).claim(self._owner(), anew=anew)
+
+    def put(self, data: bytes) -> str:
+        """Keep bytes; when this returns the store has acknowledged them. See `Blobs.put`."""
+        digest = hashlib.sha256(data).hexdigest()
+        with self._putting(digest):
+            self.objects.put(_key(digest), data)
+        return digest
+
+    @contextmanager
+    def incoming(self) -> Iterator[IncomingBlob]:
+        """Take a blob in parts; see `Blobs.incoming`.
+
+        It waits in the folder of temporary files, without a name, until its digest is known:
+        stores do not copy what is larger than 5 GB from one key to another in one step.
+        """
+        place = tempfile.gettempdir()
+        what = f"{place}: a blob cannot be written"
+        with ExitStack() as stack:
+            try:
+                file = stack.enter_context(tempfile.TemporaryFile())
+            except OSError as error:
+                raise unusable(what, error) from error
+            yield IncomingBlob(file, what, lambda digest: self._keep(file, digest))
+
+    def _keep(self, file: BinaryIO, digest: str) -> None:
+        file.flush()
+        file.seek(0)
+        with self._putting(digest):
+            self.objects.put_file(_key(digest), file)
+
+    @contextmanager
+    def _putting(self, digest: str) -> Iterator[None]:
+        self.claim()
+        before = self._locks.removals()
+        yield
+        with self._lock:
+            self._put.pop(digest, None)
+            if before is not None:
+                self._put[digest] = before
+            if len(self._put) > _KNOWN:
+                self._put.popitem(last=False)
+
+    def get(self, digest: str) -> bytes:
+        """The bytes of a digest, checked against it; see `Blobs.get`."""
+        require_digest(digest)
+        recent = self._recent.get(digest)
+        if recent is not None:
+            return recent
+        try:
+            data = self.objects.get(_key(digest))
+        except FileNotFoundError as error:
+            raise DamagedBlob(
+                f"The blob {digest[:12]} cannot be read (No such object). Restore it from a copy, "
+                "or delete the frame and upload it again."
+            ) from error
+        if hashlib.sha256(data).hexdigest() != digest:
+            raise DamagedBlob(
+                f"The blob {digest[:12]} is damaged: its content has another hash. Restore it "
+                "from a copy, or delete the frame and upload it again."
+            )
+        self._recent.put(digest, data)
+        return data
+
+    def open(self, digest: str) -> BinaryIO:
+        """A blob as a file that can be sought in, read a part at a time; see `Blobs.open`."""
+        require_digest(digest)
+        return self.objects.open(_key(digest))
+
+    def holds(self, digest: str) -> bool:
+        """Whether there is a blob of that digest.
+
+        Asked in writing transactions, for which all others wait: where this process has put it,
+        and nothing was removed since, the database alone is asked.
+        """
+        require_digest(digest)
+        with self._lock:
+            before = self._put.get(digest)
+        if before is not None and before == self._locks.removals():
+            return True
+        return self.objects.size(_key(digest)) is not None
+
+    def size(self, digest: str) -> int | None:
+        """Bytes of a blob, unchecked; None where it is missing."""
+        require_digest(digest)
+        return self.objects.size(_key(digest))
+
+    def kept(self) -> AbstractContextManager[None]:
+        """See that no blob is removed meanwhile; see `Blobs.kept`."""
+        return self._locks.kept()
+
+    def removing(self) -> AbstractContextManager[bool]:
+        """Hold the right to remove blobs; see `Blobs.removing`."""
+        return self._locks.removing()
+
+    def remove(self, digest: str) -> None:
+        """Forget a blob that nothing refers to; only within `removing`."""
+        require_digest(digest)
+        self.claim()
+        with self._lock:
+            self._put.pop(digest, None)
+        self._recent.remove(digest)
+        self.objects.delete(_key(digest))
+
+    def condition(self, digest: str, *, quick: bool = False) -> Condition:
+        """Whether a blob is as it was stored; see `Blobs.condition`."""
+        if not DIGEST.fullmatch(digest):
+            return "missing"
+        size, hashed = self.objects.size(_key(digest)), hashlib.sha256()
+        if size is None:
+            return "missing"
+        if quick:
+            return "sound"
+        try:
+            for chunk in self.objects.chunks(_key(digest), size):
+                hashed.update(chunk)
+        except FileNotFoundError:  # removed meanwhile
+            return "missing"
+        return "sound" if hashed.hexdigest() == digest else "damaged"
+
+    def quarantine(self, digest: str, folder: Path) -> Path | None:
+        """Fetch what lies under a digest into a folder of this machine, durably, and remove it."""
+        require_digest(digest)
+        place = folder / f"blob-{digest}"
+        folder.mkdir(parents=True, exist_ok=True)
+        place.unlink(missing_ok=True)
+        try:
+            self.objects.get_file(_key(digest), place)
+        except FileNotFoundError:
+            with suppress(FileNotFoundError):
+                place.unlink()
+            return None
+        with place.open("rb") as file:
+            os.fsync(file.fileno())
+        for each in (folder, folder.parent):
+            sync_folder(each)
+        self.remove(digest)
+        return place
+
+    def place(self, digest: str) -> str:
+        """Where a blob lies, for people to look at."""
+        return f"{self.objects.url}/{_key(digest)}"
+
+    def digests(self) -> Iterator[str]:
+        """All blobs, a page at a time."""
+        return (one.digest for one in self.entries() if one.digest is not None)
+
+    def entries(self) -> Iterator[BlobEntry]:
+        """All objects where blobs are kept, a page at a time.
+
+        What a writer left that was killed is not among them: stores do not show the parts of an
+        object that has no end. Let the bucket's lifecycle abort those after a day.
+        """
+        for one in self.objects.list(FOLDER):
+            name = one.key.rpartition("/")[2]
+            own = DIGEST.fullmatch(name) and one.key == _key(name)
+            place = f"{self.objects.url}/{one.key}"
+            yield BlobEntry(place, name if own else None, one.changed_at)
+
+    def check(self) -> None:
+        """See that the store answers; see `Blobs.check`."""
+        if self._asking.acquire(blocking=False):  # else somebody asks, and the last answer holds
+            try:
+                if time.monotonic() - self._answered > CHECK_S:
+                    self._wrong = self._look()
+                    self._answered = time.monotonic()
+            finally:
+                self._asking.release()
+        if self._wrong is not None:
+            raise type(self._wrong)(str(self._wrong))
+
+    def _look(self) -> UnusableStore | None:
+        try:
+            if self.objects.look(MARK) is None and self._claimed:
+                return UnusableStore(
+                    f"{self.objects.url}: {MARK} is gone, which was there before: the bucket was "
+                    "emptied or replaced. Bring its objects back."
+                )
+        except UnusableStore as error:
+            return error
+        return None
+
+    def close(self) -> None:
+        """Give back the connections of its locks, and what was read lately."""
+        self._locks.close()
+        self._recent.close()
+
+
+def _key(digest: str) -> str:
+    return f"{FOLDER}{digest[:2]}/{digest}"

@@ -1,0 +1,196 @@
+"""Frames and maps deleted for good: what is left in the database, and which blobs must go.
+
+Of a deleted frame the row stays, as every reader learns by its revision that it is gone: its id,
+its state, when it came, and how its samples were to be read. Its blobs are noted as doomed in the
+same transaction, so that they go whatever happens to this process.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Float,
+    Select,
+    and_,
+    bindparam,
+    delete,
+    func,
+    insert,
+    literal,
+    literal_column,
+    select,
+    union,
+    update,
+)
+
+from sceneprint.store.queue import now
+from sceneprint.store.quotas import ROOMLESS, count_on
+from sceneprint.store.tables import (
+    MapRow,
+    doomed,
+    events,
+    frame_tags,
+    frames,
+    jobs,
+    map_row,
+    maps,
+    signatures,
+)
+from sceneprint_client.api import FrameState, JobState
+
+#: What is known of a frame, and not of its camera; cleared with it.
+_KNOWN = (
+    "content_id", "reason", "robot", "session", "captured_at", "pose_parent", "pose", "pose_x",
+    "pose_y", "pose_z", "base_frame", "base", "novelty",
+)  # fmt: skip
+
+
+def delete_frames(
+    connection: Connection, row: MapRow, numbers: Sequence[int], reason: str | None = None
+) -> list[str]:
+    """Take frames out of all searches, and forget what was made of them and known of them.
+
+    Parameters
+    ----------
+    connection : of a writing transaction
+    row : of the map
+    numbers : of its frames, a few hundred at most; those that are deleted already are left out
+    reason : told with the events, where nobody deleted them
+
+    Returns
+    -------
+    blobs : that they referred to, and that are doomed: sweep them when this is committed
+    """
+    found = connection.execute(
+        select(frames.c.number, frames.c.id, frames.c.blob, frames.c.bytes, frames.c.state)
+        .where(frames.c.number.in_(numbers), frames.c.state != FrameState.DELETED)
+        .order_by(frames.c.number)
+    ).all()
+    if not found:
+        return []
+    living = [one.number for one in found]
+    own = signatures.c.frame_number.in_(living)
+    made = connection.execute(select(signatures.c.geometry).where(own)).scalars()
+    blobs = list(dict.fromkeys([*(one.blob for one in found), *made]))
+    doom(connection, blobs)
+    connection.execute(delete(signatures).where(own))
+    connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(living)))
+    _cancel(connection, living)
+    counted = [one for one in found if one.state not in ROOMLESS]
+    count_on(connection, row.number, -len(counted), -sum(one.bytes for one in counted))
+    # each its own revision: who reads what has changed reads on after the last that he had
+    last = _revisions(connection, row.number, len(living))
+    connection.execute(
+        update(frames)
+        .where(frames.c.number == bindparam("of"))
+        .values(
+            state=FrameState.DELETED, revision=bindparam("at"), tags=[], **dict.fromkeys(_KNOWN)
+        ),
+        [{"of": n, "at": last - len(living) + i} for i, n in enumerate(living, 1)],
+    )  # fmt: skip
+    at, data = time.time(), {} if reason is None else {"reason": reason}
+    connection.execute(
+        insert(events),
+        [
+            {"at": at, "kind": "frame.deleted", "map": row.name, "frame_id": one.id, "data": data}
+            for one in found
+        ],
+    )
+    return blobs
+
+
+def doom(connection: Connection, blobs: Iterable[str]) -> None:
+    """Note blobs that may have to be removed; a few thousand at most."""
+    wanted = sorted(set(blobs))
+    known = set(
+        connection.execute(select(doomed.c.blob).where(doomed.c.blob.in_(wanted))).scalars()
+    )
+    new = [{"blob": blob, "at": time.time()} for blob in wanted if blob not in known]
+    if new:
+        connection.execute(insert(doomed), new)
+
+
+def doom_found(connection: Connection, *found: Select[tuple[str]]) -> None:
+    """Note the blobs that some statements find, however many."""
+    blobs = union(*found).subquery()
+    connection.execute(
+        insert(doomed).from_select(
+            ["blob", "at"],
+            select(blobs.c[0], literal(time.time(), Float)).where(
+                blobs.c[0].not_in(select(doomed.c.blob))
+            ),
+        )
+    )
+
+
+def doomed_blobs(
+    connection: Connection, limit: int, before: float | None = None, after: str = ""
+) -> list[str]:
+    """Blobs that are noted, at most so many after one of them; those noted before a time, if one
+    is given.
+    """
+    asked = select(doomed.c.blob).where(doomed.c.blob > after).order_by(doomed.c.blob).limit(limit)
+    if before is not None:
+        asked = asked.where(doomed.c.at < before)
+    return list(connection.execute(asked).scalars())
+
+
+def settle(connection: Connection, blobs: Sequence[str]) -> None:
+    """Note no more that blobs are doomed: they are removed, or something refers to them."""
+    connection.execute(delete(doomed).where(doomed.c.blob.in_(blobs)))
+
+
+def _cancel(connection: Connection, numbers: Sequence[int]) -> None:
+    """Give up what is still to be done for frames."""
+    waiting = jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING))
+    connection.execute(
+        update(jobs)
+        .where(jobs.c.frame_number.in_(numbers), waiting)
+        .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
+    )
+
+
+def _revisions(connection: Connection, map_number: int, count: int) -> int:
+    """The last of so many revisions of a map that are taken at once."""
+    return int(
+        connection.execute(
+            update(maps)
+            .where(maps.c.number == map_number)
+            .values(revision=maps.c.revision + count)
+            .returning(maps.c.revision)
+        ).scalar_one()
+    )
+
+
+# Frames that are older than their map keeps them.
+
+#: Seconds of a day.
+DAY_S = 86_400.0
+#: As the index says it: of a value that is bound to a statement no planner knows that it is this.
+_LIVING: ColumnElement[bool] = frames.c.state != literal_column("'deleted'")
+
+
+def aging_maps(connection: Connection) -> list[MapRow]:
+    """Maps that keep their frames for some time only."""
+    asked = select(maps).where(maps.c.retention_days.is_not(None)).order_by(maps.c.number)
+    return [map_row(one) for one in connection.execute(asked).mappings()]
+
+
+def old_frames(connection: Connection, map_number: int, before: float, limit: int) -> list[int]:
+    """Numbers of frames of a map that were received before a time, the oldest first."""
+    asked = select(frames.c.number).where(_old(map_number, before)).order_by(frames.c.received_at)
+    return list(connection.execute(asked.limit(limit)).scalars())
+
+
+def count_old(connection: Connection, map_number: int, before: float) -> int:
+    """How many frames of a map were received before a time."""
+    asked = select(func.count()).where(_old(map_number, before))
+    return int(connection.execute(asked).scalar_one())
+
+
+def _old(map_number: int, before: float) -> ColumnElement[bool]:
+    return and_(frames.c.map_number == map_number, frames.c.received_at < before, _LIVING)

@@ -1,0 +1,514 @@
+"""Which frames of a map pass a filter: one statement over the metadata that came with them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import ColumnElement, Connection, Select, String, cast, func, or_, select, tuple_
+
+from sceneprint.store.tables import (
+    FrameRow,
+    MapRow,
+    frame_row,
+    frame_tags,
+    frames,
+    job_files,
+    signatures,
+)
+from sceneprint_client.api import Filter, FrameState, Region
+from sceneprint_client.api.listing import FrameListing, Run
+
+_NONE: NDArray[np.int64] = np.empty(0, np.int64)
+
+
+@dataclass(frozen=True)
+class QueryOrigin:
+    """Who took a query, in which run, and when (seconds since 1970), as far as is known."""
+
+    robot: str | None
+    session: str | None
+    captured_at: float | None
+
+
+def passing(
+    connection: Connection, map_number: int, wanted: Filter, taken: QueryOrigin
+) -> NDArray[np.int64]:
+    """Numbers of the indexed frames of a map that pass a filter, rising.
+
+    Parameters
+    ----------
+    connection : of the database
+    map_number : of the map
+    wanted : the filter
+    taken : the query, with session and time where the filter asks for distance from its session
+    """
+    # as one text: a row for each of 100,000 frames takes many times as long
+    listed = func.aggregate_strings(cast(frames.c.number, String), ",")
+    found = connection.execute(
+        select(listed).where(
+            frames.c.map_number == map_number,
+            frames.c.state == FrameState.INDEXED,
+            *_conditions(map_number, wanted, taken),
+        )
+    ).scalar()
+    return np.sort(np.fromstring(found, np.int64, sep=",")) if found else _NONE
+
+
+def _conditions(map_number: int, wanted: Filter, taken: QueryOrigin) -> list[ColumnElement[bool]]:
+    """What must hold; of a column that is null, no comparison does."""
+    found: list[ColumnElement[bool]] = []
+    if wanted.robot is not None:
+        found.append(frames.c.robot.in_(wanted.robot))
+    if wanted.session is not None:
+        found.append(frames.c.session.in_(wanted.session))
+    if wanted.captured_after is not None:
+        found.append(frames.c.captured_at >= wanted.captured_after.timestamp())
+    if wanted.captured_before is not None:
+        found.append(frames.c.captured_at <= wanted.captured_before.timestamp())
+    for tag in sorted(set(wanted.tags)):
+        tagged = select(frame_tags.c.frame_number).where(frame_tags.c.tag == tag)
+        found.append(frames.c.number.in_(tagged))
+    if wanted.not_within_s is not None:
+        found.append(_elsewhere(taken, wanted.not_within_s))
+    if wanted.region is not None:
+        found += _inside(wanted.region)
+    if wanted.exclude_frames:
+        barred = select(frames.c.number).where(
+            frames.c.map_number == map_number, frames.c.id.in_(wanted.exclude_frames)
+        )
+        found.append(frames.c.number.not_in(barred.correlate(None)))
+    return found
+
+
+def _elsewhere(taken: QueryOrigin, seconds: float) -> ColumnElement[bool]:
+    """Not of the query's session, or long enough before or after it."""
+    if taken.session is None or taken.captured_at is None:
+        raise ValueError("a query of no session, or of no time")
+    apart = [
+        frames.c.session.is_(None),
+        frames.c.session != taken.session,
+        frames.c.captured_at < taken.captured_at - seconds,
+        frames.c.captured_at > taken.captured_at + seconds,
+    ]
+    if taken.robot is not None:  # two robots may call their runs alike
+        apart.append(frames.c.robot != taken.robot)
+    return or_(*apart)
+
+
+def _inside(region: Region) -> list[ColumnElement[bool]]:
+    sides = [
+        getattr(frames.c, f"pose_{axis}").between(
+            getattr(region.min, axis), getattr(region.max, axis)
+        )
+        for axis in "xyz"
+    ]
+    return [frames.c.pose_parent == region.parent_frame, *sides]
+
+
+# Frames of a map by their metadata, a page at a time.
+
+#: By default a list has frames in these states.
+_LIVING = tuple(state for state in FrameState if state != FrameState.DELETED)
+
+
+def list_frames(
+    connection: Connection, map_number: int, beyond: int | None, limit: int, wanted: FrameListing
+) -> list[FrameRow]:
+    """Frames of a map in the order they came, or the newest first.
+
+    Parameters
+    ----------
+    connection : of the database
+    map_number : of the map
+    beyond : number of the frame that the page before ended with; None for the first page
+    limit : most frames
+    wanted : which frames; deleted ones only where it asks for them
+    """
+    states = _LIVING if wanted.state is None else (wanted.state,)
+    # Two ways through a large map. In the order of numbers, until the page is full: for what most
+    # frames have, and where another index has few to offer. Or by the index that holds whatever a
+    # condition may ask about, and in which the frames that pass are found without reading others.
+    # Adding 0 is how SQLite is told that it shall not take the first way.
+    number: ColumnElement[Any] = frames.c.number + 0 if _is_narrow(wanted) else frames.c.number
+    numbers: Select[Any] = select(frames.c.number).where(
+        frames.c.map_number == map_number, frames.c.state.in_(states), *_listing_conditions(wanted)
+    )
+    if beyond is not None:
+        numbers = numbers.where(number < beyond if wanted.order == "desc" else number > beyond)
+    numbers = numbers.order_by(number.desc() if wanted.order == "desc" else number).limit(limit)
+    chosen = list(connection.execute(numbers).scalars())
+    if not chosen:
+        return []
+    found = connection.execute(select(frames).where(frames.c.number.in_(chosen))).mappings()
+    rows = {row["number"]: frame_row(row) for row in found}
+    return [rows[one] for one in chosen]
+
+
+def _is_narrow(wanted: FrameListing) -> bool:
+    if wanted.tag or wanted.content_id is not None:
+        return False  # these have indexes of their own
+    named = (wanted.captured_after, wanted.captured_before, wanted.parent_frame, wanted.has_pose)
+    rare = wanted.state not in (None, FrameState.INDEXED)
+    return bool(wanted.robot or wanted.session or rare) or any(one is not None for one in named)
+
+
+def _listing_conditions(wanted: FrameListing) -> list[ColumnElement[bool]]:
+    """What must hold; of a column that is null, no comparison does."""
+    c, found = frames.c, list[ColumnElement[bool]]()
+    if wanted.robot:
+        found.append(c.robot.in_(wanted.robot))
+    if wanted.session:
+        found.append(c.session.in_(wanted.session))
+    for tag in sorted(set(wanted.tag)):
+        tagged = select(frame_tags.c.frame_number).where(frame_tags.c.tag == tag)
+        found.append(c.number.in_(tagged))
+    if wanted.captured_after is not None:
+        found.append(c.captured_at >= wanted.captured_after.timestamp())
+    if wanted.captured_before is not None:
+        found.append(c.captured_at <= wanted.captured_before.timestamp())
+    if wanted.received_after is not None:
+        found.append(c.received_at >= wanted.received_after.timestamp())
+    if wanted.received_before is not None:
+        found.append(c.received_at <= wanted.received_before.timestamp())
+    if wanted.parent_frame is not None:
+        found.append(c.pose_parent == wanted.parent_frame)
+    if wanted.has_pose is not None:
+        found.append(c.pose_x.is_not(None) if wanted.has_pose else c.pose_x.is_(None))
+    if wanted.content_id is not None:
+        found.append(c.content_id == wanted.content_id)
+    return found
+
+
+# The runs of a map: who took what, when, and where their poses lead.
+
+#: Frames in these states are of a run.
+
+
+@dataclass
+class Held:
+    """Frames of one robot and one session, either of which may not be known.
+
+    Parameters
+    ----------
+    robot, session : None where frames do not say
+    states : how many frames are in each
+    posed : how many have a pose
+    first, last : when they were taken, seconds since 1970
+    parents : how many poses lead where
+    """
+
+    robot: str | None
+    session: str | None
+    states: Counter[str] = field(default_factory=Counter)
+    posed: int = 0
+    first: float | None = None
+    last: float | None = None
+    parents: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(frozen=True)
+class RobotCount:
+    """How many frames are of one robot, with poses that lead to one frame."""
+
+    robot: str | None
+    parent: str | None
+    count: int
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A frame of a run; `at` is by the clock of the run, `pose` is T_parent_sensor."""
+
+    frame_id: str
+    at: float
+    pose: list[list[float]]
+
+
+def list_runs(
+    connection: Connection, map_number: int, after: tuple[str, str] | None, limit: int
+) -> list[Held]:
+    """Runs of a map by session and robot.
+
+    Parameters
+    ----------
+    connection : of the database
+    map_number : of the map
+    after : session and robot of the last run of the page before; "" where there is none, which no
+        name is
+    limit : most runs
+    """
+    key = (func.coalesce(frames.c.session, ""), func.coalesce(frames.c.robot, ""))
+    of_map = [frames.c.map_number == map_number, frames.c.state.in_(_LIVING)]
+    beyond = [] if after is None else [tuple_(*key) > tuple_(*after)]
+    names = connection.execute(
+        select(*key).where(*of_map, *beyond).group_by(*key).order_by(*key).limit(limit)
+    ).all()
+    runs = {(row[0], row[1]): Held(row[1] or None, row[0] or None) for row in names}
+    if not runs:
+        return []
+    keys = list(runs)
+    found = connection.execute(
+        select(
+            *key, frames.c.state, frames.c.pose_parent, func.count(),
+            func.count(frames.c.pose_x), func.min(frames.c.captured_at),
+            func.max(frames.c.captured_at),
+        )
+        .where(*of_map, tuple_(*key) >= tuple_(*keys[0]), tuple_(*key) <= tuple_(*keys[-1]))
+        .group_by(*key, frames.c.state, frames.c.pose_parent)
+    )  # fmt: skip
+    for session, robot, state, parent, count, posed, first, last in found:
+        run = runs[session, robot]
+        run.states[state] += count
+        run.posed += posed
+        run.first = min((one for one in (run.first, first) if one is not None), default=None)
+        run.last = max((one for one in (run.last, last) if one is not None), default=None)
+        if parent is not None:
+            run.parents[parent] += posed
+    return list(runs.values())
+
+
+def count_run(connection: Connection, map_number: int, run: Run) -> list[RobotCount]:
+    """Frames of a session by robot and parent frame; `run.parent_frame` does not matter."""
+    found = connection.execute(
+        select(frames.c.robot, frames.c.pose_parent, func.count())
+        .where(*_of_session(map_number, run))
+        .group_by(frames.c.robot, frames.c.pose_parent)
+        .order_by(frames.c.robot.nulls_first(), frames.c.pose_parent.nulls_first())
+    )
+    return [RobotCount(*row) for row in found]
+
+
+def poses_of_run(connection: Connection, map_number: int, run: Run) -> tuple[list[Posed], int]:
+    """Frames of a session with time and pose in the order of time, of one time the first that came;
+    by the clock `received` all with a pose, as they came.
+
+    Parameters
+    ----------
+    connection : of the database
+    map_number : of the map
+    run : whose; with `most`, so many of them at most, evenly taken. Only their rows are read: an
+        index holds what the choice needs.
+
+    Returns
+    -------
+    poses, count : how many there are of all of them
+    """
+    taken = run.clock == "captured"
+    at = frames.c.captured_at if taken else frames.c.received_at
+    posed = [
+        *_of_session(map_number, run),
+        frames.c.pose_parent == run.parent_frame,
+        frames.c.pose_x.is_not(None),
+    ]
+    if taken:
+        least = func.min(frames.c.number).label("number")
+        timed = select(least, at.label("order")).where(*posed, at.is_not(None)).group_by(at)
+    else:
+        timed = select(frames.c.number, frames.c.number.label("order")).where(*posed)
+    first = timed.subquery()
+    chosen = select(first.c.number)
+    count = int(connection.execute(select(func.count()).select_from(first)).scalar_one())
+    if run.most is not None and run.most < count:
+        place = (func.row_number().over(order_by=first.c.order) - 1).label("place")
+        placed = select(first.c.number, place).subquery()
+        # the multiples of (count - 1) / (most - 1), rounded up: with 0 and count - 1, `most`
+        even = (placed.c.place * (run.most - 1)) % (count - 1) < run.most - 1
+        chosen = select(placed.c.number).where(even)
+    found = connection.execute(
+        select(frames.c.id, at, frames.c.pose)
+        .where(frames.c.number.in_(chosen))
+        .order_by(at if taken else frames.c.number, frames.c.number)
+    )
+    return [Posed(*row) for row in found], count
+
+
+def _of_session(map_number: int, run: Run) -> list[ColumnElement[bool]]:
+    found = [
+        frames.c.map_number == map_number,
+        frames.c.state.in_(_LIVING),
+        frames.c.session == run.session,
+    ]
+    if run.robot is not None:
+        found.append(frames.c.robot == run.robot)
+    if run.captured_after is not None:
+        found.append(frames.c.captured_at >= run.captured_after.timestamp())
+    if run.captured_before is not None:
+        found.append(frames.c.captured_at <= run.captured_before.timestamp())
+    return found
+
+
+# What frames of a map weigh, and which a session brought: for whoever thins it out.
+
+
+@dataclass(frozen=True)
+class Weight:
+    """A frame that is indexed.
+
+    Parameters
+    ----------
+    frame_id : of the frame
+    upload_bytes : of its upload
+    artifact : blob of its geometry
+    """
+
+    frame_id: str
+    upload_bytes: int
+    artifact: str
+
+
+def weights_of(
+    connection: Connection, row: MapRow, session: str | None = None
+) -> dict[int, Weight]:
+    """Indexed frames of a map by their numbers, in the order they came.
+
+    Parameters
+    ----------
+    connection : of a transaction
+    row : of the map
+    session : only frames of this one, where given
+    """
+    asked = (
+        select(frames.c.number, frames.c.id, frames.c.bytes, signatures.c.geometry)
+        .join(
+            signatures,
+            (signatures.c.frame_number == frames.c.number)
+            & (signatures.c.model_id == row.model_id),
+        )
+        .where(frames.c.map_number == row.number, frames.c.state == FrameState.INDEXED)
+        .order_by(frames.c.number)
+    )
+    if session is not None:
+        asked = asked.where(frames.c.session == session)
+    found = connection.execute(asked)
+    return {number: Weight(*rest) for number, *rest in found}
+
+
+# How a map grew, and what its frames weigh: counts over many rows that few are read for.
+
+_OTHERS = tuple(state for state in FrameState if state != FrameState.INDEXED)
+#: Frames in these states have no upload any more.
+_BARE = (FrameState.DELETED, FrameState.REDUNDANT)
+_KEPT = tuple(state for state in FrameState if state not in _BARE)
+#: Numbers that one statement asks for.
+_BLOCK = 500
+
+
+def indexed_by_time(
+    connection: Connection, map_number: int, start: float, width_s: float
+) -> Counter[int]:
+    """How many frames that are indexed now became so in each interval since a time.
+
+    The index of times lacks the state, and reading every row for it would be slow: all are
+    counted, and those that are no longer indexed, which another index names, are taken off.
+
+    Parameters
+    ----------
+    connection : of the database
+    map_number : of the map
+    start : when the first interval begins, seconds since 1970
+    width_s : of an interval, seconds
+
+    Returns
+    -------
+    counts : by the number of the interval
+    """
+    at = frames.c.indexed_at
+    interval = (at - start) // width_s
+    asked = select(interval, func.count()).where(frames.c.map_number == map_number)
+    every = connection.execute(asked.where(at >= start).group_by(interval))
+    counts = Counter({int(place): n for place, n in every})
+    # adding 0 is how SQLite is told to go by the state
+    gone = connection.execute(
+        asked.where(frames.c.state.in_(_OTHERS), at + 0 >= start).group_by(interval)
+    )
+    for place, n in gone:
+        counts[int(place)] -= n
+    return counts
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """What some frames of a map weigh.
+
+    Parameters
+    ----------
+    upload_bytes, signature_bytes : of all of them
+    artifacts : blobs of their geometry
+    """
+
+    upload_bytes: int
+    signature_bytes: int
+    artifacts: list[str]
+
+
+def frames_with_uploads(
+    connection: Connection, map_number: int, most: int
+) -> tuple[list[int], int]:
+    """Numbers of frames of a map whose uploads are kept, evenly taken, and how many there are.
+
+    Parameters
+    ----------
+    connection : of the database
+    map_number : of the map
+    most : numbers
+    """
+    of_map = (frames.c.map_number == map_number) & frames.c.state.in_(_KEPT)
+    total = int(connection.execute(select(func.count()).where(of_map)).scalar_one())
+    # adding 0, as above: the index that has states holds all of this, and rows are not read
+    place = (func.row_number().over(order_by=frames.c.number + 0) - 1).label("place")
+    listed = select(frames.c.number, place).where(of_map).subquery()
+    step = max(-(-total // most), 1)
+    asked = select(listed.c.number).where(listed.c.place % step == 0)
+    return list(connection.execute(asked.order_by(listed.c.number)).scalars()), total
+
+
+def spread_frames(connection: Connection, most: int) -> list[int]:
+    """Numbers of frames of all maps whose uploads are kept, from the first to the newest.
+
+    Parameters
+    ----------
+    connection : of the database
+    most : numbers; fewer where those next to each other were deleted
+    """
+    ends = select(func.min(frames.c.number), func.max(frames.c.number))
+    first, last = connection.execute(ends).one()
+    if first is None:
+        return []
+    # by number, each found in the index: counting all frames off would read them all
+    wanted = {first + (last - first) * place // max(most - 1, 1) for place in range(most)}
+    found = []
+    for number in sorted(wanted):
+        near = select(frames.c.number).where(frames.c.number >= number, frames.c.state.in_(_KEPT))
+        found.append(connection.execute(near.order_by(frames.c.number).limit(1)).scalar())
+    return sorted({one for one in found if one is not None})
+
+
+def count_uploads(connection: Connection) -> int:
+    """How many frames of all maps have their uploads."""
+    asked = select(func.count()).where(frames.c.state.in_(_KEPT))
+    return int(connection.execute(asked).scalar_one())
+
+
+def bytes_of_files(connection: Connection) -> int:
+    """Bytes of the archives, meshes and others that are of jobs."""
+    return int(connection.execute(select(func.sum(job_files.c.bytes))).scalar() or 0)
+
+
+def weigh(connection: Connection, numbers: Sequence[int]) -> Weighed:
+    """What frames weigh, with what was made of them by whatever model."""
+    uploads = signed = 0
+    artifacts: list[str] = []
+    for first in range(0, len(numbers), _BLOCK):
+        some = numbers[first : first + _BLOCK]
+        held = select(func.sum(frames.c.bytes)).where(frames.c.number.in_(some))
+        uploads += int(connection.execute(held).scalar() or 0)
+        made = select(func.length(signatures.c.vector), signatures.c.geometry)
+        for size, geometry in connection.execute(made.where(signatures.c.frame_number.in_(some))):
+            signed += size
+            artifacts.append(geometry)
+    return Weighed(uploads, signed, artifacts)

@@ -1,0 +1,209 @@
+"""How PostgreSQL is set up: what a connection is told, and how a turn is taken.
+
+Writers take turns as they do in SQLite: each begins with one advisory lock of the database, held
+until its commit. So what a transaction reads stays true until it writes, and numbers that it is
+given are in the order of the commits.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from sqlalchemy import URL, Connection, Engine, create_engine, event, text
+from sqlalchemy.engine import ExceptionContext
+
+from sceneprint.errors import StoreAway, UnusableStore
+from sceneprint.store.database_errors import database_label, is_of_old_plan
+from sceneprint.store.sqlite import BUSY_S
+
+#: Advisory locks are two numbers: this one, which is ours alone, and what is locked.
+LOCKS = 0x5CE7E
+#: Whose turn it is to write; uploads that are stored or removed (see `blobs/`).
+TURN, BLOBS = 1, 2
+#: Who links vectors (see `vectors`).
+VECTORS = 7
+#: Seconds for one statement, and for a transaction in which nothing is asked: a client that fell
+#: silent must not keep the turn from all others.
+STATEMENT_S, IDLE_S = 60.0, 30.0
+#: Seconds that a new schema may wait for its turn: another process may be making it.
+MIGRATION_S = 600.0
+#: Seconds a writer waits after somebody has waited in vain: the queue is of the whole fleet, and
+#: who leaves it after a moment, and begins at its end again, would never get through.
+HELD_S = 2.0
+#: Connections that a process keeps, and has at most.
+KEPT, MOST = 8, 32
+#: Seconds after which a connection is made anew, so that servers added since get their share.
+_OLD_S = 1800
+#: What of libpq is set where the URL does not: a server that is gone, and sent no word, is found
+#: out within ten seconds.
+_CONNECT = {
+    "connect_timeout": "3",
+    "application_name": "sceneprint",
+    "client_encoding": "utf8",
+    "keepalives_idle": "3",
+    "keepalives_interval": "2",
+    "keepalives_count": "3",
+    "tcp_user_timeout": "9000",
+}
+#: Oldest version that is known to do.
+_OLDEST = 14
+_WARNED = "sceneprint_warned"
+
+
+def open_postgres(url: URL) -> Engine:
+    """An engine whose connections are told what all are told; none is opened yet."""
+    engine = create_engine(
+        url,
+        connect_args=connect_options(url),
+        isolation_level="READ COMMITTED",  # a writer's statements see all that was committed
+        pool_pre_ping=True,
+        pool_recycle=_OLD_S,
+        pool_size=KEPT,
+        max_overflow=MOST - KEPT,
+        pool_timeout=BUSY_S,
+    )
+    event.listen(engine, "connect", configure)
+    event.listen(engine, "begin", _begin)
+    event.listen(engine, "connect", _watch_commits)
+    event.listen(engine, "commit", _forget_warnings)
+    event.listen(engine, "handle_error", _leave_behind)
+    return engine
+
+
+def connect_options(url: URL) -> dict[str, str]:
+    """What of libpq is set beside what a URL says."""
+    return {name: value for name, value in _CONNECT.items() if name not in url.query}
+
+
+def configure(connection: Any, _record: object = None) -> None:
+    """Tell a connection of psycopg what all of them are told.
+
+    Raises
+    ------
+    UnusableStore : the server is too old, or its database is not of UTF-8.
+    """
+    version = connection.info.server_version // 10_000
+    encoding = connection.info.parameter_status("server_encoding")
+    if version < _OLDEST or encoding != "UTF8":
+        connection.close()
+        raise UnusableStore(
+            f"The server is PostgreSQL {version}, and the database of encoding {encoding}. Version "
+            f"{_OLDEST} or later is needed, and a database made with ENCODING 'UTF8'."
+        )
+    connection.adapters.register_dumper(str, _texts())
+    before, connection.autocommit = connection.autocommit, True
+    connection.execute(
+        "SELECT set_config('lock_timeout', %s, false), set_config('statement_timeout', %s, false),"
+        " set_config('idle_in_transaction_session_timeout', %s, false),"
+        # a commit that was acknowledged survives the power, and the fall of the server where a
+        # standby is waited for: more than `on` is left as it is
+        " set_config('synchronous_commit', CASE current_setting('synchronous_commit')"
+        " WHEN 'off' THEN 'on' ELSE current_setting('synchronous_commit') END, false)",
+        [_milliseconds(seconds) for seconds in (BUSY_S, STATEMENT_S, IDLE_S)],
+    )
+    connection.autocommit = before
+
+
+def history_of(connection: Any) -> str | None:
+    """Which line of history the server of a connection of psycopg writes; None: it is a standby."""
+    before, connection.autocommit = connection.autocommit, True
+    row = connection.execute(
+        "SELECT CASE WHEN pg_is_in_recovery() THEN NULL"
+        " ELSE left(pg_walfile_name(pg_current_wal_lsn()), 8) END"
+    ).fetchone()
+    connection.autocommit = before
+    return None if row is None else row[0]
+
+
+@cache
+def _texts() -> type[Any]:
+    """How texts are handed over: PostgreSQL has none with NUL, and nothing is found by such a one.
+
+    What is stored has none: the API refuses it. In what is only noted, such as whom a request was
+    about, another character takes its place.
+    """
+    from psycopg.types.string import StrDumperUnknown
+
+    class Texts(StrDumperUnknown):
+        """Texts without NUL."""
+
+        def dump(self, obj: str) -> Any:
+            """As bytes."""
+            return super().dump(obj.replace("\0", "\ufffd") if "\0" in obj else obj)
+
+    return Texts
+
+
+def allow(connection: Connection, seconds: float) -> None:
+    """Let statements of this transaction, and pauses between them, take so long; 0: any time."""
+    if connection.dialect.name == "postgresql":
+        for name in ("statement_timeout", "idle_in_transaction_session_timeout"):
+            connection.execute(
+                text("SELECT set_config(:name, :value, true)"),
+                {"name": name, "value": _milliseconds(seconds)},
+            )
+
+
+def _begin(connection: Connection) -> None:
+    """Begin a transaction: of a writer with its turn, for which it waits so long."""
+    wait_s: float | None = connection.get_execution_options().get("sceneprint_write")
+    if wait_s is None:
+        return
+    # a COMMIT that waits for its standby would be cut off by the limit of statements, and be
+    # acknowledged although the standby may lack it; what waits so goes on when there is one again
+    turn = f"SET LOCAL statement_timeout = 0; SELECT pg_advisory_xact_lock({LOCKS}, {TURN})"
+    if wait_s == BUSY_S:
+        connection.exec_driver_sql(turn)
+        return
+    # what is waited for so long is done without haste; others find the usual time again
+    after = "0" if wait_s > BUSY_S else _milliseconds(BUSY_S)
+    connection.exec_driver_sql(f"SET LOCAL lock_timeout = {_milliseconds(wait_s)}; {turn}")
+    connection.exec_driver_sql(f"SET LOCAL lock_timeout = {after}")
+    if wait_s > BUSY_S:
+        allow(connection, 0)
+
+
+def require_synchronous(connection: Connection) -> None:
+    """See that what was committed is where a commit has to be.
+
+    Raises
+    ------
+    StoreAway : somebody ended the wait for a standby; the server says so in passing.
+    """
+    if _WARNED in connection.info:
+        raise StoreAway(
+            f"{database_label(connection.engine.url)}: the wait for a standby was ended by "
+            "hand. What was written is there, and lost if the server falls before a standby "
+            "follows. Bring the standby back, or take it out of synchronous_standby_names."
+        )
+
+
+def _watch_commits(connection: Any, record: Any) -> None:
+    """Note warnings: a COMMIT has one only where it does not wait for its standby any more."""
+    if not hasattr(connection, "add_notice_handler"):
+        return
+
+    def warned(said: Any) -> None:
+        if said.severity_nonlocalized == "WARNING":
+            record.info[_WARNED] = True
+
+    connection.add_notice_handler(warned)
+
+
+def _forget_warnings(connection: Connection) -> None:
+    """Before a COMMIT, those of the statements before it."""
+    connection.info.pop(_WARNED, None)
+
+
+def _leave_behind(context: ExceptionContext) -> None:
+    """Give all connections up whose server is a standby, as the next may lead to the one that
+    writes; and those that prepared statements for tables that another process changed.
+    """
+    error = context.original_exception
+    if getattr(error, "sqlstate", None) == "25006" or is_of_old_plan(error):
+        context.is_disconnect = True
+
+
+def _milliseconds(seconds: float) -> str:
+    return str(int(1000 * seconds))

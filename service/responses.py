@@ -1,0 +1,226 @@
+"""What is made of frames and answers, as answers to requests: who has it is told so with 304."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import Any, BinaryIO, TypeVar
+
+from anyio import to_thread
+from fastapi import Request, Response
+from fastapi.responses import StreamingResponse
+from starlette.background import BackgroundTask
+
+from sceneprint.engine.maps.map_frames import Output
+from sceneprint.errors import InvalidRequest
+from service.context import Context
+from service.problems import declared, problem
+
+# What a request asks of a representation: its type, and whether it is still the one it knows.
+#
+# Headers Accept, If-Match, If-None-Match (RFC 9110, sections 12.5.1, 13.1).
+
+_TAG = re.compile(r'(W/)?"([\x21\x23-\x7e\x80-\xff]*)"')
+_TYPE = re.compile(r"\s*([\w.+*-]+/[\w.+*-]+)\s*((?:;[^,]*)?)", re.ASCII)
+_QUALITY = re.compile(r";\s*q\s*=\s*(\d+(?:\.\d*)?)", re.ASCII)
+
+
+def expected(request: Request) -> Collection[str] | None:
+    """Entity tags of If-Match, one of which the resource must have; None for any.
+
+    Raises
+    ------
+    InvalidRequest : a header that holds no tag.
+    """
+    header = ", ".join(request.headers.getlist("if-match")).strip()
+    if header in ("", "*"):
+        return None
+    found = _TAG.findall(header)
+    if not found:
+        raise InvalidRequest(
+            f"The header If-Match is {header!r:.80}. Send the ETag that you received with the "
+            "resource, including its quotes.",
+            (("If-Match", "not an entity tag"),),
+        )
+    return frozenset(tag for weak, tag in found if not weak)
+
+
+def is_known(request: Request, tag: str) -> bool:
+    """Whether If-None-Match says that the caller has what this tag stands for."""
+    header = ", ".join(request.headers.getlist("if-none-match")).strip()
+    return header == "*" or any(one == tag for _, one in _TAG.findall(header))
+
+
+def preferred_media_type(request: Request, offers: Sequence[str]) -> str:
+    """The media type that Accept likes best; the first where it likes none, or has no say."""
+    ranges = []
+    for kind, parameters in _TYPE.findall(", ".join(request.headers.getlist("accept"))[:1000]):
+        quality = _QUALITY.search(parameters)
+        ranges.append((kind.lower(), min(float(quality[1]), 1.0) if quality else 1.0))
+    rated = [max((_rated(offer, one) for one in ranges), default=(0, 0.0)) for offer in offers]
+    best = max(quality for _, quality in rated)
+    return offers[[quality for _, quality in rated].index(best)]
+
+
+def _rated(offer: str, one: tuple[str, float]) -> tuple[int, float]:
+    """How closely a range of Accept speaks of a type, and how much it likes it."""
+    kind, quality = one
+    if kind == offer:
+        return 3, quality
+    if kind == f"{offer.partition('/')[0]}/*":
+        return 2, quality
+    return (1, quality) if kind == "*/*" else (0, 0.0)
+
+
+T = TypeVar("T")
+
+
+def file_responses(
+    *kinds: str, model: Any = None, description: str, statuses: tuple[int, ...] = (404, 409)
+) -> dict[int | str, dict[str, Any]]:
+    """Responses of a route that sends files, for the OpenAPI document."""
+    headers = {
+        "ETag": {
+            "description": "Stands for these bytes: sent in If-None-Match, it saves them.",
+            "schema": {"type": "string"},
+        }
+    }
+    schema = {"schema": {"type": "string", "format": "binary"}}
+    content = dict.fromkeys(kinds, schema)
+    done: dict[str, Any] = {"description": description, "headers": headers, "content": content}
+    if model is not None:
+        done["model"] = model
+    known = {"description": "As the caller has it: its If-None-Match names this ETag."}
+    return {200: done, 304: known, **declared(*statuses)}
+
+
+async def look(find: Callable[[], Output[T]]) -> Output[T]:
+    """Look for it in a thread."""
+    return await to_thread.run_sync(find)
+
+
+def tagged(output: Output[Any]) -> dict[str, str]:
+    """Its headers."""
+    return {"ETag": f'"{output.tag}"', "Cache-Control": "private, no-cache"}
+
+
+async def sent(
+    request: Request, here: Context, output: Output[bytes], kind: str,
+    name: str | None = None, **headers: str,
+) -> Response:  # fmt: skip
+    """An output; made only where the caller does not have it yet, and when it is its turn."""
+    headers |= tagged(output)
+    if is_known(request, output.tag):
+        return Response(None, 304, headers)
+    async with here.gate.place():
+        data = await here.gate.run(output.make)
+    if name is not None:
+        headers["Content-Disposition"] = f'inline; filename="{safe(name)}"'
+    return Response(data, 200, headers, kind)
+
+
+def safe(name: str) -> str:
+    """An id as a header may hold it."""
+    return "".join(one if one.isascii() and one.isprintable() and one not in '"\\/' else "_"
+                   for one in name)  # fmt: skip
+
+
+# Files sent in parts, whole or a range of them: memory does not grow with their size.
+
+#: Bytes that are read at once.
+_CHUNK = 1 << 18
+_RANGE = re.compile(r"\s*bytes\s*=\s*(\d{0,18})\s*-\s*(\d{0,18})\s*", re.IGNORECASE | re.ASCII)
+
+
+def files(
+    media_types: Sequence[str], description: str, *statuses: int
+) -> dict[int | str, dict[str, Any]]:
+    """Responses of a route that sends such a file, for the OpenAPI document.
+
+    Parameters
+    ----------
+    media_types, description : of the file: one of these types
+    statuses : of refusals beside 416
+    """
+    binary = {one: {"schema": {"type": "string", "format": "binary"}} for one in media_types}
+    tag = {"description": "Stands for these bytes.", "schema": {"type": "string"}}
+    headers = {"ETag": tag, "Accept-Ranges": {"schema": {"type": "string"}}}
+    return {
+        200: {"description": description, "headers": headers, "content": binary},
+        206: {"description": "The range that was asked for.", "headers": headers,
+              "content": binary},
+        304: {"description": "As the caller has it: its If-None-Match names this ETag."},
+        **declared(404, 416, *statuses),
+    }  # fmt: skip
+
+
+def send_file(
+    request: Request, open_file: Callable[[], BinaryIO], media_type: str, tag: str, name: str
+) -> Response:
+    """A file, or the one range of it that the request asks for (RFC 9110, section 14).
+
+    It is opened at once: that it is removed meanwhile changes nothing.
+
+    Parameters
+    ----------
+    request : with Range, If-Range and If-None-Match
+    open_file : gives the file, which can be sought in
+    media_type, tag, name : of its content; its ETag; what to call it when it is saved
+
+    Raises
+    ------
+    OSError : it cannot be opened.
+    """
+    headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Accept-Ranges": "bytes"}
+    if is_known(request, tag):
+        return Response(None, 304, headers)
+    file = open_file()
+    size = file.seek(0, 2)
+    first, last = _wanted(request, tag, size)
+    if first > last or first >= size > 0:
+        file.close()
+        refused = problem(
+            str(getattr(request.state, "request_id", "")), "RangeNotSatisfiable", 416,
+            f"The file has {size} bytes, and the range starts after them. Request an earlier "
+            "range.",
+        )  # fmt: skip
+        refused.headers["Content-Range"] = f"bytes */{size}"
+        return refused
+    headers["Content-Length"] = str(last - first + 1)
+    headers["Content-Disposition"] = f'inline; filename="{name}"'
+    partial = (first, last) != (0, size - 1)
+    if partial:
+        headers["Content-Range"] = f"bytes {first}-{last}/{size}"
+    return StreamingResponse(
+        _chunks(file, first, last), 206 if partial else 200, headers, media_type,
+        background=BackgroundTask(file.close),
+    )  # fmt: skip
+
+
+def _wanted(request: Request, tag: str, size: int) -> tuple[int, int]:
+    """First and last byte; all of them where Range asks for several ranges, or is not understood,
+    or If-Range names another state of the file.
+    """
+    whole = 0, size - 1
+    condition = request.headers.get("if-range")
+    if condition is not None and condition.strip() != f'"{tag}"':
+        return whole
+    found = _RANGE.fullmatch(request.headers.get("range", ""))
+    if found is None or not (found[1] or found[2]) or size == 0:
+        return whole
+    if not found[1]:  # the last so many
+        return (size - min(int(found[2]), size), size - 1) if int(found[2]) else (size, size - 1)
+    first = int(found[1])
+    last = min(int(found[2]), size - 1) if found[2] else size - 1
+    if found[2] and int(found[2]) < first:
+        return whole
+    return first, last
+
+
+def _chunks(file: BinaryIO, first: int, last: int) -> Iterator[bytes]:
+    with file:
+        file.seek(first)
+        left = last - first + 1
+        while left > 0 and (chunk := file.read(min(_CHUNK, left))):
+            left -= len(chunk)
+            yield chunk

@@ -1,0 +1,333 @@
+"""Whether the service lives, whether it can work, and its figures."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from functools import partial
+from typing import Annotated, Any
+from urllib.parse import quote
+
+from anyio import to_thread
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from prometheus_client import CONTENT_TYPE_LATEST
+from pydantic import BaseModel, Field, ValidationError
+
+from sceneprint import __version__
+from sceneprint.errors import InvalidRequest, UnsupportedType
+from sceneprint.maintenance.snapshot.catalog import SNAPSHOT, SnapshotCatalog
+from sceneprint.store.events import newest_number
+from sceneprint_client.api import Job, JobState, Map, Page
+from sceneprint_client.api.admin import (
+    Audited,
+    Key,
+    MadeKey,
+    Me,
+    ModelInfo,
+    NewKey,
+    NewModel,
+    ReplicaSeen,
+    SnapshotFile,
+    Stats,
+)
+from service.auth import Asking, Guest, administers, may_admin, reads_every, v1_router
+from service.bodies import media_type, read_json
+from service.context import Here
+from service.problems import declared, invalid
+from service.responses import files, send_file
+
+router = APIRouter(tags=["operations"])
+
+
+class Health(BaseModel):
+    """The service lives."""
+
+    status: str
+    version: str
+
+
+class Readiness(Health):
+    """The service can work; `read_only`: it answers, and takes nothing."""
+
+    read_only: bool
+    frames: dict[str, int] | None = Field(
+        description="How many are in each state; null for who may not read all maps."
+    )
+    jobs: dict[str, int] | None = Field(description="As `frames`.")
+    replica: str | None = Field(
+        default=None, description="What queries are answered from, where there is a read replica."
+    )
+
+
+@router.head("/healthz", include_in_schema=False)  # as balancers ask
+@router.get("/healthz", responses=declared())
+async def healthz() -> Health:
+    """Answers while the process lives, whatever else it does."""
+    return Health(status="ok", version=__version__)
+
+
+@router.head("/readyz", include_in_schema=False)
+@router.get("/readyz", responses=declared(), response_model_exclude_defaults=True)
+def readyz(here: Here, asking: Guest) -> Readiness:
+    """Answers while the database and the object store do; 503 while one does not. No key is asked
+    for.
+    """
+    frames = jobs = None
+    here.engine.store.blobs.check()
+    if asking is not None and asking.reads_every:
+        frames, jobs = here.engine.counts()
+    else:  # whoever shows no key has nothing counted: that takes the longer the more there is
+        with here.engine.store.database.read() as connection:
+            newest_number(connection)
+    return Readiness(
+        status="ready",
+        version=__version__,
+        read_only=here.engine.store.database.read_only,
+        frames=frames,
+        jobs=jobs,
+        replica=_replica(here.engine.operations.statistics.replica()),
+    )
+
+
+def _replica(seen: ReplicaSeen | None) -> str | None:
+    if seen is None:
+        return None
+    if not seen.used:
+        return "the replica is not in use: queries read the primary"
+    return f"queries read a replica, which is at most {seen.behind_s:.1f} s behind"
+
+
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses=declared(),
+    dependencies=[Depends(reads_every)],
+)
+def metrics(here: Here) -> Response:
+    """Figures for Prometheus; a key, where one is asked for, must have `read` for `*`."""
+    figures = here.engine.operations.statistics.figures()
+    return Response(here.metrics.text(figures, here.feed.streams), media_type=CONTENT_TYPE_LATEST)
+
+
+# Keys, and who changed what.
+
+keys_router = v1_router(tag="keys")
+
+KEY_BODY: dict[str, Any] = {
+    "required": True,
+    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewKey"}}},
+}
+Cursor = Annotated[str | None, Query(description="`next_cursor` of the page before.")]
+Limit = Annotated[int, Query(ge=1, le=1000)]
+
+
+@keys_router.post(
+    "/keys",
+    status_code=201,
+    responses=declared(400, 409, 413, 415, 422),
+    openapi_extra={"requestBody": KEY_BODY},
+    dependencies=[Depends(administers)],
+)
+async def create_key(request: Request, here: Here, response: Response) -> MadeKey:
+    """Make a key. Its secret is in this answer and nowhere else; a lost one is revoked."""
+    if media_type(request) != "application/json":
+        raise UnsupportedType(
+            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
+            "application/json."
+        )
+    new = _new(await read_json(request))
+    made = await to_thread.run_sync(here.engine.create_key, new.name, new.grants, new.expires_at)
+    response.headers["Location"] = f"/v1/keys/{quote(made.name, safe='')}"
+    request.state.audited = made.model_dump(mode="json", include={"grants", "expires_at"})
+    return made
+
+
+@keys_router.get("/keys", responses=declared(422), dependencies=[Depends(administers)])
+def list_keys(here: Here, cursor: Cursor = None, limit: Limit = 100) -> Page[Key]:
+    """Keys by name, without their secrets."""
+    return here.engine.list_keys(cursor, limit)
+
+
+@keys_router.get("/keys/me", responses=declared())
+def me(asking: Asking) -> Me:
+    """What the key may do that is shown."""
+    until = asking.expires_at
+    return Me(
+        name=asking.name or None,
+        grants=dict(asking.grants),
+        expires_at=None if until is None else datetime.fromtimestamp(until, UTC),
+    )
+
+
+@keys_router.delete(
+    "/keys/{key_name:path}",
+    status_code=204,
+    responses=declared(404),
+    dependencies=[Depends(administers)],
+)
+def revoke_key(key_name: Annotated[str, Path(description="Of the key.")], here: Here) -> None:
+    """Let a key open nothing any more, from the next request on, on every machine of the store."""
+    here.engine.revoke_key(key_name)
+
+
+@keys_router.get("/audit", responses=declared(422), dependencies=[Depends(administers)])
+def list_changes(
+    here: Here,
+    actor: Annotated[
+        str | None, Query(max_length=128, description="Name of the key that made them.")
+    ] = None,
+    map_name: Annotated[
+        str | None, Query(alias="map", max_length=63, description="That was changed.")
+    ] = None,
+    cursor: Cursor = None,
+    limit: Limit = 100,
+) -> Page[Audited]:
+    """Who changed what, the newest first: all but uploads of frames, which the events tell of.
+
+    The newest 100,000 changes are kept.
+    """
+    return here.engine.audit.page(cursor, limit, actor, map_name)
+
+
+def _new(given: object) -> NewKey:
+    if not isinstance(given, dict):
+        raise InvalidRequest(
+            "The key is not a JSON object. See /docs for its fields.",
+            (("", "not an object"),),
+        )
+    try:
+        return NewKey.model_validate(given)
+    except ValidationError as error:
+        raise invalid(error, "The key") from error
+
+
+# How the service does, what maps can be signed with, and changing that.
+
+operations_router = v1_router(tag="operations")
+
+MODEL_BODY: dict[str, Any] = {
+    "required": True,
+    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewModel"}}},
+}
+
+
+@operations_router.get("/stats", responses=declared(404, 422))
+def stats(
+    here: Here,
+    asking: Asking,
+    map_name: Annotated[
+        str | None,
+        Query(alias="map", description="Of this map alone, for who may read that but not all."),
+    ] = None,
+    minutes: Annotated[int, Query(ge=1, le=60, description="Of history.")] = 60,
+) -> Stats:
+    """How the service does now, and did in the last hour, whichever of its processes did it."""
+    if map_name is None:
+        asking.require_every("read")
+    else:
+        asking.require(map_name, "read")
+    return here.engine.operations.statistics.tell(minutes, map_name)
+
+
+@operations_router.get("/models", responses=declared())
+def models(here: Here, asking: Asking) -> Page[ModelInfo]:
+    """Models that a map can be signed with: those that ship, and those that maps have or had."""
+    found = here.engine.operations.models(lambda name: asking.may("read", name))
+    if not asking.reads_every:  # one that only other maps have tells of them
+        found = [one for one in found if one.preset or one.maps]
+    return Page[ModelInfo](items=found)
+
+
+@operations_router.post(
+    "/maps/{map_name}/reencoding",
+    status_code=202,
+    responses=declared(400, 404, 409, 413, 415, 422),
+    openapi_extra={"requestBody": MODEL_BODY},
+    dependencies=[Depends(may_admin)],
+)
+async def reencode(map_name: str, request: Request, here: Here, asking: Asking) -> Map:
+    """Have every frame of a map signed with another model; the map switches when all are.
+
+    Queries go on with the model that the map has until then. `reencoding` of the map tells how
+    far it is. Asked again, it tries again what broke down.
+    """
+    if media_type(request) != "application/json":
+        raise UnsupportedType(
+            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
+            "application/json."
+        )
+    wanted = _wanted(await read_json(request))
+    may_read = None if asking.reads_every else partial(asking.may, "read")
+    find = here.engine.operations.catalogue.find
+    return await to_thread.run_sync(
+        lambda: here.engine.reencode(map_name, find(wanted.model, may_read))
+    )
+
+
+@operations_router.delete(
+    "/maps/{map_name}/reencoding",
+    responses=declared(404, 409),
+    dependencies=[Depends(may_admin)],
+)
+def cancel_reencoding(map_name: str, here: Here) -> Map:
+    """Let a map keep the model that it has; what was made for the other is removed."""
+    return here.engine.cancel_reencode(map_name)
+
+
+def _wanted(given: object) -> NewModel:
+    if not isinstance(given, dict):
+        raise InvalidRequest(
+            "The body is not a JSON object. Send one with the field `model`.",
+            (("", "not an object"),),
+        )
+    try:
+        return NewModel.model_validate(given)
+    except ValidationError as error:
+        raise invalid(error, "The model") from error
+
+
+# Snapshots of the data folder, taken by a worker while all goes on.
+
+snapshots_router = v1_router("/snapshots", "operations", administers)
+
+
+@snapshots_router.post("", status_code=202, responses=declared())
+def take_snapshot(here: Here, response: Response) -> Job:
+    """Have a snapshot taken of all maps: database and blobs, one state of both, in one archive.
+
+    Ask for the job until it has succeeded: `result` is the snapshot then. One that waits its turn
+    already is not queued twice. Restoring is for the operator: `sceneprint restore`.
+    """
+    waiting = here.engine.list_jobs(JobState.QUEUED, limit=1, kind=SNAPSHOT).items
+    job = waiting[0] if waiting else here.engine.tasks.begin(SNAPSHOT, None, {})
+    response.headers["Location"] = f"/v1/jobs/{job.job_id}"
+    return job
+
+
+@snapshots_router.get("", responses=declared())
+def list_snapshots(here: Here) -> Page[SnapshotFile]:
+    """Snapshots that were taken over the service, the newest first: all in one page."""
+    return Page[SnapshotFile](items=list(SnapshotCatalog(here.engine.settings).list()))
+
+
+@snapshots_router.get(
+    "/{snapshot_id}",
+    response_class=Response,
+    responses=files(["application/x-tar"], "The archive, for `sceneprint restore`."),
+)
+def get_snapshot(snapshot_id: str, request: Request, here: Here) -> Response:
+    """The archive. It holds all frames and the hashes of keys: keep it as you keep the folder.
+
+    With `Range` a download goes on where it broke off.
+    """
+    shelf = SnapshotCatalog(here.engine.settings)
+    found = shelf.find(snapshot_id)
+    name = f"sceneprint-{snapshot_id}.tar"
+    return send_file(
+        request, lambda: shelf.open(snapshot_id), "application/x-tar", found.sha256, name
+    )
+
+
+@snapshots_router.delete("/{snapshot_id}", status_code=204, responses=declared(404))
+def delete_snapshot(snapshot_id: str, here: Here) -> None:
+    """Remove a snapshot. A download that is under way goes on."""
+    SnapshotCatalog(here.engine.settings).delete(snapshot_id)

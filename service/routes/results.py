@@ -1,0 +1,232 @@
+"""What can be looked at after a query, for about an hour."""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from typing import Annotated, Any
+
+from anyio import to_thread
+from fastapi import Query, Request, Response
+
+from sceneprint.engine.maps.map_frames import PLY, PNG
+from sceneprint.engine.results.stored_results import unknown_query
+from sceneprint.errors import UnsupportedType
+from sceneprint_client.api import Answer, SeveralQuery
+from sceneprint_client.api import Query as Options
+from sceneprint_client.api.results import (
+    WIDTH,
+    WIDTHS,
+    MatchDetails,
+    OverlayColour,
+    OverlayTransform,
+    Question,
+    Similarities,
+    View,
+)
+from service.auth import Asking, Caller, v1_router
+from service.bodies import media_type
+from service.context import Context, Here
+from service.problems import declared
+from service.query_bodies import JSON, TEMPLATE, checked, read_object
+
+router = v1_router("/queries/{query_id}", "queries")
+
+MapName = Annotated[
+    str | None,
+    Query(
+        alias="map",
+        max_length=128,
+        description="Where matches of several maps have the same id; default: the first of them.",
+    ),
+]
+
+
+def _ply(description: str, *statuses: int) -> dict[int | str, dict[str, Any]]:
+    content = {PLY: {"schema": {"type": "string", "format": "binary"}}}
+    return {200: {"description": description, "content": content}, **declared(*statuses)}
+
+
+def readable_answer(query_id: str, here: Context, asking: Caller) -> Answer:
+    """The answer, where the caller may read all that was asked.
+
+    Raises
+    ------
+    UnknownQuery : it is not kept, or no longer, or the caller may not see it: one text for all.
+    """
+    answer = here.engine.inspection.answer(query_id)
+    maps = [*answer.maps, *([] if answer.frame is None else [answer.frame.map])]
+    if not maps or len(asking.readable(maps)) < len(maps):
+        raise unknown_query(query_id)
+    return answer
+
+
+@router.get("", responses=declared(404, 422))
+def get_answer(query_id: str, here: Here, asking: Asking) -> Answer:
+    """The answer once more, as it was given.
+
+    Answers are kept for an hour by default, and while there is room; not with `keep` false.
+    """
+    return readable_answer(query_id, here, asking)
+
+
+@router.get(
+    "/cloud.ply",
+    response_class=Response,
+    responses=_ply("Points and normals in the query's sensor's frame.", 404, 409, 422),
+)
+async def get_query_cloud(query_id: str, here: Here, asking: Asking) -> Response:
+    """The surface that the query saw, as validation compares it: binary PLY, metres."""
+    inspection = here.engine.inspection
+    await to_thread.run_sync(readable_answer, query_id, here, asking)
+    async with here.gate.place():
+        data = await here.gate.run(lambda: inspection.cloud(query_id))
+    return Response(data, media_type=PLY)
+
+
+@router.get("/similarities", responses=declared(404, 422))
+async def get_similarities(
+    query_id: str,
+    here: Here,
+    asking: Asking,
+    limit: Annotated[
+        int, Query(ge=1, le=200, description="How many of the ranking, the nearest first.")
+    ] = 50,
+) -> Similarities:
+    """How alike the query and its nearest frames are, each to each: what the selection sees."""
+    inspection = here.engine.inspection
+    await to_thread.run_sync(readable_answer, query_id, here, asking)
+    async with here.gate.place():
+        return await here.gate.run(lambda: inspection.similarities(query_id, limit))
+
+
+@router.get("/matches/{frame_id}", responses=declared(404, 409, 422))
+async def get_match(
+    query_id: str, frame_id: str, here: Here, asking: Asking, map_name: MapName = None
+) -> MatchDetails:
+    """One match with what it rests on: its rival, patches that coincide, points for and against.
+
+    It is validated once more, with the seed and the options of the query; one that the query
+    passed over is validated now.
+    """
+    inspection = here.engine.inspection
+    await to_thread.run_sync(readable_answer, query_id, here, asking)
+    async with here.gate.place():
+        return await here.gate.run(lambda: inspection.match(query_id, frame_id, map_name))
+
+
+@router.get(
+    "/matches/{frame_id}/overlay.ply",
+    response_class=Response,
+    responses=_ply("Both clouds in the match's sensor's frame, coloured.", 404, 409, 422),
+)
+async def get_overlay(
+    query_id: str,
+    frame_id: str,
+    here: Here,
+    asking: Asking,
+    map_name: MapName = None,
+    color: Annotated[
+        OverlayColour,
+        Query(
+            description="`source`: the query orange, the match blue. `normal`: directions. "
+            "`residual`: dark green within a fifth of what the model's validation allows between "
+            "surfaces (1 cm of 5 cm of rooms near by; more with distance), light green within two "
+            "fifths, yellow within all of it, grey where there is nothing to compare with or it "
+            "is farther, red where the other saw through."
+        ),
+    ] = "source",
+    transform: Annotated[
+        OverlayTransform,
+        Query(
+            description="`aligned`: as the match was found. `rival`: by the other transform that "
+            "fits best. `none`: both as their cameras saw them."
+        ),
+    ] = "aligned",
+) -> Response:
+    """The query laid on a match, to see how well they fit: binary PLY, metres."""
+    inspection = here.engine.inspection
+    await to_thread.run_sync(readable_answer, query_id, here, asking)
+    async with here.gate.place():
+        data = await here.gate.run(
+            lambda: inspection.overlay(query_id, frame_id, map_name, color, transform)
+        )
+    return Response(data, media_type=PLY)
+
+
+# A kept query once more: how it was asked, its picture, and another answer to it.
+
+
+_PNG: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "What its colours mean is in the tEXt chunks.",
+        "content": {PNG: {"schema": {"type": "string", "format": "binary"}}},
+    },
+    **declared(404, 409, 422),
+}
+
+
+def _changes() -> dict[str, Any]:
+    """The body of `again`, for the OpenAPI document."""
+    names = {**Options.model_fields, "maps": None}
+    properties = SeveralQuery.model_json_schema(ref_template=TEMPLATE)["properties"]
+    own = {
+        name: {"anyOf": [one, {"type": "null"}]}
+        for name, one in properties.items()
+        if name in names
+    }
+    schema = {"type": "object", "additionalProperties": False, "properties": own}
+    return {"requestBody": {"required": True, "content": {JSON: {"schema": schema}}}}
+
+
+@router.get("/question", responses=declared(404, 422))
+def get_question(query_id: str, here: Here, asking: Asking) -> Question:
+    """How the query was asked: of which maps, with which frame and options."""
+    readable_answer(query_id, here, asking)
+    return here.engine.again.question(query_id)
+
+
+@router.get("/preview.png", response_class=Response, responses=_PNG)
+async def get_query_preview(
+    query_id: str,
+    here: Here,
+    asking: Asking,
+    view: Annotated[
+        View,
+        Query(description="As of a frame; `patches` are not kept of a query, and refused."),
+    ] = "depth",
+    width: Annotated[int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Columns.")] = WIDTH,
+) -> Response:
+    """A picture of what the query saw, for people."""
+    again = here.engine.again
+    await to_thread.run_sync(readable_answer, query_id, here, asking)
+    async with here.gate.place():
+        data = await here.gate.run(lambda: again.preview(query_id, view, width))
+    return Response(data, 200, {"Cache-Control": "private, no-cache"}, PNG)
+
+
+@router.post("/again", responses=declared(400, 404, 409, 413, 415, 422), openapi_extra=_changes())
+async def ask_again(query_id: str, request: Request, here: Here, asking: Asking) -> Answer:
+    """Ask a kept query once more with other options, an upload without its file.
+
+    What the body leaves out is as it was asked, null puts back the default, and `maps` asks others.
+    The answer has an id of its own.
+    """
+    since, engine = time.perf_counter(), here.engine
+    answer = await to_thread.run_sync(readable_answer, query_id, here, asking)
+    if media_type(request) != JSON:
+        raise UnsupportedType(
+            f"The body is {media_type(request) or 'of no type'!r:.80}. Send options as {JSON}; "
+            "{} asks as before."
+        )
+    given = await read_object(request)
+    maps = given.pop("maps", None)
+    fields = engine.again.options(query_id, given)
+    query = checked(SeveralQuery, {**fields, "maps": answer.maps if maps is None else maps})
+    async with here.gate.place():
+        names = await to_thread.run_sync(engine.queries.maps_of, query, partial(asking.may, "read"))
+        # which also refuses `frame`, that SeveralQuery has: it is the kept one
+        options = checked(Options, fields)
+        told = await here.gate.run(lambda: engine.again.ask(query_id, names, options, since))
+    here.metrics.answer(told)
+    return told

@@ -1,0 +1,128 @@
+"""The service in this process: it streams, works while somebody waits, and ends in order."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+import sceneprint
+from sceneprint_client import Client, client, errors
+from service.embedded import LocalService
+
+BINARY = {"Content-Type": "application/octet-stream"}
+
+
+@pytest.fixture
+def local(tmp_path: Path) -> Iterator[httpx.Client]:
+    """Plain HTTP to a service in this process."""
+    transport = LocalService(tmp_path / "local")
+    with httpx.Client(base_url="http://here", transport=transport) as http:
+        yield http
+
+
+def test_a_body_is_read_in_parts_by_who_asks(local: httpx.Client) -> None:
+    local.post("/v1/maps", json={"name": "m"}).raise_for_status()
+    threads = set()
+
+    def archive() -> Iterator[bytes]:
+        for _ in range(3):
+            threads.add(threading.current_thread())
+            yield bytes(1 << 20)
+
+    answer = local.post("/v1/maps/m/imports", content=archive(), headers=BINARY)
+    assert (answer.status_code, answer.json()["type"]) == (422, "/problems/unreadable-archive")
+    assert threads == {threading.current_thread()}
+
+    def broken() -> Iterator[bytes]:
+        yield b"PK"
+        raise OSError("the disk is gone")
+
+    with pytest.raises(OSError, match="the disk is gone"):
+        local.post("/v1/maps/m/imports", content=broken(), headers=BINARY)
+    assert local.get("/v1/maps/m").json()["name"] == "m"
+
+
+def test_a_response_streams_until_it_is_closed(local: httpx.Client) -> None:
+    with local.stream("GET", "/v1/events", headers={"Accept": "text/event-stream"}) as stream:
+        parts = stream.iter_text()
+        assert next(parts).startswith("retry: ")
+        local.post("/v1/maps", json={"name": "m"}).raise_for_status()
+        assert any("map.created" in part for part in parts)
+    assert local.get("/v1/stats").json()["maps"] == 1
+
+
+def test_no_key_and_no_limit_whatever_the_environment_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (
+        ("REQUIRE_KEYS", "1"), ("HOST", "0.0.0.0"), ("REQUESTS_PER_S", "0.1"), ("WAITING", "0"),
+        ("CORS_ORIGINS", "*"), ("UPLOAD_BYTES", "1024"),
+    ):  # fmt: skip
+        monkeypatch.setenv(f"SCENEPRINT_{name}", value)
+    with Client.embedded(tmp_path) as client:
+        for _ in range(5):
+            client.create_map("m")
+        assert client.me().name is None
+        with pytest.raises(errors.UnreadableCloud):
+            client.upload("m", b"ply\n" + bytes(4096))
+
+
+def test_closing_ends_streams_and_threads(tmp_path: Path) -> None:
+    before = set(threading.enumerate())
+    client = Client.embedded(tmp_path)
+    client.create_map("m")
+    stream = client.events(after="0")
+    assert next(stream).kind == "map.created"
+    ended: list[Exception] = []
+
+    def listen() -> None:
+        try:
+            next(stream)
+        except RuntimeError as error:
+            ended.append(error)
+
+    listener = threading.Thread(target=listen)
+    listener.start()
+    client.close()
+    listener.join(30)
+    assert "closed" in str(ended[0])
+    for thread in set(threading.enumerate()) - before:
+        thread.join(10)  # the last of the loop's workers may still be on its way out
+    assert set(threading.enumerate()) <= before
+    client.close()  # again: nothing more to do
+    with pytest.raises(RuntimeError, match="closed"):
+        client.maps()
+
+
+def test_a_program_that_closes_nothing_ends(tmp_path: Path) -> None:
+    code = (
+        "from sceneprint_client import Client\n"
+        f"client = Client.embedded({str(tmp_path)!r})\n"
+        "print(client.create_map('m').name)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "m\n", "")
+
+
+def test_a_folder_that_cannot_be_opened(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    before = threading.active_count()
+    with pytest.raises(errors.UnusableStore):
+        sceneprint.Client.embedded(tmp_path / "file")
+    assert threading.active_count() <= before + 1
+
+
+def test_without_the_package_of_the_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(client, "find_spec", lambda name: None)
+    with pytest.raises(errors.MissingDependency, match="pip install sceneprint"):
+        Client.embedded(tmp_path)

@@ -1,0 +1,131 @@
+"""What a robot installs: what it loads, what it shares with the service, and the wheel itself."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+import sceneprint
+import sceneprint_client
+from sceneprint import errors as our_errors
+from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.geometry.retrieval.dpp import DiversityParameters
+from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
+from sceneprint.models import PRESETS
+from sceneprint_client import errors
+from sceneprint_client.api import Diversity, ValidationOptions
+from sceneprint_client.api import maps as map_records
+from sceneprint_client.api.admin import ModelInfo
+
+ROOT = Path(__file__).parents[2]
+
+
+def modules_after(code: str) -> set[str]:
+    """Names of the modules that a fresh process has loaded after some code."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; {code}; print(*sys.modules)"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return set(done.stdout.split())
+
+
+def test_a_robot_loads_the_client_alone() -> None:
+    heavy = {
+        "numba", "numpy", "fastapi", "starlette", "sqlalchemy", "faiss", "sceneprint", "service",
+    }  # fmt: skip
+    loaded = modules_after("import sceneprint_client")
+    assert (heavy | {"httpx", "pydantic"}) & loaded == set()
+    loaded = modules_after("from sceneprint_client import Client; Client().close()")
+    assert heavy & loaded == set()
+    assert {"httpx", "pydantic"} <= loaded
+    loaded = modules_after("from sceneprint_client import Client, meta_of")
+    assert (heavy - {"numpy"}) & loaded == set()
+
+
+def test_the_same_classes_go_by_both_names() -> None:
+    assert sceneprint.Client is sceneprint_client.Client
+    for name in our_errors.__all__:
+        assert getattr(our_errors, name) is vars(errors).get(name, vars(our_errors)[name])
+    there = {name for name, one in vars(errors).items() if isinstance(one, type)}
+    assert there - {"Iterator"} <= set(our_errors.__all__)
+    with pytest.raises(AttributeError, match="has no attribute 'Server'"):
+        sceneprint_client.Server  # noqa: B018
+    assert set(dir(sceneprint_client)) == set(sceneprint_client.__all__)
+
+
+def test_the_records_say_what_the_service_does() -> None:
+    assert map_records.PRESETS == PRESETS
+    assert ModelInfo.model_fields["metric"].annotation == Metric
+    assert ValidationOptions.model_fields["mode"].annotation == Mode
+    diversity, acceptance = DiversityParameters(), AcceptanceParameters()
+    assert Diversity().model_dump() == vars(diversity)
+    options = ValidationOptions().model_dump(exclude={"mode", "residual_deg"})
+    assert options == {name: getattr(acceptance, name) for name in options}
+    assert ValidationOptions().mode == get_args(Mode)[0]
+    assert math.radians(ValidationOptions().residual_deg) == acceptance.residual_rad
+
+
+def test_both_distributions_have_one_version() -> None:
+    main, client = (
+        tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+        for folder in (ROOT, ROOT / "client")
+    )
+    assert main["version"] == client["version"] == sceneprint_client.__version__
+    major, minor, _ = client["version"].split(".")
+    wanted = f"sceneprint-client>={major}.{minor},<{major}.{int(minor) + 1}"
+    assert wanted in main["dependencies"]
+    assert {one.partition(">")[0] for one in client["dependencies"]} == {
+        "httpx", "numpy", "pydantic",
+    }  # fmt: skip
+
+
+@pytest.mark.thorough
+def test_the_wheel_works_alone(tmp_path: Path, service_url: str) -> None:
+    """In an empty environment, of the oldest Python that there is."""
+    source = tmp_path / "source"
+    shutil.copytree(ROOT / "client", source, ignore=shutil.ignore_patterns("*.egg-info", "build"))
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    built = [*pip, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path)]
+    subprocess.run([*built, str(source)], check=True)
+    [wheel] = tmp_path.glob("sceneprint_client-*-py3-none-any.whl")
+    python = tmp_path / "env" / "bin" / "python"
+    oldest = shutil.which("python3.10") or sys.executable
+    subprocess.run([oldest, "-m", "venv", str(tmp_path / "env")], check=True)
+    installed = [str(python), "-m", "pip", "--quiet", "--disable-pip-version-check", "install"]
+    subprocess.run([*installed, str(wheel)], check=True)
+    code = f"""
+import sys
+from pathlib import Path
+from sceneprint_client import Client, errors
+from sceneprint_client.api import FrameState, JobState
+assert str(JobState.QUEUED) == f"{{JobState.QUEUED}}" == "queued"
+with Client({service_url!r}) as client:
+    client.create_map("wheel", model="depth")
+    assert client.healthy()
+    try:
+        client.frame("wheel", "nobody")
+    except errors.UnknownFrame as error:
+        print(error)
+    client.delete_map("wheel")
+try:
+    Client.embedded("nowhere")
+except errors.MissingDependency as error:
+    print(error)
+from sceneprint_client import meta_of
+print({{"sceneprint", "numba"}} & set(sys.modules))
+"""
+    done = subprocess.run(
+        [str(python), "-I", "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("There is no frame 'nobody'")
+    assert lines[1].endswith("Run: pip install sceneprint")
+    assert lines[2] == "set()"

@@ -1,0 +1,143 @@
+"""Ways to ask; and a service over the network and the one in process answer alike."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
+from sceneprint.formats.dataset import FrameReference
+from sceneprint_client import Client
+from sceneprint_client.api import Answer, NamedFrame, ValidationOptions
+
+STAGES: tuple[Any, ...] = (
+    ("retrieve",),
+    ("retrieve", "diversify"),
+    ("retrieve", "validate"),
+    ("retrieve", "diversify", "validate"),
+)
+
+
+@pytest.fixture
+def filled(
+    remote: Client, embedded: Client, map_name: str, references: tuple[FrameReference, ...]
+) -> tuple[dict[str, int], dict[str, int]]:
+    """The same frames in both; their numbers by the ids that each gave them."""
+    numbers = []
+    for client in (remote, embedded):
+        client.create_map(map_name, "both")
+        added = [client.upload(map_name, one, wait_s=30) for one in references]
+        assert {one.state for one in added} == {"indexed"}
+        numbers.append({one.frame_id: i for i, one in enumerate(added)})
+    return numbers[0], numbers[1]
+
+
+def comparable(told: Any, numbers: dict[str, int]) -> Any:
+    """What is told, with frames by number, and without what differs from call to call."""
+    drop = {"query_id", "milliseconds", "job_id", "received_at", "indexed_at", "created_at"}
+    if isinstance(told, dict):
+        return {key: comparable(value, numbers) for key, value in told.items() if key not in drop}
+    if isinstance(told, list):
+        return [comparable(value, numbers) for value in told]
+    if isinstance(told, str):
+        for frame_id, number in numbers.items():
+            told = told.replace(frame_id, f"frame {number}")
+    return told
+
+
+def test_answers_are_equal(
+    remote: Client,
+    embedded: Client,
+    map_name: str,
+    references: tuple[FrameReference, ...],
+    filled: tuple[dict[str, int], dict[str, int]],
+) -> None:
+    def ask(client: Client, numbers: dict[str, int], **how: Any) -> tuple[Answer, Any]:
+        answer = client.query(map_name, **how)
+        return answer, comparable(answer.model_dump(mode="json"), numbers)
+
+    for stages in STAGES:
+        how = {"stages": stages, "k": 2, "seed": 7, "exact": True}
+        over_http, told = ask(remote, filled[0], frame=references[1], **how)
+        in_process, same = ask(embedded, filled[1], frame=references[1], **how)
+        assert told == same
+        assert type(over_http) is type(in_process) is Answer
+        assert over_http.milliseconds.keys() == in_process.milliseconds.keys()
+        assert (over_http.seed, over_http.exact, over_http.counts.map) == (7, True, 6)
+        assert over_http.matches[0].distance == 0  # the frame itself is in the map
+        assert filled[0][over_http.matches[0].frame_id] == 1
+    assert over_http.status == "found"
+    assert over_http.location is not None
+    assert over_http.location.pose.parent_frame == "room-0/seq-01"
+    by_id = {
+        client: {n: i for i, n in ids.items()}
+        for client, ids in zip((remote, embedded), filled, strict=True)
+    }
+    stored, told = ask(remote, filled[0], frame_id=by_id[remote][4])
+    _, same = ask(embedded, filled[1], frame_id=by_id[embedded][4])
+    assert told == same
+    assert by_id[remote][4] not in [match.frame_id for match in stored.matches]
+    remote.delete_map(map_name)
+
+
+def test_all_ways_of_asking(
+    client: Client, map_name: str, references: tuple[FrameReference, ...]
+) -> None:
+    """One after the other: options, maps as one, a pose, and two frames compared."""
+    other = f"{map_name}-b"
+    client.create_map(map_name)
+    ids = [client.upload(map_name, one, wait_s=30).frame_id for one in references]
+    client.create_map(other)
+    added = client.upload(other, references[2], wait_s=30).frame_id
+    options: dict[str, Any] = {
+        "k": 2, "seed": 3, "candidates": 4, "diversity": {"omega": 8.0},
+        "validation": ValidationOptions(strong=1.0), "explain": True, "keep": False,
+        "filter": {"exclude_frames": [ids[4]]}, "stages": "retrieve,diversify,validate",
+    }  # fmt: skip
+    explained = client.query(map_name, references[1], **options)
+    assert explained.explanations is not None
+    assert len(explained.explanations) == 5
+    asked = client.query(map_name, frame_id=ids[0], explain_frame=ids[4], deadline_ms=600_000)
+    assert asked.explained_frame is not None
+    assert asked.explained_frame.frame_id == ids[4]
+    several = client.query(maps=[map_name, other], frame=references[1], **options)
+    assert several.maps == [map_name, other]
+    stored = client.query(map_name, frame_id=ids[2], maps=f"{other},{map_name}")
+    assert (stored.matches[0].map, stored.matches[0].distance) == (other, 0)
+    found = client.localize(map_name, references[0], seed=2)
+    assert found.pose is not None
+    assert (found.pose.parent_frame, found.seed) == ("room-0/seq-01", 2)
+    assert client.localize(map_name, frame_id=ids[3]).map == map_name
+    named = client.similarity((map_name, ids[0]), (other, added), seed=1)
+    sent = client.similarity(NamedFrame(map=other, frame_id=added), references[0])
+    assert sent.distance == named.distance > 0
+    bare = client.similarity(references[0], references[1], validate=False, model="depth")
+    assert bare.validation is None
+
+
+def test_what_cannot_be_asked_is_refused(
+    client: Client, map_name: str, references: tuple[FrameReference, ...]
+) -> None:
+    client.create_map(map_name, model="paper")
+    for name in ("x", "y"):
+        client.create_map(f"{map_name}-{name}")
+    frame = references[0]
+    with pytest.raises(InvalidRequest, match="maps"):
+        client.query(maps=[], frame=frame)
+    with pytest.raises(InvalidRequest, match=r"has paper-.* has depth-"):
+        client.query(maps=[map_name, f"{map_name}-x"], frame=frame)
+    with pytest.raises(UnknownMap, match="'nowhere'"):
+        client.query(maps=[map_name, "nowhere"], frame=frame)
+    with pytest.raises(InvalidRequest, match="needs validated matches"):
+        client.localize(map_name, frame, stages=("retrieve",))
+    with pytest.raises(UnknownFrame):
+        client.similarity(frame, (map_name, "nobody"))
+    with pytest.raises(UnknownFrame):
+        client.query(map_name, frame, explain_frame="nobody")
+    for wrong in (
+        {"frame": frame}, {"maps": "*"}, {"maps": "*", "map_name": map_name, "frame": frame},
+        {"maps": "*", "frame_id": "x"}, {"map_name": map_name, "frame": frame, "speed": 1},
+    ):  # fmt: skip
+        with pytest.raises(TypeError):
+            client.query(**wrong)

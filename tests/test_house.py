@@ -1,0 +1,172 @@
+"""The rules of the house: names that say what is there, functions that fit a screen, no circles."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterator
+from functools import cache
+from itertools import combinations
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("sceneprint", "service", "worker", "client")
+MOST_LINES = 60
+#: Words that an engineer of the field would not know, and the standard term.
+RETIRED = {
+    "standing": "duplicate check", "bell": "wakeup", "notices": "wakeup",
+    "telling": "serialize, response", "deaths": "dead letter", "bury": "dead letter",
+    "wire": "serializers", "looking": "read-only", "sealed": "read-only", "made": "derived file",
+    "marks": "bucket owner", "kept": "stored result", "keeping": "stored result",
+    "former": "tombstone", "again": "rerun", "parts": "job output", "shown": "result validity",
+    "seals": "opaque id", "sides": "association plan", "concluding": "association result",
+    "racks": "snapshot storage", "shelf": "snapshot catalog", "endings": "job outcome",
+    "truth": "database check", "accepting": "compatibility", "happenings": "event cursor",
+    "belonging": "patch lookup", "growing": "append buffer", "rivals": "ambiguity",
+    "switches": "model switch", "agreement": "overlap", "choosing": "search routing",
+    "surroundings": "patch descriptors", "stored": "pgvector search", "once": "idempotency",
+    "remembered": "signature cache", "slowness": "body timeout", "healing": "repair",
+    "raw": "binary body", "sweeping": "blob garbage collection", "Around": "RequestMiddleware",
+    "retiring": "retention", "members": "archive entries", "replaying": "idempotent replay",
+    "asked": "query",
+}  # fmt: skip
+
+
+@cache
+def modules() -> dict[str, ast.Module]:
+    """Syntax trees of all product modules, by path."""
+    paths = (path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py")))
+    return {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in paths}
+
+
+def definitions(
+    tree: ast.Module,
+) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef]:
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node
+
+
+def test_no_file_and_no_definition_has_a_retired_name() -> None:
+    found = [path for path in modules() if Path(path).stem in RETIRED]
+    for path, tree in modules().items():
+        found += [f"{path}:{one.name}" for one in definitions(tree) if one.name in RETIRED]
+    furniture = "sceneprint/lab/synth/furniture.py:shelf"  # a shelf, for once
+    assert [one for one in found if one != furniture] == []
+
+
+def distance(a: Path, b: Path) -> int:
+    """Steps from folder to folder."""
+    common = 0
+    for x, y in zip(a.parts, b.parts, strict=False):
+        if x != y:
+            break
+        common += 1
+    return len(a.parts) + len(b.parts) - 2 * common
+
+
+def test_no_two_files_near_each_other_have_one_name() -> None:
+    by_name = defaultdict(list)
+    for path in modules():
+        if not Path(path).stem.startswith("__"):
+            by_name[Path(path).name].append(Path(path))
+    near = [
+        f"{a} {b}"
+        for same in by_name.values()
+        for a, b in combinations(same, 2)
+        if distance(a.parent, b.parent) <= 2
+    ]
+    assert near == []
+
+
+def test_no_class_name_is_there_twice() -> None:
+    names = Counter(
+        one.name
+        for path, tree in modules().items()
+        for one in definitions(tree)
+        if isinstance(one, ast.ClassDef) and not one.name.startswith("_")
+    )
+    assert [name for name, count in names.items() if count > 1] == []
+
+
+def code_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Lines of a function but for its docstring, which may be as long as it is useful."""
+    first = node.body[0]
+    told = 0
+    if ast.get_docstring(node) is not None:
+        told = (first.end_lineno or 0) - first.lineno + 1
+    return (node.end_lineno or 0) - node.lineno + 1 - told
+
+
+def test_a_long_function_says_why() -> None:
+    functions = [
+        (path, node)
+        for path, tree in modules().items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
+    assert len(functions) > 2_000
+    found = [
+        f"{path}:{node.name} {code_lines(node)}"
+        for path, node in functions
+        if code_lines(node) > MOST_LINES
+        and not re.search(r"^\s*Length: \S", ast.get_docstring(node) or "", re.MULTILINE)
+    ]
+    assert found == []
+
+
+def imports(tree: ast.Module, known: Collection[str]) -> Iterator[str]:
+    """Which of the known modules a module imports when it is loaded.
+
+    `from a import b` is a.b where that is a module, and else a.
+    """
+    for node in tree.body:
+        if isinstance(node, ast.Import):
+            yield from (one.name for one in node.names if one.name in known)
+        elif isinstance(node, ast.ImportFrom) and node.module in known:
+            whole = (f"{node.module}.{one.name}" for one in node.names)
+            yield from (one if one in known else node.module for one in whole)
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Strongly connected components of more than one node, after Tarjan."""
+    order: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found = []
+
+    def visit(node: str) -> None:
+        order[node] = low[node] = len(order)
+        stack.append(node)
+        for other in graph[node]:
+            if other not in order:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in stack:
+                low[node] = min(low[node], order[other])
+        if low[node] == order[node]:
+            part = stack[stack.index(node) :]
+            del stack[stack.index(node) :]
+            if len(part) > 1:
+                found.append(sorted(part))
+
+    for node in graph:
+        if node not in order:
+            visit(node)
+    return found
+
+
+def test_circles_are_found() -> None:
+    graph = {"a": {"b"}, "b": {"c"}, "c": {"b", "d"}, "d": set[str](), "e": {"a"}}
+    assert circles(graph) == [["b", "c"]]
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    names = {
+        path.removesuffix(".py").removesuffix("/__init__").replace("/", "."): tree
+        for path, tree in modules().items()
+    }
+    graph = {name: set(imports(tree, names)) - {name} for name, tree in names.items()}
+    assert len(graph) > 200
+    assert circles(graph) == []

@@ -1,0 +1,72 @@
+"""Checks of the dashboard's JavaScript: pinned, and skipped with a word where there is no Node."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDER = ROOT / "tools/javascript"
+
+
+def check(folder: Path, path: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["/bin/sh", str(folder / "check")],
+        env={**os.environ, "PATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_without_node_one_line_says_that_it_was_skipped(tmp_path: Path) -> None:
+    done = check(FOLDER, str(tmp_path))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == "JavaScript not checked: node or npm is not installed\n"
+
+
+def test_make_lint_runs_it() -> None:
+    recipe = re.search(r"^lint:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert recipe is not None
+    assert "@tools/javascript/check" in recipe[1].split()
+
+
+def test_its_tools_are_pinned_and_locked() -> None:
+    wanted = json.loads((FOLDER / "package.json").read_text())["devDependencies"]
+    locked = json.loads((FOLDER / "package-lock.json").read_text())["packages"]
+    assert {name: locked[f"node_modules/{name}"]["version"] for name in wanted} == wanted
+    packages = [one for path, one in locked.items() if path]
+    assert all(one["resolved"].startswith("https://registry.npmjs.org/") for one in packages)
+    assert all(one["integrity"].startswith("sha512-") for one in packages)
+
+
+@pytest.mark.skipif(
+    not (FOLDER / "node_modules/.installed").exists() or shutil.which("node") is None,
+    reason="the tools are installed by make lint, where there is Node",
+)
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ("export const n = Math.flor(1.5);", "error TS2551: Property 'flor' does not exist"),
+        ("export const n = count(1);", "error TS2304: Cannot find name 'count'"),
+        ("/** @param {number} n */ export const f = (n) => n;\nf('1');", "error TS2345"),
+    ],
+)
+def test_a_mistake_is_found(tmp_path: Path, line: str, found: str) -> None:
+    options = json.loads((FOLDER / "tsconfig.json").read_text())
+    (tmp_path / "page.js").write_text(f"{line}\n")
+    (tmp_path / "tsconfig.json").write_text(json.dumps({**options, "include": ["page.js"]}))
+    done = subprocess.run(
+        [FOLDER / "node_modules/.bin/tsc", "-p", tmp_path, "--pretty", "false"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode != 0
+    assert found in done.stdout
