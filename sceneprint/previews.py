@@ -26,7 +26,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 #: Pixels along the longer side of a view from above, by the number of points.
 _LEAST, _MOST = 16, 320
-_OPTICAL = "x right, y down, z ahead"
+_OPTICAL = "x right, y down, z forward"
 _AXES = "the x, y and z of its own axes"
 
 

@@ -20,7 +20,7 @@ from sceneprint.geometry.surface.coverage import (
 from sceneprint.rendering import PALETTE, reconstruction_picture, rendered, viewpoint
 from sceneprint.types import DepthFrame, Intrinsics
 
-#: Half the room's width, height and depth, metres: x right, y down, z ahead; its centre at 0.
+#: Half the room's width, height and depth, metres: x right, y down, z forward; its centre at 0.
 ROOM = np.array([2.0, 1.25, 1.5])
 CAMERA = Intrinsics(160, 120, 80.0, 80.0, 79.5, 59.5)  # sees 90 by 74 degrees
 

@@ -239,10 +239,7 @@ def add_train(commands: Any) -> None:
         "--preset",
         choices=PRESETS,
         default=PRESETS[0],
-        help=(
-            "base preset: signature size and, for lidar, lengths and scenes (default: "
-            f"{PRESETS[0]})"
-        ),
+        help=f"base of signature size, lengths and scenes (default: {PRESETS[0]})",
     )
     command.add_argument(
         "--rooms",

@@ -89,7 +89,7 @@ async def get_preview(
         View,
         Query(
             description="`depth`: yellow near, violet far. `normals`: red, green, blue are "
-            "127.5 (1 + n) of x right, y down, z ahead. `patches`: each of the finest level a "
+            "127.5 (1 + n) of x right, y down, z forward. `patches`: each of the finest level a "
             "colour. Dark grey where nothing is known. Of a cloud what is seen around its "
             "viewpoint, normals along its own axes; of one without, the view from above, with "
             "heights in place of depth."

@@ -75,7 +75,7 @@ def test_a_frame_put_under_an_id(
     assert frame.T_base_sensor.matrix == [  # of the quaternion, by hand
         [0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.1], [0.0, -1.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0],
     ]  # fmt: skip
-    with pytest.raises(FrameConflict, match="other base_frame, T_base_sensor"):
+    with pytest.raises(FrameConflict, match="different base_frame, T_base_sensor"):
         client.put_frame(map_name, "a.0-1_b", references[0])
     with pytest.raises(InvalidRequest, match="frame id"):
         client.put_frame(map_name, "../x", references[0])

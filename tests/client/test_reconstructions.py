@@ -80,7 +80,7 @@ def test_a_surface_and_its_figures(client: Client, answered: Answer) -> None:
     ]
     points, triangles, comment = ply(mesh)
     assert (points, triangles) == (coverage.points, coverage.triangles)
-    assert comment == "comment frame query.optical: x right, y down, z ahead, metres"
+    assert comment == "comment frame query.optical: x right, y down, z forward, metres"
     assert struct.unpack(">II", picture[16:24]) == (1440, 920)
     again = client.reconstruct(answered, voxel_m=0.04, wait_s=60)
     assert client.reconstruction_mesh(again.job_id) == mesh

@@ -80,13 +80,14 @@ def test_what_is_shown_is_what_the_service_counted(station, page, settle, axe, u
     settle(page)
     until(lambda: page.evaluate(FIGURES)["live"] == "live")
 
-    page.locator("figure", has_text="Frames a minute").get_by_text("Show as table").click()
+    page.locator("figure", has_text="Frames per minute").get_by_text("Show as table").click()
 
     def told():
         """What is shown at one moment, and the answer that it is of: the page asks again."""
         shown = page.evaluate(FIGURES)
         of_it = [one for one in answers if one.json()["at"] == shown["at"]]
-        return (shown, of_it[0].json()) if of_it else None
+        # the table fills when the browser tells that it was opened
+        return (shown, of_it[0].json()) if of_it and shown["minutes"] else None
 
     shown, stats = until(told)
     total = stats["total"]
@@ -125,7 +126,7 @@ def test_dead_jobs_are_shown_with_their_tracebacks_and_tried_again(
     trace = first.get_by_role("region", name="Traceback")
     assert not trace.is_visible()
     first.get_by_text("Traceback of the last attempt").click()
-    assert "sceneprint.errors.DamagedBlob" in trace.inner_text()
+    assert "sceneprint_client.errors.DamagedBlob" in trace.inner_text()
     assert axe(page) == []
     place = first.get_by_role("link", name="sign").get_attribute("href")
     repair()

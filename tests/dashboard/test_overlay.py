@@ -99,7 +99,7 @@ def test_what_is_shown_is_what_the_api_says(
         ("within 10 mm", (found <= 50).mean()),
         ("within 20 mm", ((found > 50) & (found <= 100)).mean()),
         ("the other sensor saw through", (found == 254).mean()),
-        ("did not look", (found == 253).mean()),
+        ("farther, hidden, or outside the view of the other", (found == 253).mean()),
     ):  # fmt: skip
         assert f"{words} {percent(share)}" in legend
     assert axe(page) == []
@@ -296,7 +296,7 @@ def test_without_webgl_the_numbers_are_still_there(
     )
     page.goto(address(station, answer, answer["matches"][0]))
     settle(page)
-    assert "has no WebGL 2" in text(page, ".viewer-none")
+    assert "does not support WebGL 2" in text(page, ".viewer-none")
     assert figures(page)["Overlap"] == percent(answer["matches"][0]["validation"]["overlap"])
     for canvas in page.locator(".overlay-flat canvas").all():
         colours = canvas.evaluate(

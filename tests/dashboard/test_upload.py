@@ -153,10 +153,10 @@ def test_a_drop_waits_for_its_camera_and_an_archive_goes_to_imports(
         page.locator(f"input[name={name}]").fill(f"{value:g}")
     expect(page.get_by_label("Preset")).to_have_value("")
     start.click()
-    expect(row(page, "run.zip").locator(".badge")).to_have_text("taken", timeout=60_000)
+    expect(row(page, "run.zip").locator(".badge")).to_have_text("imported", timeout=60_000)
     expect(row(page, "lone.png").locator(".badge")).to_have_text("indexed", timeout=60_000)
     expect(row(page, "run.zip").locator(".row-more > p")).to_have_text(
-        "Frames: 1 taken, 1 refused."
+        "Frames: 1 imported, 1 refused."
     )
     [lone] = [
         one for one in station.client.get("/v1/maps/archive/frames").json()["items"]

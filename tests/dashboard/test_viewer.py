@@ -68,7 +68,7 @@ def drawn(page: Page) -> np.ndarray[Any, Any]:
 
 
 def seen_at(point: tuple[float, float, float]) -> tuple[int, int]:
-    """Row and column of a point (x right, y down, z ahead) seen from (0, 0, -2)."""
+    """Row and column of a point (x right, y down, z forward) seen from (0, 0, -2)."""
     x, y, z = point
     return round(HEIGHT / 2 + FOCAL * y / (z + 2)), round(WIDTH / 2 + FOCAL * x / (z + 2))
 

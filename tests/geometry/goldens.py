@@ -108,7 +108,7 @@ def check_eq2(module: ModuleType) -> None:
         np.array([[0.5, 1.5], [-1.0, 0.5]]),
         np.array([[4.0, 0.25], [0.25, 4.0]]),
     )
-    statistics = module.Statistics(pi.sum(axis=0), pi.T @ f, pi.T @ f**2, n_pairs=7, total=2.0)
+    statistics = module.LevelStatistics(pi.sum(axis=0), pi.T @ f, pi.T @ f**2, n_pairs=7, total=2.0)
     root2 = math.sqrt(2)
     expected = [
         # m0 of g = 1 is (.8 - 2 * .36) / (2 * .6)

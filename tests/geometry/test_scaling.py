@@ -33,7 +33,7 @@ BARE = {
         "ambiguous", "ambiguous_share", "stiffness", "blind_ambiguous_share",
         "blind_evidence", "blind_plane_overlap",
     },
-    "RivalParameters": {
+    "AmbiguityParameters": {
         "same_direction", "least_crossing", "hopeful_share", "hopeful_violations", "refuted",
         "rival_rad",
     },
@@ -42,7 +42,7 @@ BARE = {
     "AlignmentParameters": {"violation_weight", "same_rad"},
     "ConsensusParameters": {"angle_tolerance", "inlier_cosine"},
     "SequenceParameters": {"angle_scale", "gap_cost", "swap_cost"},
-    "AgreementParameters": {"normal_cosine"},
+    "OverlapParameters": {"normal_cosine"},
     "CovarianceParameters": {"independent", "free"},
 }  # fmt: skip
 

@@ -227,12 +227,19 @@ def test_known_correspondences_are_found() -> None:
 
 def test_golden() -> None:
     """Every number of the alignment at once: changed only on purpose."""
-    pairs = sequence_correspondences(
-        scattered(40, 50), carried(scattered(40, 50), motion(3)), np.random.default_rng(0),
-        replace(P, n_sources=6, n_coarse=20),
-    )  # fmt: skip
-    nearest = [[2, 37, 40], [12, 27, 33], [15, 7, 41], [24, 48, 47], [29, 43, 34], [38, 24, 48]]
+    source, target = scattered(40, 50), carried(scattered(40, 50), motion(3))
+    p = replace(P, n_sources=6, n_coarse=20)
+    pairs = sequence_correspondences(source, target, np.random.default_rng(0), p)
+    nearest = [[2, 37, 5], [12, 27, 33], [15, 7, 37], [24, 48, 47], [29, 43, 34], [38, 24, 29]]
     assert pairs.tolist() == [[own[0], one] for own in nearest for one in own]
+    # which are the nearest of all, without the bounds that spare most of the alignments
+    of_source, of_target = (
+        [one.symbols[i, : one.lengths[i]] for i in range(50)]
+        for one in (neighbour_sequences(a, coarse(a, p), p) for a in (source, target))
+    )
+    for own in nearest:
+        cost = [alignment_cost(of_source[own[0]], one, p) for one in of_target]
+        assert np.argsort(cost)[:3].tolist() == own
     costs = [round(alignment_cost(symbols(k, 9), symbols(k + 50, 11), P), 9) for k in range(4)]
     assert costs == [0.904202517, 0.805803733, 0.744911764, 0.850303579]
 

@@ -99,7 +99,7 @@ AGREEMENT = [
     ("half = stride // 2", "half = 0"),
     ("out[k, 0] = inliers", "out[k, 1] = inliers"),
     ("chain, transforms[k], tolerances", "chain, transforms[0], tolerances"),
-    ("Agreement(len(source), round(inliers)", "Agreement(round(inliers), round(inliers)"),
+    ("Overlap(len(source), round(inliers)", "Overlap(round(inliers), round(inliers)"),
 ]
 
 REGISTRATION = [

@@ -230,13 +230,13 @@ def check_targets(module: ModuleType) -> None:
 
 
 def check_agreement_of_clouds(module: ModuleType) -> None:
-    p = module.AgreementParameters(
+    p = module.OverlapParameters(
         surface_tolerance=0.05, point_tolerance=0.15, normal_cosine=0.7, free_space_margin=0.1,
         reference_depth=2.0, nearest=0.3, edge_px=1,
     )  # fmt: skip
 
     def found(source: Floats32, target: Surface, T: Floats | None = None) -> tuple[float, Any]:
-        result = module.agreement(source, target, np.eye(4) if T is None else T, p)
+        result = module.overlap_counts(source, target, np.eye(4) if T is None else T, p)
         return result.inliers, result.violations
 
     on, through, nothing = (1, 0), (0, 1), (0, 0)
@@ -308,7 +308,7 @@ def check_agreement_of_clouds(module: ModuleType) -> None:
 
 
 def check_agreement(module: ModuleType) -> None:
-    p = module.AgreementParameters(
+    p = module.OverlapParameters(
         surface_tolerance=0.05,
         point_tolerance=0.15,
         normal_cosine=0.7,
@@ -317,7 +317,7 @@ def check_agreement(module: ModuleType) -> None:
     )
 
     def found(source: Floats32, target: Surface, T: Floats | None = None) -> tuple[float, float]:
-        result = module.agreement(source, target, np.eye(4) if T is None else T, p)
+        result = module.overlap_counts(source, target, np.eye(4) if T is None else T, p)
         assert result.points == len(source)
         return result.inliers, result.violations
 

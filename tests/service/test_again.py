@@ -148,4 +148,4 @@ def test_what_cannot_be_asked_again(served, asked, shots, refused):
     # and a map of another model cannot be asked with this signature
     served.client.post("/v1/maps", json={"name": "again-paper", "model": "paper"})
     reply = served.client.post(f"{path}/again", json={"maps": ["again-paper"]})
-    refused(reply, 409, "not-indexed", "another model")
+    refused(reply, 409, "not-indexed", "a different model")

@@ -160,7 +160,7 @@ def test_what_cannot_be_asked_is_refused(served, maps, shots, refused, make_map)
     away = {"map": "no", "frame_id": "x"}
     refuse(several, {"frame": away, "maps": ["ask-a"]}, 404, "unknown-map", "'no'")
     same = "/v1/similarity"
-    refuse(same, {"frame_a": named}, *bad, "'frame_b' is neither")
+    refuse(same, {"frame_a": named}, *bad, "'frame_b' is missing")
     refuse(same, {"frame_a": named, "frame_b": away}, 404, "unknown-map", "'no'")
     refuse(same, {"frame_a": named, "frame_b": named, "model": "paper"}, *bad, "Leave `model` out")
     file = ("a.png", shots[0].png)

@@ -158,7 +158,7 @@ def test_a_cloud_is_who_its_points_are(served, hall, clouds, refused):
     refused(post(robot), 409, "frame-conflict", "different robot")
     millimetres = raw(npy(1000.0 * (clouds[2] + VIEWPOINT)), viewpoint="2,-1,0.5")
     millimetres["params"]["units_per_metre"] = 1000
-    refused(post(millimetres), 409, "frame-conflict", "other units_per_metre")
+    refused(post(millimetres), 409, "frame-conflict", "different units_per_metre")
     elsewhere = post(raw(repacked, viewpoint="2,-1,0.4"))  # another viewpoint, another frame
     assert elsewhere.status_code == 201
     fused = post(raw(repacked, viewpoint="none"))

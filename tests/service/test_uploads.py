@@ -42,7 +42,7 @@ def test_a_frame_has_the_id_it_was_put_under(served, hall, small_shots, refused)
     problem = refused(http.put(path, **shot.form(session="b")), 409, "frame-conflict")
     assert "a different session." in problem["detail"]
     other = refused(http.put(path, **small_shots[1].form(session="a")), 409, "frame-conflict")
-    assert "other content" in other["detail"]
+    assert "different content" in other["detail"]
     # the same content under another id is a frame of its own, and shares the blob
     twin = http.put(f"{hall}/frames/twin", **shot.form(session="b"))
     assert (twin.status_code, twin.json()["frame_id"]) == (202, "twin")

@@ -181,7 +181,7 @@ class Answer(ApiRecord):
     kind: Kind = Field(
         default="depth",
         description="Of the frame that was asked for. Transforms call the sensor of a depth image "
-        "`ID.optical` (x right, y down, z ahead), and that of a cloud, which keeps its axes, "
+        "`ID.optical` (x right, y down, z forward), and that of a cloud, which keeps its axes, "
         "`ID.sensor`.",
     )
     per_map: dict[str, OfMap] | None = Field(

@@ -106,7 +106,7 @@ class Reconstruction(ApiRecord):
     request: NewReconstruction
     parent_frame: str = Field(
         description="Coordinates of mesh.ply: those of the query's sensor, metres; of a camera "
-        "x right, y down, z ahead."
+        "x right, y down, z forward."
     )
     coverage: Coverage | None = Field(default=None, description="When it has succeeded.")
     files: list[ReconstructionFile] = Field(

@@ -246,11 +246,12 @@ def _cyclic(
     whole = (m + n) * gap
     if bound / whole > most:
         return 1.0
-    best = most * whole
+    limit = best = most * whole
     for turn in range(n):
         cost = _edits(costs, m, n, turn, gap, swap, best, rows)
         best = min(best, cost)
-    return best / whole
+    # limit / whole may round to less than `most`, and would replace what is as near
+    return best / whole if best < limit else 1.0
 
 
 @kernel

@@ -119,10 +119,10 @@ function stateOf(item) {
   if (state === "cancelled") return badge("cancelled");
   if (state === "importing") {
     const { done, total } = item.job.progress ?? {};
-    return [h("progress", { max: 1, value: total ? done / total : null, "aria-label": `${item.file.name}, taken` }),
+    return [h("progress", { max: 1, value: total ? done / total : null, "aria-label": `${item.file.name}, imported` }),
       h("span", { class: "muted number" }, total ? `${count(done)} of ${count(total)} frames` : "Waiting for a worker")];
   }
-  if (state === "imported") return h("span", { class: "badge", dataset: { kind: "good" } }, "taken");
+  if (state === "imported") return h("span", { class: "badge", dataset: { kind: "good" } }, "imported");
   return badge(state);
 }
 

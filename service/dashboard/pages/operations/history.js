@@ -7,7 +7,7 @@ const time = (value) => (value === 0 ? "0" : ms(1000 * value));
 
 /** @type {Parameters<typeof chart>[0]} */
 const FRAMES = {
-  title: "Frames a minute", kind: "bars", format: count, least: 1, nothing: "No frames in the last hour",
+  title: "Frames per minute", kind: "bars", format: count, least: 1, nothing: "No frames in the last hour",
   series: [
     { name: "indexed", colour: "--good" }, { name: "redundant", colour: "--match" },
     { name: "rejected", colour: "--warn" }, { name: "failed", colour: "--bad" },
@@ -24,7 +24,7 @@ const LATENCY = {
 };
 /** @type {Parameters<typeof chart>[0]} */
 const QUERIES = {
-  title: "Queries a minute", kind: "bars", format: count, least: 1, nothing: "No queries in the last hour",
+  title: "Queries per minute", kind: "bars", format: count, least: 1, nothing: "No queries in the last hour",
   series: [
     { name: "found", colour: "--good" }, { name: "ambiguous", colour: "--warn" },
     { name: "not_found", colour: "--edge" }, { name: "unvalidated", colour: "--match" },
@@ -32,7 +32,7 @@ const QUERIES = {
 };
 /** @type {Parameters<typeof chart>[0]} */
 const REQUESTS = {
-  title: "Requests a minute", kind: "bars", format: count, least: 1, nothing: "No requests in the last hour",
+  title: "Requests per minute", kind: "bars", format: count, least: 1, nothing: "No requests in the last hour",
   series: [
     { name: "answered", colour: "--accent" }, { name: "refused", colour: "--warn" },
     { name: "busy", colour: "--rival" }, { name: "broken", colour: "--bad" },

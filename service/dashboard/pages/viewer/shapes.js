@@ -3,7 +3,7 @@
 /**
  * The camera that saw a frame, at the origin of its own axes.
  * @param {{width: number, height: number, fx: number, fy: number, cx: number, cy: number} | null}
- *   camera intrinsics of a depth camera (x right, y down, z ahead); null of a cloud's sensor, whose
+ *   camera intrinsics of a depth camera (x right, y down, z forward); null of a cloud's sensor, whose
  *   z is up: a ring about its viewpoint, with a tick along x
  * @param {number} size metres: how far ahead the frustum ends, or the radius of the ring
  * @returns {Float32Array} six numbers a segment
