@@ -6,13 +6,14 @@ candidates of R  --associate-->  matches, C_vld first  --locate-->  pose of the 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sceneprint.geometry.pose.average import PoseAverage, average_poses
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
+from sceneprint.geometry.validation.alignment import are_scans
 from sceneprint.geometry.validation.association import preferred, voters
 from sceneprint.geometry.validation.icp import place_covariance, transported
 from sceneprint.geometry.validation.sequence_alignment import Matching
@@ -80,7 +81,8 @@ def associate(
 
     Returns
     -------
-    matches : all that were tried: C_vld first, strong before weak, then by overlap (of scans
+    matches : all that were tried, of scans the first few once more for other axes where nothing
+        was accepted: C_vld first, strong before weak, then by overlap (of scans
         all around, the nearest first); then those that were not accepted
 
     Raises
@@ -111,9 +113,32 @@ def associate(
         accepted += validation.status == "accepted"
         if accepted == k:
             break
+    if not accepted and mode == "full":
+        _retry_tilted(query, tried, open_geometry, seed, p, go_on)
     first = preferred([match.validation for match in tried])
     rest = [i for i in range(len(tried)) if i not in first]
     return [tried[i] for i in [*first, *rest]]
+
+
+#: Candidates that are tried again for a scanner that did not stand upright.
+_TILTED_TRIES = 3
+
+
+def _retry_tilted(
+    query: Geometry, tried: list[PairMatch], open_geometry: Callable[[int], Geometry | None],
+    seed: int, p: ValidationParameters | None, go_on: Callable[[], bool],
+) -> None:  # fmt: skip
+    """Validate the first candidates as scans of a scanner on its side or upside down.
+
+    What is accepted now replaces what was tried before, in place.
+    """
+    for place, before in enumerate(tried[:_TILTED_TRIES]):
+        geometry = open_geometry(before.index)
+        if geometry is None or not are_scans(query, geometry) or not go_on():
+            return
+        validation = validate(query, geometry, seed, p, other_axes=True)
+        if validation.status == "accepted":
+            tried[place] = replace(before, validation=validation)
 
 
 def locate(

@@ -38,7 +38,7 @@ from sceneprint.signing import (
     patches_for_validation,
     see,
 )
-from sceneprint.types import AnyFrame, Bytes, Geometry, Surface
+from sceneprint.types import AnyFrame, Bytes, Floats, Geometry, Surface
 
 __all__ = [
     "Signature",
@@ -169,6 +169,9 @@ def validate(
     p: ValidationParameters | None = None,
     mode: Mode = "full",
     matching: Matching = "histograms",
+    *,
+    ups: tuple[Floats | None, Floats | None] = (None, None),
+    other_axes: bool = False,
 ) -> PairValidation:
     """Whether two frames see one place, and the transform between them: Sec. III-E.
 
@@ -179,6 +182,9 @@ def validate(
     p : default: those of the model that made them, `model.parameters.validation`
     mode : "full", or "paper" for the paper's test alone
     matching : "histograms", or "sequence" for correspondences as the paper finds them: slower
+    ups : (3,) unit vectors, up in the query's and in the match's coordinates where they are known;
+        of scans
+    other_axes : whether the scanners may have stood otherwise than upright; of scans
 
     Raises
     ------
@@ -186,7 +192,8 @@ def validate(
         and `p` was not given.
     """
     _same_model(query, match)
-    return validate_geometry(query, match, seed, p or _numbers_of(query), mode, matching)
+    p = p or _numbers_of(query)
+    return validate_geometry(query, match, seed, p, mode, matching, ups=ups, other_axes=other_axes)
 
 
 #: Of models that this process has used, by id: an artifact names its model, and holds no more.

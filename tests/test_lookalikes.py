@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from benchmarks.pairs import pairs_among
 from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.geometry.pose.rigid import difference, inverse
-from sceneprint.lab.synth import KINECT, Room, corridor, symmetric_box, take
+from sceneprint.lab.synth import KINECT, Room, corridor, symmetric_box, synthesise_survey, take
+from sceneprint.lab.synth.sensors import Spinning, scan
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
-from sceneprint.types import DepthFrame, Floats, Geometry
+from sceneprint.types import AnyFrame, Cloud, DepthFrame, Floats, Geometry
 
 #: A transform this near the truth is right: then the pair was told apart after all.
 RIGHT_M = 0.2
@@ -71,6 +74,21 @@ def corridor_pairs(n: int, seed: int) -> Iterator[tuple[DepthFrame, DepthFrame]]
         yield frames[0], frames[1]
 
 
+def scan_pairs(room: Room, pitch: float, n: int, seed: int) -> Iterator[tuple[Cloud, Cloud]]:
+    """A corridor or a hall of equal bays, scanned from two places one to three pitches apart."""
+    rng = np.random.default_rng((seed, 2))
+    length, width = room.outline.max(axis=0)
+    for _ in range(n):
+        x = rng.uniform(6, length - 6 - 3 * pitch)
+        scans = []
+        for shift in (0.0, float(rng.integers(1, 4)) * pitch):
+            T = np.eye(4)
+            T[:3, :3] = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix()
+            T[:3, 3] = x + shift, rng.uniform(0.7, width - 0.7), 1.4
+            scans.append(Cloud(scan(room.caster, T, Spinning(), rng), pose=T))
+        yield scans[0], scans[1]
+
+
 def other_rooms(
     sequences: list[list[FrameReference]], n: int, seed: int, model: Model
 ) -> Counter[str]:
@@ -100,7 +118,7 @@ def overlapping(
     return [found[i] for i in np.random.default_rng(seed).permutation(len(found))[:n]]
 
 
-def geometry(frame: DepthFrame, model: Model) -> Geometry:
+def geometry(frame: AnyFrame, model: Model) -> Geometry:
     """The geometry artifact of a frame."""
     return geometry_of(see(frame, model.parameters), model)
 
@@ -115,7 +133,7 @@ def outcome(query: Geometry, match: Geometry, truth: Floats | None, seed: int) -
 
 
 def outcomes_of(
-    pairs: Iterator[tuple[DepthFrame, DepthFrame]], n: int, name: str, model: Model
+    pairs: Iterator[tuple[AnyFrame, AnyFrame]], n: int, name: str, model: Model
 ) -> Counter[str]:
     """Outcomes of pairs with known poses."""
     counted: Counter[str] = Counter()
@@ -156,6 +174,49 @@ def test_the_doors_of_a_corridor_are_not_told_apart(model: Model) -> None:
     assert counted.total() == 24
     assert not_believed(counted) >= 0.95
     assert counted["ambiguous"] >= 12
+
+
+@pytest.fixture(scope="module")
+def scans_model() -> Model:
+    return read_model("lidar")
+
+
+@pytest.mark.parametrize("doors", [24, 60])
+def test_scans_of_a_corridor_of_equal_doors_are_not_believed(
+    doors: int, scans_model: Model
+) -> None:
+    room = corridor(doors, 2.5, 2.2, 2.6)
+    counted = outcomes_of(scan_pairs(room, 2.5, 12, 31), 12, "corridor", scans_model)
+    assert counted.total() == 12
+    assert not_believed(counted) == 1.0
+    assert counted["ambiguous"] >= 6  # and not for want of a transform
+
+
+def test_scans_of_a_hall_of_equal_bays_are_seldom_believed(scans_model: Model) -> None:
+    """Turned by 180 degrees an empty hall is the same: what tells is no more than its ends."""
+    room = corridor(10, 6.0, 14.0, 6.0)
+    counted = outcomes_of(scan_pairs(room, 6.0, 24, 31), 24, "bays", scans_model)
+    assert counted.total() == 24
+    assert not_believed(counted) >= 0.9  # measured: see docs/clouds.md
+    assert counted["accepted strong, right"] >= 4
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("seed", "most"), [(7200, 1), (7300, 1)])
+def test_scans_of_synthetic_storeys(seed: int, most: int, scans_model: Model) -> None:
+    """Corridors with rooms: of what is accepted at most one in fifty is wrong."""
+    counted: Counter[str] = Counter()
+    for index in range(8):
+        survey = synthesise_survey(seed, index, 14, kind="storey")
+        frames = [(cloud.pose, geometry(cloud, scans_model)) for cloud in survey.clouds]
+        for (T_a, a), (T_b, b) in combinations(frames, 2):
+            assert T_a is not None
+            assert T_b is not None
+            counted[outcome(a, b, inverse(T_b) @ T_a, 0)] += 1
+    wrong = sum(n for what, n in counted.items() if what.endswith("wrong"))
+    right = sum(n for what, n in counted.items() if what.endswith("right"))
+    assert right >= 60
+    assert wrong <= most
 
 
 def test_frames_that_overlap_by_half_are_accepted(

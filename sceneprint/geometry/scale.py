@@ -14,13 +14,14 @@ from sceneprint.geometry.signature.pair_features import PropertyParameters
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
+from sceneprint.geometry.validation.alignment import AlignmentParameters
 from sceneprint.geometry.validation.ambiguity import AmbiguityParameters
 from sceneprint.geometry.validation.consensus import ConsensusParameters
 from sceneprint.geometry.validation.icp import CovarianceParameters, RefinementParameters
 from sceneprint.geometry.validation.overlap import OverlapParameters, PlaneParameters
 from sceneprint.geometry.validation.patch_descriptors import PatchDescriptorParameters
+from sceneprint.geometry.validation.plan_search import PlanParameters
 from sceneprint.geometry.validation.sequence_alignment import SequenceParameters
-from sceneprint.geometry.validation.validation import AlignmentParameters
 
 T = TypeVar("T")
 
@@ -52,6 +53,7 @@ POWERS: dict[type, dict[str, int]] = {
     },
     CovarianceParameters: {"least_square": 2, "most": 1, "lever": 1},
     PlaneParameters: {"same_plane": 1},
+    PlanParameters: {"cell": 1, "voxel": 1, "height_step": 1, "height_range": 1},
     RefinementParameters: {
         "first_gate": 1,
         "last_gate": 1,

@@ -39,6 +39,7 @@ from sceneprint.geometry.signature.whitening import (
     psi_units,
     whiten,
 )
+from sceneprint.geometry.validation.acceptance import AcceptanceParameters
 from sceneprint.geometry.validation.patch_descriptors import fit_compression, patch_descriptors
 from sceneprint.lab.synth import synthesise_room, synthesise_survey
 from sceneprint.models import Model, ModelParameters
@@ -104,6 +105,22 @@ def preset_scenes(preset: str) -> tuple[Scenes, int]:
     return ("sites", 3) if preset == "lidar" else ("rooms", 6)
 
 
+#: Most violations by planes of a scan's transform, and of a rival to it: what is not believed to
+#: be refuted refutes nothing.
+_MOST_VIOLATIONS = 0.08
+#: Of scans planes and free space decide, as what two of them share may be small. A corridor looks
+#: like others: six distinct planes have to agree, and hardly any lie in another's free space.
+_SCAN_ACCEPTANCE = AcceptanceParameters(
+    residual_m=0.2,
+    residual_rad=math.radians(3.0),
+    violation_weight=0.0,
+    evidence=0.0,
+    plane_overlap=0.0,
+    strong=0.0,
+    net_strong=0.15,
+    planes=6.0,
+    plane_violations=_MOST_VIOLATIONS,
+)
 #: The world of a scanner beside that of a depth camera.
 _FACTOR = 5.0
 
@@ -134,17 +151,17 @@ def _lidar() -> ModelParameters:
     noise: dict[str, Any] = {"reference_depth": 10.0, "growth": 1, "weight_depth": 1e6}
     validation = replace(
         v,
-        acceptance=replace(v.acceptance, residual_m=0.2, residual_rad=math.radians(3.0)),
+        acceptance=_SCAN_ACCEPTANCE,
         alignment=replace(
             v.alignment,
             matching=replace(v.alignment.matching, n_sources=200),
             consensus=replace(v.alignment.consensus, n_seeds=80),
-            n_refined=12,
-            coarse=replace(v.alignment.coarse, first_gate=1.2, last_gate=0.3, **noise),
+            coarse=replace(v.alignment.coarse, first_gate=0.6, last_gate=0.2, **noise),
             fine=replace(v.alignment.fine, first_gate=0.3, last_gate=0.1, **noise),
         ),
         rivals=replace(
             v.rivals,
+            refuted=_MOST_VIOLATIONS,
             first=replace(v.rivals.first, **noise),
             then=replace(v.rivals.then, **noise),
         ),

@@ -14,10 +14,15 @@ from sceneprint.geometry.validation.acceptance import (
     belief,
     objection,
 )
-from sceneprint.geometry.validation.overlap import OverlapParameters, agreements
-from sceneprint.geometry.validation.validation import AlignmentParameters, _scores
-from sceneprint.types import Floats32, Intrinsics, Surface
+from sceneprint.geometry.validation.alignment import AlignmentParameters, FrameSamples, _scores
+from sceneprint.geometry.validation.overlap import OverlapParameters, PlaneView, agreements
+from sceneprint.lab.training import preset_parameters
+from sceneprint.types import Floats32, Geometry, Intrinsics, Patches, Surface
 
+NO_PATCHES = Patches(
+    np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int32), np.zeros(0)
+)
+NO_WEIGHTS = np.zeros(0, np.float32)
 P = AcceptanceParameters()
 GOOD = Evidence(0.01, 0.01, 0.6, 0.5, 0.01, 1e-3)
 
@@ -42,6 +47,11 @@ def test_what_is_good_meets_no_objection() -> None:
         ({"overlap": 0.19}, {"overlap": 0.26}, "rejected", "only 19% of the surfaces"),
         ({"violations": 0.09}, {"violations": 0.07}, "rejected", "9.0% lies where"),
         ({"plane_overlap": 0.14}, {"plane_overlap": 0.16}, "rejected", "mostly one plane (14%"),
+        # plane overlap less three times the violations
+        (
+            {"plane_overlap": 0.159, "violations": 0.02}, {"plane_overlap": 0.161},
+            "rejected", "16% agrees by planes, and 2.0% lies where",
+        ),
         ({"stiffness": 9e-6}, {"stiffness": 1.1e-5}, "ambiguous", "leaves a direction free"),
     ],
 )  # fmt: skip
@@ -56,6 +66,53 @@ def test_each_objection_has_its_threshold(
     # the paper asks for the residual alone
     alone = objection(replace(GOOD, **worse), P, "paper")
     assert (alone is not None) == ("disagree" in found[1])
+
+
+@pytest.mark.parametrize(
+    ("worse", "just", "status", "reason"),
+    [
+        (
+            {"worst_violations": 0.051}, {"worst_violations": 0.049},
+            "rejected", "5.1% lies where the other frame saw through",
+        ),
+        (
+            {"plane_violations": 0.081}, {"plane_violations": 0.079},
+            "rejected", "8.1% lies where the other frame saw through",
+        ),
+        ({"planes": 5.4}, {"planes": 6.1}, "ambiguous", "only 5 distinct planes agree"),
+    ],
+)  # fmt: skip
+def test_scans_are_held_to_more(
+    worse: dict[str, float], just: dict[str, float], status: str, reason: str
+) -> None:
+    scans = preset_parameters("lidar")[0].validation.acceptance
+    found = objection(replace(GOOD, **worse), scans, "full")
+    assert found is not None
+    assert found[0] == status
+    assert reason in found[1]
+    assert objection(replace(GOOD, **just), scans, "full") is None
+    # of depth images the last two decide nothing
+    assert (objection(replace(GOOD, **worse), P, "full") is None) == (
+        "worst_violations" not in worse
+    )
+
+
+def test_scans_may_share_little_but_not_against_free_space() -> None:
+    scans = preset_parameters("lidar")[0].validation.acceptance
+    little = replace(GOOD, overlap=0.06, plane_overlap=0.16, violations=0.0)
+    assert objection(little, scans, "full") is None
+    assert belief(little, 0.0, scans)[:2] == ("accepted", "strong")
+    assert belief(replace(little, plane_overlap=0.14), 0.0, scans)[:2] == ("accepted", "weak")
+    found = objection(replace(little, violations=0.025), scans, "full")
+    assert found == (
+        "rejected", "16% agrees by planes, and 2.5% lies where the other frame saw through"
+    )  # fmt: skip
+
+
+def test_one_direction_alone_is_not_believed() -> None:
+    alone = replace(GOOD, residual_m=math.inf, residual_rad=math.inf)
+    found = objection(alone, P, "full")
+    assert found == ("rejected", "only one of the two directions found a transform")
 
 
 def test_a_large_residual_is_told_as_people_write_it() -> None:
@@ -94,6 +151,10 @@ def wall(z: float) -> Surface:
     return Surface(points.astype(np.float32), normals, one > 0, one, k)
 
 
+def _frame(surface: Surface) -> Geometry:
+    return Geometry(surface, NO_PATCHES, np.zeros((0, 8), np.uint8), "")
+
+
 def test_a_violation_costs_three_inliers() -> None:
     p, seen = OverlapParameters(), wall(2.0)
     on, before = np.zeros((5, 6), np.float32), np.zeros((2, 6), np.float32)
@@ -101,5 +162,13 @@ def test_a_violation_costs_three_inliers() -> None:
     source: Floats32 = np.concatenate([on, before])
     source[:, 5] = -1.0
     assert agreements(source, seen, np.eye(4)[None], p).tolist() == [[5.0, 2.0]]
-    scores = _scores(source, seen, np.eye(4)[None], AlignmentParameters(), p)
-    assert scores.tolist() == [5.0 - 3 * 2.0]
+    # a share of all points; and the wall's own, of which every one is on it
+    wall_points = np.zeros((4, 6), np.float32)
+    wall_points[:, 2], wall_points[:, 5] = 2.0, -1.0
+    frames = [
+        FrameSamples(_frame(surface), points, PlaneView(surface, NO_PATCHES, points, NO_WEIGHTS))
+        for surface, points in ((seen, source), (seen, wall_points))
+    ]
+    every = AlignmentParameters(score_stride=1)
+    scores = _scores(frames[0], frames[1], np.eye(4)[None], every, p)
+    assert scores == pytest.approx([(5 - 3 * 2) / 7 + 4 / 4])

@@ -31,7 +31,8 @@ BARE = {
     "AcceptanceParameters": {
         "residual_rad", "violation_weight", "evidence", "plane_overlap", "strong", "weak",
         "ambiguous", "ambiguous_share", "stiffness", "blind_ambiguous_share",
-        "blind_evidence", "blind_plane_overlap",
+        "blind_evidence", "blind_plane_overlap", "net_weight", "net", "net_strong", "planes",
+        "plane_violations", "worst_violations",
     },
     "AmbiguityParameters": {
         "same_direction", "least_crossing", "hopeful_share", "hopeful_violations", "refuted",
@@ -39,7 +40,8 @@ BARE = {
     },
     "PlaneParameters": {"coplanar"},
     "RefinementParameters": {"normal_cosine"},
-    "AlignmentParameters": {"violation_weight", "same_rad"},
+    "AlignmentParameters": {"violation_weight", "rank_violations", "same_rad"},
+    "PlanParameters": {"tilt", "blur", "flat_weight"},
     "ConsensusParameters": {"angle_tolerance", "inlier_cosine"},
     "SequenceParameters": {"angle_scale", "gap_cost", "swap_cost"},
     "OverlapParameters": {"normal_cosine"},

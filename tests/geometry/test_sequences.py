@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.pose.rigid import difference, inverse, moved
+from sceneprint.geometry.validation.alignment import AlignmentParameters
 from sceneprint.geometry.validation.sequence_alignment import (
     SequenceParameters,
     _cyclic,
@@ -17,11 +18,7 @@ from sceneprint.geometry.validation.sequence_alignment import (
     neighbour_sequences,
     sequence_correspondences,
 )
-from sceneprint.geometry.validation.validation import (
-    AlignmentParameters,
-    ValidationParameters,
-    validate,
-)
+from sceneprint.geometry.validation.validation import ValidationParameters, validate
 from sceneprint.lab.synth import KINECT, take, trajectory
 from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.models import read_model

@@ -17,11 +17,11 @@ from sceneprint.errors import ModelMismatch
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.pose.rigid import difference, inverse
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
-from sceneprint.geometry.validation.overlap import overlap_counts, sampled
+from sceneprint.geometry.validation.alignment import align, samples_of
+from sceneprint.geometry.validation.overlap import explained, overlap_counts, sampled
 from sceneprint.geometry.validation.validation import (
     PairValidation,
     ValidationParameters,
-    align,
     middle,
     refined_at,
     validate,
@@ -155,8 +155,9 @@ def test_a_frame_lies_on_itself(rooms: list[Views]) -> None:
 def test_the_same_seed_gives_the_same_answer(
     pairs: list[tuple[Geometry, Geometry, Floats]],
 ) -> None:
-    alone = [content(validate(q, m, seed)) for q, m, _ in pairs[:3] for seed in (0, 5)]
-    assert [answer[-3] for answer in alone] == [0, 5] * 3  # the seed is echoed
+    answers = [validate(q, m, seed) for q, m, _ in pairs[:3] for seed in (0, 5)]
+    assert [answer.seed for answer in answers] == [0, 5] * 3  # the seed is echoed
+    alone = [content(answer) for answer in answers]
     with ThreadPoolExecutor(4) as pool:
         jobs = [pool.submit(validate, q, m, seed) for q, m, _ in pairs[:3] for seed in (0, 5)]
         assert [content(job.result()) for job in jobs] == alone
@@ -355,32 +356,29 @@ def test_where_the_directions_disagree_the_better_one_is_told(rooms: list[Views]
     p, apart, met = ValidationParameters(), 0, 0
     couples = [(rooms[0][i][1], rooms[room][j][1]) for room in (0, 1) for i, j in ((0, 1), (3, 0))]
     for query, match in couples:
-        there, back = (
-            align(a, b, np.random.default_rng((0, i)), p.alignment, p.agreement)
-            for i, (a, b) in enumerate(((query, match), (match, query)))
-        )
+        a, b = (samples_of(one, p.agreement.stride, p.rivals.planes) for one in (query, match))
+        there = align(a, b, np.random.default_rng((0, 0)), p.alignment, p.agreement)
+        back = align(b, a, np.random.default_rng((0, 1)), p.alignment, p.agreement)
         assert there is not None
         assert back is not None
         found = validate(query, match)
-        told = [there.T, inverse(back.T)]
+        told = np.stack([there.T, inverse(back.T)])
         assert found.T_match_query is not None
-        same = [np.array_equal(T, found.T_match_query) for T in told]
         if found.residual_m < 0.08 and found.residual_rad < math.radians(5):
             met += 1
             np.testing.assert_array_equal(middle(*told), found.T_match_query)
+            assert found.directions == ("query_to_match", "match_to_query")
+            assert found.T_other is None
             continue
         apart += 1
-        assert sum(same) == 1
-        totals = []
-        for T in told:
-            of_query = overlap_counts(there.points, match.surface, T, p.agreement)
-            of_match = overlap_counts(back.points, query.surface, inverse(T), p.agreement)
-            inliers = of_query.inliers + of_match.inliers
-            violations = (of_query.violations or 0) + (of_match.violations or 0)
-            overlap = inliers / (of_query.points + of_match.points)
-            totals.append(overlap - 5 * violations / (inliers + violations))
-        assert same[int(np.argmax(totals))]
-        assert found.overlap - 5 * (found.violations or 0) == pytest.approx(max(totals))
+        seen = explained(a.planes, b.planes, told, p.agreement)
+        best = int(np.argmax(seen.share - seen.violations))
+        np.testing.assert_array_equal(found.T_match_query, told[best])
+        # the other one is not lost
+        np.testing.assert_array_equal(found.T_other, told[1 - best])
+        assert found.directions == (("query_to_match", "match_to_query")[best],)
+        assert found.plane_overlap == seen.share[best]
+        assert found.plane_violations == seen.violations[best]
         assert found.status == "rejected"
     assert apart >= 1
     assert met >= 1

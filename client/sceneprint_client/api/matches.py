@@ -41,10 +41,25 @@ class Validation(ApiRecord):
         description="Share that lies where the other frame saw through; null where neither frame "
         "has a viewpoint, so that nothing is known of free space.",
     )
+    planes: float | None = Field(
+        default=None, description="Distinct planes that agree, the mean of both frames."
+    )
+    plane_violations: float | None = Field(
+        default=None, description="`free_space_violations` with every plane counting alike."
+    )
     inliers: int | None = Field(default=None, description="Points of both frames that agree.")
     ambiguity: float | None = Field(
         default=None,
         description="Share that the best rival explains.",
+    )
+    search: Literal["correspondences", "plans"] | None = Field(
+        default=None,
+        description="What proposed the transform: patches with alike surroundings, or the plans of "
+        "two scans laid on each other.",
+    )
+    directions: list[Literal["query_to_match", "match_to_query"]] = Field(
+        default=[],
+        description="In which directions the search found it; of an accepted match, both.",
     )
 
 

@@ -193,6 +193,10 @@ def validation_record(v: PairValidation) -> ToldValidation:
         overlap=v.overlap,
         plane_overlap=v.plane_overlap,
         free_space_violations=v.violations,
+        planes=v.planes,
+        plane_violations=None if v.violations is None else v.plane_violations,
         inliers=v.inliers,
         ambiguity=v.ambiguity,
+        search=v.search if v.directions else None,
+        directions=list(v.directions),
     )

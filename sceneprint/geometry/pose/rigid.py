@@ -54,6 +54,31 @@ def difference(a: Floats, b: Floats) -> tuple[float, float]:
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), rotation_angle(a[:3, :3] @ b[:3, :3].T)
 
 
+def distinct(
+    transforms: Floats, scores: Floats, metres: float, radians: float, most: int
+) -> list[int]:
+    """Indices of the best few transforms (n, 4, 4) that differ from each other, best first.
+
+    Parameters
+    ----------
+    transforms, scores : one for one, greater is better
+    metres, radians : two that are nearer than both are one
+    most : of them
+    """
+    chosen: list[int] = []
+    order = np.argsort(-scores, kind="stable")
+    left = np.ones(len(order), bool)
+    while left.any() and len(chosen) < most:
+        best = int(order[np.argmax(left[order])])
+        chosen.append(best)
+        T = transforms[best]
+        apart = np.linalg.norm(transforms[:, :3, 3] - T[:3, 3], axis=1)
+        cosines = (np.einsum("nij,ij->n", transforms[:, :3, :3], T[:3, :3]) - 1) / 2
+        left &= (apart > metres) | (cosines < math.cos(radians))
+        left[best] = False
+    return chosen
+
+
 def nearest_rotation(M: Floats) -> Floats:
     """The rotation (3, 3) nearest to a matrix, in the least-squares sense."""
     u, _, vt = np.linalg.svd(M)

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.pose.rigid import distinct
 from sceneprint.geometry.validation.icp import COARSE, QUICK, RefinementParameters, refined_all
 from sceneprint.geometry.validation.overlap import (
     OverlapParameters,
@@ -40,12 +41,13 @@ class AmbiguityParameters:
     shift: float = 0.5  #: steps along a corridor, metres: what refinement can bridge
     n_shifts: int = 6  #: each way
     least_crossing: float = 0.5  #: sine of the angle between the main families of planes
+    n_proposed: int = 16  #: hypotheses of the plans that are refined as rivals
     planes: PlaneParameters = field(default_factory=PlaneParameters)
     first: RefinementParameters = QUICK  #: of all
     hopeful_share: float = 0.04  #: after it, those that explain less are dropped
     hopeful_violations: float = 0.15  #: and those that violate more
     then: RefinementParameters = COARSE  #: of the rest
-    refuted: float = 0.02  #: violations from which on a rival is none
+    refuted: float = 0.02  #: violations from which on a rival is none, if the transform has fewer
     rival_m: float = 0.25  #: a rival differs by this, metres
     rival_rad: float = math.radians(15.0)  #: or by this
 
@@ -155,8 +157,8 @@ def far_from(T: Floats, others: Floats, p: AmbiguityParameters) -> Floats:
 
 
 def best_alternative(
-    query: PlaneView, match: PlaneView, T: Floats, voted: Floats, p: AmbiguityParameters,
-    agreement_p: OverlapParameters,
+    query: PlaneView, match: PlaneView, T: Floats, violations: float, voted: Floats,
+    proposed: Floats, p: AmbiguityParameters, agreement_p: OverlapParameters,
 ) -> tuple[float, Floats | None]:  # fmt: skip
     """How far the best rival of T explains the frames, 0 to 1, and that rival: Sec. III-E.
 
@@ -164,17 +166,25 @@ def best_alternative(
     ----------
     query, match : of `plane_view`
     T : (4, 4) T_match_query
+    violations : of T, with every plane counting the same: free space refutes no rival for what it
+        holds against T as well
     voted : (n, 4, 4) other hypotheses, refined
+    proposed : (m, 4, 4) hypotheses that were not, best first: of those that differ from T and
+        from each other as rivals do, the best are refined now
     p, agreement_p : see there
     """
     moved = np.concatenate([symmetries(match.patches, p) @ T, T @ symmetries(query.patches, p)])
     near = far_from(T, refined_all(query.surface, match.surface, moved, p.first), p)
     seen = explained(query, match, near, agreement_p)
     hopeful = near[(seen.share > p.hopeful_share) & (seen.violations < p.hopeful_violations)]
+    proposed = far_from(T, proposed, p)
+    order = -np.arange(len(proposed), dtype=float)
+    chosen = distinct(proposed, order, p.rival_m, p.rival_rad, p.n_proposed)
+    hopeful = np.concatenate([hopeful, proposed[chosen]])
     rivals = np.concatenate([voted, refined_all(query.surface, match.surface, hopeful, p.then)])
     rivals = far_from(T, rivals, p)
     seen = explained(query, match, rivals, agreement_p)
-    share = np.where(seen.violations < p.refuted, seen.share, 0.0)
+    share = np.where(seen.violations < max(p.refuted, violations), seen.share, 0.0)
     if not (share > 0).any():
         return 0.0, None
     best = int(np.argmax(share))

@@ -281,17 +281,25 @@ def refined_all(
     source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
 ) -> Floats:
     """Each of the hypotheses (n, 4, 4) refined; those that lose the surface are left out."""
+    return refined_with_index(source, target, hypotheses, p)[0]
+
+
+def refined_with_index(
+    source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
+) -> tuple[Floats, list[int]]:
+    """`refined_all`, and of which of the hypotheses each is."""
     points, t = sampled(source, p.stride), compared(target, p)
     numbers, information = numbers_of(p, kind_of(source.camera)), np.zeros((6, 6))
-    kept = []
-    for hypothesis in hypotheses:
+    kept, index = [], []
+    for k, hypothesis in enumerate(hypotheses):
         T = hypothesis.copy()
         used, _ = refine_in_place(
             points, t.points, t.normals, t.camera, t.heads, t.chain, T, numbers, information
         )
         if used:
             kept.append(T)
-    return np.array(kept).reshape(-1, 4, 4)
+            index.append(k)
+    return np.array(kept).reshape(-1, 4, 4), index
 
 
 # How sure a transform is: what the last refinement knows, scaled to the errors that are made.

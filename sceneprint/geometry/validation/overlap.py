@@ -194,6 +194,12 @@ class Overlap:
     inliers: int  #: that lie on the target's surface, normals alike
     violations: int | None  #: that lie where the target saw through; None if it has no viewpoint
 
+    @property
+    def violation_share(self) -> float:
+        """Violations as a share of violations and inliers."""
+        violations = self.violations or 0
+        return violations / max(self.inliers + violations, 1)
+
 
 def sampled(surface: Surface, stride: int) -> Floats32:
     """Valid pixels of every `stride`-th row and column; of a cloud, about as many points.

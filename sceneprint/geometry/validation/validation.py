@@ -11,12 +11,13 @@ of both surfaces agrees, and next to nothing lies where the other frame saw thro
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from sceneprint.geometry.pose.rigid import (
-    difference,
     inverse,
     inverses,
     nearest_rotation,
@@ -32,148 +33,39 @@ from sceneprint.geometry.validation.acceptance import (
     belief,
     objection,
 )
+from sceneprint.geometry.validation.alignment import (
+    Alignment,
+    AlignmentParameters,
+    FrameSamples,
+    Search,
+    align,
+    align_scans,
+    are_scans,
+    samples_of,
+)
 from sceneprint.geometry.validation.ambiguity import AmbiguityParameters, best_alternative
-from sceneprint.geometry.validation.consensus import ConsensusParameters, consensus
 from sceneprint.geometry.validation.icp import (
-    COARSE,
     FINE,
     CovarianceParameters,
-    Refined,
     RefinementParameters,
     pair_covariance,
     refine,
-    refined_all,
 )
 from sceneprint.geometry.validation.overlap import (
+    Explained,
     OverlapParameters,
-    agreements,
     explained,
     overlap_counts,
-    plane_view,
     sampled,
 )
-from sceneprint.geometry.validation.patch_descriptors import MatchingParameters, correspondences
-from sceneprint.geometry.validation.sequence_alignment import (
-    Matching,
-    SequenceParameters,
-    sequence_correspondences,
-)
-from sceneprint.types import Floats, Floats32, Geometry, Sphere, Surface
+from sceneprint.geometry.validation.sequence_alignment import Matching
+from sceneprint.types import Floats, Geometry, Sphere
 
-# Sec. III-E, one direction: two frames to the transform that explains them best, and to others.
-#
-# Geometry, Geometry  --align-->  Alignment
-
-
-@dataclass(frozen=True)
-class AlignmentParameters:
-    """The numbers of the search for a transform."""
-
-    matching: MatchingParameters = field(default_factory=MatchingParameters)
-    consensus: ConsensusParameters = field(default_factory=ConsensusParameters)
-    n_refined: int = 8  #: hypotheses that are refined
-    violation_weight: float = 3.0  #: of a violation beside an inlier, in the score
-    same_m: float = 0.1  #: hypotheses this near are one
-    same_rad: float = math.radians(6.0)
-    coarse: RefinementParameters = COARSE
-    fine: RefinementParameters = FINE
-    lever: float = 1.0  #: in `stiffness` a radian counts as much as this many metres
-    sequence: SequenceParameters = field(default_factory=SequenceParameters)
-
-
-@dataclass(frozen=True, eq=False)
-class Alignment:
-    """One direction's outcome.
-
-    Parameters
-    ----------
-    T : (4, 4) T_target_source
-    others : (n, 4, 4) the other hypotheses that were refined, best first
-    stiffness : least over largest eigenvalue of the information, 0 where a direction is free
-    points : (N, 6) of the source that evidence is counted on
-    refined : the last refinement, with its information; None where it was lost
-    """
-
-    T: Floats
-    others: Floats
-    stiffness: float
-    points: Floats32
-    refined: Refined | None
-
-
-def align(
-    source: Geometry,
-    target: Geometry,
-    rng: np.random.Generator,
-    p: AlignmentParameters,
-    agreement_p: OverlapParameters,
-    matching: Matching = "histograms",
-) -> Alignment | None:
-    """The transform from source to target: Sec. III-E, in one direction.
-
-    Correspondences vote for some forty hypotheses; these are scored by how the source's points fit
-    the target's surface, the best distinct ones refined and scored again, and the best refined to
-    the end.
-
-    Parameters
-    ----------
-    source, target : geometry artifacts
-    rng : of the patches drawn
-    p, agreement_p : see there
-    matching : what correspondences are found by
-
-    Returns
-    -------
-    alignment : or None where no three correspondences agree, or no hypothesis survives refinement
-    """
-    if matching == "sequence":
-        pairs = sequence_correspondences(source.patches, target.patches, rng, p.sequence)
-    else:
-        pairs = correspondences(source.descriptors, target.descriptors, rng, p.matching)
-    hypotheses = consensus(source.patches, target.patches, pairs, p.consensus)
-    points = sampled(source.surface, agreement_p.stride)
-    if not len(hypotheses):
-        return None
-    scores = _scores(points, target.surface, hypotheses, p, agreement_p)
-    chosen = _distinct(hypotheses, scores, p)
-    refined = refined_all(source.surface, target.surface, hypotheses[chosen], p.coarse)
-    if not len(refined):
-        return None
-    scores = _scores(points, target.surface, refined, p, agreement_p)
-    order = np.argsort(-scores, kind="stable")
-    best, others = refined[order[0]], refined[order[1:]]
-    finely = sampled(source.surface, p.fine.stride)
-    fine = refine(finely, target.surface, best, p.fine, kind_of(source.surface.camera))
-    if fine is None:
-        return Alignment(best, others, 0.0, points, None)
-    scale = np.array([p.lever] * 3 + [1.0] * 3)
-    eigenvalues = np.linalg.eigvalsh(fine.information / np.outer(scale, scale))
-    stiffness = max(float(eigenvalues[0] / eigenvalues[-1]), 0.0)
-    return Alignment(fine.T, others, stiffness, points, fine)
-
-
-def _scores(
-    points: Floats32, target: Surface, transforms: Floats,
-    p: AlignmentParameters, agreement_p: OverlapParameters,
-) -> Floats:  # fmt: skip
-    counts = agreements(points, target, transforms, agreement_p)
-    scores: Floats = counts[:, 0] - p.violation_weight * counts[:, 1]
-    return scores
-
-
-def _distinct(hypotheses: Floats, scores: Floats, p: AlignmentParameters) -> list[int]:
-    """The best few that differ from each other."""
-    chosen: list[int] = []
-    for k in np.argsort(-scores, kind="stable"):
-        far = True
-        for c in chosen:
-            metres, radians = difference(hypotheses[k], hypotheses[c])
-            far = far and (metres > p.same_m or radians > p.same_rad)
-        if far:
-            chosen.append(int(k))
-        if len(chosen) == p.n_refined:
-            break
-    return chosen
+#: From which frame to which a transform was searched for.
+Direction = Literal["query_to_match", "match_to_query"]
+THERE: Direction = "query_to_match"
+BACK: Direction = "match_to_query"
+_NONE = np.empty((0, 4, 4))
 
 
 @dataclass(frozen=True)
@@ -217,6 +109,11 @@ class PairValidation:
     seed : of the random choices
     covariance : (6, 6) of T_match_query where it is accepted, else None; see `covariance.py`
     around : whether both frames see all around their sensors, as spinning scanners do
+    planes : how many distinct planes agree, the mean of both frames
+    plane_violations : `violations` with every plane counting the same
+    search : what proposed the transform: correspondences of patches, or the plans of two scans
+    directions : of the search, in which the transform was found: of an accepted one, both
+    T_other : (4, 4) where the two directions disagree, what the other one found; else None
     """
 
     status: Status
@@ -234,6 +131,11 @@ class PairValidation:
     seed: int
     covariance: Floats | None = None
     around: bool = False
+    planes: float = 0.0
+    plane_violations: float = 0.0
+    search: Search = "correspondences"
+    directions: tuple[Direction, ...] = ()
+    T_other: Floats | None = None
 
 
 def middle(a: Floats, b: Floats) -> Floats:
@@ -272,6 +174,9 @@ def validate(
     p: ValidationParameters | None = None,
     mode: Mode = "full",
     matching: Matching = "histograms",
+    *,
+    ups: tuple[Floats | None, Floats | None] = (None, None),
+    other_axes: bool = False,
 ) -> PairValidation:
     """Align a query with a candidate both ways, and decide: Sec. III-E.
 
@@ -282,6 +187,10 @@ def validate(
     p : see ValidationParameters
     mode : "full", or "paper": accept where the residual of the two directions is small, on no
         other evidence
+    matching : what correspondences are found by
+    ups : (3,) unit vectors, up in the query's and in the match's coordinates, where they are
+        known; of scans
+    other_axes : whether scanners may have stood otherwise than upright; of scans without `ups`
 
     Raises
     ------
@@ -300,13 +209,24 @@ def validate(
             "apart",
             seed, query, match,
         )  # fmt: skip
+    a, b = (
+        samples_of(one, p.agreement.stride, p.rivals.planes, up)
+        for one, up in zip((query, match), ups, strict=True)
+    )
     numbers = p.alignment, p.agreement, matching
-    there = align(query, match, np.random.default_rng((seed, 0)), *numbers)
-    back = align(match, query, np.random.default_rng((seed, 1)), *numbers)
-    if there is None or back is None:
+    there: Alignment | None
+    back: Alignment | None
+    if are_scans(query, match):
+        rng = np.random.default_rng((seed, 0))
+        found = align_scans(a, b, rng, *numbers, other_axes=other_axes)
+        there, back = found or (None, None)
+    else:
+        there = align(a, b, np.random.default_rng((seed, 0)), *numbers)
+        back = align(b, a, np.random.default_rng((seed, 1)), *numbers)
+    if there is None and back is None:
         why = "no correspondences agree on a transform that the surfaces bear out"
         return _nothing(why, seed, query, match)
-    return _decided(query, match, there, back, seed, p, mode)
+    return _decided(a, b, there, back, seed, p, mode)
 
 
 def _nothing(reason: str, seed: int, query: Geometry, match: Geometry) -> PairValidation:
@@ -318,22 +238,18 @@ def _nothing(reason: str, seed: int, query: Geometry, match: Geometry) -> PairVa
 
 
 def _decided(
-    query: Geometry, match: Geometry, there: Alignment, back: Alignment, seed: int,
-    p: ValidationParameters, mode: Mode,
+    query: FrameSamples, match: FrameSamples, there: Alignment | None, back: Alignment | None,
+    seed: int, p: ValidationParameters, mode: Mode,
 ) -> PairValidation:  # fmt: skip
-    composed = there.T @ back.T  # reading R5: the residual transform T_Q^X T_X^Q itself
-    residual = float(np.linalg.norm(composed[:3, 3])), rotation_angle(composed[:3, :3])
-    limits = p.acceptance.residual_m, p.acceptance.residual_rad
-    found = [middle(there.T, inverse(back.T))]
-    if residual[0] > limits[0] or residual[1] > limits[1]:
-        found = [there.T, inverse(back.T)]  # halfway between two places is neither of them
-    views = plane_view(query, p.rivals.planes), plane_view(match, p.rivals.planes)
-    shares = explained(*views, np.stack(found), p.agreement).share
-    told = [
-        (*_evidence(query, match, there, back, T, residual, float(share), p), T)
-        for T, share in zip(found, shares, strict=True)
-    ]
-    e, inliers, T = max(told, key=lambda one: one[0].total(p.acceptance))
+    residual, found = _estimates(there, back, p.acceptance)
+    both = [one for one in (there, back) if one is not None]
+    views = query.planes, match.planes
+    transforms = list(found.values())
+    seen = explained(*views, np.stack(transforms), p.agreement)
+    best = int(np.argmax(seen.share - p.alignment.rank_violations * seen.violations))
+    (directions, T), *others = sorted(found.items(), key=lambda one: one[1] is not transforms[best])
+    e, inliers = _evidence(query, match, both, T, residual, seen, best, p)
+    T_other = others[0][1] if others else None
     ambiguity, T_rival = 0.0, None
     strength: Strength | None = None
     against = objection(e, p.acceptance, mode)
@@ -343,17 +259,50 @@ def _decided(
         strength = "weak" if e.violations is None or e.one_sided else "strong"
         status, reason = "accepted", "the two directions agree"
     else:
-        voted = np.concatenate([there.others, inverses(back.others)])
-        ambiguity, T_rival = best_alternative(*views, T, voted, p.rivals, p.agreement)
+        voted = np.concatenate(
+            [there.others if there else _NONE, inverses(back.others) if back else _NONE]
+        )
+        ambiguity, T_rival = best_alternative(
+            *views,
+            T,
+            e.plane_violations,
+            voted,
+            there.proposed if there else _NONE,
+            p.rivals,
+            p.agreement,
+        )
         status, strength, reason = belief(e, ambiguity, p.acceptance)
     covariance = None
-    if status == "accepted":
+    if status == "accepted" and there is not None and back is not None:
         covariance = pair_covariance(there.refined, back.refined, T, p.covariance)
     return PairValidation(
         status, strength, reason, T, e.residual_m, e.residual_rad, e.overlap, e.plane_overlap,
         e.violations, inliers, ambiguity, T_rival, seed, covariance,
-        _sees_around(query) and _sees_around(match),
+        _sees_around(query.geometry) and _sees_around(match.geometry),
+        e.planes, e.plane_violations, both[0].search, directions, T_other,
     )  # fmt: skip
+
+
+def _estimates(
+    there: Alignment | None, back: Alignment | None, p: AcceptanceParameters
+) -> tuple[tuple[float, float], dict[tuple[Direction, ...], Floats]]:
+    """The residual of the two directions, metres and radians, and T_match_query by who found it.
+
+    It is the one halfway between them where they agree; halfway between two places is neither.
+    """
+    if there is not None and back is not None:
+        composed = there.T @ back.T  # reading R5: the residual transform T_Q^X T_X^Q itself
+        metres = float(np.linalg.norm(composed[:3, 3]))
+        radians = rotation_angle(composed[:3, :3])
+        if metres <= p.residual_m and radians <= p.residual_rad:
+            return (metres, radians), {(THERE, BACK): middle(there.T, inverse(back.T))}
+        return (metres, radians), {(THERE,): there.T, (BACK,): inverse(back.T)}
+    found: dict[tuple[Direction, ...], Floats] = {}
+    if there is not None:
+        found[(THERE,)] = there.T
+    if back is not None:
+        found[(BACK,)] = inverse(back.T)
+    return (math.inf, math.inf), found
 
 
 def _sees_around(frame: Geometry) -> bool:
@@ -362,22 +311,28 @@ def _sees_around(frame: Geometry) -> bool:
 
 
 def _evidence(
-    query: Geometry, match: Geometry, there: Alignment, back: Alignment, T: Floats,
-    residual: tuple[float, float], plane_overlap: float, p: ValidationParameters,
+    query: FrameSamples, match: FrameSamples, both: Sequence[Alignment], T: Floats,
+    residual: tuple[float, float], by_planes: Explained, k: int, p: ValidationParameters,
 ) -> tuple[Evidence, int]:  # fmt: skip
-    """What speaks for a transform and against it, and how many points agree under it."""
-    of_query = overlap_counts(there.points, match.surface, T, p.agreement)
-    of_match = overlap_counts(back.points, query.surface, inverse(T), p.agreement)
+    """What speaks for a transform, number k of those explained, and against it; how many points
+    agree under it.
+    """
+    of_query = overlap_counts(query.points, match.geometry.surface, T, p.agreement)
+    of_match = overlap_counts(match.points, query.geometry.surface, inverse(T), p.agreement)
     inliers = of_query.inliers + of_match.inliers
     seen = [one for one in (of_query, of_match) if one.violations is not None]
     violated = sum(one.violations or 0 for one in seen)
     agreeing = sum(one.inliers for one in seen)
+    weights = sum(float(one.planes.weights.sum(dtype=float)) for one in (query, match))
     e = Evidence(
         *residual,
         overlap=inliers / max(of_query.points + of_match.points, 1),
-        plane_overlap=plane_overlap,
+        plane_overlap=float(by_planes.share[k]),
         violations=violated / max(agreeing + violated, 1) if seen else None,
-        stiffness=min(there.stiffness, back.stiffness),
+        stiffness=min(one.stiffness for one in both),
         one_sided=len(seen) == 1,
+        planes=float(by_planes.share[k]) * weights / 2,
+        plane_violations=float(by_planes.violations[k]),
+        worst_violations=max((one.violation_share for one in seen), default=0.0),
     )
     return e, inliers

@@ -483,19 +483,21 @@ def symmetric_box(side: float = 0.6, hall: float = 12.0) -> Room:
     return Room(join([shell(outline, walls_of(outline), top), box(side, side, side)]), outline, top)
 
 
-def corridor(doors: int, pitch: float = 2.0) -> Room:
+def corridor(doors: int, pitch: float = 2.0, width: float = 1.8, height: float = 2.5) -> Room:
     """A corridor along +x with identical doors in both long walls, one every `pitch` metres.
 
-    A view shifted by a pitch sees the same doors; only the ends tell where it is.
+    A view shifted by a pitch sees the same doors; only the ends tell where it is. Wide and high it
+    is a hall of equal bays.
 
     Parameters
     ----------
     doors : doors in each wall, at least 1
     pitch : distance from door to door, metres
+    width, height : metres
     """
     if doors < 1:
         raise ValueError(f"A corridor of {doors} doors cannot be built; ask for 1 or more.")
-    length, width, top = doors * pitch, 1.8, Ceiling(2.5, np.zeros(2))
+    length, top = doors * pitch, Ceiling(height, np.zeros(2))
     outline: Floats = np.array([(0, 0), (length, 0), (length, width), (0, width)], float)
     walls = [
         _with_doors(w, doors, pitch) if k % 2 == 0 else w for k, w in enumerate(walls_of(outline))

@@ -39,9 +39,11 @@ export function evidenceCard(details) {
     ["Inliers", sampled ? `${count(v.inliers)} of ${count(sampled)}` : count(v.inliers), "points on the surface of the other frame"],
     ["Violations", v.free_space_violations === null ? "–" : percent(v.free_space_violations),
       v.free_space_violations === null ? "free space is unknown without a viewpoint" : "of these and the inliers: the other sensor saw through them"],
-    ["Residual", residual, "query to match and back, estimated independently"],
+    ["Residual", residual, "query to match and back, each refined alone"],
     v.ambiguity === 0 && v.status !== "accepted" ? ["Ambiguity", "–", "rivals are searched only if everything else agrees"]
       : ["Ambiguity", percent(v.ambiguity), "of both frames is explained by the best rival"],
+    ["Found by", { plans: "plans", correspondences: "patches" }[v.search] ?? "–",
+      v.directions?.length === 1 ? "in one direction only" : "in both directions"],
     ["Patches", details.patches ? count(details.patches.query.length) : "–", "pairs coincide"],
   ];
   if (!details.transform) return card("Evidence", h("p", { class: "muted" }, "There is no evidence without a transform."));

@@ -1,0 +1,144 @@
+"""Plans of scans: which way is up, how high, and where one lies on the other."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sceneprint.geometry.pose.rigid import difference, distinct, inverse, moved
+from sceneprint.geometry.validation.plan_search import (
+    PlanParameters,
+    _lifts,
+    other_plans,
+    plan_hypotheses,
+    plan_of,
+    up_of,
+)
+from sceneprint.types import Floats, Sphere, Surface
+
+P = PlanParameters(cell=0.5, voxel=0.2, height_step=0.25, height_range=15.0)
+
+
+def patch(corner: Floats, a: Floats, b: Floats, step: float = 0.2) -> tuple[Floats, Floats]:
+    """Points and normals of a parallelogram, which faces a x b."""
+    u, v = np.linalg.norm(a), np.linalg.norm(b)
+    s, t = np.meshgrid(np.arange(0.05, 1, step / u), np.arange(0.05, 1, step / v))
+    points = corner + s.reshape(-1, 1) * a + t.reshape(-1, 1) * b
+    normal = np.cross(a, b) / (u * v)
+    return points, np.tile(normal, (len(points), 1))
+
+
+def building() -> tuple[Floats, Floats]:
+    """A hall of 16 m by 10 m with an alcove, a table and a pillar; no symmetry. z is up."""
+    x, y, z = np.eye(3)
+    parts = [
+        patch(np.zeros(3), 16 * x, 10 * y),
+        patch(np.zeros(3), 10 * y, 4 * z),  # faces +x
+        patch(10 * y, 16 * x, 4 * z),  # faces -y
+        patch(16 * x, 4 * z, 10 * y),
+        patch(0 * x, 4 * z, 9 * x),
+        patch(9 * x - 3 * y, 4 * z, 7 * x),
+        patch(9 * x - 3 * y, 3 * y, 4 * z),
+        patch(3 * x + 6 * y + 0.9 * z, 2 * x, y),
+        patch(12 * x + 6 * y, 4 * z, y),
+        patch(12 * x + 6 * y, x, 4 * z),
+    ]
+    return np.concatenate([p for p, _ in parts]), np.concatenate([n for _, n in parts])
+
+
+def seen_from(T: Floats) -> Surface:
+    """All of the building in a sensor's coordinates, as points in no order."""
+    points, normals = building()
+    points, normals = moved(inverse(T), points), normals @ T[:3, :3]
+    shape = (1, len(points))
+    return Surface(
+        points[None].astype(np.float32), normals[None].astype(np.float32),
+        np.ones(shape, np.bool_), np.zeros(shape, np.float32), None,
+    )  # fmt: skip
+
+
+def pose(x: float, y: float, z: float, yaw: float, pitch: float = 0, roll: float = 0) -> Floats:
+    """Upright but for pitch and roll; angles in degrees."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix()
+    T[:3, 3] = x, y, z
+    return T
+
+
+def nearest(found: Floats, true: Floats) -> tuple[float, float, int]:
+    """Metres and degrees of the hypothesis that is nearest to a transform, and its rank."""
+    errors = [difference(T, true) for T in found]
+    best = min(range(len(errors)), key=lambda k: errors[k][0] + errors[k][1])
+    return errors[best][0], math.degrees(errors[best][1]), best
+
+
+@pytest.mark.parametrize(("pitch", "roll"), [(0, 0), (20, -15), (-40, 10)])
+def test_up_is_what_floors_face_and_walls_stand_across(pitch: float, roll: float) -> None:
+    T = pose(5, 4, 1, 30, pitch, roll)
+    surface = seen_from(T)
+    up = up_of(surface.normals[0].astype(float), np.array([0.0, 0, 1]), P.tilt)
+    assert up @ T[2, :3] == pytest.approx(1.0, abs=1e-6)  # the third row: world z in the sensor
+
+
+def test_without_a_normal_near_the_axis_up_is_the_axis() -> None:
+    walls = np.tile([1.0, 0.0, 0.0], (50, 1))
+    assert up_of(walls, np.array([0.0, 0, 1]), math.radians(50)).tolist() == [0, 0, 1]
+
+
+def test_a_known_up_is_taken_as_it_is() -> None:
+    T = pose(5, 4, 1, 30, 20, 0)
+    up = np.array([0.0, 0.6, 0.8])
+    plan = plan_of(seen_from(T), P, up=up)
+    np.testing.assert_allclose(plan.R[2], up)
+    np.testing.assert_allclose(plan.R @ plan.R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(plan.R) == pytest.approx(1.0)
+
+
+def test_heights_lay_floor_on_floor() -> None:
+    low, high = (plan_of(seen_from(pose(5, 4, z, 0)), P) for z in (1.0, 2.5))
+    assert _lifts(high, low, P)[0] == pytest.approx(1.5)
+    assert _lifts(low, high, P)[0] == pytest.approx(-1.5)
+
+
+@pytest.mark.parametrize("yaw", [3, 90, 178])
+def test_the_true_transform_is_proposed(yaw: float) -> None:
+    source, target = pose(4, 5, 1.2, 12, 8, -5), pose(10, 3, 2.0, 12 + yaw, -4, 10)
+    a, b = plan_of(seen_from(source), P), plan_of(seen_from(target), P)
+    found = plan_hypotheses([(a, b)], P)
+    metres, degrees, rank = nearest(found, inverse(target) @ source)
+    # half a cell, half a yaw (2.5 degrees, on a lever of some metres), half a step of height
+    assert metres < 0.7
+    assert degrees < 3.0
+    assert rank < 4
+    assert len(found) == P.n_kept * P.n_heights
+
+
+def test_a_scanner_on_its_side_is_found_by_the_other_axes() -> None:
+    source, target = pose(4, 5, 1.2, 12, 0, 90), pose(10, 3, 2.0, 40)
+    surfaces = seen_from(source), seen_from(target)
+    true = inverse(target) @ source
+    upright = [(plan_of(surfaces[0], P), plan_of(surfaces[1], P))]
+    assert nearest(plan_hypotheses(upright, P), true)[1] > 30
+    found = plan_hypotheses(other_plans(*surfaces, P), P)
+    metres, degrees, _ = nearest(found, true)
+    assert metres < 0.7
+    assert degrees < 3.0
+
+
+def test_the_axis_of_a_range_image_is_its_pole() -> None:
+    surface = seen_from(pose(4, 5, 1.2, 0, 0, 90))
+    sphere = Sphere(60, 16, 0.1, -math.pi, 0.5, pole=1)
+    on_its_side = replace(surface, camera=sphere)
+    up = plan_of(on_its_side, P).R[2]
+    np.testing.assert_allclose(up, [0, 1, 0], atol=1e-6)
+
+
+def test_distinct_by_hand() -> None:
+    transforms = np.stack([pose(x, 0, 0, yaw) for x, yaw in ((0, 0), (0.4, 0), (0.4, 20), (2, 0))])
+    assert distinct(transforms, np.array([3.0, 4, 1, 2]), 0.5, math.radians(10), 9) == [1, 3, 2]
+    assert distinct(transforms, np.array([3.0, 4, 1, 2]), 0.5, math.radians(10), 2) == [1, 3]
+    assert distinct(transforms[:0], np.empty(0), 0.5, 0.1, 5) == []
