@@ -31,7 +31,7 @@ from sceneprint.engine.search.local_index import Readers
 from sceneprint.engine.search.query import Queries
 from sceneprint.engine.serializers import frame_records, map_record
 from sceneprint.engine.sessions.association_job import Associating
-from sceneprint.engine.sessions.associations import AssociationJobs
+from sceneprint.engine.sessions.associations import ASSOCIATE, AssociationJobs
 from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
 from sceneprint.engine.upkeep.deletion import Purging, Retention
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
@@ -43,7 +43,7 @@ from sceneprint.store import frames as stored_frames
 from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import open_store, queue
-from sceneprint.store.associations import ASSOCIATE
+from sceneprint.store.deletion import remove_map
 from sceneprint.store.model_switch import models_of
 from sceneprint.store.postgres.notify import Notices
 from sceneprint.store.tables import MapRow
@@ -160,7 +160,7 @@ class Engine:
     def delete_map(self, name: str) -> None:
         """Remove a map with all that is in it; UnknownMap where there is none."""
         with self.store.database.write() as connection:
-            blobs = stored_maps.remove_map(connection, stored_maps.find_map(connection, name))
+            blobs = remove_map(connection, stored_maps.find_map(connection, name))
         self._readers.forget(name)
         collect_deleted_blobs(self.store, blobs)
 
@@ -291,7 +291,6 @@ class Engine:
         with self.store.database.write() as connection:
             row = stored_maps.find_map(connection, map_name)
             frame = stored_frames.find_frame(connection, row, frame_id)
-            queue.cancel_of(connection, frame.number)
             blobs = stored_frames.delete_frame(connection, row, frame)
         collect_deleted_blobs(self.store, blobs)
 

@@ -40,10 +40,16 @@ from sceneprint.geometry.surface.depth_image import doubled
 from sceneprint.libraries import open3d
 from sceneprint.rendering import PALETTE, reconstruction_picture
 from sceneprint.store import Store
-from sceneprint.store.associations import remove_job
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
-from sceneprint.store.queue import JobFile, files_of, find_job, jobs_with_files, unknown_job
+from sceneprint.store.queue import (
+    JobFile,
+    files_of,
+    find_job,
+    jobs_with_files,
+    remove_job,
+    unknown_job,
+)
 from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import JobRow
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics

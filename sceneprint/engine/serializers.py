@@ -17,7 +17,8 @@ from sceneprint.errors import InvalidPose, naming
 from sceneprint.formats.dataset import rigid_transform
 from sceneprint.geometry.pose.rigid import quaternion_of, rotation_of
 from sceneprint.store.deletion import DAY_S, count_old
-from sceneprint.store.maps import count_frames, model_names
+from sceneprint.store.frames import count_states
+from sceneprint.store.maps import model_names
 from sceneprint.store.model_switch import switch_progress
 from sceneprint.store.queue import jobs_of
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
@@ -169,7 +170,7 @@ def map_record(connection: Connection, row: MapRow) -> Map:
         reencoding=coming,
         created_at=when(row.created_at),
         revision=row.revision,
-        frames=count_frames(connection, row.number),
+        frames=count_states(connection, row.number),
         used_frames=row.used_frames,
         used_bytes=row.used_bytes,
         quota_frames=row.quota_frames,

@@ -3,24 +3,38 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, Connection, Select, String, cast, func, or_, select, tuple_
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Select,
+    String,
+    cast,
+    func,
+    null,
+    or_,
+    select,
+    tuple_,
+)
 
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
+    count_rows,
     frame_row,
     frame_tags,
     frames,
     job_files,
+    rows_among,
     signatures,
 )
 from sceneprint_client.api import Filter, FrameState, Region
+from sceneprint_client.api.frames import Kind
 from sceneprint_client.api.listing import FrameListing, Run
 
 _NONE: NDArray[np.int64] = np.empty(0, np.int64)
@@ -59,20 +73,30 @@ def passing(
     return np.sort(np.fromstring(found, np.int64, sep=",")) if found else _NONE
 
 
-def _conditions(map_number: int, wanted: Filter, taken: QueryOrigin) -> list[ColumnElement[bool]]:
-    """What must hold; of a column that is null, no comparison does."""
-    found: list[ColumnElement[bool]] = []
-    if wanted.robot is not None:
-        found.append(frames.c.robot.in_(wanted.robot))
-    if wanted.session is not None:
-        found.append(frames.c.session.in_(wanted.session))
+def _common_conditions(
+    wanted: Filter | FrameListing | Run, tags: Sequence[str] = ()
+) -> list[ColumnElement[bool]]:
+    """What must hold of robot, session, tags and time; of a column that is null, no comparison
+    does.
+    """
+    c, found = frames.c, list[ColumnElement[bool]]()
+    for column, names in ((c.robot, wanted.robot), (c.session, wanted.session)):
+        if isinstance(names, str):
+            found.append(column == names)
+        elif names:
+            found.append(column.in_(names))
+    for tag in sorted(set(tags)):
+        found.append(c.number.in_(select(frame_tags.c.frame_number).where(frame_tags.c.tag == tag)))
     if wanted.captured_after is not None:
-        found.append(frames.c.captured_at >= wanted.captured_after.timestamp())
+        found.append(c.captured_at >= wanted.captured_after.timestamp())
     if wanted.captured_before is not None:
-        found.append(frames.c.captured_at <= wanted.captured_before.timestamp())
-    for tag in sorted(set(wanted.tags)):
-        tagged = select(frame_tags.c.frame_number).where(frame_tags.c.tag == tag)
-        found.append(frames.c.number.in_(tagged))
+        found.append(c.captured_at <= wanted.captured_before.timestamp())
+    return found
+
+
+def _conditions(map_number: int, wanted: Filter, taken: QueryOrigin) -> list[ColumnElement[bool]]:
+    """What must hold of the frames that pass a filter."""
+    found = _common_conditions(wanted, wanted.tags)
     if wanted.not_within_s is not None:
         found.append(_elsewhere(taken, wanted.not_within_s))
     if wanted.region is not None:
@@ -158,19 +182,8 @@ def _is_narrow(wanted: FrameListing) -> bool:
 
 
 def _listing_conditions(wanted: FrameListing) -> list[ColumnElement[bool]]:
-    """What must hold; of a column that is null, no comparison does."""
-    c, found = frames.c, list[ColumnElement[bool]]()
-    if wanted.robot:
-        found.append(c.robot.in_(wanted.robot))
-    if wanted.session:
-        found.append(c.session.in_(wanted.session))
-    for tag in sorted(set(wanted.tag)):
-        tagged = select(frame_tags.c.frame_number).where(frame_tags.c.tag == tag)
-        found.append(c.number.in_(tagged))
-    if wanted.captured_after is not None:
-        found.append(c.captured_at >= wanted.captured_after.timestamp())
-    if wanted.captured_before is not None:
-        found.append(c.captured_at <= wanted.captured_before.timestamp())
+    """What must hold of the frames of a list."""
+    c, found = frames.c, _common_conditions(wanted, wanted.tag)
     if wanted.received_after is not None:
         found.append(c.received_at >= wanted.received_after.timestamp())
     if wanted.received_before is not None:
@@ -185,8 +198,6 @@ def _listing_conditions(wanted: FrameListing) -> list[ColumnElement[bool]]:
 
 
 # The runs of a map: who took what, when, and where their poses lead.
-
-#: Frames in these states are of a run.
 
 
 @dataclass
@@ -328,18 +339,69 @@ def poses_of_run(connection: Connection, map_number: int, run: Run) -> tuple[lis
 
 
 def _of_session(map_number: int, run: Run) -> list[ColumnElement[bool]]:
-    found = [
+    of_map = [frames.c.map_number == map_number, frames.c.state.in_(_LIVING)]
+    return [*of_map, *_common_conditions(run)]
+
+
+# Frames of sessions in the order in which they were taken, for jobs that associate them.
+
+
+@dataclass(frozen=True)
+class PathFrame:
+    """A frame of a run, as far as associations need it.
+
+    Parameters
+    ----------
+    number, id : of the frame
+    robot, session, captured_at : as far as is known
+    parent : that its pose leads to
+    pose : T_parent_sensor, or None
+    is_cloud : whether it is a point cloud
+    """
+
+    number: int
+    id: str
+    robot: str | None
+    session: str | None
+    captured_at: float | None
+    parent: str | None
+    pose: list[list[float]] | None
+    is_cloud: bool
+
+    @property
+    def kind(self) -> Kind:
+        """A depth image or a point cloud."""
+        return "cloud" if self.is_cloud else "depth"
+
+
+def numbers_of_session(
+    connection: Connection, map_number: int, session: str, robot: str | None
+) -> list[int]:
+    """Numbers of the indexed frames of a session in the order of time, then as they came.
+
+    Those without a time come last.
+    """
+    asked = select(frames.c.number).where(
         frames.c.map_number == map_number,
-        frames.c.state.in_(_LIVING),
-        frames.c.session == run.session,
-    ]
-    if run.robot is not None:
-        found.append(frames.c.robot == run.robot)
-    if run.captured_after is not None:
-        found.append(frames.c.captured_at >= run.captured_after.timestamp())
-    if run.captured_before is not None:
-        found.append(frames.c.captured_at <= run.captured_before.timestamp())
-    return found
+        frames.c.state == FrameState.INDEXED,
+        frames.c.session == session,
+    )
+    if robot is not None:
+        asked = asked.where(frames.c.robot == robot)
+    time = frames.c.captured_at
+    return list(connection.execute(asked.order_by(time.is_(None), time, frames.c.number)).scalars())
+
+
+def stops_of(connection: Connection, numbers: Iterable[int]) -> dict[int, PathFrame]:
+    """Frames by their numbers; those that are deleted, or not indexed any more, are left out."""
+    asked = select(
+        frames.c.number, frames.c.id, frames.c.robot, frames.c.session, frames.c.captured_at,
+        frames.c.pose_parent, frames.c.pose, frames.c.cloud.is_not(null()),
+    ).where(frames.c.state == FrameState.INDEXED)  # fmt: skip
+    return {
+        row.number: PathFrame(*row)
+        for row in rows_among(connection, asked, frames.c.number, numbers)
+    }
 
 
 # What frames of a map weigh, and which a session brought: for whoever thins it out.
@@ -394,8 +456,6 @@ _OTHERS = tuple(state for state in FrameState if state != FrameState.INDEXED)
 #: Frames in these states have no upload any more.
 _BARE = (FrameState.DELETED, FrameState.REDUNDANT)
 _KEPT = tuple(state for state in FrameState if state not in _BARE)
-#: Numbers that one statement asks for.
-_BLOCK = 500
 
 
 def indexed_by_time(
@@ -458,7 +518,7 @@ def frames_with_uploads(
     most : numbers
     """
     of_map = (frames.c.map_number == map_number) & frames.c.state.in_(_KEPT)
-    total = int(connection.execute(select(func.count()).where(of_map)).scalar_one())
+    total = count_rows(connection, of_map)
     # adding 0, as above: the index that has states holds all of this, and rows are not read
     place = (func.row_number().over(order_by=frames.c.number + 0) - 1).label("place")
     listed = select(frames.c.number, place).where(of_map).subquery()
@@ -490,8 +550,7 @@ def spread_frames(connection: Connection, most: int) -> list[int]:
 
 def count_uploads(connection: Connection) -> int:
     """How many frames of all maps have their uploads."""
-    asked = select(func.count()).where(frames.c.state.in_(_KEPT))
-    return int(connection.execute(asked).scalar_one())
+    return count_rows(connection, frames.c.state.in_(_KEPT))
 
 
 def bytes_of_files(connection: Connection) -> int:
@@ -501,14 +560,8 @@ def bytes_of_files(connection: Connection) -> int:
 
 def weigh(connection: Connection, numbers: Sequence[int]) -> Weighed:
     """What frames weigh, with what was made of them by whatever model."""
-    uploads = signed = 0
-    artifacts: list[str] = []
-    for first in range(0, len(numbers), _BLOCK):
-        some = numbers[first : first + _BLOCK]
-        held = select(func.sum(frames.c.bytes)).where(frames.c.number.in_(some))
-        uploads += int(connection.execute(held).scalar() or 0)
-        made = select(func.length(signatures.c.vector), signatures.c.geometry)
-        for size, geometry in connection.execute(made.where(signatures.c.frame_number.in_(some))):
-            signed += size
-            artifacts.append(geometry)
-    return Weighed(uploads, signed, artifacts)
+    held = rows_among(connection, select(frames.c.bytes), frames.c.number, numbers)
+    asked = select(func.length(signatures.c.vector), signatures.c.geometry)
+    made = list(rows_among(connection, asked, signatures.c.frame_number, numbers))
+    uploads = sum(row.bytes for row in held)
+    return Weighed(uploads, sum(size for size, _ in made), [geometry for _, geometry in made])

@@ -9,12 +9,10 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, delete, func, insert, select, update
 
 from sceneprint.errors import UnknownFrame
-from sceneprint.store.batching import among, blocks
 from sceneprint.store.deletion import delete_frames
 from sceneprint.store.events import record_event
-from sceneprint.store.maps import find_map
+from sceneprint.store.maps import ROOMLESS, count_on, find_map
 from sceneprint.store.queue import now
-from sceneprint.store.quotas import ROOMLESS, count_on
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
@@ -23,6 +21,7 @@ from sceneprint.store.tables import (
     frames,
     job_files,
     maps,
+    rows_among,
     signatures,
 )
 from sceneprint_client.api import FrameState
@@ -143,15 +142,9 @@ def frame_of(connection: Connection, number: int) -> FrameRow:
 
 def frames_of(connection: Connection, numbers: Iterable[int]) -> dict[int, FrameRow]:
     """Frames by their numbers; those that are gone are left out."""
-    found: dict[int, FrameRow] = {}
-    for some in blocks(numbers):
-        rows = connection.execute(
-            select(frames).where(
-                among(connection, frames.c.number, some), frames.c.state != FrameState.DELETED
-            )
-        ).mappings()
-        found |= {row["number"]: frame_row(row) for row in rows}
-    return found
+    asked = select(frames).where(frames.c.state != FrameState.DELETED)
+    found = rows_among(connection, asked, frames.c.number, numbers)
+    return {row.number: frame_row(row._mapping) for row in found}
 
 
 def set_state(
@@ -196,10 +189,12 @@ def refers_to(connection: Connection, blob: str) -> bool:
     return any(connection.execute(one.limit(1)).first() for one in (of_frame, of_artifact, of_job))
 
 
-def count_states(connection: Connection) -> dict[str, int]:
-    """How many frames of all maps are in each state."""
-    rows = connection.execute(select(frames.c.state, func.count()).group_by(frames.c.state))
-    return {row[0]: row[1] for row in rows}
+def count_states(connection: Connection, map_number: int | None = None) -> dict[str, int]:
+    """How many frames are in each state that has any, of one map or of all."""
+    asked = select(frames.c.state, func.count()).group_by(frames.c.state).order_by(frames.c.state)
+    if map_number is not None:
+        asked = asked.where(frames.c.map_number == map_number)
+    return {row[0]: row[1] for row in connection.execute(asked)}
 
 
 def _free(connection: Connection, map_number: int, frame_id: str) -> None:

@@ -19,16 +19,6 @@ def count_maps(connection: Connection) -> int:
     return int(connection.execute(select(func.count()).select_from(maps)).scalar_one())
 
 
-def count_jobs_of(connection: Connection, map_number: int) -> dict[str, int]:
-    """How many jobs of a map are in each state that has any."""
-    rows = connection.execute(
-        select(jobs.c.state, func.count())
-        .where(jobs.c.map_number == map_number)
-        .group_by(jobs.c.state)
-    )
-    return {row[0]: row[1] for row in rows}
-
-
 def oldest_waiting(connection: Connection, map_number: int | None = None) -> float | None:
     """When the job was made that waits for longest, seconds since 1970; None: none waits.
 

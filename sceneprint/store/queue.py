@@ -50,8 +50,16 @@ from sqlalchemy import (
 
 from sceneprint.errors import JobOver, LostLease, UnknownJob
 from sceneprint.logs import request_id
-from sceneprint.store.batching import among, blocks
-from sceneprint.store.tables import JobRow, frames, job_files, job_items, job_row, jobs, maps
+from sceneprint.store.tables import (
+    JobRow,
+    frames,
+    job_files,
+    job_items,
+    job_row,
+    jobs,
+    maps,
+    rows_among,
+)
 from sceneprint_client.api import JobState
 
 # Jobs, one by one and as a list.
@@ -157,21 +165,17 @@ def last_of(
 
 def jobs_of(connection: Connection, frame_numbers: list[int]) -> dict[int, JobRow]:
     """The latest job of each frame that is to have it indexed, not those that sign it again."""
-    found: dict[int, JobRow] = {}
-    for some in blocks(frame_numbers):
-        rows = connection.execute(
-            select(jobs)
-            .where(among(connection, jobs.c.frame_number, some), jobs.c.kind == "sign")
-            .order_by(jobs.c.number)
-        ).mappings()
-        found |= {row["frame_number"]: job_row(row) for row in rows}
-    return found
+    asked = select(jobs).where(jobs.c.kind == "sign").order_by(jobs.c.number)
+    found = rows_among(connection, asked, jobs.c.frame_number, frame_numbers)
+    return {row.frame_number: job_row(row._mapping) for row in found}
 
 
-def count_jobs(connection: Connection) -> dict[str, int]:
-    """How many jobs are in each state that has any."""
-    rows = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state))
-    return {row[0]: row[1] for row in rows}
+def count_jobs(connection: Connection, map_number: int | None = None) -> dict[str, int]:
+    """How many jobs are in each state that has any, of one map or of all."""
+    asked = select(jobs.c.state, func.count()).group_by(jobs.c.state)
+    if map_number is not None:
+        asked = asked.where(jobs.c.map_number == map_number)
+    return {row[0]: row[1] for row in connection.execute(asked)}
 
 
 # The clock by which leases end and jobs are due: of the database, as those of its hosts differ.
@@ -195,6 +199,8 @@ def read_clock(connection: Connection) -> float:
     return float(connection.execute(select(now(connection))).scalar_one())
 
 
+#: States of jobs that something may still come of.
+PENDING = (JobState.QUEUED, JobState.RUNNING)
 #: Tries that broke down before a job is dead.
 MAXIMUM_FAILURES = 3
 #: Tries in all before it is. More, as a worker that fell silent or was killed may have died of
@@ -526,21 +532,14 @@ def cancel(connection: Connection, job: JobRow) -> None:
     """
     if job.state.over:
         raise JobOver(f"Job {job.id} is {job.state}: {job.state.sentence} Nothing is left to do.")
-    connection.execute(
-        update(jobs)
-        .where(jobs.c.number == job.number)
-        .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
-    )
+    cancel_jobs(connection, jobs.c.number == job.number)
 
 
-def cancel_of(connection: Connection, frame_number: int) -> None:
-    """Cancel what is still to be done for a frame."""
+def cancel_jobs(connection: Connection, *which: ColumnElement[bool]) -> None:
+    """Cancel those of some jobs that wait or run."""
     connection.execute(
         update(jobs)
-        .where(
-            jobs.c.frame_number == frame_number,
-            jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING)),
-        )
+        .where(*which, jobs.c.state.in_(PENDING))
         .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
     )
 
@@ -678,4 +677,16 @@ def remove_parts(
         own &= job_files.c.name.in_(list(files))
     blobs = list(connection.execute(select(job_files.c.blob).where(own)).scalars())
     connection.execute(delete(job_files).where(own))
+    return blobs
+
+
+def remove_job(connection: Connection, job: JobRow) -> list[str]:
+    """Forget a job with all that it found; a worker that is at it finds its lease lost.
+
+    Returns
+    -------
+    blobs : that it referred to: sweep them when this is committed
+    """
+    blobs = remove_parts(connection, job.number)
+    connection.execute(delete(jobs).where(jobs.c.number == job.number))
     return blobs

@@ -7,22 +7,29 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from zlib import crc32
 
-from sqlalchemy import Connection, delete, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, delete, func, insert, select, update
 
 from sceneprint.errors import DamagedSignature
-from sceneprint.store.batching import among, blocks
 from sceneprint.store.maps import next_revision
 from sceneprint.store.model_switch import (
-    PENDING,
     QUEUED_AT_ONCE,
     REENCODE,
     REMOVED_AT_ONCE,
     models_of,
 )
 from sceneprint.store.postgres import vectors
-from sceneprint.store.queue import now
-from sceneprint.store.tables import FrameRow, MapRow, frames, jobs, maps, signatures
-from sceneprint_client.api import FrameState, JobState
+from sceneprint.store.queue import PENDING
+from sceneprint.store.tables import (
+    FrameRow,
+    MapRow,
+    count_rows,
+    frames,
+    jobs,
+    maps,
+    rows_among,
+    signatures,
+)
+from sceneprint_client.api import FrameState
 
 
 @dataclass(frozen=True)
@@ -178,40 +185,29 @@ def count_indexed(
 
 def deleted_since(connection: Connection, map_number: int, revision: int) -> frozenset[int]:
     """Numbers of the frames of a map that are searched no more since a revision."""
-    found = connection.execute(
-        select(frames.c.number).where(
-            frames.c.map_number == map_number,
-            frames.c.revision > revision,
-            frames.c.state != FrameState.INDEXED,
-        )
-    )
-    return frozenset(found.scalars())
+    gone = select(frames.c.number).where(*_gone(map_number, revision))
+    return frozenset(connection.execute(gone).scalars())
 
 
 def count_gone(connection: Connection, map_number: int, revision: int) -> int:
     """How many frames of a map are searched no more since a revision."""
-    counted = connection.execute(
-        select(func.count()).where(
-            frames.c.map_number == map_number,
-            frames.c.revision > revision,
-            frames.c.state != FrameState.INDEXED,
-        )
+    return count_rows(connection, *_gone(map_number, revision))
+
+
+def _gone(map_number: int, revision: int) -> tuple[ColumnElement[bool], ...]:
+    return (
+        frames.c.map_number == map_number,
+        frames.c.revision > revision,
+        frames.c.state != FrameState.INDEXED,
     )
-    return int(counted.scalar_one())
 
 
 def geometry_blobs(connection: Connection, numbers: Iterable[int], model_id: str) -> dict[int, str]:
     """Blobs of the geometry artifacts of frames."""
-    found: dict[int, str] = {}
-    for some in blocks(numbers):
-        rows = connection.execute(
-            select(signatures.c.frame_number, signatures.c.geometry).where(
-                among(connection, signatures.c.frame_number, some),
-                signatures.c.model_id == model_id,
-            )
-        )
-        found |= {row.frame_number: row.geometry for row in rows}
-    return found
+    own = signatures.c.model_id == model_id
+    asked = select(signatures.c.frame_number, signatures.c.geometry).where(own)
+    found = rows_among(connection, asked, signatures.c.frame_number, numbers)
+    return {row.frame_number: row.geometry for row in found}
 
 
 def stored_vector(connection: Connection, number: int, model_id: str) -> bytes | None:
@@ -250,16 +246,10 @@ def stored_signatures(
     connection: Connection, numbers: Iterable[int], model_id: str
 ) -> dict[int, bytes]:
     """Signatures of frames; those that have none, or a damaged one, are left out."""
-    found: dict[int, bytes] = {}
-    for some in blocks(numbers):
-        rows = connection.execute(
-            select(signatures.c.frame_number, signatures.c.vector, signatures.c.checksum).where(
-                among(connection, signatures.c.frame_number, some),
-                signatures.c.model_id == model_id,
-            )
-        )
-        found |= {n: bytes(vector) for n, vector, checksum in rows if crc32(vector) == checksum}
-    return found
+    asked = select(signatures.c.frame_number, signatures.c.vector, signatures.c.checksum)
+    own = asked.where(signatures.c.model_id == model_id)
+    rows = rows_among(connection, own, signatures.c.frame_number, numbers)
+    return {n: bytes(vector) for n, vector, checksum in rows if crc32(vector) == checksum}
 
 
 # What is left of the models that a map no longer has, nor is to have.
@@ -307,12 +297,3 @@ def stale_jobs(connection: Connection, row: MapRow) -> list[int]:
         .limit(QUEUED_AT_ONCE)
     )  # fmt: skip
     return list(found.scalars())
-
-
-def cancel_jobs(connection: Connection, numbers: list[int]) -> None:
-    """Cancel jobs that wait or run."""
-    connection.execute(
-        update(jobs)
-        .where(jobs.c.number.in_(numbers), jobs.c.state.in_(PENDING))
-        .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
-    )

@@ -12,8 +12,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
 from sceneprint.engine.upkeep.blob_garbage import collect_blobs
 from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
-from sceneprint.store.associations import remove_job
-from sceneprint.store.queue import JobFile, files_of, find_job, items_of
+from sceneprint.store.queue import JobFile, files_of, find_job, items_of, remove_job
 from sceneprint.store.tables import events, jobs
 from sceneprint_client.api import Job, JobState, NewMap
 

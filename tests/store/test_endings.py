@@ -10,7 +10,7 @@ import pytest
 
 from sceneprint.errors import LostLease
 from sceneprint.store import Store, queue
-from sceneprint.store.tables import JobRow
+from sceneprint.store.tables import JobRow, jobs
 from sceneprint_client.api import JobState
 
 Queued = Callable[..., JobRow]
@@ -132,14 +132,14 @@ def test_cancelling_takes_a_job_from_whoever_has_it(
     running, waiting, over, other = (queued(name) for name in "abcd")
     held = hand.taken()
     with store.database.write() as connection:
-        queue.cancel_of(connection, waiting.frame_number)
+        queue.cancel_jobs(connection, jobs.c.frame_number == waiting.frame_number)
     assert hand.row(waiting).state == JobState.CANCELLED
     done = hand.taken()
     assert done.job.number == over.number  # not the cancelled one
     with store.database.write() as connection:
         queue.finish(connection, done, JobState.SUCCEEDED)
-        queue.cancel_of(connection, over.frame_number)
-        queue.cancel_of(connection, running.frame_number)
+        queue.cancel_jobs(connection, jobs.c.frame_number == over.frame_number)
+        queue.cancel_jobs(connection, jobs.c.frame_number == running.frame_number)
     assert hand.row(over).state == JobState.SUCCEEDED
     with pytest.raises(LostLease), store.database.write() as connection:
         queue.finish(connection, held, JobState.SUCCEEDED)

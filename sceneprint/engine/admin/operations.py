@@ -16,10 +16,18 @@ from sceneprint.engine.serializers import when
 from sceneprint.errors import InvalidRequest, SceneprintError
 from sceneprint.settings import Settings
 from sceneprint.store import Database, Store
-from sceneprint.store.events import EventRow, Wanted, list_events, newest_number, newest_seen
+from sceneprint.store.events import (
+    EventRow,
+    Wanted,
+    floor_of,
+    list_events,
+    newest_number,
+    newest_seen,
+    remove_events,
+    spent_numbers,
+)
 from sceneprint.store.maps import find_map
 from sceneprint.store.opaque_ids import OpaqueIds
-from sceneprint.store.retention import floor_of, remove_events, spent_numbers
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api.admin import MISSED, Event, EventPage, ModelInfo
 

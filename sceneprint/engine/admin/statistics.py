@@ -34,13 +34,12 @@ from sceneprint.store.frame_queries import (
     weigh,
 )
 from sceneprint.store.frames import count_states
-from sceneprint.store.maps import count_frames, find_map, list_maps
+from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.metrics import (
     Sample,
     add_sample,
     at_work,
     count_events,
-    count_jobs_of,
     count_maps,
     count_samples,
     oldest_waiting,
@@ -375,8 +374,8 @@ class Statistics:
                 oldest = oldest_waiting(connection)
                 workers = self.workers(connection)
             else:
-                frames = count_frames(connection, row.number)
-                jobs = count_jobs_of(connection, row.number)
+                frames = count_states(connection, row.number)
+                jobs = count_jobs(connection, row.number)
                 maps, indexes = 1, [index_state(connection, self._indexes, row)]
                 oldest, workers = oldest_waiting(connection, row.number), None
             taken = None if row is None else self._sizes_of_map(connection, row)

@@ -36,7 +36,7 @@ from sceneprint.formats.dataset.upload_metadata import parent_frame_of, session_
 from sceneprint.store import Store, queue
 from sceneprint.store.blobs.folder import IncomingBlob
 from sceneprint.store.database_errors import unusable
-from sceneprint.store.idempotency import IdempotentRequest
+from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import (
     JobFile,

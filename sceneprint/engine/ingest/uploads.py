@@ -30,13 +30,12 @@ from sceneprint.errors import (
     UnusableStore,
 )
 from sceneprint.store import Store
-from sceneprint.store.batching import Grouping
+from sceneprint.store.database import Grouping
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import add_frame, frames_of_content, living_frame, loosen, renew_frame
-from sceneprint.store.idempotency import IdempotentRequest
-from sceneprint.store.maps import find_map
+from sceneprint.store.keys import IdempotentRequest
+from sceneprint.store.maps import find_map, require_room
 from sceneprint.store.queue import enqueue, jobs_of
-from sceneprint.store.quotas import require_room
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Added, FrameMeta, FrameState

@@ -34,7 +34,7 @@ from sceneprint.errors import (
 )
 from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
-from sceneprint.store.idempotency import IdempotentRequest
+from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map, map_of
 from sceneprint.store.queue import (
     Claim,

@@ -36,8 +36,8 @@ from sceneprint.previews import depth_view, normals_view, onto, patches_view, pi
 from sceneprint.signing import hierarchy_of, see
 from sceneprint.store import Store, frame_queries
 from sceneprint.store.frame_queries import Held, count_run, indexed_by_time, list_runs, poses_of_run
-from sceneprint.store.frames import find_frame
-from sceneprint.store.maps import count_frames, find_map, model_names
+from sceneprint.store.frames import count_states, find_frame
+from sceneprint.store.maps import find_map, model_names
 from sceneprint.store.opaque_ids import START, Kind, OpaqueIds
 from sceneprint.store.signatures import PatchCounts, geometry_blobs, signature_sizes, stored_vector
 from sceneprint.store.tables import FrameRow, MapRow
@@ -360,7 +360,7 @@ def growth(store: Store, map_name: str, by: By = "day", last: int = 30) -> Growt
     start = (time.time() // width - last + 1) * width
     with store.database.read() as connection:
         row = find_map(connection, map_name)
-        indexed = count_frames(connection, row.number).get(FrameState.INDEXED, 0)
+        indexed = count_states(connection, row.number).get(FrameState.INDEXED, 0)
         counts = indexed_by_time(connection, row.number, start, width)
     ahead = sum(n for place, n in counts.items() if place >= last)
     counts[last - 1] += ahead  # by a clock that was set back since

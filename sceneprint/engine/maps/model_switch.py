@@ -30,7 +30,8 @@ from sceneprint.models import Model, read_model, write_model
 from sceneprint.store import Store, signatures
 from sceneprint.store import model_switch as stored
 from sceneprint.store.maps import find_map, keep_model, list_maps, model_names
-from sceneprint.store.tables import MapRow
+from sceneprint.store.queue import cancel_jobs
+from sceneprint.store.tables import MapRow, jobs
 from sceneprint_client.api import Map
 
 log = logging.getLogger(__name__)
@@ -187,7 +188,8 @@ def _tidy(store: Store, row: MapRow, at_most_s: float = math.inf) -> bool:
                 break
         with store.database.write() as connection:
             now = find_map(connection, row.name)
-            signatures.cancel_jobs(connection, signatures.stale_jobs(connection, now))
+            stale = signatures.stale_jobs(connection, now)
+            cancel_jobs(connection, jobs.c.number.in_(stale))
     after = 0
     while True:
         with store.database.read() as connection:

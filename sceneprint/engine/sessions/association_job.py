@@ -43,7 +43,7 @@ from sceneprint.geometry.retrieval.dpp import diversify
 from sceneprint.matches import PairMatch, associate
 from sceneprint.models import Model
 from sceneprint.store import Store
-from sceneprint.store.associations import PathFrame, stops_of
+from sceneprint.store.frame_queries import PathFrame, stops_of
 from sceneprint.store.frames import frames_of
 from sceneprint.store.maps import find_map, unknown_map
 from sceneprint.store.queue import items_of

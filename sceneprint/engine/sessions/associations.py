@@ -17,16 +17,15 @@ from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
 from sceneprint.formats.pose_graph import information_of
 from sceneprint.index.mapped_files import Keys
 from sceneprint.store import Store
-from sceneprint.store.associations import (
-    ASSOCIATE,
+from sceneprint.store.frame_queries import (
     PathFrame,
+    QueryOrigin,
     numbers_of_session,
-    remove_job,
+    passing,
     stops_of,
 )
-from sceneprint.store.frame_queries import QueryOrigin, passing
 from sceneprint.store.maps import find_map
-from sceneprint.store.queue import find_job, items_of, list_jobs
+from sceneprint.store.queue import find_job, items_of, list_jobs, remove_job
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint_client.api import JobState, Page, Progress
 from sceneprint_client.api.base import Transform
@@ -38,6 +37,9 @@ from sceneprint_client.api.sessions import (
     GraphFormat,
     NewAssociation,
 )
+
+#: Kind of the jobs.
+ASSOCIATE = "associate"
 
 # Which frames an association goes through, and which each of them may be found to be near.
 

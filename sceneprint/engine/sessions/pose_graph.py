@@ -18,7 +18,7 @@ from sceneprint.engine.serializers import sensor_frame, transform, when
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.formats.pose_graph import PoseEdge, g2o, information_of
 from sceneprint.geometry.pose.rigid import inverse, rotation_angle
-from sceneprint.store.associations import PathFrame
+from sceneprint.store.frame_queries import PathFrame
 from sceneprint.types import Floats
 from sceneprint_client.api.sessions import Graph, GraphFormat, Vertex
 from sceneprint_client.api.sessions import GraphEdge as ToldEdge
