@@ -26,16 +26,15 @@ from sceneprint.engine.reconstruction import ReconstructionJobs
 from sceneprint.engine.results.inspection import Inspection, PointClouds
 from sceneprint.engine.results.rerun import Rerun
 from sceneprint.engine.results.stored_results import ResultValidity, open_results
-from sceneprint.engine.search.index_view import IndexView
 from sceneprint.engine.search.local_index import Readers
+from sceneprint.engine.search.map_view import IndexView
 from sceneprint.engine.search.query import Queries
 from sceneprint.engine.serializers import frame_records, map_record
 from sceneprint.engine.sessions.association_job import Associating
 from sceneprint.engine.sessions.associations import ASSOCIATE, AssociationJobs
-from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
 from sceneprint.engine.upkeep.deletion import Purging, Retention
-from sceneprint.engine.upkeep.index_upkeep import Upkeep
-from sceneprint.engine.upkeep.vector_tables import VectorTables
+from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
+from sceneprint.engine.upkeep.repair import collect_deleted_blobs
 from sceneprint.errors import BusyIndex, ModelError, StoreAway, UnusableStore
 from sceneprint.models import Model
 from sceneprint.settings import Settings

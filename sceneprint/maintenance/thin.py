@@ -32,7 +32,7 @@ from sceneprint_client.api import FrameState
 
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
-    from sceneprint.engine.search.index_view import IndexView
+    from sceneprint.engine.search.map_view import IndexView
 
 #: Memory that the choice of a number of frames may take: 8 bytes for each kept one and each frame.
 CHOICE_BYTES = 2 << 30

@@ -16,7 +16,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.ingest import archive_import
 from sceneprint.engine.ingest import uploads as uploading
 from sceneprint.engine.jobs.tasks import LongJob
-from sceneprint.engine.upkeep.blob_garbage import collect_blobs
+from sceneprint.engine.upkeep.repair import collect_blobs
 from sceneprint.errors import LostLease, UnknownMap, UnusableStore
 from sceneprint.formats.archive.archive import Archive
 from sceneprint.store.queue import files_of

@@ -20,7 +20,7 @@ from sceneprint.engine.ingest.uploads import UploadResult as UploadOutcome
 from sceneprint.engine.jobs.lifecycle import get_job
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
 from sceneprint.engine.maps.map_frames import row_of
-from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
+from sceneprint.engine.upkeep.repair import collect_deleted_blobs
 from sceneprint.errors import (
     SceneprintError,
     StoreError,

@@ -18,8 +18,12 @@ from sqlalchemy import Connection, select
 
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upload
-from sceneprint.engine.upkeep.blob_garbage import collect_blobs, collect_deleted_blobs
-from sceneprint.engine.upkeep.repair import take_upload, without_loss
+from sceneprint.engine.upkeep.repair import (
+    collect_blobs,
+    collect_deleted_blobs,
+    take_upload,
+    without_loss,
+)
 from sceneprint.errors import (
     FrameConflict,
     InvalidRequest,

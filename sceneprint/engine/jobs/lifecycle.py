@@ -14,7 +14,7 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.maps.map_frames import opened_cursor
 from sceneprint.engine.serializers import job_record
-from sceneprint.engine.upkeep.blob_garbage import collect_blobs
+from sceneprint.engine.upkeep.repair import collect_blobs
 from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError, UnusableStore
 from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event

@@ -17,8 +17,8 @@ import numpy as np
 
 from sceneprint.engine.search.local_index import trusted
 from sceneprint.engine.serializers import map_record, model_label
-from sceneprint.engine.upkeep.blob_garbage import collect_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
+from sceneprint.engine.upkeep.repair import collect_blobs
 from sceneprint.errors import (
     BusyIndex,
     Conflict,

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.engine.ingest.frame_decoder import read_upload
-from sceneprint.engine.search.index_view import MapView
-from sceneprint.engine.search.pgvector_index import Stored, search_stored
+from sceneprint.engine.search.map_view import MapView, Stored, search_stored
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import (
     DamagedBlob,

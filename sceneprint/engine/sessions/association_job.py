@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
 from sceneprint.engine.models import Signers
-from sceneprint.engine.search.index_view import MapView
 from sceneprint.engine.search.local_index import Readers
+from sceneprint.engine.search.map_view import MapView
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import transform
 from sceneprint.engine.sessions.associations import Plan, eligible, runs_of

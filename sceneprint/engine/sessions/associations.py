@@ -12,7 +12,7 @@ from sceneprint.engine.jobs.tasks import Tasks
 from sceneprint.engine.maps.map_frames import opened_cursor, row_of
 from sceneprint.engine.serializers import sensor_frame, transform, when
 from sceneprint.engine.sessions.pose_graph import graph_text, pose_graph
-from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
+from sceneprint.engine.upkeep.repair import collect_deleted_blobs
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
 from sceneprint.formats.pose_graph import information_of
 from sceneprint.index.mapped_files import Keys

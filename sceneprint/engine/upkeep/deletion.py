@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 from sceneprint.engine.reconstruction import ReconstructionJobs
 from sceneprint.engine.results.stored_results import ResultValidity, StoredResults
-from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs, collect_doomed_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
+from sceneprint.engine.upkeep.repair import collect_deleted_blobs, collect_doomed_blobs
 from sceneprint.errors import BusyIndex, SceneprintError, UnknownJob, UnknownMap
 from sceneprint.store import Store
 from sceneprint.store.deletion import DAY_S, aging_maps, delete_frames, old_frames

@@ -19,7 +19,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -28,6 +28,7 @@ from sceneprint.errors import DamagedBlob, UnusableStore
 from sceneprint.store.blobs.folder import (
     DIGEST,
     BlobEntry,
+    Blobs,
     Condition,
     IncomingBlob,
     Locks,
@@ -212,7 +213,7 @@ _KNOWN = 4_096
 CHECK_S = 2.0
 
 
-class ObjectBlobs:
+class ObjectBlobs(Blobs):
     """Blobs under the prefix of an object store.
 
     Parameters
@@ -226,9 +227,10 @@ class ObjectBlobs:
     def __init__(
         self, objects: Objects, locks: Locks, owner: Callable[[], str], purge_s: float = 3600.0
     ) -> None:
+        super().__init__(locks)
         self.objects = objects
         self._recent = Recent(purge_s)
-        self._locks, self._owner = locks, owner
+        self._owner = owner
         self._claimed = False
         self._put: OrderedDict[str, int] = OrderedDict()  # removals until then, by digest
         self._lock = threading.Lock()
@@ -335,14 +337,6 @@ class ObjectBlobs:
         require_digest(digest)
         return self.objects.size(_key(digest))
 
-    def kept(self) -> AbstractContextManager[None]:
-        """See that no blob is removed meanwhile; see `Blobs.kept`."""
-        return self._locks.kept()
-
-    def removing(self) -> AbstractContextManager[bool]:
-        """Hold the right to remove blobs; see `Blobs.removing`."""
-        return self._locks.removing()
-
     def remove(self, digest: str) -> None:
         """Forget a blob that nothing refers to; only within `removing`."""
         require_digest(digest)
@@ -432,7 +426,7 @@ class ObjectBlobs:
 
     def close(self) -> None:
         """Give back the connections of its locks, and what was read lately."""
-        self._locks.close()
+        super().close()
         self._recent.close()
 
 

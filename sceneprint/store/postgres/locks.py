@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.errors import UnusableStore
+from sceneprint.store.blobs.folder import Locks
 from sceneprint.store.postgres.connection import BLOBS, LOCKS
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ _TAKE = "SELECT pg_try_advisory_lock(%s, %s)"
 _GIVE = "SELECT pg_advisory_unlock(%s, %s)"
 
 
-class SessionLocks:
+class SessionLocks(Locks):
     """Of all processes of all hosts that share a database of PostgreSQL.
 
     A pooler that hands one connection to several clients takes them away: connect to the server
