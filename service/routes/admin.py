@@ -231,7 +231,7 @@ def stats(
 @operations_router.get("/models", responses=declared())
 def models(here: Here, asking: Asking) -> Page[ModelInfo]:
     """Models that a map can be signed with: those that ship, and those that maps have or had."""
-    found = here.engine.operations.models(lambda name: asking.may("read", name))
+    found = here.engine.operations.catalogue.tell(lambda name: asking.may("read", name))
     if not asking.reads_every:  # one that only other maps have tells of them
         found = [one for one in found if one.preset or one.maps]
     return Page[ModelInfo](items=found)

@@ -12,7 +12,6 @@ from anyio import to_thread
 from fastapi import Header, Query, Request, Response
 
 from sceneprint.engine.admin.operations import MOST_KINDS, event_record
-from sceneprint.engine.maps.map_frames import event_of, opened_cursor
 from sceneprint.store.events import Wanted
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint_client.api import Job, JobState, Page
@@ -141,11 +140,9 @@ async def events(
     last = after if last_event_id is None else last_event_id
 
     def asked() -> tuple[Wanted, int | None]:
-        opened_cursor(
-            seals, "event", cursor
-        )  # a stream has no pages; what is wrong is told all the same
+        seals.row("event", cursor)  # a stream has no pages; what is wrong is told all the same
         wanted = _wanted(here, asking, map_name, kind)
-        return wanted, None if last is None else event_of(seals, last, place)
+        return wanted, None if last is None else seals.event(last, place)
 
     wanted, number = await to_thread.run_sync(asked)
     if MEDIA_TYPE in request.headers.get("accept", ""):

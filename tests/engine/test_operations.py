@@ -225,7 +225,7 @@ def test_models_are_listed_with_the_maps_that_may_be_named(make_engine, small_mo
     for name in ("hall", "shop"):
         engine.create_map(NewMap(name=name, model="depth"))
     engine.reencode("shop", small_model)
-    found = {one.name: one for one in engine.operations.models(lambda name: name != "hall")}
+    found = {one.name: one for one in engine.operations.catalogue.tell(lambda name: name != "hall")}
     assert list(found) == [*PRESETS, "small"]
     depth, small = read_model("depth"), found["small"]
     assert found["depth"].maps == ["shop"]

@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from sceneprint.engine.maps.map_frames import opened_cursor
 from sceneprint.errors import InvalidRequest
 from sceneprint.store import Store
 from sceneprint.store import keys as stored
 from sceneprint.store.keys import KeyChange
+from sceneprint.store.opaque_ids import invalid_cursor
 from sceneprint_client.api import Page
 from sceneprint_client.api.admin import EVERY, GRANTED, Audited, Key, MadeKey, Scope
 
@@ -62,10 +62,10 @@ class Audit:
         InvalidRequest : a cursor that was not given out.
         """
         seals = self._store.seals
-        before = opened_cursor(seals, "audit", cursor)
+        before = seals.row("audit", cursor)
         with self._store.database.read() as connection:
             found = stored.list_changes(connection, before, limit + 1, actor, map_name)
-        more = seals.seal("audit", found[limit - 1].number) if len(found) > limit else None
+        more = seals.next_cursor("audit", [one.number for one in found], limit)
         return Page[Audited](items=[_audit_record(one) for one in found[:limit]], next_cursor=more)
 
 
@@ -133,7 +133,8 @@ def list_keys(store: Store, cursor: str | None = None, limit: int = 100) -> Page
     after = None if cursor is None else _name_of(cursor)
     with store.database.read() as connection:
         found = stored.list_keys(connection, after, limit + 1)
-    more = _cursor_of(found[limit - 1].name) if len(found) > limit else None
+    last = found[limit - 1].name.encode() if len(found) > limit else None
+    more = None if last is None else base64.urlsafe_b64encode(last).decode()
     return Page[Key](items=[_key_record(row) for row in found[:limit]], next_cursor=more)
 
 
@@ -160,15 +161,8 @@ def _key_record(row: stored.KeyRow) -> Key:
     )
 
 
-def _cursor_of(name: str) -> str:
-    return base64.urlsafe_b64encode(name.encode()).decode()
-
-
 def _name_of(cursor: str) -> str:
     try:
         return base64.urlsafe_b64decode(cursor.encode()).decode()
     except (binascii.Error, UnicodeError) as error:
-        raise InvalidRequest(
-            f"The cursor {cursor!r:.40} is not valid. Use the `next_cursor` of a page.",
-            (("cursor", "not a cursor of this service"),),
-        ) from error
+        raise invalid_cursor(cursor) from error

@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from sceneprint.engine.admin.statistics import Statistics, anchors
-from sceneprint.engine.maps.map_frames import event_of, opened_cursor
 from sceneprint.engine.maps.maps import Catalogue
 from sceneprint.engine.serializers import when
 from sceneprint.errors import InvalidRequest, SceneprintError
@@ -29,7 +28,7 @@ from sceneprint.store.events import (
 from sceneprint.store.maps import find_map
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint.store.wakeup import Wakeup
-from sceneprint_client.api.admin import MISSED, Event, EventPage, ModelInfo
+from sceneprint_client.api.admin import MISSED, Event, EventPage
 
 # Following events: where a reader begins, and what comes next.
 #
@@ -96,8 +95,8 @@ log = logging.getLogger(__name__)
 #: commit, and after one look.
 TIDY_S = 60.0
 AT_ONCE, AT_MOST = 2_000, 20_000
-#: Most beginnings of kinds that may be asked for; and events read at once.
-MOST_KINDS, AT_A_TIME = 20, 500
+#: Most beginnings of kinds that may be asked for.
+MOST_KINDS = 20
 
 
 class OperatorTasks:
@@ -139,22 +138,6 @@ class OperatorTasks:
             row = find_map(connection, map_name)
         return Wanted(frozenset((row.name,)), tuple(kinds))
 
-    def begin(self, wanted: Wanted, after: str | None) -> tuple[list[Event], int]:
-        """The place to read on from, behind the event of an id, and what is to be told first.
-
-        Raises
-        ------
-        InvalidRequest : no id of an event.
-        """
-        last = None if after is None else event_of(self._store.seals, after)
-        found, place, _ = begin(self._store.database, wanted, self._settings.events_kept, last)
-        return self._told(found), place
-
-    def read_on(self, wanted: Wanted, place: int) -> tuple[list[Event], int]:
-        """Events that came after a place, and the place to read on from."""
-        found, place, _ = next_events(self._store.database, wanted, place, AT_A_TIME)
-        return self._told(found), place
-
     def events(
         self, wanted: Wanted, *, after: str | None = None, cursor: str | None = None,
         limit: int = 100, newest_first: bool = False,
@@ -174,8 +157,8 @@ class OperatorTasks:
         InvalidRequest : a cursor that was not given out, or no id of an event.
         """
         seals, before = self._store.seals, None
-        least = 0 if after is None else event_of(seals, after)
-        place = opened_cursor(seals, "event", cursor)
+        least = 0 if after is None else seals.event(after)
+        place = seals.row("event", cursor)
         if place is not None:
             least, before = (least, place) if newest_first else (max(least, place), None)
         with self._store.database.read() as connection:
@@ -184,16 +167,9 @@ class OperatorTasks:
                 connection, wanted, after=least, before=before, limit=limit + 1,
                 newest_first=newest_first,
             )  # fmt: skip
-        items = self._told(found[:limit])
+        items = [event_record(seals, one) for one in found[:limit]]
         more = items[-1].id if len(found) > limit else None
         return EventPage(items=items, next_cursor=more, newest=seals.seal("event", newest))
-
-    def _told(self, found: Sequence[EventRow]) -> list[Event]:
-        return [event_record(self._store.seals, one) for one in found]
-
-    def models(self, may_read: Callable[[str], bool] = lambda _: True) -> list[ModelInfo]:
-        """Models that maps can be signed with, each with the maps that may be named."""
-        return self.catalogue.tell(may_read)
 
     def tidy(self) -> int:
         """Remove events that are no longer kept, if it is time; returns how many.

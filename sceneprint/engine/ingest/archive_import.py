@@ -19,7 +19,6 @@ from sceneprint.engine.ingest.uploads import Upload, Uploads, item_of
 from sceneprint.engine.ingest.uploads import UploadResult as UploadOutcome
 from sceneprint.engine.jobs.lifecycle import get_job
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
-from sceneprint.engine.maps.map_frames import row_of
 from sceneprint.engine.upkeep.repair import collect_deleted_blobs
 from sceneprint.errors import (
     SceneprintError,
@@ -38,6 +37,7 @@ from sceneprint.store.blobs.folder import IncomingBlob
 from sceneprint.store.database_errors import unusable
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map
+from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.queue import (
     JobFile,
     files_of,

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection
 
-from sceneprint.engine.maps.map_frames import opened_cursor
 from sceneprint.engine.serializers import job_record
 from sceneprint.engine.upkeep.repair import collect_blobs
 from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError, UnusableStore
@@ -204,13 +203,13 @@ def list_jobs(
     ------
     InvalidRequest : a cursor that was not given out.
     """
-    before = opened_cursor(store.seals, "job", cursor)
+    before = store.seals.row("job", cursor)
     with store.database.read() as connection:
         found = list_stored(connection, before, limit + 1, state, kind, map_names)
     items = [
         job_record(one.job, one.frame_id, one.map_name, one.followed_by) for one in found[:limit]
     ]
-    more = store.seals.seal("job", found[limit - 1].job.number) if len(found) > limit else None
+    more = store.seals.next_cursor("job", [one.job.number for one in found], limit)
     return Page[Job](items=items, next_cursor=more)
 
 

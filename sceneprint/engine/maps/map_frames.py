@@ -38,7 +38,7 @@ from sceneprint.store import Store, frame_queries
 from sceneprint.store.frame_queries import Held, count_run, indexed_by_time, list_runs, poses_of_run
 from sceneprint.store.frames import count_states, find_frame
 from sceneprint.store.maps import find_map, model_names
-from sceneprint.store.opaque_ids import START, Kind, OpaqueIds
+from sceneprint.store.opaque_ids import invalid_cursor
 from sceneprint.store.signatures import PatchCounts, geometry_blobs, signature_sizes, stored_vector
 from sceneprint.store.tables import FrameRow, MapRow
 from sceneprint.types import Geometry, Hierarchy, Intrinsics, Ints32, Patches, Surface
@@ -134,68 +134,6 @@ def check_unchanged(store: Store, found: IndexedFrame) -> None:
         )
 
 
-# Cursors of pages: where a page ended, as those who read it are told.
-
-
-def row_of(cursor: str | None) -> int | None:
-    """The place that a cursor stands for in a list that is numbered by itself.
-
-    Raises
-    ------
-    InvalidRequest : it was not given out.
-    """
-    if cursor is None:
-        return None
-    if not (cursor.isascii() and cursor.isdigit() and len(cursor) < 19):
-        raise _not_given_out(cursor)
-    return int(cursor)
-
-
-def opened_cursor(seals: OpaqueIds, kind: Kind, cursor: str | None) -> int | None:
-    """The number of the row that a cursor stands for, where rows count over all maps.
-
-    Raises
-    ------
-    InvalidRequest : it was not given out.
-    """
-    if cursor is None:
-        return None
-    number = None if cursor == START else seals.open(kind, cursor)
-    if number is None:
-        raise _not_given_out(cursor)
-    return number
-
-
-def event_of(seals: OpaqueIds, given: str, place: str = "after") -> int:
-    """The number of the event that an id stands for; 0 for START, which is before all of them.
-
-    Parameters
-    ----------
-    seals : of the store
-    given : the id
-    place : where it was given
-
-    Raises
-    ------
-    InvalidRequest : it is the id of no event of this store.
-    """
-    number = seals.open("event", given)
-    if number is None:
-        raise InvalidRequest(
-            f"{given!r:.40} is not the id of an event here. Start again: with {START} for all "
-            "stored events, or without an id for new events only.",
-            ((place, "not the id of an event"),),
-        )
-    return number
-
-
-def _not_given_out(cursor: str) -> InvalidRequest:
-    return InvalidRequest(
-        f"The cursor {cursor!r:.40} is not valid. Use the `next_cursor` of a page.",
-        (("cursor", "not a cursor of this service"),),
-    )
-
-
 #: Most poses of one trajectory: more are asked for in parts.
 MOST_POSES = 100_000
 #: Most parent frames that are told of a session.
@@ -212,12 +150,12 @@ def list_frames(
     UnknownMap : no such map.
     InvalidRequest : a cursor that was not given out.
     """
-    beyond = opened_cursor(store.seals, "frame", cursor)
+    beyond = store.seals.row("frame", cursor)
     with store.database.read() as connection:
         row = find_map(connection, map_name)
         found = frame_queries.list_frames(connection, row.number, beyond, limit + 1, wanted)
         items = frame_records(connection, row, found[:limit])
-    more = store.seals.seal("frame", found[limit - 1].number) if len(found) > limit else None
+    more = store.seals.next_cursor("frame", [one.number for one in found], limit)
     return Page[Frame](items=items, next_cursor=more)
 
 
@@ -331,10 +269,7 @@ def _names_of(cursor: str) -> tuple[str, str]:
             return session, robot
     except (ValueError, TypeError, RecursionError):  # whatever else somebody may think up
         pass
-    raise InvalidRequest(
-        f"The cursor {cursor!r:.40} is not valid. Use the `next_cursor` of a page.",
-        (("cursor", "not a cursor of this service"),),
-    )
+    raise invalid_cursor(cursor)
 
 
 # How a map grew: frames by the hour or the day in which they were indexed.

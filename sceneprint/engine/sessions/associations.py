@@ -9,7 +9,6 @@ import numpy as np
 from sqlalchemy import Connection
 
 from sceneprint.engine.jobs.tasks import Tasks
-from sceneprint.engine.maps.map_frames import opened_cursor, row_of
 from sceneprint.engine.serializers import sensor_frame, transform, when
 from sceneprint.engine.sessions.pose_graph import graph_text, pose_graph
 from sceneprint.engine.upkeep.repair import collect_deleted_blobs
@@ -25,6 +24,7 @@ from sceneprint.store.frame_queries import (
     stops_of,
 )
 from sceneprint.store.maps import find_map
+from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.queue import find_job, items_of, list_jobs, remove_job
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint_client.api import JobState, Page, Progress
@@ -168,12 +168,12 @@ class AssociationJobs:
         InvalidRequest : a cursor that was not given out.
         """
         seals = self._store.seals
-        before = opened_cursor(seals, "job", cursor)
+        before = seals.row("job", cursor)
         with self._store.database.read() as connection:
             find_map(connection, map_name)
             found = list_jobs(connection, before, limit + 1, None, ASSOCIATE, [map_name])
         items = [_association_record(one.job, map_name) for one in found[:limit]]
-        more = seals.seal("job", found[limit - 1].job.number) if len(found) > limit else None
+        more = seals.next_cursor("job", [one.job.number for one in found], limit)
         return Page[Association](items=items, next_cursor=more)
 
     def get(self, map_name: str, job_id: str) -> Association:
