@@ -16,36 +16,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index.flat import allocate, write_index
-from sceneprint.index.generation import Generation, newest, open_generation
-from sceneprint.index.lists import (
+from sceneprint.index.faiss_index import (
     GROWTH,
     NEAR,
     Lists,
+    allocate,
     centre_lists,
     extend_lists,
     measure_lists,
     still_holds,
     train_lists,
+    write_index,
     write_lists,
 )
-from sceneprint.index.manifest import (
-    GenerationManifest,
-    Recall,
-    manifests,
-    read_manifest,
-    write_manifest,
-)
-from sceneprint.index.mapped_files import (
+from sceneprint.index.generation import Generation, newest, open_generation
+from sceneprint.index.generation_files import (
     BLOCK_BYTES,
     Block,
+    GenerationManifest,
     Keys,
     Places,
+    Recall,
     building,
     check_block,
     is_ours,
+    manifests,
     put,
+    read_manifest,
     unfinished,
+    write_manifest,
 )
 from sceneprint.types import Bytes
 
@@ -159,7 +158,7 @@ def _overtaken(folder: Path, previous: Generation | None) -> bool:
     """Whether a generation was published, or the folder emptied, since `previous` was opened."""
     if previous is None:
         return False
-    found = newest(folder, previous.model_id, previous.dimension, known=previous)
+    found = newest(folder, previous.model_id, previous.manifest.dimension, known=previous)
     return found is None or found.number != previous.number
 
 
@@ -168,7 +167,8 @@ def _draft(
 ) -> Draft:
     """Merge what stays of the generation before with what is new."""
     none = np.empty(0, np.int64)
-    new_keys, stored = _spooled(folder, blocks, None if previous is None else previous.dimension)
+    dimension = None if previous is None else previous.manifest.dimension
+    new_keys, stored = _spooled(folder, blocks, dimension)
     if previous is None and len(new_keys) == 0:
         raise ValueError("a generation of no frames that follows none")
     Places(new_keys)  # raises where a key is there twice
@@ -226,8 +226,8 @@ def _lists(
     if clean or np.count_nonzero(draft.before >= 0) < len(previous):
         # the centroid of a list of one frame is that frame: none may outlive what is deleted
         lists = centre_lists(lists, draft.vectors)
-    if not clean and still_holds(previous.recall, n):
-        return replace(lists, probes=known.probes), previous.recall
+    if not clean and still_holds(previous.manifest.recall, n):
+        return replace(lists, probes=known.probes), previous.manifest.recall
     return measure_lists(lists, draft.vectors)
 
 

@@ -25,7 +25,7 @@ from sceneprint.geometry.retrieval.distance import (
 )
 from sceneprint.geometry.retrieval.dpp import novel, summarise
 from sceneprint.index import signatures_of
-from sceneprint.index.mapped_files import Keys
+from sceneprint.index.generation_files import Keys
 from sceneprint.store.frame_queries import Weight, weights_of
 from sceneprint.types import Bytes
 from sceneprint_client.api import FrameState

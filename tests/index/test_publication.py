@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from sceneprint.index import Generation, clear, newest, newest_number, publication, publish
-from sceneprint.index.mapped_files import Block, building
+from sceneprint.index.generation_files import Block, building
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -53,8 +53,8 @@ def test_what_is_published_is_what_is_opened(
         assert holds(generation, frames_of(keys, signatures))
         assert generation is not None
         assert (generation.number, generation.revision, generation.model_id) == (1, 41, "model")
-        assert (generation.dimension, len(generation)) == (LENGTH, 300)
-        assert generation.anchor == "an event"
+        assert (generation.manifest.dimension, len(generation)) == (LENGTH, 300)
+        assert generation.manifest.anchor == "an event"
         assert not generation.vectors.flags.writeable
         with pytest.raises(ValueError, match="no frames"):
             generation.vectors_of(np.array([keys[0], 3]))

@@ -22,7 +22,7 @@ from sqlalchemy import Connection, func, select
 from sceneprint.engine.search.local_index import index_folder, is_index_folder
 from sceneprint.engine.serializers import when
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
-from sceneprint.index.manifest import GenerationManifest, manifests, read_manifest
+from sceneprint.index.generation_files import GenerationManifest, manifests, read_manifest
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database, FolderBlobs, Store
 from sceneprint.store.events import anchor_number, newest_number

@@ -188,7 +188,7 @@ def trusted(connection: Connection, row: MapRow, found: Generation | None) -> Ge
     """A generation, unless the database was put back to a state before it, and went on."""
     if found is None:
         return None
-    if found.revision <= row.revision and holds_anchor(connection, found.anchor):
+    if found.revision <= row.revision and holds_anchor(connection, found.manifest.anchor):
         return found
     require_primary("the state of an index")
     return None

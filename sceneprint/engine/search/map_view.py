@@ -23,7 +23,7 @@ from sqlalchemy import Connection
 from sceneprint.errors import UnknownFrame
 from sceneprint.geometry.retrieval.distance import Metric, distances
 from sceneprint.index import Generation, SearchHits, Tail, search, signatures_of
-from sceneprint.index.mapped_files import Keys
+from sceneprint.index.generation_files import Keys
 from sceneprint.models import Model
 from sceneprint.store import Database
 from sceneprint.store.postgres import vectors

@@ -26,7 +26,7 @@ from sceneprint.errors import (
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.retrieval.distance import Ranking, ranking_size, similarity
 from sceneprint.index import SearchHits
-from sceneprint.index.mapped_files import Keys
+from sceneprint.index.generation_files import Keys
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, prepare, sign
 from sceneprint.store import Store

@@ -14,7 +14,7 @@ from sceneprint.engine.sessions.pose_graph import graph_text, pose_graph
 from sceneprint.engine.upkeep.repair import collect_deleted_blobs
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
 from sceneprint.formats.pose_graph import information_of
-from sceneprint.index.mapped_files import Keys
+from sceneprint.index.generation_files import Keys
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import (
     PathFrame,
