@@ -118,10 +118,7 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
 
 def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
     """Queue a job again over which something went wrong, or let it be dead."""
-    reason = (
-        str(error) if isinstance(error, SceneprintError) else f"{type(error).__name__}: {error}"
-    )
-    trace = "".join(traceback.format_exception(error))
+    reason, trace = failure_texts(error)
     log.error("job raised an exception", extra=about(work, error=reason, traceback=trace))
     try:
         with store.database.write() as connection:
@@ -132,12 +129,17 @@ def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
             after = FrameState.FAILED if dead else FrameState.RECEIVED
             set_state(connection, work.frame.number, after, reason if dead else None)
             if dead:
-                record_event(
-                    connection, "frame.failed", work.map.name, work.frame.id, work.claim.job.id
-                )
+                record_job_event(connection, "frame.failed", work)
     except LostLease:
         return None
     return state
+
+
+def failure_texts(error: Exception) -> tuple[str, str]:
+    """What a job says of an error that it broke down over, and its traceback."""
+    known = isinstance(error, SceneprintError)
+    reason = str(error) if known else f"{type(error).__name__}: {error}"
+    return reason, "".join(traceback.format_exception(error))
 
 
 def about(work: Work, **more: object) -> dict[str, object]:
@@ -233,7 +235,7 @@ def cancel(store: Store, job_id: str) -> Job:
         job = queue.find_job(connection, job_id)
         if job.state != JobState.CANCELLED:
             queue.cancel(connection, job)
-            _fail_frame(connection, job, CANCELLED)
+            fail_frame(connection, job, CANCELLED)
         return _job_record(connection, queue.find_job(connection, job_id))
 
 
@@ -308,7 +310,7 @@ def worker_died(
         if job.frame_number is None:
             pass  # it is of no single frame
         elif job.state == JobState.DEAD:
-            _fail_frame(connection, job, error)
+            fail_frame(connection, job, error)
         elif frame_of(connection, job.frame).state == FrameState.SIGNING:
             set_state(connection, job.frame, FrameState.RECEIVED)
     about = {"job_id": job_id, "state": job.state, "attempt": job.attempts, "error": error}
@@ -316,7 +318,7 @@ def worker_died(
     return job.state
 
 
-def _fail_frame(connection: Connection, job: JobRow, reason: str) -> None:
+def fail_frame(connection: Connection, job: JobRow, reason: str | None) -> None:
     """A frame that will not be signed; one that is indexed, or gone, stays so."""
     if job.frame_number is None:
         return

@@ -17,6 +17,7 @@ from sceneprint.engine.jobs.lifecycle import (
     Work,
     about,
     break_down,
+    fail_frame,
     leave,
     record_job_event,
     reject,
@@ -41,7 +42,6 @@ from sceneprint.geometry.retrieval.distance import Metric, distance_share, dista
 from sceneprint.models import Model
 from sceneprint.pipeline import prepare
 from sceneprint.store import Database, Store, queue
-from sceneprint.store.events import record_event
 from sceneprint.store.frames import frame_of, set_state
 from sceneprint.store.maps import find_map, map_of
 from sceneprint.store.model_switch import REENCODE, enqueue_all, models_of
@@ -97,12 +97,8 @@ def _abandon(store: Store) -> None:
     """Give up jobs that kill every worker, and their frames."""
     with store.database.write() as connection:
         for job in queue.dead_letter(connection):
-            if job.kind == REENCODE or job.frame_number is None:
-                continue
-            frame = frame_of(connection, job.frame)
-            set_state(connection, frame.number, FrameState.FAILED, job.error)
-            name = map_of(connection, frame.map_number).name
-            record_event(connection, "frame.failed", name, frame.id, job.id)
+            if job.kind != REENCODE:
+                fail_frame(connection, job, job.error)
 
 
 def run(

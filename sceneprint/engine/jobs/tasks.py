@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import logging
 import time
-import traceback
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from sceneprint.engine.jobs.lifecycle import renewed
+from sceneprint.engine.jobs.lifecycle import LEFT_S, failure_texts, renewed
 from sceneprint.engine.serializers import job_record
 from sceneprint.engine.upkeep.repair import collect_deleted_blobs
 from sceneprint.errors import (
@@ -120,8 +119,6 @@ log = logging.getLogger(__name__)
 
 #: Seconds of a slice: frames that wait to be signed come between two.
 SLICE_S = 15.0
-#: Seconds until a job is tried again whose result could not be stored.
-LEFT_S = 5.0
 #: Errors that trying again cannot help: what was asked for cannot be done.
 HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, SnapshotError)
 
@@ -299,9 +296,7 @@ class Tasks:
         return JobState.FAILED
 
     def _break_down(self, task: LongJob, error: Exception) -> JobState | None:
-        known = isinstance(error, SceneprintError)
-        reason = str(error) if known else f"{type(error).__name__}: {error}"
-        trace = "".join(traceback.format_exception(error))
+        reason, trace = failure_texts(error)
         log.error("job raised an exception", extra=_about(task, error=reason, traceback=trace))
         try:
             with self._store.database.write() as connection:
