@@ -44,9 +44,8 @@ from sceneprint.store import maps as stored_maps
 from sceneprint.store import open_store, queue
 from sceneprint.store.deletion import remove_map
 from sceneprint.store.model_switch import models_of
-from sceneprint.store.postgres.notify import Notices
 from sceneprint.store.tables import MapRow
-from sceneprint.store.wakeup import Wakeup
+from sceneprint.store.wakeup import Notices, Wakeup
 from sceneprint_client.api import (
     Added,
     Answer,

@@ -48,17 +48,13 @@ def add_frame(
         _free(connection, map_number, frame_id)
     pose = values["pose"]
     place = {} if pose is None else {f"pose_{axis}": pose[i][3] for i, axis in enumerate("xyz")}
-    connection.execute(
-        insert(frames).values(
-            id=frame_id, map_number=map_number, state=FrameState.RECEIVED,
-            received_at=now(connection), **values, **place,
-        )
+    made = insert(frames).values(
+        id=frame_id, map_number=map_number, state=FrameState.RECEIVED,
+        received_at=now(connection), **values, **place,
     )  # fmt: skip
+    row = frame_row(connection.execute(made.returning(frames)).mappings().one())
     count_on(connection, map_number, 1, values["bytes"])
-    row = _one(connection, (frames.c.map_number == map_number) & (frames.c.id == frame_id))
-    named = [{"frame_number": row.number, "tag": tag} for tag in sorted(set(row.tags))]
-    if named:
-        connection.execute(insert(frame_tags), named)
+    _write_tags(connection, row.number, row.tags)
     return row
 
 
@@ -97,19 +93,13 @@ def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
     ------
     UnknownFrame : there is none.
     """
-    found = (
-        connection.execute(
-            select(frames).where(frames.c.map_number == row.number, frames.c.id == frame_id)
-        )
-        .mappings()
-        .first()
-    )
+    found = _first(connection, frames.c.map_number == row.number, frames.c.id == frame_id)
     if found is None:
         raise UnknownFrame(
             f"There is no frame {frame_id!r:.80} in map {row.name!r}. List them with "
             f"GET /v1/maps/{row.name}/frames."
         )
-    return frame_row(found)
+    return found
 
 
 def frames_of_content(connection: Connection, map_number: int, content_id: str) -> list[FrameRow]:
@@ -125,19 +115,14 @@ def frames_of_content(connection: Connection, map_number: int, content_id: str) 
 
 def living_frame(connection: Connection, map_number: int, frame_id: str) -> FrameRow | None:
     """The frame of an id in a map, or None where there is none that is not deleted."""
-    found = connection.execute(
-        select(frames).where(
-            frames.c.map_number == map_number,
-            frames.c.id == frame_id,
-            frames.c.state != FrameState.DELETED,
-        )
-    ).mappings().first()  # fmt: skip
-    return None if found is None else frame_row(found)
+    there = frames.c.state != FrameState.DELETED
+    return _first(connection, frames.c.map_number == map_number, frames.c.id == frame_id, there)
 
 
 def frame_of(connection: Connection, number: int) -> FrameRow:
     """The frame of a number that is known to exist."""
-    return _one(connection, frames.c.number == number)
+    asked = select(frames).where(frames.c.number == number)
+    return frame_row(connection.execute(asked).mappings().one())
 
 
 def frames_of(connection: Connection, numbers: Iterable[int]) -> dict[int, FrameRow]:
@@ -199,15 +184,9 @@ def count_states(connection: Connection, map_number: int | None = None) -> dict[
 
 def _free(connection: Connection, map_number: int, frame_id: str) -> None:
     """Let a deleted frame give its id up: its row stays, as readers learn of it by its number."""
-    connection.execute(
-        update(frames)
-        .where(
-            frames.c.map_number == map_number,
-            frames.c.id == frame_id,
-            frames.c.state == FrameState.DELETED,
-        )
-        .values(id=uuid.uuid4().hex)
-    )
+    deleted = frames.c.state == FrameState.DELETED
+    own = update(frames).where(frames.c.map_number == map_number, frames.c.id == frame_id, deleted)
+    connection.execute(own.values(id=uuid.uuid4().hex))
 
 
 def _weigh(connection: Connection, number: int, state: FrameState | None, size: int | None) -> None:
@@ -229,8 +208,15 @@ def _weigh(connection: Connection, number: int, state: FrameState | None, size: 
     count_on(connection, map_number, is_now - was, is_now * after - was * before)
 
 
-def _one(connection: Connection, condition: ColumnElement[bool]) -> FrameRow:
-    return frame_row(connection.execute(select(frames).where(condition)).mappings().one())
+def _first(connection: Connection, *conditions: ColumnElement[bool]) -> FrameRow | None:
+    found = connection.execute(select(frames).where(*conditions)).mappings().first()
+    return None if found is None else frame_row(found)
+
+
+def _write_tags(connection: Connection, number: int, tags: Iterable[str]) -> None:
+    named = [{"frame_number": number, "tag": tag} for tag in sorted(set(tags))]
+    if named:
+        connection.execute(insert(frame_tags), named)
 
 
 # What a frame was uploaded on condition of: that its map lacks the place.
@@ -280,9 +266,7 @@ def write_frame(
     connection.execute(update(frames).where(frames.c.number == frame.number).values(**written))
     if "tags" in changed:
         connection.execute(delete(frame_tags).where(frame_tags.c.frame_number == frame.number))
-        named = [{"frame_number": frame.number, "tag": tag} for tag in sorted(set(changed["tags"]))]
-        if named:
-            connection.execute(insert(frame_tags), named)
+        _write_tags(connection, frame.number, changed["tags"])
     record_event(connection, "frame.edited", row.name, frame.id, fields=sorted(changed))
     return frame_of(connection, frame.number)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, func, insert, select
 
-from sceneprint.store.tables import events, jobs, maps, samples
+from sceneprint.store.tables import count_rows, events, jobs, maps, samples
 from sceneprint_client.api import JobState
 
 
@@ -150,5 +150,4 @@ def samples_since(connection: Connection, kind: str, at: float) -> list[Sample]:
 
 def count_samples(connection: Connection, kind: str, at: float) -> int:
     """How many samples of a kind there are from a time on."""
-    counted = select(func.count()).where(samples.c.kind == kind, samples.c.at >= at)
-    return int(connection.execute(counted).scalar_one())
+    return count_rows(connection, samples.c.kind == kind, samples.c.at >= at)

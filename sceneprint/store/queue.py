@@ -29,7 +29,7 @@ from __future__ import annotations
 import time
 import uuid
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from sqlalchemy import (
@@ -52,6 +52,7 @@ from sceneprint.errors import JobOver, LostLease, UnknownJob
 from sceneprint.logs import request_id
 from sceneprint.store.tables import (
     JobRow,
+    count_rows,
     frames,
     job_files,
     job_items,
@@ -582,19 +583,13 @@ class JobFile:
 
 def append_items(connection: Connection, job_number: int, items: list[dict[str, Any]]) -> None:
     """Add to what a job has found."""
-    first = count_items(connection, job_number)
+    first = count_rows(connection, job_items.c.job_number == job_number)
     for start in range(0, len(items), _BLOCK):
         rows = [
             {"job_number": job_number, "number": first + start + i, "data": item}
             for i, item in enumerate(items[start : start + _BLOCK])
         ]
         connection.execute(insert(job_items), rows)
-
-
-def count_items(connection: Connection, job_number: int) -> int:
-    """How many items a job has found: they are numbered from 0."""
-    asked = select(func.count()).where(job_items.c.job_number == job_number)
-    return int(connection.execute(asked).scalar_one())
 
 
 def items_of(
@@ -614,21 +609,14 @@ def add_files(connection: Connection, job_number: int, files: Iterable[JobFile])
     for one in files:
         own = (job_files.c.job_number == job_number) & (job_files.c.name == one.name)
         connection.execute(delete(job_files).where(own))
-        connection.execute(
-            insert(job_files).values(
-                job_number=job_number, name=one.name, blob=one.blob, bytes=one.bytes,
-                media_type=one.media_type,
-            )
-        )  # fmt: skip
+        connection.execute(insert(job_files).values(job_number=job_number, **asdict(one)))
 
 
 def files_of(connection: Connection, job_number: int) -> dict[str, JobFile]:
     """Files of a job by their names."""
-    asked = select(job_files).where(job_files.c.job_number == job_number).order_by(job_files.c.name)
-    return {
-        row["name"]: JobFile(row["name"], row["blob"], row["bytes"], row["media_type"])
-        for row in connection.execute(asked).mappings()
-    }
+    c = job_files.c
+    asked = select(c.name, c.blob, c.bytes, c.media_type).where(c.job_number == job_number)
+    return {row.name: JobFile(*row) for row in connection.execute(asked.order_by(c.name))}
 
 
 def jobs_with_files(connection: Connection, kind: str) -> list[JobRow]:

@@ -76,19 +76,7 @@ class SignatureChange:
 def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) -> int:
     """Store a signature and let queries find the frame; returns the map's revision."""
     # a map that goes back to a model may still have what that model once made of the frame
-    connection.execute(
-        delete(signatures).where(
-            signatures.c.frame_number == frame.number, signatures.c.model_id == made.model_id
-        )
-    )
-    connection.execute(
-        insert(signatures).values(
-            frame_number=frame.number, model_id=made.model_id, vector=made.vector,
-            checksum=crc32(made.vector), geometry=made.geometry,
-            n_patches=list(made.n_patches), n_pairs=list(made.n_pairs),
-        )
-    )  # fmt: skip
-    vectors.put(connection, frame.number, made.model_id, len(made.vector))
+    _write_signature(connection, frame, made)
     revision = next_revision(connection, frame.map_number)
     connection.execute(
         update(frames)
@@ -109,21 +97,11 @@ def replace_signature(connection: Connection, frame: FrameRow, made: StoredSigna
     changed : whether the stored bytes were others
     """
     own = (signatures.c.frame_number == frame.number) & (signatures.c.model_id == made.model_id)
-    values = {
-        "vector": made.vector, "checksum": crc32(made.vector), "geometry": made.geometry,
-        "n_patches": list(made.n_patches), "n_pairs": list(made.n_pairs),
-    }  # fmt: skip
     known = connection.execute(select(signatures.c.vector, signatures.c.checksum).where(own))
     before = known.first()
-    if before is None:
-        connection.execute(
-            insert(signatures).values(frame_number=frame.number, model_id=made.model_id, **values)
-        )
-    else:
-        connection.execute(update(signatures).where(own).values(**values))
-    vectors.put(connection, frame.number, made.model_id, len(made.vector))
+    _write_signature(connection, frame, made)
     # a checksum that does not fit made readers pass the frame over, whatever its bytes
-    if before is not None and tuple(before) == (made.vector, values["checksum"]):
+    if before is not None and tuple(before) == (made.vector, crc32(made.vector)):
         return False
     searched = select(maps.c.model_id).where(maps.c.number == frame.map_number)
     if connection.execute(searched).scalar_one() == made.model_id:
@@ -132,6 +110,20 @@ def replace_signature(connection: Connection, frame: FrameRow, made: StoredSigna
             update(frames).where(frames.c.number == frame.number).values(revision=revision)
         )
     return True
+
+
+def _write_signature(connection: Connection, frame: FrameRow, made: StoredSignature) -> None:
+    """Store a signature and its vector in place of those that the model made before."""
+    own = (signatures.c.frame_number == frame.number) & (signatures.c.model_id == made.model_id)
+    connection.execute(delete(signatures).where(own))
+    connection.execute(
+        insert(signatures).values(
+            frame_number=frame.number, model_id=made.model_id, vector=made.vector,
+            checksum=crc32(made.vector), geometry=made.geometry,
+            n_patches=list(made.n_patches), n_pairs=list(made.n_pairs),
+        )
+    )  # fmt: skip
+    vectors.put(connection, frame.number, made.model_id, len(made.vector))
 
 
 def changes_since(
