@@ -264,12 +264,7 @@ _STILL = np.eye(4).tolist()
 
 
 class ReconstructionJobs:
-    """Begins reconstructions, does them, and hands out what they made.
-
-    Parameters
-    ----------
-    store, tasks : of the engine
-    """
+    """Begins reconstructions, does them, and hands out what they made."""
 
     def __init__(self, store: Store, tasks: Tasks) -> None:
         self._store, self._tasks = store, tasks
@@ -312,7 +307,7 @@ class ReconstructionJobs:
                 blob = self._store.blobs.put(kept.geometry)
                 files = [JobFile(QUERY, blob, len(kept.geometry), "application/octet-stream")]
             try:
-                job = self._tasks.begin(KIND, of, data, files=files)
+                job, _ = self._tasks.begin(KIND, of, data, files=files)
             except Swept:
                 continue
             except BaseException:

@@ -415,10 +415,6 @@ def open_database(url: str) -> Database:
 
     A SQLite file that may not be written is opened for reading.
 
-    Parameters
-    ----------
-    url : of SQLAlchemy
-
     Raises
     ------
     UnusableStore : no such database, or it cannot be opened.
@@ -457,12 +453,7 @@ class _Waiting:
 
 
 class Grouping:
-    """Writes of many threads to one database; safe to share between them.
-
-    Parameters
-    ----------
-    database : see Database
-    """
+    """Writes of many threads to one database; safe to share between them."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

@@ -28,10 +28,6 @@ from sceneprint.store.sqlite import begin_sqlite
 def look_at(url: str) -> Iterator[Database]:
     """Open a database that may be in use, and change nothing: no schema, no log, no lock left.
 
-    Parameters
-    ----------
-    url : of SQLAlchemy
-
     Raises
     ------
     UnusableStore : there is none; of an older schema; or, at the end, one that nobody used at

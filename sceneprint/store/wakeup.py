@@ -205,12 +205,7 @@ AGAIN_S = 2.0
 
 
 class Notices(Wakeup):
-    """The bell of a PostgreSQL database.
-
-    Parameters
-    ----------
-    database : see Database
-    """
+    """The bell of a PostgreSQL database."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

@@ -12,6 +12,7 @@ from anyio import to_thread
 from fastapi import Header, Query, Request, Response
 
 from sceneprint.engine.admin.operations import MOST_KINDS, event_record
+from sceneprint.engine.jobs import lifecycle
 from sceneprint.store.events import Wanted
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint_client.api import Job, JobState, Page
@@ -45,7 +46,7 @@ def list_jobs(
         names = (map_name,)
     elif names is None and not asking.may("admin"):
         names = tuple(one.name for one in here.engine.list_maps().items)
-    return here.engine.list_jobs(state, cursor, limit, kind, names)
+    return lifecycle.list_jobs(here.engine.store, state, cursor, limit, kind, names)
 
 
 @router.get("/{job_id}", responses=declared(404))
@@ -58,7 +59,7 @@ def get_job(job_id: str, here: Here, asking: Asking) -> Job:
 def cancel_job(job_id: str, here: Here, asking: Asking) -> Job:
     """Give up a job that is not over; its frame is `failed` then. Asked twice, it stays so."""
     asking.require_job(here.engine.get_job(job_id), "write")
-    return here.engine.cancel_job(job_id)
+    return lifecycle.cancel(here.engine.store, job_id)
 
 
 @router.post(

@@ -24,12 +24,7 @@ COMMAND = "command"
 
 
 class Audit:
-    """The audit log of one store.
-
-    Parameters
-    ----------
-    store : see Store
-    """
+    """The audit log of one store."""
 
     def __init__(self, store: Store) -> None:
         self._store = store

@@ -100,12 +100,7 @@ MOST_KINDS = 20
 
 
 class OperatorTasks:
-    """Events, figures and models of one store.
-
-    Parameters
-    ----------
-    store, settings, bell : see there
-    """
+    """Events, figures and models of one store."""
 
     def __init__(self, store: Store, settings: Settings, bell: Wakeup) -> None:
         self._store, self._settings = store, settings

@@ -334,12 +334,7 @@ class Figures:
 
 
 class Statistics:
-    """Figures of one store.
-
-    Parameters
-    ----------
-    store, settings, bell : see there
-    """
+    """Figures of one store."""
 
     def __init__(self, store: Store, settings: Settings, bell: Wakeup) -> None:
         self._store, self._settings, self._bell = store, settings, bell

@@ -261,14 +261,12 @@ class Imports:
 
         Raises
         ------
-        UnknownMap, IdempotencyConflict : see `Tasks.begin_once`; the archive is removed.
+        UnknownMap, IdempotencyConflict : see `Tasks.begin`; the archive is removed.
         UnusableStore : an import of the same archive has just ended, and removed it.
         """
         data = options.model_dump(mode="json")
         try:
-            job, again = self._tasks.begin_once(
-                KIND, map_name, data, options.priority, [archive], once
-            )
+            job, again = self._tasks.begin(KIND, map_name, data, options.priority, [archive], once)
         except Swept as error:
             raise UnusableStore(f"{error} Send the archive again.") from error
         except SceneprintError:

@@ -189,8 +189,8 @@ _GIVEN_UP = (FrameState.FAILED, FrameState.REJECTED)
 
 
 def list_jobs(
-    store: Store, state: JobState | None, cursor: str | None, limit: int, kind: str | None = None,
-    map_names: Collection[str] | None = None,
+    store: Store, state: JobState | None = None, cursor: str | None = None, limit: int = 100,
+    kind: str | None = None, map_names: Collection[str] | None = None,
 ) -> Page[Job]:  # fmt: skip
     """Jobs, the newest first.
 

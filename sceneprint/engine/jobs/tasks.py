@@ -124,12 +124,7 @@ HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, S
 
 
 class Tasks:
-    """Kinds of long jobs, each with what does it.
-
-    Parameters
-    ----------
-    store, bell : see there
-    """
+    """Kinds of long jobs, each with what does it."""
 
     def __init__(self, store: Store, bell: Wakeup) -> None:
         self._store, self._bell = store, bell
@@ -154,8 +149,8 @@ class Tasks:
 
     def begin(
         self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
-        files: Collection[JobFile] = (),
-    ) -> Job:  # fmt: skip
+        files: Collection[JobFile] = (), once: IdempotentRequest | None = None,
+    ) -> tuple[Job, bool]:  # fmt: skip
         """Queue a job of a kind.
 
         Parameters
@@ -165,22 +160,17 @@ class Tasks:
         data : what is asked for, as JSON
         priority : as of frames
         files : that it works on
+        once : the request that is to take effect once
+
+        Returns
+        -------
+        job : the job
+        replayed : whether `once` began it before; it is told as it is
 
         Raises
         ------
         UnknownMap : no such map.
         Swept : a file is gone; put it once more.
-        """
-        return self.begin_once(kind, map_name, data, priority, files)[0]
-
-    def begin_once(
-        self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
-        files: Collection[JobFile] = (), once: IdempotentRequest | None = None,
-    ) -> tuple[Job, bool]:  # fmt: skip
-        """As `begin`, with a flag: True where `once` began it before, and it is told as it is.
-
-        Raises
-        ------
         IdempotencyConflict : something else was asked with the key of `once`.
         """
         with self._store.database.write() as connection:

@@ -485,12 +485,7 @@ def open_results(
 
 
 class ResultValidity:
-    """Looks frames and maps up, once each: of one moment, so make a new one for the next.
-
-    Parameters
-    ----------
-    store : see Store
-    """
+    """Looks frames and maps up, once each: of one moment, so make a new one for the next."""
 
     def __init__(self, store: Store) -> None:
         self._store = store

@@ -163,12 +163,7 @@ _OPENED = 64
 
 
 class Associating:
-    """The handler of the jobs.
-
-    Parameters
-    ----------
-    store, signers, readers : of the engine
-    """
+    """The handler of the jobs."""
 
     def __init__(self, store: Store, signers: Signers, readers: Readers) -> None:
         self._store, self._signers, self._readers = store, signers, readers

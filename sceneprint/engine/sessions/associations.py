@@ -128,12 +128,7 @@ _BLOCK = 500
 
 
 class AssociationJobs:
-    """Associations of the sessions of maps.
-
-    Parameters
-    ----------
-    store, tasks : of the engine
-    """
+    """Associations of the sessions of maps."""
 
     def __init__(self, store: Store, tasks: Tasks) -> None:
         self._store, self._tasks = store, tasks
@@ -150,7 +145,7 @@ class AssociationJobs:
             row = find_map(connection, map_name)
         total = len(runs_of(self._store, row, asked)[0])
         data = asked.model_dump(mode="json", exclude_unset=True)
-        job = self._tasks.begin(ASSOCIATE, map_name, data)
+        job, _ = self._tasks.begin(ASSOCIATE, map_name, data)
         return Association(
             association_id=job.job_id, map=map_name, asked=asked, state=job.state,
             progress=Progress(done=0, total=total), result=None, error=None,

@@ -150,12 +150,7 @@ REASON = "retention"
 
 
 class Retention:
-    """Deletes what is too old; any number of processes may.
-
-    Parameters
-    ----------
-    store : see Store
-    """
+    """Deletes what is too old; any number of processes may."""
 
     def __init__(self, store: Store) -> None:
         self._store = store

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +76,7 @@ class Scrubber:
         if self._round is None:
             if not self._is_time():
                 return None
-            self._round = _all(folders)
+            self._round = chain.from_iterable(map(scrub, folders))
         until = time.monotonic() + STEP_S
         while time.monotonic() < until:
             try:
@@ -105,11 +106,6 @@ class Scrubber:
         except OSError:
             return False  # a cache that cannot be written cannot be healed either
         return True
-
-
-def _all(folders: Sequence[Path]) -> Iterator[Path | None]:
-    for folder in folders:
-        yield from scrub(folder)
 
 
 log = logging.getLogger(__name__)
@@ -162,13 +158,14 @@ class Upkeep:
                 published += self._tried(row, anyway=True)
         return published
 
-    def rebuild(self, row: MapRow) -> Generation | None:
-        """Publish the index of a map from nothing; None where another process is building it.
+    def rebuild(self, row: MapRow) -> Generation:
+        """Publish the index of a map from nothing.
 
         Raises
         ------
         UnknownMap : the map is gone.
         InvalidRequest : there is no indexed frame in it, or its model's signatures are psi itself.
+        BusyIndex : another process is building it.
         OSError : it cannot be written; what was there stays.
         """
         if self._signers(row.model_id).model.metric != "l2":
@@ -177,7 +174,12 @@ class Upkeep:
                 "vectors, and queries compare all of them. If the map is too large for that, "
                 "switch its model with `sceneprint reencode`."
             )
-        return self._publish(row, anyway=True, anew=True)
+        generation = self._publish(row, anyway=True, anew=True)
+        if generation is None:
+            raise BusyIndex(
+                f"The index of map {row.name!r} is being built by another process. Try again later."
+            )
+        return generation
 
     def ahead(self, row: MapRow) -> Generation | None:
         """Publish the index of the model that a map is about to switch to, where that is due.
