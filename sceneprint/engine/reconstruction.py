@@ -39,17 +39,9 @@ from sceneprint.geometry.surface.coverage import added_areas, observed_volume, o
 from sceneprint.geometry.surface.depth_image import doubled
 from sceneprint.libraries import open3d
 from sceneprint.rendering import PALETTE, reconstruction_picture
-from sceneprint.store import Store
+from sceneprint.store import Store, queue
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
-from sceneprint.store.queue import (
-    JobFile,
-    files_of,
-    find_job,
-    jobs_with_files,
-    remove_job,
-    unknown_job,
-)
 from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import JobRow
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics
@@ -66,7 +58,7 @@ from sceneprint_client.api.reconstructions import (
 
 # Views of an answer fused: their depth out of the store, the surface, its figures, its files.
 #
-# data of a job, geometry of the query  --fused-->  Fused
+# data of a job, geometry of the query  --fused-->  coverage, PLY, PNG
 
 Source = Literal["upload", "geometry"]
 Strength = Literal["strong", "weak"]
@@ -90,26 +82,10 @@ class JobView:
     transform: list[list[float]]
 
 
-@dataclass(frozen=True, eq=False)
-class Fused:
-    """What became of the views.
-
-    Parameters
-    ----------
-    coverage : see Coverage
-    ply : surface or cloud, in the query's camera frame, coloured by view
-    png : its picture
-    """
-
-    coverage: Coverage
-    ply: bytes
-    png: bytes
-
-
 def fused(
     store: Store, views: Sequence[JobView], query: Geometry | None, own: JobView | None,
     wanted: NewReconstruction, model_id: str, parent_frame: str, asked_at: float,
-) -> Fused:  # fmt: skip
+) -> tuple[Coverage, bytes, bytes]:  # fmt: skip
     """Fuse the matches of an answer, and what the query saw.
 
     Parameters
@@ -122,6 +98,12 @@ def fused(
     model_id : whose artifacts stand in for uploads that are lost
     parent_frame : what the query's camera frame is called
     asked_at : when the answer was given, seconds since 1970
+
+    Returns
+    -------
+    coverage : what became of the views
+    ply : surface or cloud, in the query's camera frame, coloured by view
+    png : its picture
 
     Raises
     ------
@@ -178,7 +160,7 @@ def fused(
     named = f"{len(frames)} views, {coverage.area_m2:.1f} m², {volume:.1f} m³ observed"
     explained = f"{coverage.query_explained:.0%} of the query explained"
     title = named if query is None else f"{named}; {explained}"
-    return Fused(coverage, ply, reconstruction_picture(mesh, first, frames, added, title))
+    return coverage, ply, reconstruction_picture(mesh, first, frames, added, title)
 
 
 def _own(
@@ -305,7 +287,7 @@ class ReconstructionJobs:
             files = []
             if kept.geometry is not None:
                 blob = self._store.blobs.put(kept.geometry)
-                files = [JobFile(QUERY, blob, len(kept.geometry), "application/octet-stream")]
+                files = [queue.JobFile(QUERY, blob, len(kept.geometry), "application/octet-stream")]
             try:
                 job, _ = self._tasks.begin(KIND, of, data, files=files)
             except Swept:
@@ -319,9 +301,9 @@ class ReconstructionJobs:
         """A reconstruction; UnknownJob where there is none."""
         with self._store.database.read() as connection:
             job = _find(connection, job_id)
-            return _reconstruction_record(job, files_of(connection, job.number))
+            return _reconstruction_record(job, queue.files_of(connection, job.number))
 
-    def file(self, job_id: str, name: str) -> JobFile:
+    def file(self, job_id: str, name: str) -> queue.JobFile:
         """A file that a reconstruction made.
 
         Raises
@@ -331,7 +313,7 @@ class ReconstructionJobs:
         """
         with self._store.database.read() as connection:
             job = _find(connection, job_id)
-            found = files_of(connection, job.number).get(name)
+            found = queue.files_of(connection, job.number).get(name)
         if found is None or name not in MEDIA_TYPES:
             why = f": {job.error}" if job.error else "."
             raise NotIndexed(
@@ -343,13 +325,13 @@ class ReconstructionJobs:
     def delete(self, job_id: str) -> None:
         """Remove a reconstruction, whatever has become of it; UnknownJob where there is none."""
         with self._store.database.write() as connection:
-            blobs = remove_job(connection, _find(connection, job_id))
+            blobs = queue.remove_job(connection, _find(connection, job_id))
         collect_deleted_blobs(self._store, blobs)
 
     def forget(self, standing: ResultValidity) -> int:
         """Remove those of which any view was deleted since: they show it; returns how many."""
         with self._store.database.read() as connection:
-            found = jobs_with_files(connection, KIND)
+            found = queue.jobs_with_files(connection, KIND)
         gone = [job for job in found if not _stands(job, standing)]
         for job in gone:
             with suppress(UnknownJob):  # somebody else has
@@ -363,26 +345,26 @@ class ReconstructionJobs:
         wanted = NewReconstruction.model_validate(data["request"])
         views = [JobView(**view) for view in data["views"]]
         own = None if data["own"] is None else JobView(**data["own"])
-        result = fused(
+        coverage, ply, png = fused(
             self._store, views, self._query_of(task), own, wanted, data["model_id"],
             data["parent_frame"], data["asked_at"],
         )  # fmt: skip
         files = [
-            JobFile(name, self._store.blobs.put(content), len(content), MEDIA_TYPES[name])
-            for name, content in ((MESH, result.ply), (PICTURE, result.png))
+            queue.JobFile(name, self._store.blobs.put(content), len(content), MEDIA_TYPES[name])
+            for name, content in ((MESH, ply), (PICTURE, png))
         ]
         return SliceResult(
             over=True,
             progress={"done": len(views), "total": len(views)},
             files=files,
-            result=result.coverage.model_dump(mode="json"),
+            result=coverage.model_dump(mode="json"),
             drop=(QUERY,),
         )
 
     def _query_of(self, task: LongJob) -> Geometry | None:
         """What the query saw; a reconstruction does without it where it is damaged."""
         with self._store.database.read() as connection:
-            found = files_of(connection, task.claim.job.number).get(QUERY)
+            found = queue.files_of(connection, task.claim.job.number).get(QUERY)
         if found is not None:
             with suppress(DamagedBlob, UnreadableGeometry):
                 return read_geometry(self._store.blobs.get(found.blob))
@@ -431,13 +413,13 @@ def _stands(job: JobRow, standing: ResultValidity) -> bool:
 
 
 def _find(connection: Connection, job_id: str) -> JobRow:
-    job = find_job(connection, job_id)
+    job = queue.find_job(connection, job_id)
     if job.kind != KIND:
-        raise unknown_job(job_id)
+        raise queue.unknown_job(job_id)
     return job
 
 
-def _reconstruction_record(job: JobRow, files: dict[str, JobFile]) -> Reconstruction:
+def _reconstruction_record(job: JobRow, files: dict[str, queue.JobFile]) -> Reconstruction:
     data, done = job.data or {}, job.state == JobState.SUCCEEDED
     made = [files[name] for name in MEDIA_TYPES if name in files]
     return Reconstruction(

@@ -12,16 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sceneprint.errors import DamagedIndex
+from sceneprint.index import generation_files
 from sceneprint.index.faiss_index import Lists, codes_of, map_index, map_lists
-from sceneprint.index.generation_files import (
-    GenerationManifest,
-    Keys,
-    Places,
-    check,
-    manifests,
-    mapped,
-    read_manifest,
-)
 from sceneprint.types import Bytes
 
 if TYPE_CHECKING:
@@ -31,7 +23,6 @@ from numpy.typing import NDArray
 
 from sceneprint.geometry.retrieval.distance import Metric, distances
 from sceneprint.index.faiss_index import nearest
-from sceneprint.index.generation_files import check_block
 
 log = logging.getLogger(__name__)
 
@@ -51,8 +42,8 @@ class Generation:
     inodes : of the files by their names: another may have taken a name since
     """
 
-    manifest: GenerationManifest
-    keys: Keys
+    manifest: generation_files.GenerationManifest
+    keys: generation_files.Keys
     index: IndexScalarQuantizer
     lists: Lists | None
     inodes: Mapping[str, int]
@@ -81,11 +72,11 @@ class Generation:
         return codes_of(self.index)
 
     @cached_property
-    def places(self) -> Places:
+    def places(self) -> generation_files.Places:
         """Rows of the frames by their keys."""
-        return Places(self.keys)
+        return generation_files.Places(self.keys)
 
-    def vectors_of(self, keys: Keys) -> Bytes:
+    def vectors_of(self, keys: generation_files.Keys) -> Bytes:
         """Signatures (r, D) of some frames, a copy.
 
         Raises
@@ -118,24 +109,24 @@ def newest(
     the generation; None where there is none, so that the map must be published from the database
     """
     while True:
-        listed, found, errors = manifests(folder), None, []
+        listed, found, errors = generation_files.manifests(folder), None, []
         for _, path in listed:
             try:
-                manifest = read_manifest(path)
+                manifest = generation_files.read_manifest(path)
                 if (manifest.model_id, manifest.dimension) == (model_id, dimension):
                     found = open_generation(folder, manifest, known)
                     break
             except DamagedIndex as error:
                 errors.append(error)
         # what a builder removed after it was listed is not damaged, and something newer is there
-        if not errors or manifests(folder) == listed:
+        if not errors or generation_files.manifests(folder) == listed:
             for each in errors:
                 log.warning("Damaged index skipped; it will be rebuilt: %s", each)
             return found
 
 
 def open_generation(
-    folder: Path, manifest: GenerationManifest, known: Generation | None = None,
+    folder: Path, manifest: generation_files.GenerationManifest, known: Generation | None = None,
     written: Mapping[str, int] | None = None,
 ) -> Generation:  # fmt: skip
     """Open the files of a generation.
@@ -157,10 +148,10 @@ def open_generation(
     sound.update(written or {})
     for name, size in manifest.files:
         if inodes[name] != sound.get(name, -1):
-            for _ in check(folder, name, size):
+            for _ in generation_files.check(folder, name, size):
                 pass
     names = {name.rpartition(".")[2]: folder / name for name, _ in manifest.files}
-    keys = np.frombuffer(mapped(names["keys"]), "<i8")
+    keys = np.frombuffer(generation_files.mapped(names["keys"]), "<i8")
     if (keys[1:] <= keys[:-1]).any():
         raise DamagedIndex(f"{names['keys']}: its keys are not in order.")
     n, lists = len(keys), None
@@ -202,11 +193,11 @@ class Tail:
     ValueError : other arrays, or a key that is there twice.
     """
 
-    keys: Keys
+    keys: generation_files.Keys
     signatures: Bytes
 
     def __post_init__(self) -> None:
-        check_block(self.keys, self.signatures, self.signatures.shape[-1])
+        generation_files.check_block(self.keys, self.signatures, self.signatures.shape[-1])
         _ = self.places
 
     def __len__(self) -> int:
@@ -218,12 +209,12 @@ class Tail:
         return cls(np.empty(0, np.int64), np.empty((0, dimension), np.uint8))
 
     @cached_property
-    def places(self) -> Places:
+    def places(self) -> generation_files.Places:
         """Rows of the frames by their keys."""
-        return Places(self.keys)
+        return generation_files.Places(self.keys)
 
 
-def signatures_of(keys: Keys, generation: Generation | None, tail: Tail) -> Bytes:
+def signatures_of(keys: generation_files.Keys, generation: Generation | None, tail: Tail) -> Bytes:
     """Signatures of some frames: of the hits of a search, to compare them among each other.
 
     Parameters
@@ -287,7 +278,7 @@ class SearchHits:
     compared : frames whose exact distance was computed
     """
 
-    keys: Keys
+    keys: generation_files.Keys
     distances: NDArray[np.int64]
     exact: bool
     compared: int
@@ -304,7 +295,7 @@ def search(
     *,
     metric: Metric,
     dead: frozenset[int] = frozenset(),
-    among: Keys | None = None,
+    among: generation_files.Keys | None = None,
     exact: bool = False,
 ) -> SearchHits:
     """Find the nearest frames of a map. Any number of threads may search one generation.
@@ -345,7 +336,9 @@ def search(
     return SearchHits(keys[first], found[first], whole, compared)
 
 
-def _free(part: Generation | Tail, gone: Keys, among: Keys | None) -> NDArray[np.bool_]:
+def _free(
+    part: Generation | Tail, gone: generation_files.Keys, among: generation_files.Keys | None
+) -> NDArray[np.bool_]:
     """Which frames of a part may be found: those among the given ones that are not gone."""
     free = np.full(len(part), among is None)
     if among is not None:
@@ -355,7 +348,7 @@ def _free(part: Generation | Tail, gone: Keys, among: Keys | None) -> NDArray[np
     return free
 
 
-def _known(places: Places, keys: Keys) -> NDArray[np.int64]:
+def _known(places: generation_files.Places, keys: generation_files.Keys) -> NDArray[np.int64]:
     at = places.of(keys)
     return at[at >= 0]
 
@@ -389,7 +382,7 @@ def _compared(
     return rows, distances(query, generation.vectors, "l2", rows)
 
 
-def _nearest(keys: Keys, found: NDArray[np.int64], size: int) -> NDArray[np.intp]:
+def _nearest(keys: generation_files.Keys, found: NDArray[np.int64], size: int) -> NDArray[np.intp]:
     """Places of the smallest `size`, rising, ties by key."""
     size = min(size, len(keys))
     if size == 0:

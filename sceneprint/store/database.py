@@ -15,15 +15,7 @@ from sqlalchemy import Connection, Engine, event
 
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
 from sceneprint.store.database_errors import database_label, explained
-from sceneprint.store.postgres.connection import HELD_S as HELD_OF_FLEET_S
-from sceneprint.store.postgres.connection import (
-    MIGRATION_S,
-    configure,
-    connect_options,
-    history_of,
-    open_postgres,
-    require_synchronous,
-)
+from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.sqlite import BUSY_S, HELD_S, ReadOnlyFile, open_sqlite, shrink_log
 
 if TYPE_CHECKING:
@@ -234,7 +226,7 @@ class Database:
         return self._history
 
     def _note_history(self, connection: Any, _record: object) -> None:
-        self._history = history_of(connection) or self._history
+        self._history = postgres.history_of(connection) or self._history
 
     @property
     def dialect(self) -> str:
@@ -306,10 +298,10 @@ class Database:
             with self.explained(), self._engine.begin() as connection:
                 yield connection
             return
-        held_s = HELD_S if self.is_sqlite else HELD_OF_FLEET_S
+        held_s = HELD_S if self.is_sqlite else postgres.HELD_S
         wait_s = held_s if self._held else BUSY_S
         if unchecked and not self.is_sqlite:
-            wait_s = MIGRATION_S
+            wait_s = postgres.MIGRATION_S
         if not self._turn.acquire(timeout=wait_s):
             raise StoreLocked(
                 f"{self.shown}: other writers of this process have waited for long, and "
@@ -326,7 +318,7 @@ class Database:
                     self._held = False
                     yield writing
                 if not self.is_sqlite:
-                    require_synchronous(writing)
+                    postgres.require_synchronous(writing)
         except StoreLocked:
             self._held = True
             raise
@@ -362,10 +354,10 @@ class Database:
 
         with self.explained():
             args, given = self._engine.dialect.create_connect_args(self._engine.url)
-            options = {**connect_options(self._engine.url), **given}
+            options = {**postgres.connect_options(self._engine.url), **given}
             found = psycopg.connect(*args, **options, autocommit=True)
             try:
-                configure(found)
+                postgres.configure(found)
             except BaseException:
                 found.close()
                 raise
@@ -407,7 +399,7 @@ def reach_database(given: str) -> Database:
     url = database_url(given)
     if url.get_backend_name() == "sqlite":
         return Database(*open_sqlite(url))
-    return Database(open_postgres(url))
+    return Database(postgres.open_postgres(url))
 
 
 def open_database(url: str) -> Database:

@@ -108,7 +108,7 @@ def test_files_removed_while_they_are_opened_are_not_damaged(
             assert not path.exists() or int(path.name[:10]) > 2
         return read_manifest(path)
 
-    monkeypatch.setattr("sceneprint.index.generation.read_manifest", late)
+    monkeypatch.setattr("sceneprint.index.generation_files.read_manifest", late)
     assert number_of(folder) == 4
     assert caplog.record_tuples == []
 

@@ -140,8 +140,8 @@ def test_the_blobs_of_a_database_that_is_there_are_not_made_up_for(
 def test_a_turn_that_another_process_keeps_is_said(
     served: Database, keeper: Callable[[], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("BUSY_S", "HELD_OF_FLEET_S"):
-        monkeypatch.setattr(database, name, 0.2)
+    monkeypatch.setattr(database, "BUSY_S", 0.2)
+    monkeypatch.setattr(postgres, "HELD_S", 0.2)
     for _ in range(2):  # the second, who comes after one that waited in vain, waits less
         with (
             pytest.raises(StoreLocked, match=r"nothing was stored\. Come back.*pg_stat_activity"),

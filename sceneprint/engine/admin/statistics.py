@@ -24,27 +24,10 @@ from sceneprint.engine.serializers import when
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
 from sceneprint.index.generation_files import GenerationManifest, manifests, read_manifest
 from sceneprint.settings import Settings
-from sceneprint.store import Blobs, Database, FolderBlobs, Store
+from sceneprint.store import Blobs, Database, FolderBlobs, Store, frame_queries, metrics
 from sceneprint.store.events import anchor_number, newest_number
-from sceneprint.store.frame_queries import (
-    bytes_of_files,
-    count_uploads,
-    frames_with_uploads,
-    spread_frames,
-    weigh,
-)
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import find_map, list_maps
-from sceneprint.store.metrics import (
-    Sample,
-    add_sample,
-    at_work,
-    count_events,
-    count_maps,
-    count_samples,
-    oldest_waiting,
-    samples_since,
-)
 from sceneprint.store.queue import count_jobs, read_clock
 from sceneprint.store.signatures import count_indexed
 from sceneprint.store.tables import MapRow
@@ -209,8 +192,8 @@ def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRo
     indexes : folder of search indexes
     row : of the map
     """
-    numbers, total = frames_with_uploads(connection, row.number, WEIGHED)
-    weight = weigh(connection, numbers)
+    numbers, total = frame_queries.frames_with_uploads(connection, row.number, WEIGHED)
+    weight = frame_queries.weigh(connection, numbers)
     artifacts = _of_artifacts(store.blobs, weight.artifacts)
     share = max(len(numbers), 1)
     return Sizes(
@@ -235,10 +218,10 @@ def _of_database(database: Database) -> int | None:
 def _of_objects(store: Store) -> int:
     """Bytes of all blobs in an object store: some of the rows are weighed, nothing is listed."""
     with store.database.read() as connection:
-        some = spread_frames(connection, SPREAD)
-        weight = weigh(connection, some)
-        total = count_uploads(connection)
-        files = bytes_of_files(connection)
+        some = frame_queries.spread_frames(connection, SPREAD)
+        weight = frame_queries.weigh(connection, some)
+        total = frame_queries.count_uploads(connection)
+        files = frame_queries.bytes_of_files(connection)
     each = (weight.upload_bytes + _of_artifacts(store.blobs, weight.artifacts)) / max(len(some), 1)
     return int(each * total) + files
 
@@ -360,19 +343,22 @@ class Statistics:
         with self._store.database.read() as connection:
             row = None if map_name is None else find_map(connection, map_name)
             kinds = [f"frame.{outcome}" for outcome in OUTCOMES]
-            happened = count_events(connection, kinds, start, MINUTE_S, map_name)
-            samples: list[Sample] | None = None
+            happened = metrics.count_events(connection, kinds, start, MINUTE_S, map_name)
+            samples: list[metrics.Sample] | None = None
             if row is None:
                 frames, jobs = count_states(connection), count_jobs(connection)
-                maps, indexes = count_maps(connection), index_states(connection, self._indexes)
-                samples = samples_since(connection, SERVICE, start)
-                oldest = oldest_waiting(connection)
+                maps, indexes = (
+                    metrics.count_maps(connection),
+                    index_states(connection, self._indexes),
+                )
+                samples = metrics.samples_since(connection, SERVICE, start)
+                oldest = metrics.oldest_waiting(connection)
                 workers = self.workers(connection)
             else:
                 frames = count_states(connection, row.number)
                 jobs = count_jobs(connection, row.number)
                 maps, indexes = 1, [index_state(connection, self._indexes, row)]
-                oldest, workers = oldest_waiting(connection, row.number), None
+                oldest, workers = metrics.oldest_waiting(connection, row.number), None
             taken = None if row is None else self._sizes_of_map(connection, row)
         return Stats(
             at=when(now),
@@ -414,28 +400,28 @@ class Statistics:
     def began(self, worker: str) -> None:
         """Note that a worker has begun; where that cannot be written, nobody will know."""
         with suppress(SceneprintError), self._store.database.write(turn=False) as connection:
-            add_sample(connection, WORKER, worker, {})
+            metrics.add_sample(connection, WORKER, worker, {})
 
     def _look(self) -> Figures:
         now = time.time()
         with self._store.database.read() as connection:
-            oldest = oldest_waiting(connection)
+            oldest = metrics.oldest_waiting(connection)
             return Figures(
                 frames=count_states(connection),
                 jobs=count_jobs(connection),
-                maps=count_maps(connection),
+                maps=metrics.count_maps(connection),
                 oldest_waiting_s=0.0 if oldest is None else max(now - oldest, 0.0),
                 indexes=index_states(connection, self._indexes),
                 workers=self.workers(connection),
                 sizes=self.sizes(),
-                began=count_samples(connection, WORKER, now - HOUR_S),
+                began=metrics.count_samples(connection, WORKER, now - HOUR_S),
                 events=newest_number(connection),
                 replica=self.replica(),
             )
 
     def workers(self, connection: Connection) -> list[WorkerSeen]:
         """Processes that wait for jobs, with SQLite on this machine, and those that have one."""
-        busy = at_work(connection, read_clock(connection))
+        busy = metrics.at_work(connection, read_clock(connection))
         names = sorted({*self._bell.listeners(connection), *busy})
         return [WorkerSeen(name=name, job_id=busy.get(name)) for name in names]
 
@@ -467,10 +453,13 @@ def _use(row: MapRow) -> MapUse:
 
 
 def _minutes(
-    happened: Mapping[tuple[int, str], int], samples: list[Sample] | None, start: float, count: int
+    happened: Mapping[tuple[int, str], int],
+    samples: list[metrics.Sample] | None,
+    start: float,
+    count: int,
 ) -> list[Minute]:
     """What happened in each minute; a minute in which nothing did is told too."""
-    of_minute: dict[int, list[Sample]] = {place: [] for place in range(count)}
+    of_minute: dict[int, list[metrics.Sample]] = {place: [] for place in range(count)}
     for sample in samples or ():
         place = int((sample.at - start) // MINUTE_S)
         if place in of_minute:  # a clock that was set back may be ahead of now
@@ -487,7 +476,7 @@ def _minutes(
 
 
 def _recent_counts(
-    happened: Mapping[tuple[int, str], int], places: range, samples: list[Sample] | None
+    happened: Mapping[tuple[int, str], int], places: range, samples: list[metrics.Sample] | None
 ) -> dict[str, Any]:
     """Fields of `Counted` for some minutes."""
     told: dict[str, Any] = {

@@ -11,32 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from sqlalchemy import Connection
 
+from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_stored
-from sceneprint.engine.jobs.lifecycle import (
-    Outdated,
-    Work,
-    about,
-    break_down,
-    fail_frame,
-    leave,
-    record_job_event,
-    reject,
-    renewed,
-    restart_jobs,
-)
+from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.models import Signers
 from sceneprint.engine.search.local_index import Readers
 from sceneprint.engine.upkeep.repair import collect_blobs
-from sceneprint.errors import (
-    DamagedBlob,
-    FrameError,
-    LostLease,
-    SceneprintError,
-    StoreAway,
-    UnknownMap,
-    UnusableStore,
-)
 from sceneprint.formats.artifact import write_geometry
 from sceneprint.geometry.retrieval.distance import Metric, distance_share, distances
 from sceneprint.models import Model
@@ -63,7 +44,7 @@ log = logging.getLogger(__name__)
 AWAY_S, AGAIN_S = 12.0, 0.5
 
 
-def claim(store: Store, worker: str, lease_s: float) -> Work | LongJob | None:
+def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob | None:
     """Take the next job, or None where there is none; gives up those that kill every worker.
 
     A job of no single frame comes as a Task.
@@ -90,7 +71,7 @@ def claim(store: Store, worker: str, lease_s: float) -> Work | LongJob | None:
         frame = frame_of(connection, held.job.frame)
         if held.job.kind != REENCODE:
             set_state(connection, frame.number, FrameState.SIGNING)
-        return Work(held, frame, map_of(connection, frame.map_number))
+        return lifecycle.Work(held, frame, map_of(connection, frame.map_number))
 
 
 def _abandon(store: Store) -> None:
@@ -98,12 +79,12 @@ def _abandon(store: Store) -> None:
     with store.database.write() as connection:
         for job in queue.dead_letter(connection):
             if job.kind != REENCODE:
-                fail_frame(connection, job, job.error)
+                lifecycle.fail_frame(connection, job, job.error)
 
 
 def run(
-    store: Store, signers: Signers, readers: Readers, work: Work, lease_s: float, longest_s: float,
-    broke: Callable[[], None] | None = None,
+    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, lease_s: float,
+    longest_s: float, broke: Callable[[], None] | None = None,
 ) -> JobState | None:  # fmt: skip
     """Sign a claimed frame.
 
@@ -126,23 +107,23 @@ def run(
     made: StoredSignature | None = None
     gone: list[str] = []
     try:
-        with renewed(store, work.claim, lease_s, longest_s):
+        with lifecycle.renewed(store, work.claim, lease_s, longest_s):
             made = _sign(store, signers, work)
             gone = _store_patiently(store, signers, readers, work, made)
         state = JobState.SUCCEEDED
-    except LostLease as error:
-        log.warning("lease lost", extra=about(work, error=str(error)))
+    except errors.LostLease as error:
+        log.warning("lease lost", extra=lifecycle.about(work, error=str(error)))
         state = None
-    except Outdated:
-        state = restart_jobs(store, work)
-    except FrameError as error:
-        state = reject(store, work, error)
-    except UnusableStore:  # a full disk is no fault of the frame's, and costs it no try
-        leave(store, work, made)
+    except lifecycle.Outdated:
+        state = lifecycle.restart_jobs(store, work)
+    except errors.FrameError as error:
+        state = lifecycle.reject(store, work, error)
+    except errors.UnusableStore:  # a full disk is no fault of the frame's, and costs it no try
+        lifecycle.leave(store, work, made)
         raise
     except Exception as error:
-        state = break_down(store, work, error)
-        if broke is not None and not isinstance(error, SceneprintError):
+        state = lifecycle.break_down(store, work, error)
+        if broke is not None and not isinstance(error, errors.SceneprintError):
             broke()
     if made is not None and state != JobState.SUCCEEDED:
         gone = [made.geometry]  # nothing came to refer to it
@@ -151,13 +132,13 @@ def run(
     if state is None:
         return None
     milliseconds = round(1e3 * (time.perf_counter() - start), 1)
-    log.info("job %s", state, extra=about(work, state=state, milliseconds=milliseconds))
+    log.info("job %s", state, extra=lifecycle.about(work, state=state, milliseconds=milliseconds))
     return state
 
 
-def _sign(store: Store, signers: Signers, work: Work) -> StoredSignature:
+def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> StoredSignature:
     if work.model_id not in models_of(work.map):
-        raise Outdated
+        raise lifecycle.Outdated
     frame = read_stored(store.blobs.get(work.frame.blob), work.frame)
     signature, geometry = prepare(frame, signers(work.model_id))
     return StoredSignature(
@@ -170,7 +151,7 @@ def _sign(store: Store, signers: Signers, work: Work) -> StoredSignature:
 
 
 def _store_patiently(
-    store: Store, signers: Signers, readers: Readers, work: Work, made: StoredSignature
+    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, made: StoredSignature
 ) -> list[str]:
     """As `_store`, while another server takes the place of one that fell.
 
@@ -180,14 +161,14 @@ def _store_patiently(
     while True:
         try:
             return _store(store, signers, readers, work, made)
-        except StoreAway:
+        except errors.StoreAway:
             if time.monotonic() > until:
                 raise
             time.sleep(AGAIN_S)
 
 
 def _store(
-    store: Store, signers: Signers, readers: Readers, work: Work, made: StoredSignature
+    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, made: StoredSignature
 ) -> list[str]:
     """Signature, artifact, state and end of the job in one commit.
 
@@ -205,24 +186,26 @@ def _store(
             queue.finish(connection, work.claim, JobState.SUCCEEDED)
             row = map_of(connection, work.frame.map_number)
             if row.model_id != made.model_id:
-                raise Outdated
+                raise lifecycle.Outdated
             reason = None
             if seen is not None:
                 reason = judge(connection, work.frame, made, seen, signers(made.model_id).model)
             if reason is not None:
                 set_state(connection, work.frame.number, FrameState.REDUNDANT, reason)
-                record_job_event(connection, "frame.redundant", work)
+                lifecycle.record_job_event(connection, "frame.redundant", work)
                 return [work.frame.blob, made.geometry]
             if not store.blobs.holds(made.geometry):  # nothing referred to it until now
-                raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
+                raise errors.DamagedBlob(
+                    "A deletion elsewhere swept the artifact: it must be made again."
+                )
             index_frame(connection, work.frame, made)
             if row.next_model_id is not None:
                 enqueue_all(connection, row, [work.frame.number])
-            record_job_event(connection, "frame.indexed", work)
+            lifecycle.record_job_event(connection, "frame.indexed", work)
             return []
 
 
-def _replace_signature(store: Store, work: Work, made: StoredSignature) -> list[str]:
+def _replace_signature(store: Store, work: lifecycle.Work, made: StoredSignature) -> list[str]:
     """Signature and artifact of an indexed frame, beside those of another model or in the place
     of damaged ones, and the end of the job in one commit.
 
@@ -236,12 +219,14 @@ def _replace_signature(store: Store, work: Work, made: StoredSignature) -> list[
         row = map_of(connection, work.frame.map_number)
         indexed = frame_of(connection, number).state == FrameState.INDEXED
         if not indexed or made.model_id not in models_of(row):
-            raise Outdated
+            raise lifecycle.Outdated
         if not store.blobs.holds(made.geometry):
-            raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
+            raise errors.DamagedBlob(
+                "A deletion elsewhere swept the artifact: it must be made again."
+            )
         before = geometry_blobs(connection, [number], made.model_id).values()
         replace_signature(connection, work.frame, made)
-        record_job_event(connection, "frame.reencoded", work)
+        lifecycle.record_job_event(connection, "frame.reencoded", work)
         return [blob for blob in before if blob != made.geometry]
 
 
@@ -254,19 +239,13 @@ def _replace_signature(store: Store, work: Work, made: StoredSignature) -> list[
 
 
 @dataclass(frozen=True)
-class NearestFrame:
-    """The indexed frame nearest to another; `distance` is of their signatures."""
-
-    number: int
-    distance: int
-
-
-@dataclass(frozen=True)
 class Look:
-    """The nearest frame of a map as of one revision; None in an empty map."""
+    """The frame of a map that is nearest as of one revision, and how far its signature is; None in
+    an empty map.
+    """
 
     revision: int
-    nearest: NearestFrame | None
+    nearest: tuple[int, int] | None
 
 
 class Stale(Exception):
@@ -293,15 +272,15 @@ def look(database: Database, readers: Readers, row: MapRow, made: StoredSignatur
     with database.read() as connection:
         try:
             now = find_map(connection, row.name)
-        except UnknownMap as error:
-            raise LostLease(str(error)) from error
+        except errors.UnknownMap as error:
+            raise errors.LostLease(str(error)) from error
         if now.number != row.number or now.model_id != made.model_id:
             return None
         (view,) = readers.views(connection, database, [now])
     hits = view.search(_vector(made), 1, dead=view.dead)
     if len(hits) == 0:
         return Look(view.revision, None)
-    return Look(view.revision, NearestFrame(int(hits.keys[0]), int(hits.distances[0])))
+    return Look(view.revision, (int(hits.keys[0]), int(hits.distances[0])))
 
 
 def judge(
@@ -328,11 +307,11 @@ def judge(
     nearest = _nearest_now(connection, row, _vector(made), seen, model.metric)
     if nearest is None:
         return None
-    apart = np.array(nearest.distance)
+    apart = np.array(nearest[1])
     share = float(distance_share(apart, model.unrelated_distance, model.metric))
     if share > novelty:
         return None
-    there = frame_of(connection, nearest.number).id
+    there = frame_of(connection, nearest[0]).id
     return (
         f"the map already has this place: frame {there} is at {share:.3f} of the distance of "
         f"unrelated frames (required: more than {novelty:g})"
@@ -341,17 +320,17 @@ def judge(
 
 def _nearest_now(
     connection: Connection, row: MapRow, vector: Bytes, seen: Look, metric: Metric
-) -> NearestFrame | None:
+) -> tuple[int, int] | None:
     nearest = seen.nearest
     for block in changes_since(connection, row, seen.revision):
         for change in block:
-            if nearest is not None and change.number == nearest.number:
+            if nearest is not None and change.number == nearest[0]:
                 raise Stale
             if change.vector is not None:
                 stored = np.frombuffer(change.vector, np.uint8)
                 distance = int(distances(vector, stored[None], metric)[0])
-                if nearest is None or distance < nearest.distance:
-                    nearest = NearestFrame(change.number, distance)
+                if nearest is None or distance < nearest[1]:
+                    nearest = change.number, distance
     return nearest
 
 

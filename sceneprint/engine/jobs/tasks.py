@@ -35,15 +35,6 @@ from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map, map_of
-from sceneprint.store.queue import (
-    Claim,
-    JobFile,
-    add_files,
-    append_items,
-    files_of,
-    find_job,
-    remove_parts,
-)
 from sceneprint.store.tables import MapRow
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Job, JobState
@@ -66,7 +57,7 @@ class LongJob:
     map : that it is about; None where it is of none
     """
 
-    claim: Claim
+    claim: queue.Claim
     map: MapRow | None
 
     @property
@@ -105,7 +96,7 @@ class SliceResult:
     over: bool
     progress: dict[str, Any]
     items: list[dict[str, Any]] = field(default_factory=list)
-    files: list[JobFile] = field(default_factory=list)
+    files: list[queue.JobFile] = field(default_factory=list)
     result: dict[str, Any] | None = None
     drop: Collection[str] = ()
     event: str | None = None
@@ -149,7 +140,7 @@ class Tasks:
 
     def begin(
         self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
-        files: Collection[JobFile] = (), once: IdempotentRequest | None = None,
+        files: Collection[queue.JobFile] = (), once: IdempotentRequest | None = None,
     ) -> tuple[Job, bool]:  # fmt: skip
         """Queue a job of a kind.
 
@@ -178,12 +169,12 @@ class Tasks:
             before = None if once is None else once.found(connection)
             if before is not None:
                 with suppress(UnknownJob):  # its map may have been deleted and made anew
-                    there = find_job(connection, before["job_id"])
+                    there = queue.find_job(connection, before["job_id"])
                     return job_record(there, None, map_name), True
             self._check(files)
             number = None if row is None else row.number
             job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
-            add_files(connection, job.number, files)
+            queue.add_files(connection, job.number, files)
             if once is not None:
                 once.keep(connection, {"job_id": job.id})
         self._bell.ring()
@@ -263,13 +254,13 @@ class Tasks:
                 queue.go_on(connection, task.claim, outcome.progress)
             self._check(outcome.files)
             # after the job: it may be gone, and nothing can be of one that is
-            append_items(connection, job.number, outcome.items)
-            before = files_of(connection, job.number)
-            add_files(connection, job.number, outcome.files)
-            gone = remove_parts(connection, job.number, items=False, files=outcome.drop)
+            queue.append_items(connection, job.number, outcome.items)
+            before = queue.files_of(connection, job.number)
+            queue.add_files(connection, job.number, outcome.files)
+            gone = queue.remove_parts(connection, job.number, items=False, files=outcome.drop)
             return gone + [before[one.name].blob for one in outcome.files if one.name in before]
 
-    def _check(self, files: Collection[JobFile]) -> None:
+    def _check(self, files: Collection[queue.JobFile]) -> None:
         """See that files are there, in the transaction that comes to refer to them."""
         for one in files:
             if not self._store.blobs.holds(one.blob):

@@ -15,19 +15,11 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_stored
 from sceneprint.engine.models import Signers
 from sceneprint.engine.serializers import frame_records, model_label, sensor_of, tag_of, when
 from sceneprint.engine.upkeep.repair import resign_frames
-from sceneprint.errors import (
-    Busy,
-    DamagedBlob,
-    DamagedSignature,
-    InvalidRequest,
-    NotIndexed,
-    UnknownFrame,
-    UnreadableGeometry,
-)
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.formats.points.ply_export import points_of, write_ply
@@ -89,7 +81,7 @@ def find_indexed(store: Store, map_name: str, frame_id: str) -> IndexedFrame:
         artifacts = geometry_blobs(connection, [frame.number], row.model_id)
         label = model_label(model_names(connection)[row.model_id], row.model_id)
     if frame.state != FrameState.INDEXED or frame.number not in artifacts:
-        raise NotIndexed(
+        raise errors.NotIndexed(
             f"Frame {frame.id} is {frame.state}: {frame.state.sentence} Derived data is "
             "available once the frame is indexed."
         )
@@ -99,7 +91,7 @@ def find_indexed(store: Store, map_name: str, frame_id: str) -> IndexedFrame:
 def living(row: MapRow, frame: FrameRow) -> FrameRow:
     """The frame; UnknownFrame where it was deleted."""
     if frame.state == FrameState.DELETED:
-        raise UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted.")
+        raise errors.UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted.")
     return frame
 
 
@@ -113,7 +105,7 @@ def geometry_of(store: Store, found: IndexedFrame) -> Geometry:
     """
     try:
         return read_geometry(store.blobs.get(found.artifact))
-    except (DamagedBlob, UnreadableGeometry):
+    except (errors.DamagedBlob, errors.UnreadableGeometry):
         check_unchanged(store, found)
         resign_frames(store, found.row, [found.frame.number], found.row.model_id)
         raise
@@ -129,7 +121,7 @@ def check_unchanged(store: Store, found: IndexedFrame) -> None:
     """
     now = find_indexed(store, found.row.name, found.frame.id)
     if (now.frame.number, now.artifact) != (found.frame.number, found.artifact):
-        raise Busy(
+        raise errors.Busy(
             f"Frame {found.frame.id} was signed with another model in the meantime. Try again."
         )
 
@@ -193,7 +185,7 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
         parent = _only("parent_frame", run.parent_frame, parents, run.session)
         total = sum(one.count for one in counted)
         if run.most is None and total > MOST_POSES:
-            raise InvalidRequest(
+            raise errors.InvalidRequest(
                 f"Session {run.session!r:.140} has {total} frames, but a trajectory has at most "
                 f"{MOST_POSES}. Limit it with `most`, or select a part with `captured_after` and "
                 "`captured_before`.",
@@ -235,7 +227,7 @@ def _only(what: str, asked: str | None, found: Iterable[str | None], session: st
     names = sorted(set(found), key=lambda name: name or "")
     if len(names) > 1:
         told = ", ".join("none" if name is None else repr(name)[:60] for name in names[:5])
-        raise InvalidRequest(
+        raise errors.InvalidRequest(
             f"Session {session!r:.140} has frames with {len(names)} values of `{what}` ({told}), "
             f"but a trajectory covers one. Choose it with `{what}`.",
             ((what, "required, as there are several"),),
@@ -498,7 +490,7 @@ class FrameFiles:
             row = find_map(connection, map_name)
             frame = living(row, find_frame(connection, row, frame_id))
         if frame.state == FrameState.REDUNDANT:
-            raise NotIndexed(
+            raise errors.NotIndexed(
                 f"Frame {frame.id} is redundant, so its upload was not stored. "
                 f"{frame.reason or ''} Upload it without `if_novel` to store it."
             )
@@ -527,12 +519,12 @@ class FrameFiles:
             with self._store.database.read() as connection:
                 vector = stored_vector(connection, number, model_id)
                 sizes = signature_sizes(connection, number, model_id)
-        except DamagedSignature:
+        except errors.DamagedSignature:
             resign_frames(self._store, found.row, [number], model_id)
             raise
         if vector is None or sizes is None:
             check_unchanged(self._store, found)
-            raise DamagedSignature(
+            raise errors.DamagedSignature(
                 f"The signature of frame {found.frame.id} is missing. Run `sceneprint fsck` to "
                 "find out why."
             )
@@ -555,7 +547,7 @@ def placed(frame: FrameRow, within: CloudFrame) -> tuple[str, list[list[float]]]
     }[within]
     if matrix is None or name is None:
         lacking = "pose" if within == "parent" else "T_base_sensor"
-        raise InvalidRequest(
+        raise errors.InvalidRequest(
             f"Frame {frame.id} has no {lacking}, so its points are available only in {optical}. "
             "Use frame=optical, or add one with PATCH.",
             (("frame", f"it has no {lacking}"),),

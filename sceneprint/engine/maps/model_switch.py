@@ -15,16 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from sceneprint import errors
 from sceneprint.engine.search.local_index import trusted
 from sceneprint.engine.serializers import map_record, model_label
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.engine.upkeep.repair import collect_blobs
-from sceneprint.errors import (
-    BusyIndex,
-    Conflict,
-    SceneprintError,
-    UnknownMap,
-)
 from sceneprint.index import Generation
 from sceneprint.models import Model, read_model, write_model
 from sceneprint.store import Store, signatures
@@ -60,12 +55,12 @@ def begin(store: Store, map_name: str, model: str | Path | Model) -> Map:
         row = find_map(connection, map_name)
         if row.next_model_id not in (None, wanted.id):
             label = model_label(model_names(connection)[row.next_model_id], row.next_model_id)
-            raise Conflict(
+            raise errors.Conflict(
                 f"Map {row.name!r} is already switching to {label}. Wait until it has switched, "
                 f"or cancel with `sceneprint reencode {row.name} --cancel`."
             )
         if row.next_model_id is None and row.model_id == wanted.id:
-            raise Conflict(
+            raise errors.Conflict(
                 f"Map {row.name!r} is already signed with {wanted.label}. There is nothing to do."
             )
         if row.next_model_id is None:
@@ -88,7 +83,7 @@ def cancel(store: Store, map_name: str) -> Map:
     with store.database.write() as connection:
         row = find_map(connection, map_name)
         if row.next_model_id is None:
-            raise Conflict(
+            raise errors.Conflict(
                 f"Map {row.name!r} is not switching to another model, so there is nothing to "
                 "cancel. To undo a finished switch, run it again with --model and the previous "
                 "model."
@@ -123,9 +118,9 @@ class ModelSwitches:
                     models = (row.next_model_id,)
                 if self._tidied.get(row.number) != models and _tidy(self._store, row, TIDY_S):
                     self._tidied[row.number] = models
-            except UnknownMap:
+            except errors.UnknownMap:
                 pass  # deleted in the meantime
-            except SceneprintError as error:
+            except errors.SceneprintError as error:
                 log.error("map not reencoded", extra={"map": row.name, "error": str(error)})
 
     def _go_on(self, row: MapRow) -> bool:
@@ -140,7 +135,7 @@ class ModelSwitches:
                 return False  # jobs that broke down: somebody must say what is to become of them
         try:
             generation = self._upkeep.ahead(row)
-        except BusyIndex:
+        except errors.BusyIndex:
             return False  # next time
         return self._switch(row, generation)
 
