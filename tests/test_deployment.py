@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.fleet.postgres import Server, binaries, of_nobody
 from sceneprint.engine import Engine
-from sceneprint.engine.admin.keys import list_keys
+from sceneprint.engine.admin.operations import list_keys
 from sceneprint.settings import Settings
 from sceneprint_client.api import NewMap
 

@@ -58,7 +58,7 @@ def add_keys(commands: Any) -> None:
 def run_keys(options: argparse.Namespace) -> int:
     """Do what was asked for with the keys of the data folder."""
     from sceneprint.engine import Engine
-    from sceneprint.engine.admin.keys import list_keys
+    from sceneprint.engine.admin.operations import list_keys
     from sceneprint.errors import InvalidRequest
 
     given = [name for name in ("scope", "map", "expires") if getattr(options, name) is not None]

@@ -9,9 +9,8 @@ from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 
-from sceneprint.engine.admin import keys
-from sceneprint.engine.admin.keys import Audit
-from sceneprint.engine.admin.operations import OperatorTasks
+from sceneprint.engine.admin import operations
+from sceneprint.engine.admin.operations import Audit, OperatorTasks
 from sceneprint.engine.ingest.archive_import import Imports
 from sceneprint.engine.ingest.uploads import Upload, Uploads
 from sceneprint.engine.jobs import lifecycle
@@ -195,8 +194,8 @@ class Engine:
         self, name: str, grants: Mapping[str, Scope] | None = None,
         expires_at: datetime | None = None,
     ) -> MadeKey:  # fmt: skip
-        """Make a key, and show its secret; see `keys.create_key`."""
-        return keys.create_key(self.store, name, grants, expires_at)
+        """Make a key, and show its secret; see `operations.create_key`."""
+        return operations.create_key(self.store, name, grants, expires_at)
 
     def revoke_key(self, name: str) -> None:
         """Let a key open nothing any more; UnknownKey where there is none."""

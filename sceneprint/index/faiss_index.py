@@ -294,12 +294,6 @@ def _assigned(centroids: Floats32, vectors: Bytes, rows: NDArray[np.int64]) -> I
 def measure_lists(lists: Lists, vectors: Bytes, seed: int = 0) -> tuple[Lists, Recall]:
     """Look up some frames, and probe so many lists that a search finds ENOUGH of the nearest.
 
-    Parameters
-    ----------
-    lists : of the signatures
-    vectors : (N, d)
-    seed : of the choice of frames
-
     Returns
     -------
     the lists with their number of probes, a power of two or all; and what a search finds so

@@ -409,14 +409,7 @@ def stops_of(connection: Connection, numbers: Iterable[int]) -> dict[int, PathFr
 
 @dataclass(frozen=True)
 class Weight:
-    """A frame that is indexed.
-
-    Parameters
-    ----------
-    frame_id : of the frame
-    upload_bytes : of its upload
-    artifact : blob of its geometry
-    """
+    """A frame that is indexed."""
 
     frame_id: str
     upload_bytes: int
@@ -509,14 +502,7 @@ class Weighed:
 def frames_with_uploads(
     connection: Connection, map_number: int, most: int
 ) -> tuple[list[int], int]:
-    """Numbers of frames of a map whose uploads are kept, evenly taken, and how many there are.
-
-    Parameters
-    ----------
-    connection : of the database
-    map_number : of the map
-    most : numbers
-    """
+    """Numbers of frames of a map whose uploads are kept, evenly taken, and how many there are."""
     of_map = (frames.c.map_number == map_number) & frames.c.state.in_(_KEPT)
     total = count_rows(connection, of_map)
     # adding 0, as above: the index that has states holds all of this, and rows are not read

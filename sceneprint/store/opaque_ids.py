@@ -29,12 +29,7 @@ START = "0"
 
 
 class OpaqueIds:
-    """The seals of one store.
-
-    Parameters
-    ----------
-    database : that has the secret
-    """
+    """The seals of one store."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -59,11 +54,6 @@ class OpaqueIds:
 
     def event(self, given: str, place: str = "after") -> int:
         """The number of the event that an id stands for; 0 for START, which is before all of them.
-
-        Parameters
-        ----------
-        given : the id
-        place : where it was given
 
         Raises
         ------

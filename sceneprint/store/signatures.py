@@ -10,13 +10,8 @@ from zlib import crc32
 from sqlalchemy import ColumnElement, Connection, delete, func, insert, select, update
 
 from sceneprint.errors import DamagedSignature
+from sceneprint.store import model_switch
 from sceneprint.store.maps import next_revision
-from sceneprint.store.model_switch import (
-    QUEUED_AT_ONCE,
-    REENCODE,
-    REMOVED_AT_ONCE,
-    models_of,
-)
 from sceneprint.store.postgres import vectors
 from sceneprint.store.queue import PENDING
 from sceneprint.store.tables import (
@@ -248,23 +243,16 @@ def stored_signatures(
 
 
 def stale_signatures(connection: Connection, row: MapRow, after: int) -> list[tuple[int, str]]:
-    """The next signatures of a map that are of neither of its models: frame, model.
-
-    Parameters
-    ----------
-    connection : of a transaction
-    row : of the map
-    after : number of a frame
-    """
+    """The next signatures of a map that are of neither of its models: frame, model."""
     found = connection.execute(
         select(signatures.c.frame_number, signatures.c.model_id)
         .join(frames, frames.c.number == signatures.c.frame_number)
         .where(
             frames.c.map_number == row.number, frames.c.number > after,
-            signatures.c.model_id.not_in(models_of(row)),
+            signatures.c.model_id.not_in(model_switch.models_of(row)),
         )
         .order_by(frames.c.number)
-        .limit(REMOVED_AT_ONCE)
+        .limit(model_switch.REMOVED_AT_ONCE)
     )  # fmt: skip
     return [(number, model_id) for number, model_id in found]
 
@@ -283,9 +271,9 @@ def stale_jobs(connection: Connection, row: MapRow) -> list[int]:
         select(jobs.c.number)
         .join(frames, frames.c.number == jobs.c.frame_number)
         .where(
-            jobs.c.state.in_(PENDING), jobs.c.kind == REENCODE,
-            jobs.c.model_id.not_in(models_of(row)), frames.c.map_number == row.number,
+            jobs.c.state.in_(PENDING), jobs.c.kind == model_switch.REENCODE,
+            jobs.c.model_id.not_in(model_switch.models_of(row)), frames.c.map_number == row.number,
         )
-        .limit(QUEUED_AT_ONCE)
+        .limit(model_switch.QUEUED_AT_ONCE)
     )  # fmt: skip
     return list(found.scalars())

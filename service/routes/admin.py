@@ -13,7 +13,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, Field, ValidationError
 
 from sceneprint import __version__
-from sceneprint.engine.admin import keys
+from sceneprint.engine.admin import operations
 from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.maps import model_switch
 from sceneprint.errors import InvalidRequest, UnsupportedType
@@ -147,7 +147,7 @@ async def create_key(request: Request, here: Here, response: Response) -> MadeKe
 @keys_router.get("/keys", responses=declared(422), dependencies=[Depends(administers)])
 def list_keys(here: Here, cursor: Cursor = None, limit: Limit = 100) -> Page[Key]:
     """Keys by name, without their secrets."""
-    return keys.list_keys(here.engine.store, cursor, limit)
+    return operations.list_keys(here.engine.store, cursor, limit)
 
 
 @keys_router.get("/keys/me", responses=declared())

@@ -183,15 +183,7 @@ def sizes(settings: Settings, store: Store) -> Sizes:
 def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRow) -> Sizes:
     """Bytes of what one map takes: of it alone, so that nothing shows of any other.
 
-    A blob that several frames share counts for each of them.
-
-    Parameters
-    ----------
-    connection : of the store's database
-    store : see Store
-    indexes : folder of search indexes
-    row : of the map
-    """
+    A blob that several frames share counts for each of them."""
     numbers, total = frame_queries.frames_with_uploads(connection, row.number, WEIGHED)
     weight = frame_queries.weigh(connection, numbers)
     artifacts = _of_artifacts(store.blobs, weight.artifacts)
@@ -291,29 +283,13 @@ SERVICE, WORKER = "service", "worker"
 
 @dataclass(frozen=True)
 class Figures:
-    """How the whole store is.
-
-    Parameters
-    ----------
-    frames, jobs : number in each state that has any
-    maps : number
-    oldest_waiting_s : see Stats; 0 where none waits
-    indexes, workers, sizes : see Stats
-    began : workers that began in the last hour
-    events : number of the newest event
-    replica : see Stats
+    """How the whole store is: its statistics, workers that began in the last hour, and the number
+    of the newest event.
     """
 
-    frames: dict[str, int]
-    jobs: dict[str, int]
-    maps: int
-    oldest_waiting_s: float
-    indexes: list[IndexState]
-    workers: list[WorkerSeen]
-    sizes: Sizes
+    stats: Stats
     began: int
     events: int
-    replica: ReplicaSeen | None = None
 
 
 class Statistics:
@@ -403,21 +379,10 @@ class Statistics:
             metrics.add_sample(connection, WORKER, worker, {})
 
     def _look(self) -> Figures:
-        now = time.time()
+        stats = self.tell(minutes=1)
         with self._store.database.read() as connection:
-            oldest = metrics.oldest_waiting(connection)
-            return Figures(
-                frames=count_states(connection),
-                jobs=count_jobs(connection),
-                maps=metrics.count_maps(connection),
-                oldest_waiting_s=0.0 if oldest is None else max(now - oldest, 0.0),
-                indexes=index_states(connection, self._indexes),
-                workers=self.workers(connection),
-                sizes=self.sizes(),
-                began=metrics.count_samples(connection, WORKER, now - HOUR_S),
-                events=newest_number(connection),
-                replica=self.replica(),
-            )
+            began = metrics.count_samples(connection, WORKER, time.time() - HOUR_S)
+            return Figures(stats, began, newest_number(connection))
 
     def workers(self, connection: Connection) -> list[WorkerSeen]:
         """Processes that wait for jobs, with SQLite on this machine, and those that have one."""

@@ -80,15 +80,7 @@ def next_of(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[Step
 def take(
     uploads: Uploads, task: LongJob, archive: Archive, steps: Sequence[Step], options: ImportOptions
 ) -> list[ImportItem]:
-    """Take some frames in one commit, as long as the job is this worker's.
-
-    Parameters
-    ----------
-    uploads : what takes them
-    task : of the import
-    archive, steps : see `next_of`
-    options : of the import
-    """
+    """Take some frames in one commit, as long as the job is this worker's."""
 
     def fence(connection: Connection) -> None:  # cancelled, or of a map that was made anew
         queue.check_held(connection, task.claim)

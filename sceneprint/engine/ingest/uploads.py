@@ -18,12 +18,7 @@ from sqlalchemy import Connection, select
 
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upload
-from sceneprint.engine.upkeep.repair import (
-    collect_blobs,
-    collect_deleted_blobs,
-    take_upload,
-    without_loss,
-)
+from sceneprint.engine.upkeep import repair
 from sceneprint.store import Store
 from sceneprint.store.database import Grouping
 from sceneprint.store.events import record_event
@@ -336,10 +331,10 @@ class Uploads:
         except errors.SceneprintError as error:
             return UploadResult(None, error=error)
         # what came takes the place of an upload that was lost
-        left = take_upload(self._store, map_name, there.frame_id, ready.upload.data)
+        left = repair.take_upload(self._store, map_name, there.frame_id, ready.upload.data)
         if left:
-            collect_blobs(self._store, left)
-        return UploadResult(there.model_copy(update={"reason": without_loss(there.reason)}))
+            repair.collect_blobs(self._store, left)
+        return UploadResult(there.model_copy(update={"reason": repair.without_loss(there.reason)}))
 
     def _write(
         self, map_name: str, ready: dict[int, _Prepared], known: list[UploadResult | None],
@@ -385,10 +380,10 @@ class Uploads:
                 found = self._writes.run(do)
             except errors.SceneprintError:
                 with suppress(errors.UnusableStore):  # leave nothing, on a full disk least of all
-                    collect_blobs(self._store, list(blobs))
+                    repair.collect_blobs(self._store, list(blobs))
                 raise
             if found is not None:
-                collect_deleted_blobs(self._store, left)
+                repair.collect_deleted_blobs(self._store, left)
                 return found
 
 

@@ -192,14 +192,7 @@ def list_jobs(
     store: Store, state: JobState | None = None, cursor: str | None = None, limit: int = 100,
     kind: str | None = None, map_names: Collection[str] | None = None,
 ) -> Page[Job]:  # fmt: skip
-    """Jobs, the newest first.
-
-    Parameters
-    ----------
-    store : see Store
-    state, kind : that are wanted; default: all
-    cursor, limit : of the page
-    map_names : whose jobs are wanted; default: of all maps, and of none
+    """A page of jobs, the newest first; see `queue.list_jobs`.
 
     Raises
     ------
@@ -292,16 +285,8 @@ def worker_died(
 ) -> JobState | None:
     """Take a job from a worker that died over it, now and not when its lease runs out.
 
-    Parameters
-    ----------
-    store : see Store
-    job_id, token : of the dead worker's claim
-    error, traceback : what is known of its death
-    counts : whether the job may have been the cause
-
-    Returns
-    -------
-    state : of the job; None where the death changed nothing
+    Parameters are those of `queue.fail_of_dead`. Returns the state of the job; None where the death
+    changed nothing.
     """
     with store.database.write() as connection:
         job = fail_of_dead(connection, job_id, token, error, traceback, counts=counts)

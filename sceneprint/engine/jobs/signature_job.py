@@ -47,13 +47,7 @@ AWAY_S, AGAIN_S = 12.0, 0.5
 def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob | None:
     """Take the next job, or None where there is none; gives up those that kill every worker.
 
-    A job of no single frame comes as a Task.
-
-    Parameters
-    ----------
-    store : see Store
-    worker : who asks
-    lease_s : seconds until the lease must be renewed
+    A job of no single frame comes as a LongJob. See also `queue.claim`.
     """
     with store.database.read() as connection:
         if not queue.has_due(connection):
@@ -287,14 +281,6 @@ def judge(
     connection: Connection, frame: FrameRow, made: StoredSignature, seen: Look | None, model: Model
 ) -> str | None:
     """Why a frame is not kept, in the transaction that would index it; None where it is.
-
-    Parameters
-    ----------
-    connection : of a writing transaction
-    frame : as it was claimed
-    made : of it
-    seen : by `look`
-    model : of the signature
 
     Raises
     ------

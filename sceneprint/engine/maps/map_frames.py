@@ -272,16 +272,7 @@ WIDTHS_S: dict[By, float] = {"hour": 3600.0, "day": 86400.0}
 def growth(store: Store, map_name: str, by: By = "day", last: int = 30) -> Growth:
     """How many of a map's frames were indexed in each of the last hours or days, of UTC.
 
-    Parameters
-    ----------
-    store : see Store
-    map_name : of the map
-    by : what is counted by
-    last : hours or days, with the one that is not over
-
-    Raises
-    ------
-    UnknownMap : no such map.
+    `last` is how many, with the one that is not over. UnknownMap where there is no such map.
     """
     width = WIDTHS_S[by]
     start = (time.time() // width - last + 1) * width
@@ -363,13 +354,7 @@ def npy_of(vector: bytes) -> bytes:
 
 
 class FrameFiles:
-    """What frames are made of.
-
-    Parameters
-    ----------
-    store : see Store
-    signers : of the store's models
-    """
+    """What frames are made of."""
 
     def __init__(self, store: Store, signers: Signers) -> None:
         self._store, self._signers = store, signers

@@ -96,13 +96,7 @@ class StoredPair:
 
 
 class Pairs:
-    """Matches of answers that are kept.
-
-    Parameters
-    ----------
-    store, signers : of the engine
-    kept : the answers
-    """
+    """Matches of answers that are kept."""
 
     def __init__(self, store: Store, signers: Signers, kept: StoredResults) -> None:
         self._store, self._signers, self._kept = store, signers, kept
@@ -223,13 +217,7 @@ def _match_of(kept: StoredResult, frame_id: str, map_name: str | None) -> ToldMa
 
 
 class Inspection:
-    """Answers that are kept, and what is behind them.
-
-    Parameters
-    ----------
-    store, signers : of the engine
-    kept : the answers
-    """
+    """Answers that are kept, and what is behind them."""
 
     def __init__(self, store: Store, signers: Signers, kept: StoredResults) -> None:
         self._store, self._signers, self._kept = store, signers, kept
@@ -396,13 +384,7 @@ def _triples(rows: Floats) -> list[Triple]:
 
 
 class PointClouds:
-    """Points to be drawn.
-
-    Parameters
-    ----------
-    store, pairs : of the engine
-    kept : the answers
-    """
+    """Points to be drawn."""
 
     def __init__(self, store: Store, pairs: Pairs, kept: StoredResults) -> None:
         self._store, self._pairs, self._kept = store, pairs, kept

@@ -30,13 +30,7 @@ from sceneprint_client.api.results import Question, View
 
 
 class Rerun:
-    """Kept queries, asked once more.
-
-    Parameters
-    ----------
-    store, kept : of the engine
-    queries : answers them
-    """
+    """Kept queries, asked once more."""
 
     def __init__(self, store: Store, kept: StoredResults, queries: Queries) -> None:
         self._store, self._kept, self._queries = store, kept, queries

@@ -466,14 +466,7 @@ class ResultObjects(StoredResults):
 def open_results(
     settings: Settings, blobs: Blobs, stands: Stands = lambda _: True
 ) -> StoredResults:
-    """Answers as the settings want them kept.
-
-    Parameters
-    ----------
-    settings : see Settings
-    blobs : of the store
-    stands : whether one that is found may still be looked at
-    """
+    """Answers as the settings want them kept; `stands`: see StoredResults."""
     if isinstance(blobs, ObjectBlobs):
         return ResultObjects(
             blobs.objects, settings.query_s, settings.query_bytes, settings.purge_s, stands

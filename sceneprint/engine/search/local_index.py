@@ -195,15 +195,7 @@ def trusted(connection: Connection, row: MapRow, found: Generation | None) -> Ge
 
 
 class Reader:
-    """One map, searched by many threads.
-
-    Parameters
-    ----------
-    connection : of the database
-    row : of the map
-    folder : of its index
-    model : of the map
-    """
+    """One map, searched by many threads."""
 
     def __init__(self, connection: Connection, row: MapRow, folder: Path, model: Model) -> None:
         self._folder, self._model = folder, model

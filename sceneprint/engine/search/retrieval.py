@@ -13,16 +13,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_upload
 from sceneprint.engine.search.map_view import MapView, Stored, search_stored
 from sceneprint.engine.upkeep.repair import resign_frames
-from sceneprint.errors import (
-    DamagedBlob,
-    DamagedSignature,
-    InvalidRequest,
-    UnknownFrame,
-    UnreadableGeometry,
-)
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.retrieval.distance import Ranking, ranking_size, similarity
 from sceneprint.index import SearchHits
@@ -121,11 +115,11 @@ def prepare_stored(store: Store, map_name: str, frame_id: str, query: Query) -> 
             frame = find_frame(connection, row, frame_id)
             vector = stored_vector(connection, frame.number, row.model_id)
             blobs = geometry_blobs(connection, [frame.number], row.model_id)
-    except DamagedSignature:
+    except errors.DamagedSignature:
         resign_frames(store, row, [frame.number], row.model_id)
         raise
     if vector is None:
-        raise InvalidRequest(
+        raise errors.InvalidRequest(
             f"Frame {frame_id} is {frame.state}: {frame.state.sentence} Only an indexed frame "
             "can be a query.",
             (("frame_id", f"is {frame.state}"),),
@@ -138,10 +132,10 @@ def prepare_stored(store: Store, map_name: str, frame_id: str, query: Query) -> 
         try:
             artifact = store.blobs.get(blobs[frame.number])
             geometry = read_geometry(artifact)
-        except (DamagedBlob, UnreadableGeometry):
+        except (errors.DamagedBlob, errors.UnreadableGeometry):
             with store.queried.read() as connection:
                 if not refers_to(connection, blobs[frame.number]):
-                    raise UnknownFrame(
+                    raise errors.UnknownFrame(
                         f"Frame {frame_id} of map {map_name!r} was deleted during the query."
                     ) from None
             resign_frames(store, row, [frame.number], row.model_id)
@@ -158,7 +152,7 @@ def check_taken(taken: QueryOrigin, query: Query) -> QueryOrigin:
     if query.filter is not None and query.filter.not_within_s is not None:
         missing = [name for name in ("session", "captured_at") if getattr(taken, name) is None]
         if missing:
-            raise InvalidRequest(
+            raise errors.InvalidRequest(
                 "The filter has `not_within_s`, but the query frame has no "
                 f"{' and no '.join(missing)}. Send the frame with both in its meta, or leave "
                 "`not_within_s` out.",

@@ -68,13 +68,6 @@ def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: s
     For use beside a query: what goes wrong is logged, and nothing is raised. A frame that is being
     signed again, or was a while ago, is left as it is.
 
-    Parameters
-    ----------
-    store : see Store
-    row : of the map
-    numbers : of the frames
-    model_id : to sign them with
-
     Returns
     -------
     how many jobs were queued

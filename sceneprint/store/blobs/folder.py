@@ -179,12 +179,7 @@ class BlobEntry:
 
 
 class Blobs(ABC):
-    """Where blobs are kept; safe to share between threads.
-
-    Parameters
-    ----------
-    locks : of all that share them
-    """
+    """Where blobs are kept; safe to share between threads."""
 
     def __init__(self, locks: Locks) -> None:
         self._locks = locks

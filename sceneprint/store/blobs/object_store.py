@@ -53,10 +53,6 @@ MARK = "sceneprint.json"
 class BucketOwner:
     """The mark of a prefix.
 
-    Parameters
-    ----------
-    objects : of the prefix
-
     Every method raises UnusableStore where the prefix is another's, or cannot be used.
     """
 
@@ -240,10 +236,6 @@ class ObjectBlobs(Blobs):
 
     def claim(self, *, anew: bool = True) -> None:
         """See that the prefix is this store's, and mark it where it is nobody's yet.
-
-        Parameters
-        ----------
-        anew : mark it
 
         Raises
         ------

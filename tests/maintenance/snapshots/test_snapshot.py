@@ -22,7 +22,7 @@ from pathlib import Path
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.engine.admin.keys import list_keys
+from sceneprint.engine.admin.operations import list_keys
 from sceneprint.errors import SnapshotError, UnusableStore
 from sceneprint.maintenance.snapshot import creation
 from sceneprint.maintenance.snapshot.creation import take_snapshot
