@@ -139,12 +139,13 @@ def fused(
     added = added_areas(mesh, first, len(frames)).tolist()
     volume, _ = observed_volume(frames)
     as_mesh = wanted.output == "mesh"
+    seen = None if query is None else query.surface.points[query.surface.valid].astype(np.float64)
     coverage = Coverage(
         views=[one.model_copy(update={"added_m2": a}) for one, a in zip(told, added, strict=True)],
         left_out=left_out,
         area_m2=float(sum(added)),
         observed_volume_m3=volume,
-        query_explained=0.0 if query is None else share_seen(_points(query), others),
+        query_explained=0.0 if seen is None else share_seen(seen, others),
         voxel_m=voxel,
         points=len(mesh.points),
         triangles=len(mesh.triangles) if as_mesh else 0,
@@ -218,10 +219,6 @@ def _no_image(name: str) -> UselessFrame:
         f"{name} is a point cloud, but reconstruction fuses only depth images. Use overlay.ply "
         "to view its points with the others."
     )
-
-
-def _points(geometry: Geometry) -> Floats:
-    return geometry.surface.points[geometry.surface.valid].astype(np.float64)
 
 
 def _fused_view(view: JobView | None, frame: DepthFrame, source: Source) -> FusedView:
@@ -364,7 +361,7 @@ class ReconstructionJobs:
     def _query_of(self, task: LongJob) -> Geometry | None:
         """What the query saw; a reconstruction does without it where it is damaged."""
         with self._store.database.read() as connection:
-            found = queue.files_of(connection, task.claim.job.number).get(QUERY)
+            found = queue.files_of(connection, task.job.number).get(QUERY)
         if found is not None:
             with suppress(DamagedBlob, UnreadableGeometry):
                 return read_geometry(self._store.blobs.get(found.blob))

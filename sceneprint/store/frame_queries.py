@@ -22,6 +22,7 @@ from sqlalchemy import (
     tuple_,
 )
 
+from sceneprint.store.maps import ROOMLESS
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
@@ -222,24 +223,6 @@ class Held:
     parents: Counter[str] = field(default_factory=Counter)
 
 
-@dataclass(frozen=True)
-class RobotCount:
-    """How many frames are of one robot, with poses that lead to one frame."""
-
-    robot: str | None
-    parent: str | None
-    count: int
-
-
-@dataclass(frozen=True)
-class Posed:
-    """A frame of a run; `at` is by the clock of the run, `pose` is T_parent_sensor."""
-
-    frame_id: str
-    at: float
-    pose: list[list[float]]
-
-
 def list_runs(
     connection: Connection, map_number: int, after: tuple[str, str] | None, limit: int
 ) -> list[Held]:
@@ -283,18 +266,24 @@ def list_runs(
     return list(runs.values())
 
 
-def count_run(connection: Connection, map_number: int, run: Run) -> list[RobotCount]:
-    """Frames of a session by robot and parent frame; `run.parent_frame` does not matter."""
+def count_run(
+    connection: Connection, map_number: int, run: Run
+) -> list[tuple[str | None, str | None, int]]:
+    """Robots, parent frames and numbers of the frames of a session; `run.parent_frame` does not
+    matter.
+    """
     found = connection.execute(
         select(frames.c.robot, frames.c.pose_parent, func.count())
         .where(*_of_session(map_number, run))
         .group_by(frames.c.robot, frames.c.pose_parent)
         .order_by(frames.c.robot.nulls_first(), frames.c.pose_parent.nulls_first())
     )
-    return [RobotCount(*row) for row in found]
+    return [(robot, parent, count) for robot, parent, count in found]
 
 
-def poses_of_run(connection: Connection, map_number: int, run: Run) -> tuple[list[Posed], int]:
+def poses_of_run(
+    connection: Connection, map_number: int, run: Run
+) -> tuple[list[tuple[str, float, list[list[float]]]], int]:
     """Frames of a session with time and pose in the order of time, of one time the first that came;
     by the clock `received` all with a pose, as they came.
 
@@ -307,7 +296,8 @@ def poses_of_run(connection: Connection, map_number: int, run: Run) -> tuple[lis
 
     Returns
     -------
-    poses, count : how many there are of all of them
+    poses : id of the frame, when by the clock of the run, and T_parent_sensor
+    count : how many there are of all of them
     """
     taken = run.clock == "captured"
     at = frames.c.captured_at if taken else frames.c.received_at
@@ -335,7 +325,7 @@ def poses_of_run(connection: Connection, map_number: int, run: Run) -> tuple[lis
         .where(frames.c.number.in_(chosen))
         .order_by(at if taken else frames.c.number, frames.c.number)
     )
-    return [Posed(*row) for row in found], count
+    return [(frame_id, when, pose) for frame_id, when, pose in found], count
 
 
 def _of_session(map_number: int, run: Run) -> list[ColumnElement[bool]]:
@@ -446,9 +436,7 @@ def weights_of(
 # How a map grew, and what its frames weigh: counts over many rows that few are read for.
 
 _OTHERS = tuple(state for state in FrameState if state != FrameState.INDEXED)
-#: Frames in these states have no upload any more.
-_BARE = (FrameState.DELETED, FrameState.REDUNDANT)
-_KEPT = tuple(state for state in FrameState if state not in _BARE)
+_KEPT = tuple(state for state in FrameState if state not in ROOMLESS)
 
 
 def indexed_by_time(
@@ -482,21 +470,6 @@ def indexed_by_time(
     for place, n in gone:
         counts[int(place)] -= n
     return counts
-
-
-@dataclass(frozen=True)
-class Weighed:
-    """What some frames of a map weigh.
-
-    Parameters
-    ----------
-    upload_bytes, signature_bytes : of all of them
-    artifacts : blobs of their geometry
-    """
-
-    upload_bytes: int
-    signature_bytes: int
-    artifacts: list[str]
 
 
 def frames_with_uploads(
@@ -544,10 +517,12 @@ def bytes_of_files(connection: Connection) -> int:
     return int(connection.execute(select(func.sum(job_files.c.bytes))).scalar() or 0)
 
 
-def weigh(connection: Connection, numbers: Sequence[int]) -> Weighed:
-    """What frames weigh, with what was made of them by whatever model."""
+def weigh(connection: Connection, numbers: Sequence[int]) -> tuple[int, int, list[str]]:
+    """Bytes of the uploads of some frames, and of what was made of them by whatever model: bytes of
+    signatures, and blobs of artifacts.
+    """
     held = rows_among(connection, select(frames.c.bytes), frames.c.number, numbers)
     asked = select(func.length(signatures.c.vector), signatures.c.geometry)
     made = list(rows_among(connection, asked, signatures.c.frame_number, numbers))
     uploads = sum(row.bytes for row in held)
-    return Weighed(uploads, sum(size for size, _ in made), [geometry for _, geometry in made])
+    return uploads, sum(size for size, _ in made), [geometry for _, geometry in made]

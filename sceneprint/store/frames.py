@@ -165,10 +165,8 @@ def delete_frame(connection: Connection, row: MapRow, frame: FrameRow) -> list[s
 
 def refers_to(connection: Connection, blob: str) -> bool:
     """Whether a frame that is kept, a signature or a job refers to a blob."""
-    of_frame = select(frames.c.number).where(
-        frames.c.blob == blob,
-        frames.c.state.not_in((FrameState.DELETED, FrameState.REDUNDANT)),
-    )
+    kept = frames.c.state.not_in(ROOMLESS)
+    of_frame = select(frames.c.number).where(frames.c.blob == blob, kept)
     of_artifact = select(signatures.c.frame_number).where(signatures.c.geometry == blob)
     of_job = select(job_files.c.job_number).where(job_files.c.blob == blob)
     return any(connection.execute(one.limit(1)).first() for one in (of_frame, of_artifact, of_job))

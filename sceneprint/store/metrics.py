@@ -115,12 +115,10 @@ class Sample:
     Parameters
     ----------
     at : end of the time in which it was counted, seconds since 1970
-    process : host and process id
     data : by kind
     """
 
     at: float
-    process: str
     data: dict[str, Any]
 
 
@@ -140,12 +138,8 @@ def add_sample(connection: Connection, kind: str, process: str, data: dict[str, 
 
 def samples_since(connection: Connection, kind: str, at: float) -> list[Sample]:
     """Samples of all processes from a time on, the oldest first."""
-    found = connection.execute(
-        select(samples.c.at, samples.c.process, samples.c.data)
-        .where(samples.c.kind == kind, samples.c.at >= at)
-        .order_by(samples.c.at)
-    )
-    return [Sample(*row) for row in found]
+    of_kind = select(samples.c.at, samples.c.data).where(samples.c.kind == kind, samples.c.at >= at)
+    return [Sample(*row) for row in connection.execute(of_kind.order_by(samples.c.at))]
 
 
 def count_samples(connection: Connection, kind: str, at: float) -> int:

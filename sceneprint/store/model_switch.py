@@ -180,11 +180,7 @@ def switch_model(connection: Connection, row: MapRow) -> list[str]:
     for number, one in rejected.items():
         set_state(connection, number, FrameState.REJECTED, one.error)
         # readers and indexes that hold it, of a time when the map had this model, learn of it
-        connection.execute(
-            update(frames)
-            .where(frames.c.number == number)
-            .values(revision=next_revision(connection, row.number))
-        )
+        touch(connection, row, [number])
         record_event(connection, "frame.rejected", row.name, one.id, one.job_id)
     for number, frame_id in earlier:
         set_state(connection, number, FrameState.RECEIVED)

@@ -211,18 +211,6 @@ MAXIMUM_ATTEMPTS = 10
 BACKOFF_S = 2.0
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A job that this worker holds until its lease runs out."""
-
-    job: JobRow
-
-    @property
-    def token(self) -> int:
-        """Of this claim alone."""
-        return self.job.token
-
-
 def enqueue(
     connection: Connection, kind: str, frame_number: int | None, priority: int = 0,
     model_id: str | None = None, *, map_number: int | None = None,
@@ -273,7 +261,7 @@ def has_due(connection: Connection) -> bool:
     return connection.execute(asked).first() is not None
 
 
-def claim(connection: Connection, worker: str, lease_s: float) -> Claim | None:
+def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
     """Take the next job: one that waits, or one whose worker fell silent.
 
     Parameters
@@ -301,7 +289,7 @@ def claim(connection: Connection, worker: str, lease_s: float) -> Claim | None:
         )
         .returning(jobs)
     ).mappings().one()  # fmt: skip
-    return Claim(job_row(row))
+    return job_row(row)
 
 
 def _first(
@@ -324,7 +312,7 @@ def _first(
     return None if found is None else (-found.priority, found.attempts, found.number)
 
 
-def renew(connection: Connection, held: Claim, lease_s: float) -> None:
+def renew(connection: Connection, held: JobRow, lease_s: float) -> None:
     """Extend a lease.
 
     Raises
@@ -334,7 +322,7 @@ def renew(connection: Connection, held: Claim, lease_s: float) -> None:
     _hold(connection, held, leased_until=now(connection) + lease_s)
 
 
-def check_held(connection: Connection, held: Claim) -> None:
+def check_held(connection: Connection, held: JobRow) -> None:
     """See that a claim is still the latest, in the transaction that stores a part of its work.
 
     Raises
@@ -348,7 +336,7 @@ def check_held(connection: Connection, held: Claim) -> None:
 
 
 def finish(
-    connection: Connection, held: Claim, state: JobState, error: str | None = None,
+    connection: Connection, held: JobRow, state: JobState, error: str | None = None,
     traceback: str | None = None, **values: object,
 ) -> None:  # fmt: skip
     """End a job, in the transaction that stores what it made; `values`: of its other columns.
@@ -363,7 +351,7 @@ def finish(
     )  # fmt: skip
 
 
-def go_on(connection: Connection, held: Claim, progress: dict[str, Any]) -> None:
+def go_on(connection: Connection, held: JobRow, progress: dict[str, Any]) -> None:
     """Queue a long job again after a part of it, behind those that wait.
 
     However many tries it took, they count no more: it came further.
@@ -380,7 +368,7 @@ def go_on(connection: Connection, held: Claim, progress: dict[str, Any]) -> None
     )  # fmt: skip
 
 
-def fail(connection: Connection, held: Claim, error: str, traceback: str) -> JobState:
+def fail(connection: Connection, held: JobRow, error: str, traceback: str) -> JobState:
     """Queue a job that broke down for another try, or let it be dead.
 
     Raises
@@ -388,9 +376,9 @@ def fail(connection: Connection, held: Claim, error: str, traceback: str) -> Job
     LostLease : as `renew`.
     """
     # not as it was claimed: an earlier worker may have died over the job since
-    known = select(jobs.c.failures).where(jobs.c.number == held.job.number)
+    known = select(jobs.c.failures).where(jobs.c.number == held.number)
     failures = (connection.execute(known).scalar() or 0) + 1
-    if failures >= MAXIMUM_FAILURES or held.job.attempts >= MAXIMUM_ATTEMPTS:
+    if failures >= MAXIMUM_FAILURES or held.attempts >= MAXIMUM_ATTEMPTS:
         finish(connection, held, JobState.DEAD, error, traceback)
         return JobState.DEAD
     _hold(
@@ -405,7 +393,7 @@ def pause_s(failures: int) -> float:
     return BACKOFF_S * 4.0 ** (failures - 1)
 
 
-def give_back(connection: Connection, held: Claim, after_s: float = 0.0) -> None:
+def give_back(connection: Connection, held: JobRow, after_s: float = 0.0) -> None:
     """Queue a job again that was not begun, as if it had not been claimed.
 
     Parameters
@@ -419,32 +407,32 @@ def give_back(connection: Connection, held: Claim, after_s: float = 0.0) -> None
     LostLease : as `renew`.
     """
     _hold(
-        connection, held, state=JobState.QUEUED, attempts=held.job.attempts - 1,
+        connection, held, state=JobState.QUEUED, attempts=held.attempts - 1,
         leased_until=None, worker=None, run_after=now(connection) + after_s,
     )  # fmt: skip
 
 
-def _hold(connection: Connection, held: Claim, **values: object) -> None:
+def _hold(connection: Connection, held: JobRow, **values: object) -> None:
     """Change a job while its claim is the latest."""
     changed = connection.execute(update(jobs).where(*_own(held)).values(**values))
     if changed.rowcount != 1:
         raise _lost(held)
 
 
-def _own(held: Claim) -> tuple[ColumnElement[bool], ...]:
+def _own(held: JobRow) -> tuple[ColumnElement[bool], ...]:
     """What holds of a job while a claim on it does."""
     return (
-        jobs.c.number == held.job.number,
+        jobs.c.number == held.number,
         jobs.c.token == held.token,
         jobs.c.state == JobState.RUNNING,
         # a standby that lacked the claim, and was promoted, may have given its token to another
-        jobs.c.worker == held.job.worker,
+        jobs.c.worker == held.worker,
     )
 
 
-def _lost(held: Claim) -> LostLease:
+def _lost(held: JobRow) -> LostLease:
     return LostLease(
-        f"Job {held.job.id} is no longer held by this worker: its lease ran out, or it was "
+        f"Job {held.id} is no longer held by this worker: its lease ran out, or it was "
         "cancelled. Nothing was stored."
     )
 

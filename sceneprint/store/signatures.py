@@ -47,14 +47,6 @@ class StoredSignature:
 
 
 @dataclass(frozen=True)
-class PatchCounts:
-    """Patches and ordered pairs of each level of a frame, the finest first."""
-
-    n_patches: tuple[int, ...]
-    n_pairs: tuple[int, ...]
-
-
-@dataclass(frozen=True)
 class SignatureChange:
     """A frame that was indexed, or is searched no more; `vector` is None then, or is damaged.
 
@@ -204,11 +196,9 @@ def stored_vector(connection: Connection, number: int, model_id: str) -> bytes |
     ------
     DamagedSignature : its bytes are not those that were stored.
     """
-    found = connection.execute(
-        select(signatures.c.vector, signatures.c.checksum).where(
-            signatures.c.frame_number == number, signatures.c.model_id == model_id
-        )
-    ).first()
+    own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
+    asked = select(signatures.c.vector, signatures.c.checksum).where(own)
+    found = connection.execute(asked).first()
     if found is None:
         return None
     if crc32(found.vector) != found.checksum:
@@ -219,14 +209,17 @@ def stored_vector(connection: Connection, number: int, model_id: str) -> bytes |
     return bytes(found.vector)
 
 
-def signature_sizes(connection: Connection, number: int, model_id: str) -> PatchCounts | None:
-    """How much of a frame went into its signature, or None where it has none."""
-    found = connection.execute(
-        select(signatures.c.n_patches, signatures.c.n_pairs).where(
-            signatures.c.frame_number == number, signatures.c.model_id == model_id
-        )
-    ).first()
-    return None if found is None else PatchCounts(tuple(found.n_patches), tuple(found.n_pairs))
+def patch_counts(
+    connection: Connection, number: int, model_id: str
+) -> tuple[list[int], list[int]] | None:
+    """Patches and ordered pairs of each level that went into the signature of a frame, the finest
+    first; None where it has none.
+    """
+    asked = select(signatures.c.n_patches, signatures.c.n_pairs).where(
+        signatures.c.frame_number == number, signatures.c.model_id == model_id
+    )
+    found = connection.execute(asked).first()
+    return None if found is None else (found.n_patches, found.n_pairs)
 
 
 def stored_signatures(

@@ -101,7 +101,7 @@ def test_an_archive_stays_until_its_import_is_over_and_no_longer(
     begun(empty, data)
     task = claimed(empty)
     with empty.store.database.read() as connection:
-        [file] = files_of(connection, task.claim.job.number).values()
+        [file] = files_of(connection, task.job.number).values()
     assert empty.store.blobs.holds(file.blob)
     assert file.bytes == empty.store.blobs.size(file.blob)
     assert empty.run(task) == JobState.SUCCEEDED

@@ -42,8 +42,8 @@ def claimed(engine: Engine) -> working.Work:
 
 
 def die(engine: Engine, work: working.Work, *, counts: bool = True) -> JobState | None:
-    held = work.claim
-    return worker_died(engine.store, held.job.id, held.token, "signal 11", "Fatal", counts=counts)
+    held = work.job
+    return worker_died(engine.store, held.id, held.token, "signal 11", "Fatal", counts=counts)
 
 
 def test_a_cancelled_job_is_done_by_nobody_and_can_be_tried_again(
@@ -272,7 +272,7 @@ def test_when_there_is_something_to_do_next(empty: Engine, uploads: Any) -> None
     assert empty.due_in_s() is None
     for one in uploads[:3]:
         empty.add_frame("hall", one.data, one.meta)
-    running = claimed(empty).claim.job
+    running = claimed(empty).job
     with empty.store.database.write() as connection:
         start = read_clock(connection)
         connection.execute(update(jobs).values(run_after=start + 50.0))

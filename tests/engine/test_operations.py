@@ -120,7 +120,7 @@ def test_what_waits_and_who_works(make_engine, uploads):
     here = f"{os.uname().nodename}:{os.getpid()}"
     assert stats.workers is not None
     assert {one.name: one.job_id for one in stats.workers} == {
-        "far:17": work.claim.job.id, here: None
+        "far:17": work.job.id, here: None
     }  # fmt: skip
     assert engine.operations.statistics.tell(1).workers == [stats.workers[0]]
     engine.put_back(work)

@@ -187,7 +187,7 @@ def test_a_job_that_is_removed_while_a_slice_runs_is_no_fault_of_its_worker(
 ) -> None:
     def handle(task: LongJob, until: float) -> SliceResult:
         with engine.store.database.write() as connection:
-            remove_job(connection, find_job(connection, task.claim.job.id))
+            remove_job(connection, find_job(connection, task.job.id))
         return count_to(engine, 2)(task, until)
 
     engine.tasks.register("count", handle)

@@ -63,10 +63,8 @@ def test_dead_jobs_are_listed_with_their_tracebacks(idle, make_map, small_shots,
         for number in range(1, 4):
             work = engine.claim("w")
             for failure in range(3):
-                token = work.claim.token - failure  # as if three had died over it
-                worker_died(
-                    engine.store, work.claim.job.id, token, f"died {number}", "T", counts=True
-                )
+                token = work.job.token - failure  # as if three had died over it
+                worker_died(engine.store, work.job.id, token, f"died {number}", "T", counts=True)
     # two of the three deaths were of workers that had lost it
     found = client.get("/v1/jobs", params={"state": "dead", "limit": 2}).json()
     assert [job["job_id"] for job in found["items"]] == ids[:0:-1]

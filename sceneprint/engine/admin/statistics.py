@@ -185,12 +185,12 @@ def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRo
 
     A blob that several frames share counts for each of them."""
     numbers, total = frame_queries.frames_with_uploads(connection, row.number, WEIGHED)
-    weight = frame_queries.weigh(connection, numbers)
-    artifacts = _of_artifacts(store.blobs, weight.artifacts)
+    uploads, signed, made = frame_queries.weigh(connection, numbers)
+    artifacts = _of_artifacts(store.blobs, made)
     share = max(len(numbers), 1)
     return Sizes(
-        database=weight.signature_bytes * total // share,
-        blobs=(weight.upload_bytes + artifacts) * total // share,
+        database=signed * total // share,
+        blobs=(uploads + artifacts) * total // share,
         index=sum(_files_of(index_folder(indexes, row), deep=True)),
         free=None,
         disk=None,
@@ -211,10 +211,10 @@ def _of_objects(store: Store) -> int:
     """Bytes of all blobs in an object store: some of the rows are weighed, nothing is listed."""
     with store.database.read() as connection:
         some = frame_queries.spread_frames(connection, SPREAD)
-        weight = frame_queries.weigh(connection, some)
+        uploads, _, artifacts = frame_queries.weigh(connection, some)
         total = frame_queries.count_uploads(connection)
         files = frame_queries.bytes_of_files(connection)
-    each = (weight.upload_bytes + _of_artifacts(store.blobs, weight.artifacts)) / max(len(some), 1)
+    each = (uploads + _of_artifacts(store.blobs, artifacts)) / max(len(some), 1)
     return int(each * total) + files
 
 

@@ -83,7 +83,7 @@ def take(
     """Take some frames in one commit, as long as the job is this worker's."""
 
     def fence(connection: Connection) -> None:  # cancelled, or of a map that was made anew
-        queue.check_held(connection, task.claim)
+        queue.check_held(connection, task.job)
 
     outcomes: list[UploadOutcome | None] = []
     taken = []
@@ -286,7 +286,7 @@ class Imports:
         """Import a part of an archive: frames until the time is over, at least some."""
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
-            file = queue.files_of(connection, task.claim.job.number).get(FILE)
+            file = queue.files_of(connection, task.job.number).get(FILE)
         if file is None:
             raise errors.UnreadableArchive(
                 "The archive was removed because its import failed or was cancelled too long "
@@ -297,7 +297,7 @@ class Imports:
                 return self._slice(task, archive, options, until)
         except errors.UnreadableArchive:  # trying again cannot help, and it may be large
             with self._store.database.write() as connection:
-                number = task.claim.job.number
+                number = task.job.number
                 gone = queue.remove_parts(connection, number, items=False, files=[FILE])
             collect_deleted_blobs(self._store, gone)
             raise

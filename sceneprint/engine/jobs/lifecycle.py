@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from sqlalchemy import Connection
 
 from sceneprint.engine.serializers import job_record
-from sceneprint.engine.upkeep.repair import collect_blobs
-from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError, UnusableStore
+from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError
 from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import frame_of, set_state
@@ -22,7 +21,6 @@ from sceneprint.store.maps import map_of
 from sceneprint.store.model_switch import REENCODE
 from sceneprint.store.queue import fail_of_dead
 from sceneprint.store.queue import list_jobs as list_stored
-from sceneprint.store.signatures import StoredSignature
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
 from sceneprint_client.api import FrameState, Job, JobState, Page
 
@@ -38,23 +36,23 @@ class Work:
 
     Parameters
     ----------
-    claim : on the job
+    job : as it was claimed
     frame, map : that it is about
     """
 
-    claim: queue.Claim
+    job: JobRow
     frame: FrameRow
     map: MapRow
 
     @property
     def again(self) -> bool:
         """Whether the frame is indexed, stays so all the while, and is signed once more."""
-        return self.claim.job.kind == REENCODE
+        return self.job.kind == REENCODE
 
     @property
     def model_id(self) -> str:
         """Of the model to sign with."""
-        return self.claim.job.model_id or self.map.model_id
+        return self.job.model_id or self.map.model_id
 
 
 class Outdated(Exception):
@@ -64,20 +62,9 @@ class Outdated(Exception):
 def put_back(store: Store, work: Work, after_s: float = 0.0) -> None:
     """Queue again what was claimed and not begun, as when a worker is told to stop."""
     with suppress(LostLease), store.database.write() as connection:
-        queue.give_back(connection, work.claim, after_s)
+        queue.give_back(connection, work.job, after_s)
         if not work.again:
             set_state(connection, work.frame.number, FrameState.RECEIVED)
-
-
-def leave(store: Store, work: Work, made: StoredSignature | None) -> None:
-    """Give a job back, as far as the store lets us; else its lease runs out.
-
-    Others go before it: it may be its own folder of blobs alone that cannot be written.
-    """
-    with suppress(UnusableStore):
-        put_back(store, work, LEFT_S)
-        if made is not None:
-            collect_blobs(store, [made.geometry])
 
 
 def restart_jobs(store: Store, work: Work) -> JobState | None:
@@ -87,7 +74,7 @@ def restart_jobs(store: Store, work: Work) -> JobState | None:
         return JobState.QUEUED
     try:
         with store.database.write() as connection:
-            queue.finish(connection, work.claim, JobState.CANCELLED)
+            queue.finish(connection, work.job, JobState.CANCELLED)
     except LostLease:
         return None
     return JobState.CANCELLED
@@ -95,7 +82,7 @@ def restart_jobs(store: Store, work: Work) -> JobState | None:
 
 def record_job_event(connection: Connection, kind: str, work: Work) -> None:
     """Note what has become of a job."""
-    record_event(connection, kind, work.map.name, work.frame.id, work.claim.job.id)
+    record_event(connection, kind, work.map.name, work.frame.id, work.job.id)
 
 
 def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
@@ -103,7 +90,7 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
     reason = str(error).removeprefix(f"{work.frame.id}: ")
     try:
         with store.database.write() as connection:
-            queue.finish(connection, work.claim, JobState.FAILED, reason)
+            queue.finish(connection, work.job, JobState.FAILED, reason)
             if not work.again:
                 if map_of(connection, work.frame.map_number).model_id != work.model_id:
                     raise Outdated
@@ -122,7 +109,7 @@ def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
     log.error("job raised an exception", extra=about(work, error=reason, traceback=trace))
     try:
         with store.database.write() as connection:
-            state = queue.fail(connection, work.claim, reason, trace)
+            state = queue.fail(connection, work.job, reason, trace)
             if work.again:
                 return state
             dead = state == JobState.DEAD
@@ -145,10 +132,10 @@ def failure_texts(error: Exception) -> tuple[str, str]:
 def about(work: Work, **more: object) -> dict[str, object]:
     """What a line of the log says of a job."""
     return {
-        "job_id": work.claim.job.id,
+        "job_id": work.job.id,
         "frame_id": work.frame.id,
         "map": work.map.name,
-        "attempt": work.claim.job.attempts,
+        "attempt": work.job.attempts,
         **more,
     }
 
@@ -157,7 +144,7 @@ def about(work: Work, **more: object) -> dict[str, object]:
 
 
 @contextmanager
-def renewed(store: Store, claim: queue.Claim, lease_s: float, longest_s: float) -> Iterator[None]:
+def renewed(store: Store, claim: JobRow, lease_s: float, longest_s: float) -> Iterator[None]:
     """Renew a lease from a thread of its own while the work goes on."""
     done = threading.Event()
 

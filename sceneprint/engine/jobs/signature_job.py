@@ -53,27 +53,22 @@ def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob
         if not queue.has_due(connection):
             return None
         given_up = queue.is_given_up(connection)
-    if given_up:
-        _abandon(store)
+    if given_up:  # jobs that kill every worker, and their frames
+        with store.database.write() as connection:
+            for job in queue.dead_letter(connection):
+                if job.kind != REENCODE:
+                    lifecycle.fail_frame(connection, job, job.error)
     with store.database.write(turn=False) as connection:
         held = queue.claim(connection, worker, lease_s)
         if held is None:
             return None
-        if held.job.frame_number is None:
-            number = held.job.map_number
+        if held.frame_number is None:
+            number = held.map_number
             return LongJob(held, None if number is None else map_of(connection, number))
-        frame = frame_of(connection, held.job.frame)
-        if held.job.kind != REENCODE:
+        frame = frame_of(connection, held.frame)
+        if held.kind != REENCODE:
             set_state(connection, frame.number, FrameState.SIGNING)
         return lifecycle.Work(held, frame, map_of(connection, frame.map_number))
-
-
-def _abandon(store: Store) -> None:
-    """Give up jobs that kill every worker, and their frames."""
-    with store.database.write() as connection:
-        for job in queue.dead_letter(connection):
-            if job.kind != REENCODE:
-                lifecycle.fail_frame(connection, job, job.error)
 
 
 def run(
@@ -101,7 +96,7 @@ def run(
     made: StoredSignature | None = None
     gone: list[str] = []
     try:
-        with lifecycle.renewed(store, work.claim, lease_s, longest_s):
+        with lifecycle.renewed(store, work.job, lease_s, longest_s):
             made = _sign(store, signers, work)
             gone = _store_patiently(store, signers, readers, work, made)
         state = JobState.SUCCEEDED
@@ -113,7 +108,11 @@ def run(
     except errors.FrameError as error:
         state = lifecycle.reject(store, work, error)
     except errors.UnusableStore:  # a full disk is no fault of the frame's, and costs it no try
-        lifecycle.leave(store, work, made)
+        with suppress(errors.UnusableStore):  # else its lease runs out
+            # others go before it: it may be its own folder of blobs alone that cannot be written
+            lifecycle.put_back(store, work, lifecycle.LEFT_S)
+            if made is not None:
+                collect_blobs(store, [made.geometry])
         raise
     except Exception as error:
         state = lifecycle.break_down(store, work, error)
@@ -177,7 +176,7 @@ def _store(
         if work.frame.novelty is not None:
             seen = look(store.database, readers, work.map, made)
         with suppress(Stale), store.database.write() as connection:
-            queue.finish(connection, work.claim, JobState.SUCCEEDED)
+            queue.finish(connection, work.job, JobState.SUCCEEDED)
             row = map_of(connection, work.frame.map_number)
             if row.model_id != made.model_id:
                 raise lifecycle.Outdated
@@ -209,7 +208,7 @@ def _replace_signature(store: Store, work: lifecycle.Work, made: StoredSignature
     """
     number = work.frame.number
     with store.database.write() as connection:
-        queue.finish(connection, work.claim, JobState.SUCCEEDED)
+        queue.finish(connection, work.job, JobState.SUCCEEDED)
         row = map_of(connection, work.frame.map_number)
         indexed = frame_of(connection, number).state == FrameState.INDEXED
         if not indexed or made.model_id not in models_of(row):

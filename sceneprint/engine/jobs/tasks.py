@@ -35,7 +35,7 @@ from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map, map_of
-from sceneprint.store.tables import MapRow
+from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Job, JobState
 
@@ -53,28 +53,28 @@ class LongJob:
 
     Parameters
     ----------
-    claim : on the job
+    job : as it was claimed
     map : that it is about; None where it is of none
     """
 
-    claim: queue.Claim
+    job: JobRow
     map: MapRow | None
 
     @property
     def data(self) -> dict[str, Any]:
         """What was asked for."""
-        return self.claim.job.data or {}
+        return self.job.data or {}
 
     @property
     def progress(self) -> dict[str, Any]:
         """How far the slices before have come: of the last `Outcome`; empty before the first."""
-        return self.claim.job.progress or {}
+        return self.job.progress or {}
 
     @property
     def of_map(self) -> MapRow:
         """The map, of a kind of job that always has one."""
         if self.map is None:
-            raise ValueError(f"job {self.claim.job.id} has no map")
+            raise ValueError(f"job {self.job.id} has no map")
         return self.map
 
 
@@ -188,11 +188,11 @@ class Tasks:
         broke: Callable[[], None] | None = None,
     ) -> JobState | None:
         """Do a slice of a claimed job; see `signature_job.run` for the rest."""
-        start, job = time.perf_counter(), task.claim.job
+        start, job = time.perf_counter(), task.job
         state: JobState | None
         try:
             longest_s = self.longest_s(job.kind, longest_s)
-            with renewed(self._store, task.claim, lease_s, longest_s):
+            with renewed(self._store, task.job, lease_s, longest_s):
                 handler = self._handlers.get(job.kind)
                 if handler is None:
                     raise MissingDependency(
@@ -223,7 +223,7 @@ class Tasks:
     def put_back(self, task: LongJob, after_s: float = 0.0) -> None:
         """Return a claimed job undone."""
         with suppress(LostLease, UnusableStore), self._store.database.write() as connection:
-            queue.give_back(connection, task.claim, after_s)
+            queue.give_back(connection, task.job, after_s)
 
     def _keep(self, task: LongJob, outcome: SliceResult) -> JobState:
         try:
@@ -238,11 +238,11 @@ class Tasks:
 
     def _stored(self, task: LongJob, outcome: SliceResult) -> list[str]:
         """What a slice came to, in one commit; returns blobs that may be of no use any more."""
-        job = task.claim.job
+        job = task.job
         with self._store.database.write() as connection:
             if outcome.over:
                 queue.finish(
-                    connection, task.claim, JobState.SUCCEEDED, progress=outcome.progress,
+                    connection, task.job, JobState.SUCCEEDED, progress=outcome.progress,
                     result=outcome.result,
                 )  # fmt: skip
                 if outcome.event is not None:
@@ -251,7 +251,7 @@ class Tasks:
                         connection, outcome.event, name, None, job.id, **(outcome.result or {})
                     )
             else:
-                queue.go_on(connection, task.claim, outcome.progress)
+                queue.go_on(connection, task.job, outcome.progress)
             self._check(outcome.files)
             # after the job: it may be gone, and nothing can be of one that is
             queue.append_items(connection, job.number, outcome.items)
@@ -271,7 +271,7 @@ class Tasks:
     def _fail(self, task: LongJob, reason: str) -> JobState | None:
         try:
             with self._store.database.write() as connection:
-                queue.finish(connection, task.claim, JobState.FAILED, reason)
+                queue.finish(connection, task.job, JobState.FAILED, reason)
         except LostLease:
             return None
         return JobState.FAILED
@@ -281,13 +281,13 @@ class Tasks:
         log.error("job raised an exception", extra=_about(task, error=reason, traceback=trace))
         try:
             with self._store.database.write() as connection:
-                return queue.fail(connection, task.claim, reason, trace)
+                return queue.fail(connection, task.job, reason, trace)
         except LostLease:
             return None
 
 
 def _about(task: LongJob, **more: object) -> dict[str, object]:
     """What a line of the log says of a job."""
-    job = task.claim.job
+    job = task.job
     name = None if task.map is None else task.map.name
     return {"job_id": job.id, "kind": job.kind, "map": name, "attempt": job.attempts, **more}

@@ -31,7 +31,7 @@ from sceneprint.store.frame_queries import Held, count_run, indexed_by_time, lis
 from sceneprint.store.frames import count_states, find_frame
 from sceneprint.store.maps import find_map, model_names
 from sceneprint.store.opaque_ids import invalid_cursor
-from sceneprint.store.signatures import PatchCounts, geometry_blobs, signature_sizes, stored_vector
+from sceneprint.store.signatures import geometry_blobs, patch_counts, stored_vector
 from sceneprint.store.tables import FrameRow, MapRow
 from sceneprint.types import Geometry, Hierarchy, Intrinsics, Ints32, Patches, Surface
 from sceneprint_client.api import Frame, FrameState, Page
@@ -180,10 +180,10 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
     with store.database.read() as connection:
         row = find_map(connection, map_name)
         counted = count_run(connection, row.number, run)
-        robot = _only("robot", run.robot, {one.robot for one in counted}, run.session)
-        parents = {one.parent for one in counted if one.parent is not None}
+        robot = _only("robot", run.robot, {one for one, _, _ in counted}, run.session)
+        parents = {one for _, one, _ in counted if one is not None}
         parent = _only("parent_frame", run.parent_frame, parents, run.session)
-        total = sum(one.count for one in counted)
+        total = sum(count for _, _, count in counted)
         if run.most is None and total > MOST_POSES:
             raise errors.InvalidRequest(
                 f"Session {run.session!r:.140} has {total} frames, but a trajectory has at most "
@@ -198,8 +198,8 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
         session=run.session,
         robot=robot,
         parent_frame=parent,
-        frame_ids=[one.frame_id for one in kept],
-        poses=[trajectory_row(one.at, np.array(one.pose)) for one in kept],
+        frame_ids=[frame_id for frame_id, _, _ in kept],
+        poses=[trajectory_row(at, np.array(pose)) for _, at, pose in kept],
         posed=posed,
         left_out=total - len(kept),
     )
@@ -438,15 +438,15 @@ class FrameFiles:
         found = find_indexed(self._store, map_name, frame_id)
 
         def make() -> FrameSignature:
-            vector, sizes = self._signature(found)
+            vector, (n_patches, n_pairs) = self._signature(found)
             return FrameSignature(
                 frame_id=found.frame.id,
                 map=found.row.name,
                 model=found.label,
                 model_id=found.row.model_id,
                 length=len(vector),
-                n_patches=list(sizes.n_patches),
-                n_pairs=list(sizes.n_pairs),
+                n_patches=n_patches,
+                n_pairs=n_pairs,
                 base64=base64.b64encode(vector).decode(),
             )
 
@@ -498,12 +498,12 @@ class FrameFiles:
         drawn = geometry_of(self._store, found).surface
         return onto(vista_of(drawn), drawn, seen.points.reshape(-1, 3), labels.ravel())
 
-    def _signature(self, found: IndexedFrame) -> tuple[bytes, PatchCounts]:
+    def _signature(self, found: IndexedFrame) -> tuple[bytes, tuple[list[int], list[int]]]:
         number, model_id = found.frame.number, found.row.model_id
         try:
             with self._store.database.read() as connection:
                 vector = stored_vector(connection, number, model_id)
-                sizes = signature_sizes(connection, number, model_id)
+                sizes = patch_counts(connection, number, model_id)
         except errors.DamagedSignature:
             resign_frames(self._store, found.row, [number], model_id)
             raise

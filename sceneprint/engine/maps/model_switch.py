@@ -142,8 +142,7 @@ class ModelSwitches:
     def _switch(self, row: MapRow, generation: Generation | None) -> bool:
         with self._store.database.write() as connection:
             now = find_map(connection, row.name)
-            same = (now.number, now.next_model_id) == (row.number, row.next_model_id)
-            if not same or not stored.is_complete(connection, now):
+            if not _still(now, row) or not stored.is_complete(connection, now):
                 return False  # a frame was indexed meanwhile, or somebody was first
             found = trusted(connection, now, generation)
             if found is not None:

@@ -59,16 +59,14 @@ def figures(v: ValidationRecord) -> str:
     """What a validation found, in one line: its reason, and the numbers it rests on."""
     if v.residual is None:
         return f"{v.status}: {v.reason}"
+    share = v.free_space_violations
+    violations = "unknown" if share is None else f"{share:.3g}"
     return (
         f"{v.status}: {v.reason} (the directions disagree by {v.residual.translation_m:.3g} m, "
         f"{v.residual.rotation_deg:.3g} deg; overlap {v.overlap:.3g}, by planes "
-        f"{v.plane_overlap:.3g}; violations {_or_unknown(v.free_space_violations)}; ambiguity "
+        f"{v.plane_overlap:.3g}; violations {violations}; ambiguity "
         f"{v.ambiguity:.3g})"
     )
-
-
-def _or_unknown(share: float | None) -> str:
-    return "unknown" if share is None else f"{share:.3g}"
 
 
 def _each(

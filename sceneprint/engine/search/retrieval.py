@@ -318,17 +318,13 @@ def _searched(
         )
         if stored else ()
     )  # fmt: skip
+    # the database counts the query itself, where it is of the map
     return tuple(
-        _count_searched(next(found), part)
+        replace(hits := next(found), compared=min(hits.compared, part.passed))
         if isinstance(part.place.view, Stored)
         else part.place.view.search(vector, size, dead=part.dead, among=part.among, exact=exact)
         for part in parts
     )
-
-
-def _count_searched(hits: SearchHits, part: MapSearch) -> SearchHits:
-    """The database counts the query itself, where it is of the map."""
-    return replace(hits, compared=min(hits.compared, part.passed))
 
 
 def _part(store: Store, place: SearchedMap, asked: PreparedQuery, query: Query) -> MapSearch:

@@ -173,7 +173,7 @@ class Associating:
             if time.monotonic() >= until:
                 return SliceResult(False, progress, items)
         with self._store.database.read() as connection:
-            found = items_of(connection, task.claim.job.number) + items
+            found = items_of(connection, task.job.number) + items
             stops = stops_of(connection, {*plan.source, *plan.target})
         judged, counts, joins = finish_association(found, plan.source, plan.target, stops, asked)
         result = {

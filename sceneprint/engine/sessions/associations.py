@@ -261,7 +261,8 @@ class AssociationJobs:
             progress = job.progress or {}
             numbers = [progress["source"], progress["target"]]
             stops = stops_of(connection, {number for run in numbers for number in run})
-        runs = [[stops[n] for n in run if n in stops] for run in _distinct(numbers)]
+        distinct = numbers[:1] if numbers[0] == numbers[1] else numbers
+        runs = [[stops[n] for n in run if n in stops] for run in distinct]
         chosen = [
             item
             for item in items
@@ -272,10 +273,6 @@ class AssociationJobs:
         ]
         graph = pose_graph(runs, chosen, job.result["joins"], odometry=odometry)
         return graph_text(graph, kind)
-
-
-def _distinct(runs: list[list[int]]) -> list[list[int]]:
-    return runs[:1] if runs[0] == runs[1] else runs
 
 
 def _find(connection: Connection, map_name: str, job_id: str) -> JobRow:

@@ -102,13 +102,9 @@ ReconstructionJobs,
                 return do()
             except (UnknownMap, UnknownJob):
                 return 0  # deleted meanwhile: the next time
-            except BusyIndex as error:
-                log.info("purge incomplete", extra={"error": str(error)})
-                if failed is not None:
-                    failed.append(error)
-                return 0
             except (SceneprintError, OSError, ValueError) as error:
-                log.error("purge incomplete", extra={"error": str(error)})
+                level = logging.INFO if isinstance(error, BusyIndex) else logging.ERROR
+                log.log(level, "purge incomplete", extra={"error": str(error)})
                 if failed is not None:
                     failed.append(error)
                 return 0
