@@ -151,8 +151,8 @@ def measure(
     return SearchFigures(
         frames=len(generation),
         signature_bytes=length,
-        probes=generation.recall.probes,
-        recall=generation.recall.share,
+        probes=generation.manifest.recall.probes,
+        recall=generation.manifest.recall.share,
         publish=whole.stages["publish"],
         append=whole.stages["append"],
         open=opened,

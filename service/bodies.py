@@ -29,7 +29,7 @@ from sceneprint.errors import (
     UnusableStore,
 )
 from sceneprint.formats.image.depth_file import size_of
-from sceneprint.store.idempotency import IdempotentRequest
+from sceneprint.store.keys import IdempotentRequest
 from sceneprint_client.api import FrameMeta
 from sceneprint_client.api.frames import (
     MOST_OF_BATCH,

@@ -203,28 +203,28 @@ class Metrics:
 
     def text(self, figures: Figures, streams: int) -> bytes:
         """All figures in Prometheus' text format."""
+        stats, workers = figures.stats, figures.stats.workers or []
         for state in FrameState:
-            self._frames.labels(state).set(figures.frames.get(state, 0))
+            self._frames.labels(state).set(stats.frames.get(state, 0))
         for kind in JobState:
-            self._jobs.labels(kind).set(figures.jobs.get(kind, 0))
+            self._jobs.labels(kind).set(stats.jobs.get(kind, 0))
         self._streams.set(streams)
-        self._maps.set(figures.maps)
-        self._oldest.set(figures.oldest_waiting_s)
+        self._maps.set(stats.maps)
+        self._oldest.set(stats.oldest_waiting_s or 0.0)
         for gauge in (self._generation, self._tail):
             gauge.clear()  # maps come and go
-        for index in figures.indexes[:MOST_MAPS]:
+        for index in stats.indexes[:MOST_MAPS]:
             self._generation.labels(index.map).set(index.generation or 0)
             self._tail.labels(index.map).set(index.tail)
-        busy = sum(worker.job_id is not None for worker in figures.workers)
+        busy = sum(worker.job_id is not None for worker in workers)
         self._workers.labels("busy").set(busy)
-        self._workers.labels("idle").set(len(figures.workers) - busy)
+        self._workers.labels("idle").set(len(workers) - busy)
         self._began.set(figures.began)
         self._events.set(figures.events)
-        if figures.replica is not None:
-            self._tell_replica(figures.replica)
-        sizes = figures.sizes
-        self._disk.labels("database").set(sizes.database or 0)
-        self._disk.labels("blobs").set(sizes.blobs)
-        self._disk.labels("index").set(sizes.index)
-        self._free.set(sizes.free or 0)  # of the whole it is known
+        if stats.replica is not None:
+            self._tell_replica(stats.replica)
+        self._disk.labels("database").set(stats.bytes.database or 0)
+        self._disk.labels("blobs").set(stats.bytes.blobs)
+        self._disk.labels("index").set(stats.bytes.index)
+        self._free.set(stats.bytes.free or 0)  # of the whole it is known
         return generate_latest(self.registry)

@@ -333,7 +333,7 @@ def bring_to() -> Callable[[str, str], None]:
         from alembic import command
         from sqlalchemy import create_engine
 
-        from sceneprint.store.schema import migration_config
+        from sceneprint.store.database import migration_config
 
         config, engine = migration_config(), create_engine(url)
         with engine.begin() as connection:

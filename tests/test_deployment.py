@@ -13,6 +13,7 @@ import pytest
 
 from benchmarks.fleet.postgres import Server, binaries, of_nobody
 from sceneprint.engine import Engine
+from sceneprint.engine.admin.operations import list_keys
 from sceneprint.settings import Settings
 from sceneprint_client.api import NewMap
 
@@ -100,7 +101,7 @@ def test_commands_in_their_order(primary: Server, run: Run, tmp_path: Path) -> N
         run(back, SCENEPRINT_DATABASE_URL=url, FOLDER=str(tmp_path / "again"))
         with Engine(Settings(data_dir=tmp_path / "again")) as engine:
             assert [one.name for one in engine.list_maps().items] == ["building"]
-            assert [one.name for one in engine.list_keys().items] == ["operator", "robot-7"]
+            assert [one.name for one in list_keys(engine.store).items] == ["operator", "robot-7"]
     finally:
         run(f"pg_ctl stop --mode immediate --silent --pgdata {standby_data}")
 

@@ -112,11 +112,11 @@ class Worker:
         if self._stop.asked:
             self._engine.put_back(claimed)
             return True
-        held = claimed.claim
-        asked = (held.job.data or {}).get("request_id")
+        held = claimed.job
+        asked = (held.data or {}).get("request_id")
         usual_s = self._engine.settings.job_s
-        seconds = self._engine.tasks.longest_s(held.job.kind, usual_s)
-        with of_request(asked), self._trace.job(held.job.id, held.token, seconds):
+        seconds = self._engine.tasks.longest_s(held.kind, usual_s)
+        with of_request(asked), self._trace.job(held.id, held.token, seconds):
             self._engine.run(claimed, self._break)
         return True
 

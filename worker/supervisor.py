@@ -15,6 +15,7 @@ from multiprocessing.context import SpawnProcess
 from types import FrameType
 
 from sceneprint.engine import Engine
+from sceneprint.engine.jobs.lifecycle import worker_died
 from sceneprint.errors import SceneprintError
 from sceneprint.settings import Settings
 from worker.loop import work
@@ -134,7 +135,7 @@ class Supervisor:
         text = left.text or "It left no traceback."
         try:
             with Engine(self._settings) as engine:
-                engine.worker_died(left.job_id, left.token, error, text, counts=counts)
+                worker_died(engine.store, left.job_id, left.token, error, text, counts=counts)
         except SceneprintError as trouble:  # its lease will end it
             log.error("store unreachable", extra={"error": str(trouble)})
 

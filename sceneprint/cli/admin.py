@@ -58,6 +58,7 @@ def add_keys(commands: Any) -> None:
 def run_keys(options: argparse.Namespace) -> int:
     """Do what was asked for with the keys of the data folder."""
     from sceneprint.engine import Engine
+    from sceneprint.engine.admin.operations import list_keys
     from sceneprint.errors import InvalidRequest
 
     given = [name for name in ("scope", "map", "expires") if getattr(options, name) is not None]
@@ -67,7 +68,7 @@ def run_keys(options: argparse.Namespace) -> int:
         if options.list:
             cursor = None
             while True:
-                page = engine.list_keys(cursor, 1000)
+                page = list_keys(engine.store, cursor, 1000)
                 for key in page.items:
                     print(_key_line(key))
                 cursor = page.next_cursor

@@ -127,8 +127,7 @@ def _sqlite_file(settings: Settings, url: URL) -> Check:
 
 def _database_server(settings: Settings) -> Check:
     from sceneprint.errors import SceneprintError
-    from sceneprint.store.database import reach_database
-    from sceneprint.store.schema import revision_of
+    from sceneprint.store.database import reach_database, revision_of
 
     try:
         database = reach_database(settings.database)
@@ -153,7 +152,7 @@ def _path_of(url: URL) -> Path | None:
 
 def _schema(engine: Engine) -> Check:
     """Compare the schema with the one of this version; the database is not touched."""
-    from sceneprint.store.schema import revision_of
+    from sceneprint.store.database import revision_of
 
     try:
         with engine.connect() as connection:
@@ -164,7 +163,7 @@ def _schema(engine: Engine) -> Check:
 
 
 def _compared(found: str | None, place: str) -> Check:
-    from sceneprint.store.schema import known_revisions
+    from sceneprint.store.database import known_revisions
 
     head, known = known_revisions()
     place = f"{place}, schema {found}"
@@ -359,8 +358,7 @@ def _clock(before: float, there: float, after: float, settings: Settings) -> Che
 
 def _replica(url: str, settings: Settings) -> Check:
     from sceneprint.errors import SceneprintError
-    from sceneprint.store.database import reach_database
-    from sceneprint.store.schema import known_revisions, revision_of
+    from sceneprint.store.database import known_revisions, reach_database, revision_of
 
     try:
         database = reach_database(url)

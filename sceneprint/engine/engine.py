@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 
-from sceneprint.engine.admin import keys
-from sceneprint.engine.admin.keys import Audit
-from sceneprint.engine.admin.operations import OperatorTasks
+from sceneprint.engine.admin import operations
+from sceneprint.engine.admin.operations import Audit, OperatorTasks
 from sceneprint.engine.ingest.archive_import import Imports
 from sceneprint.engine.ingest.uploads import Upload, Uploads
 from sceneprint.engine.jobs import lifecycle
@@ -26,28 +25,26 @@ from sceneprint.engine.reconstruction import ReconstructionJobs
 from sceneprint.engine.results.inspection import Inspection, PointClouds
 from sceneprint.engine.results.rerun import Rerun
 from sceneprint.engine.results.stored_results import ResultValidity, open_results
-from sceneprint.engine.search.index_view import IndexView
 from sceneprint.engine.search.local_index import Readers
+from sceneprint.engine.search.map_view import IndexView
 from sceneprint.engine.search.query import Queries
 from sceneprint.engine.serializers import frame_records, map_record
 from sceneprint.engine.sessions.association_job import Associating
-from sceneprint.engine.sessions.associations import AssociationJobs
-from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
+from sceneprint.engine.sessions.associations import ASSOCIATE, AssociationJobs
 from sceneprint.engine.upkeep.deletion import Purging, Retention
-from sceneprint.engine.upkeep.index_upkeep import Upkeep
-from sceneprint.engine.upkeep.vector_tables import VectorTables
-from sceneprint.errors import BusyIndex, ModelError, StoreAway, UnusableStore
+from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
+from sceneprint.engine.upkeep.repair import collect_deleted_blobs
+from sceneprint.errors import ModelError, StoreAway, UnusableStore
 from sceneprint.models import Model
 from sceneprint.settings import Settings
 from sceneprint.store import frames as stored_frames
 from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import open_store, queue
-from sceneprint.store.associations import ASSOCIATE
+from sceneprint.store.deletion import remove_map
 from sceneprint.store.model_switch import models_of
-from sceneprint.store.postgres.notify import Notices
 from sceneprint.store.tables import MapRow
-from sceneprint.store.wakeup import Wakeup
+from sceneprint.store.wakeup import Notices, Wakeup
 from sceneprint_client.api import (
     Added,
     Answer,
@@ -62,7 +59,7 @@ from sceneprint_client.api import (
     Page,
     Query,
 )
-from sceneprint_client.api.admin import Key, MadeKey, Scope
+from sceneprint_client.api.admin import MadeKey, Scope
 from sceneprint_client.api.listing import FrameListing
 
 log = logging.getLogger(__name__)
@@ -70,10 +67,6 @@ log = logging.getLogger(__name__)
 
 class Engine:
     """Maps, frames, queries and jobs over one store; safe to share between threads.
-
-    Parameters
-    ----------
-    settings : see Settings
 
     Raises
     ------
@@ -160,7 +153,7 @@ class Engine:
     def delete_map(self, name: str) -> None:
         """Remove a map with all that is in it; UnknownMap where there is none."""
         with self.store.database.write() as connection:
-            blobs = stored_maps.remove_map(connection, stored_maps.find_map(connection, name))
+            blobs = remove_map(connection, stored_maps.find_map(connection, name))
         self._readers.forget(name)
         collect_deleted_blobs(self.store, blobs)
 
@@ -182,26 +175,11 @@ class Engine:
             self._readers.purge(connection)
         self.kept.forget(ResultValidity(self.store).all_of)  # this node may have no worker
 
-    def cancel_reencode(self, name: str) -> Map:
-        """Let a map keep the model it has; see `model_switch.cancel`."""
-        return model_switch.cancel(self.store, name)
-
     # jobs
 
     def get_job(self, job_id: str) -> Job:
         """A job; UnknownJob where there is none."""
         return lifecycle.get_job(self.store, job_id)
-
-    def list_jobs(
-        self, state: JobState | None = None, cursor: str | None = None, limit: int = 100,
-        kind: str | None = None, map_names: Collection[str] | None = None,
-    ) -> Page[Job]:  # fmt: skip
-        """Jobs, the newest first; see `lifecycle.list_jobs`."""
-        return lifecycle.list_jobs(self.store, state, cursor, limit, kind, map_names)
-
-    def cancel_job(self, job_id: str) -> Job:
-        """Give up a job that is not over; see `lifecycle.cancel`."""
-        return lifecycle.cancel(self.store, job_id)
 
     def retry_job(self, job_id: str) -> tuple[Job, bool]:
         """Try again what was given up, in a new job; see `lifecycle.retry`."""
@@ -216,12 +194,8 @@ class Engine:
         self, name: str, grants: Mapping[str, Scope] | None = None,
         expires_at: datetime | None = None,
     ) -> MadeKey:  # fmt: skip
-        """Make a key, and show its secret; see `keys.create_key`."""
-        return keys.create_key(self.store, name, grants, expires_at)
-
-    def list_keys(self, cursor: str | None = None, limit: int = 100) -> Page[Key]:
-        """Keys by name; see `keys.list_keys`."""
-        return keys.list_keys(self.store, cursor, limit)
+        """Make a key, and show its secret; see `operations.create_key`."""
+        return operations.create_key(self.store, name, grants, expires_at)
 
     def revoke_key(self, name: str) -> None:
         """Let a key open nothing any more; UnknownKey where there is none."""
@@ -257,20 +231,8 @@ class Engine:
         self, map_name: str, cursor: str | None = None, limit: int = 100,
         state: FrameState | None = None, wanted: FrameListing | None = None,
     ) -> Page[Frame]:  # fmt: skip
-        """Frames of a map in the order they came, deleted ones only where asked for.
-
-        Parameters
-        ----------
-        map_name : of the map
-        cursor : of the page before
-        limit : most frames
-        state : in this one; None for all but deleted ones
-        wanted : more that must hold, `state` with it
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        InvalidRequest : a cursor that was not given out.
+        """Frames of a map in the order they came, deleted ones only where asked for; see
+        `map_frames.list_frames`. `wanted` has more that must hold, `state` with it.
         """
         return list_frames(self.store, map_name, wanted or FrameListing(state=state), cursor, limit)
 
@@ -291,7 +253,6 @@ class Engine:
         with self.store.database.write() as connection:
             row = stored_maps.find_map(connection, map_name)
             frame = stored_frames.find_frame(connection, row, frame_id)
-            queue.cancel_of(connection, frame.number)
             blobs = stored_frames.delete_frame(connection, row, frame)
         collect_deleted_blobs(self.store, blobs)
 
@@ -344,12 +305,6 @@ class Engine:
             self.settings.job_s, broke,
         )  # fmt: skip
 
-    def worker_died(
-        self, job_id: str, token: int, error: str, traceback: str, *, counts: bool
-    ) -> JobState | None:
-        """Take a job from a worker that died over it; see `lifecycle.worker_died`."""
-        return lifecycle.worker_died(self.store, job_id, token, error, traceback, counts=counts)
-
     def put_back(self, work: Work | LongJob) -> None:
         """Return a claimed job undone."""
         if isinstance(work, LongJob):
@@ -388,12 +343,7 @@ class Engine:
         InvalidRequest : there is no indexed frame in it.
         BusyIndex : another process is building it.
         """
-        generation = self._upkeep.rebuild(self._row(map_name))
-        if generation is None:
-            raise BusyIndex(
-                f"The index of map {map_name!r} is being built by another process. Try again later."
-            )
-        return generation.number
+        return self._upkeep.rebuild(self._row(map_name)).number
 
 
 # Opening a store whose server may be away: what is started beside it may be there before it.

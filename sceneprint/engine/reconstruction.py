@@ -19,7 +19,7 @@ from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
 from sceneprint.engine.maps.map_frames import living
 from sceneprint.engine.results.stored_results import ResultValidity, StoredResult
 from sceneprint.engine.serializers import when
-from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
+from sceneprint.engine.upkeep.repair import collect_deleted_blobs
 from sceneprint.errors import (
     DamagedBlob,
     FrameError,
@@ -39,11 +39,9 @@ from sceneprint.geometry.surface.coverage import added_areas, observed_volume, o
 from sceneprint.geometry.surface.depth_image import doubled
 from sceneprint.libraries import open3d
 from sceneprint.rendering import PALETTE, reconstruction_picture
-from sceneprint.store import Store
-from sceneprint.store.associations import remove_job
+from sceneprint.store import Store, queue
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
-from sceneprint.store.queue import JobFile, files_of, find_job, jobs_with_files, unknown_job
 from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import JobRow
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics
@@ -60,7 +58,7 @@ from sceneprint_client.api.reconstructions import (
 
 # Views of an answer fused: their depth out of the store, the surface, its figures, its files.
 #
-# data of a job, geometry of the query  --fused-->  Fused
+# data of a job, geometry of the query  --fused-->  coverage, PLY, PNG
 
 Source = Literal["upload", "geometry"]
 Strength = Literal["strong", "weak"]
@@ -84,26 +82,10 @@ class JobView:
     transform: list[list[float]]
 
 
-@dataclass(frozen=True, eq=False)
-class Fused:
-    """What became of the views.
-
-    Parameters
-    ----------
-    coverage : see Coverage
-    ply : surface or cloud, in the query's camera frame, coloured by view
-    png : its picture
-    """
-
-    coverage: Coverage
-    ply: bytes
-    png: bytes
-
-
 def fused(
     store: Store, views: Sequence[JobView], query: Geometry | None, own: JobView | None,
     wanted: NewReconstruction, model_id: str, parent_frame: str, asked_at: float,
-) -> Fused:  # fmt: skip
+) -> tuple[Coverage, bytes, bytes]:  # fmt: skip
     """Fuse the matches of an answer, and what the query saw.
 
     Parameters
@@ -116,6 +98,12 @@ def fused(
     model_id : whose artifacts stand in for uploads that are lost
     parent_frame : what the query's camera frame is called
     asked_at : when the answer was given, seconds since 1970
+
+    Returns
+    -------
+    coverage : what became of the views
+    ply : surface or cloud, in the query's camera frame, coloured by view
+    png : its picture
 
     Raises
     ------
@@ -151,12 +139,13 @@ def fused(
     added = added_areas(mesh, first, len(frames)).tolist()
     volume, _ = observed_volume(frames)
     as_mesh = wanted.output == "mesh"
+    seen = None if query is None else query.surface.points[query.surface.valid].astype(np.float64)
     coverage = Coverage(
         views=[one.model_copy(update={"added_m2": a}) for one, a in zip(told, added, strict=True)],
         left_out=left_out,
         area_m2=float(sum(added)),
         observed_volume_m3=volume,
-        query_explained=0.0 if query is None else share_seen(_points(query), others),
+        query_explained=0.0 if seen is None else share_seen(seen, others),
         voxel_m=voxel,
         points=len(mesh.points),
         triangles=len(mesh.triangles) if as_mesh else 0,
@@ -172,7 +161,7 @@ def fused(
     named = f"{len(frames)} views, {coverage.area_m2:.1f} m², {volume:.1f} m³ observed"
     explained = f"{coverage.query_explained:.0%} of the query explained"
     title = named if query is None else f"{named}; {explained}"
-    return Fused(coverage, ply, reconstruction_picture(mesh, first, frames, added, title))
+    return coverage, ply, reconstruction_picture(mesh, first, frames, added, title)
 
 
 def _own(
@@ -232,10 +221,6 @@ def _no_image(name: str) -> UselessFrame:
     )
 
 
-def _points(geometry: Geometry) -> Floats:
-    return geometry.surface.points[geometry.surface.valid].astype(np.float64)
-
-
 def _fused_view(view: JobView | None, frame: DepthFrame, source: Source) -> FusedView:
     samples = int(np.count_nonzero(frame.depth))
     return FusedView(
@@ -258,12 +243,7 @@ _STILL = np.eye(4).tolist()
 
 
 class ReconstructionJobs:
-    """Begins reconstructions, does them, and hands out what they made.
-
-    Parameters
-    ----------
-    store, tasks : of the engine
-    """
+    """Begins reconstructions, does them, and hands out what they made."""
 
     def __init__(self, store: Store, tasks: Tasks) -> None:
         self._store, self._tasks = store, tasks
@@ -304,9 +284,9 @@ class ReconstructionJobs:
             files = []
             if kept.geometry is not None:
                 blob = self._store.blobs.put(kept.geometry)
-                files = [JobFile(QUERY, blob, len(kept.geometry), "application/octet-stream")]
+                files = [queue.JobFile(QUERY, blob, len(kept.geometry), "application/octet-stream")]
             try:
-                job = self._tasks.begin(KIND, of, data, files=files)
+                job, _ = self._tasks.begin(KIND, of, data, files=files)
             except Swept:
                 continue
             except BaseException:
@@ -318,9 +298,9 @@ class ReconstructionJobs:
         """A reconstruction; UnknownJob where there is none."""
         with self._store.database.read() as connection:
             job = _find(connection, job_id)
-            return _reconstruction_record(job, files_of(connection, job.number))
+            return _reconstruction_record(job, queue.files_of(connection, job.number))
 
-    def file(self, job_id: str, name: str) -> JobFile:
+    def file(self, job_id: str, name: str) -> queue.JobFile:
         """A file that a reconstruction made.
 
         Raises
@@ -330,7 +310,7 @@ class ReconstructionJobs:
         """
         with self._store.database.read() as connection:
             job = _find(connection, job_id)
-            found = files_of(connection, job.number).get(name)
+            found = queue.files_of(connection, job.number).get(name)
         if found is None or name not in MEDIA_TYPES:
             why = f": {job.error}" if job.error else "."
             raise NotIndexed(
@@ -342,13 +322,13 @@ class ReconstructionJobs:
     def delete(self, job_id: str) -> None:
         """Remove a reconstruction, whatever has become of it; UnknownJob where there is none."""
         with self._store.database.write() as connection:
-            blobs = remove_job(connection, _find(connection, job_id))
+            blobs = queue.remove_job(connection, _find(connection, job_id))
         collect_deleted_blobs(self._store, blobs)
 
     def forget(self, standing: ResultValidity) -> int:
         """Remove those of which any view was deleted since: they show it; returns how many."""
         with self._store.database.read() as connection:
-            found = jobs_with_files(connection, KIND)
+            found = queue.jobs_with_files(connection, KIND)
         gone = [job for job in found if not _stands(job, standing)]
         for job in gone:
             with suppress(UnknownJob):  # somebody else has
@@ -362,26 +342,26 @@ class ReconstructionJobs:
         wanted = NewReconstruction.model_validate(data["request"])
         views = [JobView(**view) for view in data["views"]]
         own = None if data["own"] is None else JobView(**data["own"])
-        result = fused(
+        coverage, ply, png = fused(
             self._store, views, self._query_of(task), own, wanted, data["model_id"],
             data["parent_frame"], data["asked_at"],
         )  # fmt: skip
         files = [
-            JobFile(name, self._store.blobs.put(content), len(content), MEDIA_TYPES[name])
-            for name, content in ((MESH, result.ply), (PICTURE, result.png))
+            queue.JobFile(name, self._store.blobs.put(content), len(content), MEDIA_TYPES[name])
+            for name, content in ((MESH, ply), (PICTURE, png))
         ]
         return SliceResult(
             over=True,
             progress={"done": len(views), "total": len(views)},
             files=files,
-            result=result.coverage.model_dump(mode="json"),
+            result=coverage.model_dump(mode="json"),
             drop=(QUERY,),
         )
 
     def _query_of(self, task: LongJob) -> Geometry | None:
         """What the query saw; a reconstruction does without it where it is damaged."""
         with self._store.database.read() as connection:
-            found = files_of(connection, task.claim.job.number).get(QUERY)
+            found = queue.files_of(connection, task.job.number).get(QUERY)
         if found is not None:
             with suppress(DamagedBlob, UnreadableGeometry):
                 return read_geometry(self._store.blobs.get(found.blob))
@@ -430,13 +410,13 @@ def _stands(job: JobRow, standing: ResultValidity) -> bool:
 
 
 def _find(connection: Connection, job_id: str) -> JobRow:
-    job = find_job(connection, job_id)
+    job = queue.find_job(connection, job_id)
     if job.kind != KIND:
-        raise unknown_job(job_id)
+        raise queue.unknown_job(job_id)
     return job
 
 
-def _reconstruction_record(job: JobRow, files: dict[str, JobFile]) -> Reconstruction:
+def _reconstruction_record(job: JobRow, files: dict[str, queue.JobFile]) -> Reconstruction:
     data, done = job.data or {}, job.state == JobState.SUCCEEDED
     made = [files[name] for name in MEDIA_TYPES if name in files]
     return Reconstruction(

@@ -17,7 +17,8 @@ from sceneprint.errors import InvalidPose, naming
 from sceneprint.formats.dataset import rigid_transform
 from sceneprint.geometry.pose.rigid import quaternion_of, rotation_of
 from sceneprint.store.deletion import DAY_S, count_old
-from sceneprint.store.maps import count_frames, model_names
+from sceneprint.store.frames import count_states
+from sceneprint.store.maps import model_names
 from sceneprint.store.model_switch import switch_progress
 from sceneprint.store.queue import jobs_of
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
@@ -156,7 +157,9 @@ def query_sensor(frame: FrameName | None, kind: Kind, maps: Sequence[str]) -> st
 
 def map_record(connection: Connection, row: MapRow) -> Map:
     """A map."""
-    names, coming = model_names(connection), None
+    names, coming, overdue = model_names(connection), None, None
+    if row.retention_days is not None:
+        overdue = count_old(connection, row.number, time.time() - DAY_S * row.retention_days)
     if row.next_model_id is not None:
         label = model_label(names[row.next_model_id], row.next_model_id)
         now = switch_progress(connection, row)
@@ -169,21 +172,15 @@ def map_record(connection: Connection, row: MapRow) -> Map:
         reencoding=coming,
         created_at=when(row.created_at),
         revision=row.revision,
-        frames=count_frames(connection, row.number),
+        frames=count_states(connection, row.number),
         used_frames=row.used_frames,
         used_bytes=row.used_bytes,
         quota_frames=row.quota_frames,
         quota_bytes=row.quota_bytes,
         retention_days=row.retention_days,
-        overdue=None if row.retention_days is None else _overdue(connection, row),
+        overdue=overdue,
         etag=map_tag(row),
     )
-
-
-def _overdue(connection: Connection, row: MapRow) -> int:
-    """Frames that a map has kept for longer than it should."""
-    before = time.time() - DAY_S * (row.retention_days or 0.0)
-    return count_old(connection, row.number, before)
 
 
 def frame_records(connection: Connection, row: MapRow, found: list[FrameRow]) -> list[Frame]:

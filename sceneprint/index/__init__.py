@@ -9,10 +9,9 @@ processes of a machine share in memory. A search compares all of them; only a ma
 truth: deleting the folder loses nothing but the time to publish it again.
 """
 
-from sceneprint.index.generation import Generation, newest
-from sceneprint.index.manifest import manifests, newest_number, scrub
+from sceneprint.index.generation import Generation, SearchHits, Tail, newest, search, signatures_of
+from sceneprint.index.generation_files import manifests, newest_number, scrub
 from sceneprint.index.publication import clear, publish
-from sceneprint.index.search import SearchHits, Tail, search, signatures_of
 
 __all__ = [
     "Generation",

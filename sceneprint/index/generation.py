@@ -1,4 +1,4 @@
-"""Generations: what one published state of the cache holds, and how it is opened."""
+"""Generations: one published state of the cache, opened, and searched with newer frames."""
 
 from __future__ import annotations
 
@@ -12,16 +12,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index.flat import codes_of, map_index
-from sceneprint.index.lists import Lists, map_lists
-from sceneprint.index.manifest import GenerationManifest, Recall, manifests, read_manifest
-from sceneprint.index.mapped_files import Keys, Places, check, mapped
+from sceneprint.index import generation_files
+from sceneprint.index.faiss_index import Lists, codes_of, map_index, map_lists
 from sceneprint.types import Bytes
 
 if TYPE_CHECKING:
     from faiss import IndexScalarQuantizer
 
-_log = logging.getLogger(__name__)
+from numpy.typing import NDArray
+
+from sceneprint.geometry.retrieval.distance import Metric, distances
+from sceneprint.index.faiss_index import nearest
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +42,8 @@ class Generation:
     inodes : of the files by their names: another may have taken a name since
     """
 
-    manifest: GenerationManifest
-    keys: Keys
+    manifest: generation_files.GenerationManifest
+    keys: generation_files.Keys
     index: IndexScalarQuantizer
     lists: Lists | None
     inodes: Mapping[str, int]
@@ -63,32 +66,17 @@ class Generation:
         """Of the model that signed them."""
         return self.manifest.model_id
 
-    @property
-    def anchor(self) -> str:
-        """As given to `publish`."""
-        return self.manifest.anchor
-
-    @property
-    def recall(self) -> Recall:
-        """What a search finds that does not compare all."""
-        return self.manifest.recall
-
-    @property
-    def dimension(self) -> int:
-        """D, bytes of a signature."""
-        return self.manifest.dimension
-
     @cached_property
     def vectors(self) -> Bytes:
         """Signatures (N, D) uint8 where they are mapped, read-only, in the order of the keys."""
         return codes_of(self.index)
 
     @cached_property
-    def places(self) -> Places:
+    def places(self) -> generation_files.Places:
         """Rows of the frames by their keys."""
-        return Places(self.keys)
+        return generation_files.Places(self.keys)
 
-    def vectors_of(self, keys: Keys) -> Bytes:
+    def vectors_of(self, keys: generation_files.Keys) -> Bytes:
         """Signatures (r, D) of some frames, a copy.
 
         Raises
@@ -121,24 +109,24 @@ def newest(
     the generation; None where there is none, so that the map must be published from the database
     """
     while True:
-        listed, found, errors = manifests(folder), None, []
+        listed, found, errors = generation_files.manifests(folder), None, []
         for _, path in listed:
             try:
-                manifest = read_manifest(path)
+                manifest = generation_files.read_manifest(path)
                 if (manifest.model_id, manifest.dimension) == (model_id, dimension):
                     found = open_generation(folder, manifest, known)
                     break
             except DamagedIndex as error:
                 errors.append(error)
         # what a builder removed after it was listed is not damaged, and something newer is there
-        if not errors or manifests(folder) == listed:
+        if not errors or generation_files.manifests(folder) == listed:
             for each in errors:
-                _log.warning("Damaged index skipped; it will be rebuilt: %s", each)
+                log.warning("Damaged index skipped; it will be rebuilt: %s", each)
             return found
 
 
 def open_generation(
-    folder: Path, manifest: GenerationManifest, known: Generation | None = None,
+    folder: Path, manifest: generation_files.GenerationManifest, known: Generation | None = None,
     written: Mapping[str, int] | None = None,
 ) -> Generation:  # fmt: skip
     """Open the files of a generation.
@@ -160,10 +148,10 @@ def open_generation(
     sound.update(written or {})
     for name, size in manifest.files:
         if inodes[name] != sound.get(name, -1):
-            for _ in check(folder, name, size):
+            for _ in generation_files.check(folder, name, size):
                 pass
     names = {name.rpartition(".")[2]: folder / name for name, _ in manifest.files}
-    keys = np.frombuffer(mapped(names["keys"]), "<i8")
+    keys = np.frombuffer(generation_files.mapped(names["keys"]), "<i8")
     if (keys[1:] <= keys[:-1]).any():
         raise DamagedIndex(f"{names['keys']}: its keys are not in order.")
     n, lists = len(keys), None
@@ -179,3 +167,227 @@ def _inode(path: Path) -> int:
         return path.stat().st_ino
     except OSError:
         return 0
+
+
+# Search: the nearest frames of a map by exact distance of signatures, Sec. III-C.
+#
+# The tail is compared whole, and so is a generation; of one with an inverted file only the lists
+# that are nearest to the query. What they miss is missed, and measured when it is published.
+
+# Tails: frames newer than a generation, held in memory and always compared exactly.
+
+
+@dataclass(frozen=True, eq=False)
+class Tail:
+    """Frames newer than a generation.
+
+    A frame that is in both counts once, with the signature it has here.
+
+    Parameters
+    ----------
+    keys : (n,) int64, none twice
+    signatures : (n, D) uint8
+
+    Raises
+    ------
+    ValueError : other arrays, or a key that is there twice.
+    """
+
+    keys: generation_files.Keys
+    signatures: Bytes
+
+    def __post_init__(self) -> None:
+        generation_files.check_block(self.keys, self.signatures, self.signatures.shape[-1])
+        _ = self.places
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    @classmethod
+    def empty(cls, dimension: int) -> Tail:
+        """No frames, of signatures of that many bytes."""
+        return cls(np.empty(0, np.int64), np.empty((0, dimension), np.uint8))
+
+    @cached_property
+    def places(self) -> generation_files.Places:
+        """Rows of the frames by their keys."""
+        return generation_files.Places(self.keys)
+
+
+def signatures_of(keys: generation_files.Keys, generation: Generation | None, tail: Tail) -> Bytes:
+    """Signatures of some frames: of the hits of a search, to compare them among each other.
+
+    Parameters
+    ----------
+    keys : (r,) int64
+    generation : or None where there is none
+    tail : frames newer than that
+
+    Returns
+    -------
+    (r, D) uint8, in the order of `keys`; the tail's where a frame is in both
+
+    Raises
+    ------
+    ValueError : a frame is in neither, or the lengths of signatures differ.
+    """
+    check_lengths(tail.signatures.shape[1], generation, tail)
+    in_tail = tail.places.of(keys)
+    result = np.empty((len(keys), tail.signatures.shape[1]), np.uint8)
+    result[in_tail >= 0] = tail.signatures[in_tail[in_tail >= 0]]
+    others = keys[in_tail < 0]
+    if len(others) and generation is None:
+        raise ValueError(f"no frames {others[:5].tolist()} in this index")
+    if len(others) and generation is not None:
+        result[in_tail < 0] = generation.vectors_of(others)
+    return result
+
+
+def check_lengths(dimension: int, generation: Generation | None, tail: Tail) -> None:
+    """See that signatures of generation and tail have that many bytes.
+
+    Raises
+    ------
+    ValueError : they have not.
+    """
+    found = {tail.signatures.shape[1]}
+    if generation is not None:
+        found.add(generation.manifest.dimension)
+    if found != {dimension}:
+        raise ValueError(f"signatures of {sorted(found)} bytes where {dimension} were expected")
+
+
+#: Where fewer than one in this many frames may be found, they are compared one by one: FAISS reads
+#: all of them.
+FEW = 8
+#: Longest answer that FAISS gives: of a longer one, ordering costs more than comparing.
+LONGEST = 2048
+
+Found = tuple[NDArray[np.int64], NDArray[np.int64]]
+
+
+@dataclass(frozen=True, eq=False)
+class SearchHits:
+    """The nearest frames that a search found.
+
+    Parameters
+    ----------
+    keys : (r,) int64 of the frames
+    distances : (r,) int64, exact, rising; equal ones by key
+    exact : every frame of the map was compared, so that these are the nearest
+    compared : frames whose exact distance was computed
+    """
+
+    keys: generation_files.Keys
+    distances: NDArray[np.int64]
+    exact: bool
+    compared: int
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+
+def search(
+    query: Bytes,
+    generation: Generation | None,
+    tail: Tail,
+    size: int,
+    *,
+    metric: Metric,
+    dead: frozenset[int] = frozenset(),
+    among: generation_files.Keys | None = None,
+    exact: bool = False,
+) -> SearchHits:
+    """Find the nearest frames of a map. Any number of threads may search one generation.
+
+    Parameters
+    ----------
+    query : (D,) uint8, a signature of the model of the map
+    generation : or None where there is none
+    tail : frames newer than that; where a frame is in both, this one counts
+    size : of the answer; all frames where there are fewer
+    metric : of the model of the map; a generation is of "l2"
+    dead : keys of frames that were deleted since
+    among : keys of the frames that may be found, where not all may; others are no matter
+    exact : compare every frame, of those that may be found
+
+    Raises
+    ------
+    ValueError : no signature of that length, a negative size, or a generation under "l1".
+    """
+    if query.ndim != 1 or query.dtype != np.uint8 or size < 0:
+        raise ValueError(f"{size} for a query {query.dtype} {query.shape}")
+    check_lengths(len(query), generation, tail)
+    gone = np.fromiter(dead, np.int64, len(dead))
+    alive = np.flatnonzero(_free(tail, gone, among))
+    keys, found, whole = tail.keys[alive], distances(query, tail.signatures, metric, alive), True
+    compared = len(alive)
+    if generation is not None and len(generation):
+        if metric != "l2":
+            raise ValueError(f"an index of metric 'l2' searched by {metric!r}")
+        free = _free(generation, np.concatenate([gone, tail.keys]), among)
+        count = int(free.sum())
+        own, whole = _candidates(query, generation, free, count, size, exact)
+        compared += count if own is None else len(own)
+        rows, distant = _compared(query, generation, free, count, size, own)
+        keys = np.concatenate([keys, generation.keys[rows]])
+        found = np.concatenate([found, distant])
+    first = _nearest(keys, found, size)
+    return SearchHits(keys[first], found[first], whole, compared)
+
+
+def _free(
+    part: Generation | Tail, gone: generation_files.Keys, among: generation_files.Keys | None
+) -> NDArray[np.bool_]:
+    """Which frames of a part may be found: those among the given ones that are not gone."""
+    free = np.full(len(part), among is None)
+    if among is not None:
+        free[_known(part.places, among)] = True
+    if len(gone):
+        free[_known(part.places, gone)] = False
+    return free
+
+
+def _known(places: generation_files.Places, keys: generation_files.Keys) -> NDArray[np.int64]:
+    at = places.of(keys)
+    return at[at >= 0]
+
+
+def _candidates(
+    query: Bytes, generation: Generation, free: NDArray[np.bool_], count: int, size: int,
+    exact: bool,
+) -> tuple[NDArray[np.int64] | None, bool]:  # fmt: skip
+    """Rows that are compared one by one, None for all that are free; and whether these are all."""
+    if count < len(generation) // FEW:
+        return np.flatnonzero(free), True
+    if generation.lists is None or exact:
+        return None, True
+    all_free = count == len(generation)
+    rows = generation.lists.candidates(query, min(size, count), None if all_free else free)
+    return rows, len(rows) == count
+
+
+def _compared(
+    query: Bytes, generation: Generation, free: NDArray[np.bool_], count: int, size: int,
+    rows: NDArray[np.int64] | None,
+) -> Found:  # fmt: skip
+    """Rows among which the nearest are, and their distances."""
+    if rows is None and size <= LONGEST:
+        all_free = count == len(generation)
+        found = nearest(generation.index, query, min(size, count), None if all_free else free)
+        if found is not None:
+            return found
+    if rows is None:
+        rows = np.flatnonzero(free)
+    return rows, distances(query, generation.vectors, "l2", rows)
+
+
+def _nearest(keys: generation_files.Keys, found: NDArray[np.int64], size: int) -> NDArray[np.intp]:
+    """Places of the smallest `size`, rising, ties by key."""
+    size = min(size, len(keys))
+    if size == 0:
+        return np.empty(0, np.intp)
+    candidates = np.flatnonzero(found <= np.partition(found, size - 1)[size - 1])
+    order = np.lexsort((keys[candidates], found[candidates]))
+    chosen: NDArray[np.intp] = candidates[order[:size]]
+    return chosen

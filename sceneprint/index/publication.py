@@ -16,36 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index.flat import allocate, write_index
+from sceneprint.index import faiss_index
 from sceneprint.index.generation import Generation, newest, open_generation
-from sceneprint.index.lists import (
-    GROWTH,
-    NEAR,
-    Lists,
-    centre_lists,
-    extend_lists,
-    measure_lists,
-    still_holds,
-    train_lists,
-    write_lists,
-)
-from sceneprint.index.manifest import (
-    GenerationManifest,
-    Recall,
-    manifests,
-    read_manifest,
-    write_manifest,
-)
-from sceneprint.index.mapped_files import (
+from sceneprint.index.generation_files import (
     BLOCK_BYTES,
     Block,
+    GenerationManifest,
     Keys,
     Places,
+    Recall,
     building,
     check_block,
     is_ours,
+    manifests,
     put,
+    read_manifest,
     unfinished,
+    write_manifest,
 )
 from sceneprint.types import Bytes
 
@@ -123,10 +110,10 @@ def publish(
         lists, recall = _lists(draft, previous, clean, flat_bytes)
         files = [
             put(folder, "keys", lambda take: take(draft.keys.astype("<i8").tobytes())),
-            put(folder, "faiss", lambda take: write_index(draft.index, take)),
+            put(folder, "faiss", lambda take: faiss_index.write_index(draft.index, take)),
         ]
         if lists is not None:
-            files.append(put(folder, "lists", lambda take: write_lists(lists, take)))
+            files.append(put(folder, "lists", lambda take: faiss_index.write_lists(lists, take)))
         manifest = GenerationManifest(
             number=listed[0][0] + 1 if listed else 1,
             revision=revision,
@@ -159,7 +146,7 @@ def _overtaken(folder: Path, previous: Generation | None) -> bool:
     """Whether a generation was published, or the folder emptied, since `previous` was opened."""
     if previous is None:
         return False
-    found = newest(folder, previous.model_id, previous.dimension, known=previous)
+    found = newest(folder, previous.model_id, previous.manifest.dimension, known=previous)
     return found is None or found.number != previous.number
 
 
@@ -168,7 +155,8 @@ def _draft(
 ) -> Draft:
     """Merge what stays of the generation before with what is new."""
     none = np.empty(0, np.int64)
-    new_keys, stored = _spooled(folder, blocks, None if previous is None else previous.dimension)
+    dimension = None if previous is None else previous.manifest.dimension
+    new_keys, stored = _spooled(folder, blocks, dimension)
     if previous is None and len(new_keys) == 0:
         raise ValueError("a generation of no frames that follows none")
     Places(new_keys)  # raises where a key is there twice
@@ -180,7 +168,7 @@ def _draft(
     order = np.argsort(keys)
     before = np.concatenate([kept, np.full(len(new), -1)])[order]
     spooled = np.concatenate([np.full(len(kept), -1), new])[order]
-    index, vectors = allocate(len(keys), stored.shape[1])
+    index, vectors = faiss_index.allocate(len(keys), stored.shape[1])
     step = max(BLOCK_BYTES // stored.shape[1], 1)
     for start in range(0, len(keys), step):
         rows = slice(start, start + step)
@@ -214,21 +202,21 @@ def _spooled(folder: Path, blocks: Iterable[Block], dimension: int | None) -> tu
 
 def _lists(
     draft: Draft, previous: Generation | None, clean: bool, flat_bytes: int
-) -> tuple[Lists | None, Recall]:
+) -> tuple[faiss_index.Lists | None, Recall]:
     """The inverted file, where the signatures are so many, and what a search finds by it."""
     n = len(draft.keys)
     if draft.vectors.nbytes <= flat_bytes:
-        return None, Recall(1.0, NEAR, 0, 0, n)
+        return None, Recall(1.0, faiss_index.NEAR, 0, 0, n)
     known = None if previous is None else previous.lists
-    if previous is None or known is None or n >= GROWTH * known.trained_on:
-        return measure_lists(train_lists(draft.vectors), draft.vectors)
-    lists = extend_lists(known, draft.vectors, draft.before)
+    if previous is None or known is None or n >= faiss_index.GROWTH * known.trained_on:
+        return faiss_index.measure_lists(faiss_index.train_lists(draft.vectors), draft.vectors)
+    lists = faiss_index.extend_lists(known, draft.vectors, draft.before)
     if clean or np.count_nonzero(draft.before >= 0) < len(previous):
         # the centroid of a list of one frame is that frame: none may outlive what is deleted
-        lists = centre_lists(lists, draft.vectors)
-    if not clean and still_holds(previous.recall, n):
-        return replace(lists, probes=known.probes), previous.recall
-    return measure_lists(lists, draft.vectors)
+        lists = faiss_index.centre_lists(lists, draft.vectors)
+    if not clean and faiss_index.still_holds(previous.manifest.recall, n):
+        return replace(lists, probes=known.probes), previous.manifest.recall
+    return faiss_index.measure_lists(lists, draft.vectors)
 
 
 def _clean(folder: Path, kept: set[Path]) -> None:

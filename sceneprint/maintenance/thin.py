@@ -25,14 +25,14 @@ from sceneprint.geometry.retrieval.distance import (
 )
 from sceneprint.geometry.retrieval.dpp import novel, summarise
 from sceneprint.index import signatures_of
-from sceneprint.index.mapped_files import Keys
+from sceneprint.index.generation_files import Keys
 from sceneprint.store.frame_queries import Weight, weights_of
 from sceneprint.types import Bytes
 from sceneprint_client.api import FrameState
 
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
-    from sceneprint.engine.search.index_view import IndexView
+    from sceneprint.engine.search.map_view import IndexView
 
 #: Memory that the choice of a number of frames may take: 8 bytes for each kept one and each frame.
 CHOICE_BYTES = 2 << 30

@@ -23,7 +23,7 @@ from sceneprint.store.blobs.object_store import ObjectBlobs
 from sceneprint.store.database import Database, is_there, open_database
 from sceneprint.store.database_errors import unusable
 from sceneprint.store.opaque_ids import OpaqueIds
-from sceneprint.store.postgres.locks import SessionLocks
+from sceneprint.store.postgres.connection import SessionLocks
 from sceneprint.store.postgres.replica import Replica, current
 from sceneprint.store.sqlite import is_read_only
 

@@ -15,26 +15,118 @@ from sqlalchemy import Connection, Engine, event
 
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
 from sceneprint.store.database_errors import database_label, explained
-from sceneprint.store.postgres.connection import HELD_S as HELD_OF_FLEET_S
-from sceneprint.store.postgres.connection import (
-    MIGRATION_S,
-    configure,
-    connect_options,
-    history_of,
-    open_postgres,
-    require_synchronous,
-)
-from sceneprint.store.schema import (
-    create_schema,
-    database_url,
-    known_revisions,
-    migration_config,
-    revision_of,
-)
+from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.sqlite import BUSY_S, HELD_S, ReadOnlyFile, open_sqlite, shrink_log
 
 if TYPE_CHECKING:
     import psycopg
+import re
+from collections.abc import Callable
+from contextvars import copy_context
+from functools import cache
+from secrets import token_bytes
+from typing import TYPE_CHECKING, TypeVar, cast
+
+from sqlalchemy import URL, insert, inspect, make_url
+from sqlalchemy.exc import ArgumentError
+
+import migrations
+from sceneprint.errors import SceneprintError
+from sceneprint.store.tables import metadata, secrets
+
+if TYPE_CHECKING:
+    from alembic.config import Config
+
+
+_FOLDER = Path(migrations.__file__).parent
+#: How each file of `migrations/versions` says what it makes of what.
+_SAYS = re.compile(r'^(revision|down_revision) = (?:"(\w+)"|None)$', re.MULTILINE)
+
+
+def migration_config() -> Config:
+    """What Alembic needs to find `migrations/`."""
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", str(_FOLDER))
+    return config
+
+
+@cache
+def known_revisions() -> tuple[str, frozenset[str]]:
+    """The revision that this version works with, and all that it can bring there."""
+    made: dict[str, str] = {}
+    for path in _FOLDER.glob("versions/*.py"):
+        said = dict(_SAYS.findall(path.read_text(encoding="utf-8")))
+        if "revision" in said:
+            made[said["revision"]] = said["down_revision"]
+    (head,) = made.keys() - made.values()
+    return head, frozenset(made)
+
+
+def revision_of(connection: Connection) -> str | None:
+    """Revision of a database; None: nobody has made a schema in it."""
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    found: str | None = connection.exec_driver_sql(
+        "SELECT version_num FROM alembic_version"
+    ).scalar_one_or_none()
+    return found
+
+
+def create_schema(connection: Connection) -> None:
+    """Create all tables of this version in an empty SQLite database, as the migrations would."""
+    head, _ = known_revisions()
+    metadata.create_all(connection, checkfirst=False)
+    connection.execute(insert(secrets).values(name="seals", value=token_bytes(32)))
+    connection.exec_driver_sql(
+        "CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL, "
+        "CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num))"
+    )
+    connection.exec_driver_sql("INSERT INTO alembic_version VALUES (?)", (head,))
+
+
+# Which databases a URL may mean: SQLite or PostgreSQL.
+
+#: What a URL of a server begins with; the short ones are what providers hand out.
+_SERVERS = ("postgresql", "postgres", "postgresql+psycopg")
+
+
+def database_url(given: str) -> URL:
+    """The URL of a database, of one of the two kinds that are known.
+
+    Raises
+    ------
+    UnusableStore : it is none, or of no such kind; the message repeats nothing of it but the kind.
+    """
+    kind = given.partition(":")[0]
+    try:
+        if kind in _SERVERS:
+            return _of_server(given)
+        url = make_url(given)
+        is_sqlite = url.get_backend_name() == "sqlite"
+    # ValueError: a port that is no number, and may be half of a password
+    except (ArgumentError, ValueError):
+        raise UnusableStore(
+            f"{kind!r:.80} begins no URL of a database that can be opened. Set "
+            "SCENEPRINT_DATABASE_URL to one, such as postgresql+psycopg://user:password@host/name, "
+            "with @ : and / in a password written as %40, %3A and %2F; or leave it out for SQLite "
+            "in the data folder."
+        ) from None
+    if not is_sqlite:
+        raise UnusableStore(
+            f"{kind!r:.80} is no database that is known. Set SCENEPRINT_DATABASE_URL to "
+            "postgresql+psycopg://user:password@host/database, or leave it out for SQLite in the "
+            "data folder."
+        )
+    return url
+
+
+def _of_server(given: str) -> URL:
+    if given.count("@") > 1:  # the rest would be taken for the name of a host, and be told
+        raise ValueError("an @ in a password")
+    return make_url(given).set(drivername="postgresql+psycopg")
+
 
 # A database brought to the schema of this version: by one process, while others wait.
 
@@ -42,7 +134,7 @@ if TYPE_CHECKING:
 _migrating = threading.Lock()
 
 
-def migrate(database: Database, engine: Engine) -> None:
+def migrate(database: Database) -> None:
     """Bring a database to the schema of this version, in one transaction.
 
     Raises
@@ -51,19 +143,19 @@ def migrate(database: Database, engine: Engine) -> None:
     NewerSchema : a later version of sceneprint wrote it; nothing is touched.
     UnusableStore : it cannot be written, or its rows refer to others that are not there.
     """
-    head, known = known_revisions()
+    head, _ = known_revisions()
     with database.read() as connection:
-        current = _current(connection, known, engine)
+        current = current_revision(connection)
     if current == head:
         return
     if database.read_only:
         raise ReadOnlyStore(
-            f"{database_label(engine.url)} has schema {current}, this version needs {head}, and "
+            f"{database.shown} has schema {current}, this version needs {head}, and "
             "the file is read-only. Open it once where it may be written, or use the version that "
             "wrote it."
         )
     with database.write(unchecked=True) as connection:  # another process may have been first
-        current = _current(connection, known, engine)
+        current = current_revision(connection)
         if current is None and database.is_sqlite:
             create_schema(connection)
         elif current != head:
@@ -73,26 +165,29 @@ def migrate(database: Database, engine: Engine) -> None:
             config.attributes["connection"] = connection
             with _migrating:
                 command.upgrade(config, "head")
-            if database.is_sqlite:
-                _require_whole(connection, engine)
+            # what `unchecked` did not look at, looked at in the end
+            if (
+                database.is_sqlite
+                and connection.exec_driver_sql("PRAGMA foreign_key_check").first() is not None
+            ):
+                raise UnusableStore(
+                    f"{database.shown}: rows refer to others that are not there, so it is "
+                    "not brought to the schema of this version, and nothing was changed. Run "
+                    "`sceneprint fsck` of the version that wrote it."
+                )
 
 
-def _require_whole(connection: Connection, engine: Engine) -> None:
-    """What `unchecked` did not look at, looked at in the end."""
-    if connection.exec_driver_sql("PRAGMA foreign_key_check").first() is not None:
-        raise UnusableStore(
-            f"{database_label(engine.url)}: rows refer to others that are not there, so it is "
-            "not brought "
-            "to the schema of this version, and nothing was changed. Run `sceneprint fsck` of the "
-            "version that wrote it."
-        )
+def current_revision(connection: Connection) -> str | None:
+    """Revision of a database that this version knows; None: nobody has made a schema in it.
 
-
-def _current(connection: Connection, known: frozenset[str], engine: Engine) -> str | None:
+    Raises
+    ------
+    NewerSchema : a later version of sceneprint wrote it.
+    """
     current = revision_of(connection)
-    if current is not None and current not in known:
+    if current is not None and current not in known_revisions()[1]:
         raise NewerSchema(
-            f"{database_label(engine.url)} has schema {current}, which this version of "
+            f"{database_label(connection.engine.url)} has schema {current}, which this version of "
             "sceneprint does not know: a later one wrote it. Use that version, or another data "
             "folder."
         )
@@ -131,7 +226,7 @@ class Database:
         return self._history
 
     def _note_history(self, connection: Any, _record: object) -> None:
-        self._history = history_of(connection) or self._history
+        self._history = postgres.history_of(connection) or self._history
 
     @property
     def dialect(self) -> str:
@@ -203,10 +298,10 @@ class Database:
             with self.explained(), self._engine.begin() as connection:
                 yield connection
             return
-        held_s = HELD_S if self.is_sqlite else HELD_OF_FLEET_S
+        held_s = HELD_S if self.is_sqlite else postgres.HELD_S
         wait_s = held_s if self._held else BUSY_S
         if unchecked and not self.is_sqlite:
-            wait_s = MIGRATION_S
+            wait_s = postgres.MIGRATION_S
         if not self._turn.acquire(timeout=wait_s):
             raise StoreLocked(
                 f"{self.shown}: other writers of this process have waited for long, and "
@@ -223,7 +318,7 @@ class Database:
                     self._held = False
                     yield writing
                 if not self.is_sqlite:
-                    require_synchronous(writing)
+                    postgres.require_synchronous(writing)
         except StoreLocked:
             self._held = True
             raise
@@ -259,10 +354,10 @@ class Database:
 
         with self.explained():
             args, given = self._engine.dialect.create_connect_args(self._engine.url)
-            options = {**connect_options(self._engine.url), **given}
+            options = {**postgres.connect_options(self._engine.url), **given}
             found = psycopg.connect(*args, **options, autocommit=True)
             try:
-                configure(found)
+                postgres.configure(found)
             except BaseException:
                 found.close()
                 raise
@@ -294,14 +389,17 @@ def is_there(url: str) -> bool:
         database.close()
 
 
-def reach_database(url: str) -> Database:
+def reach_database(given: str) -> Database:
     """A database as it is: no schema is made or looked at, and a server is not yet asked.
 
     Raises
     ------
     UnusableStore : the URL is none of a database that is known.
     """
-    return _reached(url)[0]
+    url = database_url(given)
+    if url.get_backend_name() == "sqlite":
+        return Database(*open_sqlite(url))
+    return Database(postgres.open_postgres(url))
 
 
 def open_database(url: str) -> Database:
@@ -309,29 +407,129 @@ def open_database(url: str) -> Database:
 
     A SQLite file that may not be written is opened for reading.
 
-    Parameters
-    ----------
-    url : of SQLAlchemy
-
     Raises
     ------
     UnusableStore : no such database, or it cannot be opened.
     ReadOnlyStore : it may be read alone, and an earlier version wrote it.
     NewerSchema : a later version of sceneprint wrote it; nothing is touched.
     """
-    database, engine = _reached(url)
+    database = reach_database(url)
     try:
-        migrate(database, engine)
+        migrate(database)
     except BaseException:
         database.close()
         raise
     return database
 
 
-def _reached(given: str) -> tuple[Database, Engine]:
-    url = database_url(given)
-    if url.get_backend_name() != "sqlite":
-        engine = open_postgres(url)
-        return Database(engine), engine
-    engine, sealed = open_sqlite(url)
-    return Database(engine, sealed), engine
+# Writers that come while another one writes are written together in the next transaction: a commit
+# waits for the disk, whatever is in it, and eight clients need not wait eight times.
+#
+#     run(a), run(b), run(c)  --one commit-->  each gets its own result
+
+T = TypeVar("T")
+
+#: Pieces of work in one transaction: other writers wait meanwhile.
+MOST_TOGETHER = 32
+
+
+class _Waiting:
+    """A piece of work, and what came of it."""
+
+    def __init__(self, do: Callable[[Connection], Any]) -> None:
+        own = copy_context()  # another thread may do it: what it says of a request is of this one
+        self.do: Callable[[Connection], Any] = lambda connection: own.run(do, connection)
+        self.done = False
+        self.result: Any = None
+        self.error: Exception | None = None
+
+
+class Grouping:
+    """Writes of many threads to one database; safe to share between them."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._waiting: list[_Waiting] = []
+        self._list = threading.Lock()
+        self._writing = threading.Lock()
+
+    def run(self, do: Callable[[Connection], T]) -> T:
+        """Do it in a writing transaction; when this returns it is committed.
+
+        Parameters
+        ----------
+        do : whatever it raises of `SceneprintError`, beside `UnusableStore`, it raises before it
+            writes: others of the transaction go on. It may be called more than once
+
+        Raises
+        ------
+        what `do` raises, and what `Database.write` does.
+        """
+        mine = _Waiting(do)
+        with self._list:
+            self._waiting.append(mine)
+        try:
+            with self._writing:  # meanwhile somebody may have written mine with his own
+                while not mine.done:  # there may be more before it than are written at once
+                    self._write()
+        except BaseException:  # such as Ctrl-C
+            with self._list:
+                if mine in self._waiting:
+                    self._waiting.remove(mine)
+            raise
+        if mine.error is not None:
+            raise mine.error
+        return cast(T, mine.result)
+
+    def _write(self) -> None:
+        """Write what waits, from the first on."""
+        taken: list[_Waiting] = []
+        try:
+            self._write_together(taken)
+        except BaseException:  # Ctrl-C is the caller's alone: the others write themselves
+            with self._list:
+                self._waiting = [one for one in taken if not one.done] + self._waiting
+            raise
+
+    def _write_together(self, taken: list[_Waiting]) -> None:
+        """Write what waits in one transaction, or each alone; `taken` is filled with it."""
+        try:
+            with self._database.write() as connection:
+                with self._list:  # not before it is our turn: more have come since
+                    taken[:], self._waiting = (
+                        self._waiting[:MOST_TOGETHER],
+                        self._waiting[MOST_TOGETHER:],
+                    )
+                for one in taken:
+                    _do(one, connection)
+        except Exception as error:
+            if not taken:  # it was never our turn: who waits has waited as long
+                with self._list:
+                    taken[:], self._waiting = self._waiting, []
+            if len(taken) == 1 or isinstance(error, UnusableStore):
+                for one in taken:
+                    one.result, one.error = None, error
+            else:
+                for one in taken:  # one of them broke the transaction of all
+                    self._write_alone(one)
+                    one.done = True
+        for one in taken:
+            one.done = True
+
+    def _write_alone(self, one: _Waiting) -> None:
+        one.result = one.error = None
+        try:
+            with self._database.write() as connection:
+                _do(one, connection)
+        except Exception as error:
+            one.result, one.error = None, error
+
+
+def _do(one: _Waiting, connection: Connection) -> None:
+    one.result = one.error = None
+    try:
+        one.result = one.do(connection)
+    except UnusableStore:
+        raise
+    except SceneprintError as error:
+        one.error = error

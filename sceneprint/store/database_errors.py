@@ -71,20 +71,13 @@ def explained(engine: Engine) -> Iterator[None]:
             "later."
         ) from error
     except Exception as error:
-        if not _is_of_driver(error):
+        driver = sys.modules.get("psycopg")  # over a connection that is not SQLAlchemy's
+        if driver is None or not isinstance(error, driver.Error):  # on SQLite it is never loaded
             raise
-        found = explain_error(
-            engine.url, error, isinstance(error, sys.modules["psycopg"].OperationalError)
-        )
+        found = explain_error(engine.url, error, isinstance(error, driver.OperationalError))
         if found is None:
             raise
         raise found from error
-
-
-def _is_of_driver(error: Exception) -> bool:
-    """Whether psycopg raised it itself, over a connection that is not SQLAlchemy's."""
-    driver = sys.modules.get("psycopg")  # a process on SQLite never loads it
-    return driver is not None and isinstance(error, driver.Error)
 
 
 def _of_server(url: URL, error: DBAPIError) -> UnusableStore | None:

@@ -18,7 +18,6 @@ from sqlalchemy import (
     and_,
     bindparam,
     delete,
-    func,
     insert,
     literal,
     literal_column,
@@ -27,20 +26,24 @@ from sqlalchemy import (
     update,
 )
 
-from sceneprint.store.queue import now
-from sceneprint.store.quotas import ROOMLESS, count_on
+from sceneprint.store.events import record_event, remember
+from sceneprint.store.maps import ROOMLESS, count_on, next_revision
+from sceneprint.store.queue import cancel_jobs
 from sceneprint.store.tables import (
     MapRow,
+    count_rows,
     doomed,
     events,
     frame_tags,
     frames,
+    job_files,
+    job_items,
     jobs,
     map_row,
     maps,
     signatures,
 )
-from sceneprint_client.api import FrameState, JobState
+from sceneprint_client.api import FrameState
 
 #: What is known of a frame, and not of its camera; cleared with it.
 _KNOWN = (
@@ -79,11 +82,11 @@ def delete_frames(
     doom(connection, blobs)
     connection.execute(delete(signatures).where(own))
     connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(living)))
-    _cancel(connection, living)
+    cancel_jobs(connection, jobs.c.frame_number.in_(living))
     counted = [one for one in found if one.state not in ROOMLESS]
     count_on(connection, row.number, -len(counted), -sum(one.bytes for one in counted))
     # each its own revision: who reads what has changed reads on after the last that he had
-    last = _revisions(connection, row.number, len(living))
+    last = next_revision(connection, row.number, len(living))
     connection.execute(
         update(frames)
         .where(frames.c.number == bindparam("of"))
@@ -101,6 +104,34 @@ def delete_frames(
         ],
     )
     return blobs
+
+
+def remove_map(connection: Connection, row: MapRow) -> list[str]:
+    """Remove a map with all that is in it.
+
+    Returns
+    -------
+    blobs : that it referred to
+    """
+    own = select(frames.c.number).where(frames.c.map_number == row.number)
+    of_map = select(jobs.c.number).where(jobs.c.map_number == row.number)
+    asked = (
+        select(frames.c.blob).where(frames.c.map_number == row.number),
+        select(signatures.c.geometry).where(signatures.c.frame_number.in_(own)),
+        select(job_files.c.blob).where(job_files.c.job_number.in_(of_map)),
+    )
+    referred = sorted({blob for one in asked for blob in connection.execute(one).scalars()})
+    doom_found(connection, *asked)
+    connection.execute(delete(signatures).where(signatures.c.frame_number.in_(own)))
+    for made in (job_items, job_files):
+        connection.execute(delete(made).where(made.c.job_number.in_(of_map)))
+    connection.execute(delete(jobs).where(jobs.c.map_number == row.number))
+    connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(own)))
+    connection.execute(delete(frames).where(frames.c.map_number == row.number))
+    connection.execute(delete(maps).where(maps.c.number == row.number))
+    record_event(connection, "map.deleted", row.name)
+    remember(connection, row)
+    return referred
 
 
 def doom(connection: Connection, blobs: Iterable[str]) -> None:
@@ -144,28 +175,6 @@ def settle(connection: Connection, blobs: Sequence[str]) -> None:
     connection.execute(delete(doomed).where(doomed.c.blob.in_(blobs)))
 
 
-def _cancel(connection: Connection, numbers: Sequence[int]) -> None:
-    """Give up what is still to be done for frames."""
-    waiting = jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING))
-    connection.execute(
-        update(jobs)
-        .where(jobs.c.frame_number.in_(numbers), waiting)
-        .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
-    )
-
-
-def _revisions(connection: Connection, map_number: int, count: int) -> int:
-    """The last of so many revisions of a map that are taken at once."""
-    return int(
-        connection.execute(
-            update(maps)
-            .where(maps.c.number == map_number)
-            .values(revision=maps.c.revision + count)
-            .returning(maps.c.revision)
-        ).scalar_one()
-    )
-
-
 # Frames that are older than their map keeps them.
 
 #: Seconds of a day.
@@ -188,8 +197,7 @@ def old_frames(connection: Connection, map_number: int, before: float, limit: in
 
 def count_old(connection: Connection, map_number: int, before: float) -> int:
     """How many frames of a map were received before a time."""
-    asked = select(func.count()).where(_old(map_number, before))
-    return int(connection.execute(asked).scalar_one())
+    return count_rows(connection, _old(map_number, before))
 
 
 def _old(map_number: int, before: float) -> ColumnElement[bool]:

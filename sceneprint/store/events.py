@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, func, insert, or_, select
+from sqlalchemy import ColumnElement, Connection, delete, func, insert, or_, select
 
-from sceneprint.store.tables import events
+from sceneprint.store.tables import MapRow, among, blocks, events, former_maps, maps
 
 
 def record_event(
@@ -145,3 +146,175 @@ def anchor_number(anchor: str) -> int | None:
     """Number of the event that an anchor marks; None where it is none."""
     number = anchor.partition(" ")[0]
     return int(number) if number.isascii() and number.isdigit() and len(number) < 19 else None
+
+
+# Which events are kept: so many of each map, whatever happens in the others.
+
+
+def floors(connection: Connection, kept: int) -> dict[str | None, int]:
+    """By map, the number of the newest event that is no longer kept, where there is such a one.
+
+    None stands for the events of no map and those of maps that are gone, taken together: nobody
+    could bound what is kept of maps that are made and deleted for ever.
+
+    Parameters
+    ----------
+    connection : of the database
+    kept : newest events that stay of each map
+    """
+    oldest = connection.execute(select(func.min(events.c.number))).scalar()
+    if oldest is None or newest_number(connection) - oldest < kept:
+        return {}  # there are no more of all of them
+    found: dict[str | None, int] = {}
+    for name in (*_names(connection), None):
+        of = _of(name)
+        least, most = (
+            connection.execute(select(end(events.c.number)).where(of)).scalar()
+            for end in (func.min, func.max)
+        )
+        if least is None or most is None or most - least < kept:
+            continue
+        beyond = select(events.c.number).where(of).order_by(events.c.number.desc())
+        number = connection.execute(beyond.offset(kept).limit(1)).scalar()
+        if number is not None:
+            found[name] = number
+    return found
+
+
+def floor_of(connection: Connection, wanted: Wanted, kept: int, after: int) -> int:
+    """Number up to which events of those that are wanted may be gone; 0: all are there.
+
+    Parameters
+    ----------
+    connection : of the database
+    wanted : whose maps are looked at, and not its kinds
+    kept : see `floors`
+    after : only whether the answer is greater is asked for: most often that is known at once
+    """
+    if newest_number(connection) - kept <= after:
+        return 0  # a map has no more events than there are numbers
+    found = floors(connection, kept)
+    if wanted.maps is None:
+        return max(found.values(), default=0)
+    names = set(_names(connection))
+    own = [found.get(one, 0) for one in wanted.maps & names]
+    return max([*own, *_floors_of_gone(connection, wanted.maps - names, found.get(None, 0))])
+
+
+def _floors_of_gone(connection: Connection, names: Collection[str], floor: int) -> Iterator[int]:
+    """As `floor_of`, of each of some maps that are gone: 0 first, so that there is one.
+
+    Their events go together, and yet nothing is missed after the last of one's own.
+    """
+    yield 0
+    for name in names:
+        last = last_event(connection, name)
+        left = select(events.c.number).where(events.c.map == name).limit(1)
+        # the last of all that go together may be gone too: then no floor tells of them
+        yield last if connection.execute(left).first() is None else min(floor, last)
+
+
+def spent_numbers(
+    connection: Connection, kept: int, anchors: Collection[int], limit: int
+) -> list[int]:
+    """Numbers of events that may be removed, map by map, the oldest of each first.
+
+    An index is believed while the event is there that was the last of its map when it was made:
+    its anchor. So of each map the last one stays of those that are old enough to go: an index
+    that is being published has no other. And so do the anchors of indexes that are there.
+
+    Parameters
+    ----------
+    connection : of the database
+    kept : newest events of each map that stay
+    anchors : numbers that stay too
+    limit : at most so many
+    """
+    found: list[int] = []
+    for name, floor in floors(connection, kept).items():
+        old = select(events.c.number).where(_of(name), events.c.number <= floor)
+        stay = {number for number in anchors if number <= floor}
+        if name is not None:
+            stay.add(floor)
+        most = limit - len(found) + len(stay)
+        oldest = connection.execute(old.order_by(events.c.number).limit(most)).scalars()
+        found += [number for number in oldest if number not in stay]
+        if len(found) >= limit:
+            break
+    return found[:limit]
+
+
+def remove_events(connection: Connection, numbers: Sequence[int]) -> None:
+    """Remove events; see `spent_numbers`."""
+    for some in blocks(numbers):
+        connection.execute(delete(events).where(among(connection, events.c.number, some)))
+
+
+def _names(connection: Connection) -> list[str]:
+    return list(connection.execute(select(maps.c.name)).scalars())
+
+
+def _of(name: str | None) -> ColumnElement[bool]:
+    """That an event is of a map; None: of none that is there."""
+    if name is not None:
+        return events.c.map == name
+    gone = select(maps.c.name)
+    return or_(events.c.map.is_(None), events.c.map.not_in(gone))
+
+
+# What is remembered of maps that are gone, by their names.
+#
+# The number of its last event: who read on after that has missed nothing of it, whatever was
+# removed of other maps since. And its quota, which the next map of the name inherits.
+
+#: Names that are remembered, beside those with a quota: of older ones it is not known any more
+#: when they went.
+MOST_FORMER = 10_000
+
+
+def remember(connection: Connection, row: MapRow) -> None:
+    """Note a map that was just removed; its last event is told already."""
+    last = select(func.max(events.c.number)).where(events.c.map == row.name)
+    connection.execute(delete(former_maps).where(former_maps.c.name == row.name))
+    connection.execute(
+        insert(former_maps).values(
+            name=row.name, number=connection.execute(last).scalar_one(),
+            quota_frames=row.quota_frames, quota_bytes=row.quota_bytes,
+        )
+    )  # fmt: skip
+    beyond = (
+        select(former_maps.c.number)
+        .where(_spent())
+        .order_by(former_maps.c.number.desc())
+        .offset(MOST_FORMER)
+        .limit(1)
+    )
+    oldest = connection.execute(beyond).scalar()
+    if oldest is not None:
+        connection.execute(delete(former_maps).where(_spent(), former_maps.c.number <= oldest))
+
+
+def inherited(connection: Connection, name: str) -> dict[str, float | None]:
+    """The quota of the map that had a name before; from now on the new one has it."""
+    asked = select(former_maps.c.quota_frames, former_maps.c.quota_bytes)
+    found = connection.execute(asked.where(former_maps.c.name == name)).mappings().first()
+    connection.execute(delete(former_maps).where(former_maps.c.name == name))
+    return {} if found is None else dict(found)
+
+
+def last_event(connection: Connection, name: str) -> int:
+    """Number of the last event of a map that is gone; of one that is not known, the least number
+    after which it has none.
+    """
+    asked = select(former_maps.c.number).where(former_maps.c.name == name)
+    found = connection.execute(asked).scalar()
+    if found is not None:
+        return int(found)
+    count, least = connection.execute(
+        select(func.count(), func.min(former_maps.c.number)).where(_spent())
+    ).one()
+    return int(least) if count >= MOST_FORMER else 0
+
+
+def _spent() -> ColumnElement[bool]:
+    return former_maps.c.quota_frames.is_(None) & former_maps.c.quota_bytes.is_(None)

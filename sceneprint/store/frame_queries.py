@@ -3,24 +3,39 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, Connection, Select, String, cast, func, or_, select, tuple_
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Select,
+    String,
+    cast,
+    func,
+    null,
+    or_,
+    select,
+    tuple_,
+)
 
+from sceneprint.store.maps import ROOMLESS
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
+    count_rows,
     frame_row,
     frame_tags,
     frames,
     job_files,
+    rows_among,
     signatures,
 )
 from sceneprint_client.api import Filter, FrameState, Region
+from sceneprint_client.api.frames import Kind
 from sceneprint_client.api.listing import FrameListing, Run
 
 _NONE: NDArray[np.int64] = np.empty(0, np.int64)
@@ -59,20 +74,30 @@ def passing(
     return np.sort(np.fromstring(found, np.int64, sep=",")) if found else _NONE
 
 
-def _conditions(map_number: int, wanted: Filter, taken: QueryOrigin) -> list[ColumnElement[bool]]:
-    """What must hold; of a column that is null, no comparison does."""
-    found: list[ColumnElement[bool]] = []
-    if wanted.robot is not None:
-        found.append(frames.c.robot.in_(wanted.robot))
-    if wanted.session is not None:
-        found.append(frames.c.session.in_(wanted.session))
+def _common_conditions(
+    wanted: Filter | FrameListing | Run, tags: Sequence[str] = ()
+) -> list[ColumnElement[bool]]:
+    """What must hold of robot, session, tags and time; of a column that is null, no comparison
+    does.
+    """
+    c, found = frames.c, list[ColumnElement[bool]]()
+    for column, names in ((c.robot, wanted.robot), (c.session, wanted.session)):
+        if isinstance(names, str):
+            found.append(column == names)
+        elif names:
+            found.append(column.in_(names))
+    for tag in sorted(set(tags)):
+        found.append(c.number.in_(select(frame_tags.c.frame_number).where(frame_tags.c.tag == tag)))
     if wanted.captured_after is not None:
-        found.append(frames.c.captured_at >= wanted.captured_after.timestamp())
+        found.append(c.captured_at >= wanted.captured_after.timestamp())
     if wanted.captured_before is not None:
-        found.append(frames.c.captured_at <= wanted.captured_before.timestamp())
-    for tag in sorted(set(wanted.tags)):
-        tagged = select(frame_tags.c.frame_number).where(frame_tags.c.tag == tag)
-        found.append(frames.c.number.in_(tagged))
+        found.append(c.captured_at <= wanted.captured_before.timestamp())
+    return found
+
+
+def _conditions(map_number: int, wanted: Filter, taken: QueryOrigin) -> list[ColumnElement[bool]]:
+    """What must hold of the frames that pass a filter."""
+    found = _common_conditions(wanted, wanted.tags)
     if wanted.not_within_s is not None:
         found.append(_elsewhere(taken, wanted.not_within_s))
     if wanted.region is not None:
@@ -158,19 +183,8 @@ def _is_narrow(wanted: FrameListing) -> bool:
 
 
 def _listing_conditions(wanted: FrameListing) -> list[ColumnElement[bool]]:
-    """What must hold; of a column that is null, no comparison does."""
-    c, found = frames.c, list[ColumnElement[bool]]()
-    if wanted.robot:
-        found.append(c.robot.in_(wanted.robot))
-    if wanted.session:
-        found.append(c.session.in_(wanted.session))
-    for tag in sorted(set(wanted.tag)):
-        tagged = select(frame_tags.c.frame_number).where(frame_tags.c.tag == tag)
-        found.append(c.number.in_(tagged))
-    if wanted.captured_after is not None:
-        found.append(c.captured_at >= wanted.captured_after.timestamp())
-    if wanted.captured_before is not None:
-        found.append(c.captured_at <= wanted.captured_before.timestamp())
+    """What must hold of the frames of a list."""
+    c, found = frames.c, _common_conditions(wanted, wanted.tag)
     if wanted.received_after is not None:
         found.append(c.received_at >= wanted.received_after.timestamp())
     if wanted.received_before is not None:
@@ -185,8 +199,6 @@ def _listing_conditions(wanted: FrameListing) -> list[ColumnElement[bool]]:
 
 
 # The runs of a map: who took what, when, and where their poses lead.
-
-#: Frames in these states are of a run.
 
 
 @dataclass
@@ -209,24 +221,6 @@ class Held:
     first: float | None = None
     last: float | None = None
     parents: Counter[str] = field(default_factory=Counter)
-
-
-@dataclass(frozen=True)
-class RobotCount:
-    """How many frames are of one robot, with poses that lead to one frame."""
-
-    robot: str | None
-    parent: str | None
-    count: int
-
-
-@dataclass(frozen=True)
-class Posed:
-    """A frame of a run; `at` is by the clock of the run, `pose` is T_parent_sensor."""
-
-    frame_id: str
-    at: float
-    pose: list[list[float]]
 
 
 def list_runs(
@@ -272,18 +266,24 @@ def list_runs(
     return list(runs.values())
 
 
-def count_run(connection: Connection, map_number: int, run: Run) -> list[RobotCount]:
-    """Frames of a session by robot and parent frame; `run.parent_frame` does not matter."""
+def count_run(
+    connection: Connection, map_number: int, run: Run
+) -> list[tuple[str | None, str | None, int]]:
+    """Robots, parent frames and numbers of the frames of a session; `run.parent_frame` does not
+    matter.
+    """
     found = connection.execute(
         select(frames.c.robot, frames.c.pose_parent, func.count())
         .where(*_of_session(map_number, run))
         .group_by(frames.c.robot, frames.c.pose_parent)
         .order_by(frames.c.robot.nulls_first(), frames.c.pose_parent.nulls_first())
     )
-    return [RobotCount(*row) for row in found]
+    return [(robot, parent, count) for robot, parent, count in found]
 
 
-def poses_of_run(connection: Connection, map_number: int, run: Run) -> tuple[list[Posed], int]:
+def poses_of_run(
+    connection: Connection, map_number: int, run: Run
+) -> tuple[list[tuple[str, float, list[list[float]]]], int]:
     """Frames of a session with time and pose in the order of time, of one time the first that came;
     by the clock `received` all with a pose, as they came.
 
@@ -296,7 +296,8 @@ def poses_of_run(connection: Connection, map_number: int, run: Run) -> tuple[lis
 
     Returns
     -------
-    poses, count : how many there are of all of them
+    poses : id of the frame, when by the clock of the run, and T_parent_sensor
+    count : how many there are of all of them
     """
     taken = run.clock == "captured"
     at = frames.c.captured_at if taken else frames.c.received_at
@@ -324,22 +325,73 @@ def poses_of_run(connection: Connection, map_number: int, run: Run) -> tuple[lis
         .where(frames.c.number.in_(chosen))
         .order_by(at if taken else frames.c.number, frames.c.number)
     )
-    return [Posed(*row) for row in found], count
+    return [(frame_id, when, pose) for frame_id, when, pose in found], count
 
 
 def _of_session(map_number: int, run: Run) -> list[ColumnElement[bool]]:
-    found = [
+    of_map = [frames.c.map_number == map_number, frames.c.state.in_(_LIVING)]
+    return [*of_map, *_common_conditions(run)]
+
+
+# Frames of sessions in the order in which they were taken, for jobs that associate them.
+
+
+@dataclass(frozen=True)
+class PathFrame:
+    """A frame of a run, as far as associations need it.
+
+    Parameters
+    ----------
+    number, id : of the frame
+    robot, session, captured_at : as far as is known
+    parent : that its pose leads to
+    pose : T_parent_sensor, or None
+    is_cloud : whether it is a point cloud
+    """
+
+    number: int
+    id: str
+    robot: str | None
+    session: str | None
+    captured_at: float | None
+    parent: str | None
+    pose: list[list[float]] | None
+    is_cloud: bool
+
+    @property
+    def kind(self) -> Kind:
+        """A depth image or a point cloud."""
+        return "cloud" if self.is_cloud else "depth"
+
+
+def numbers_of_session(
+    connection: Connection, map_number: int, session: str, robot: str | None
+) -> list[int]:
+    """Numbers of the indexed frames of a session in the order of time, then as they came.
+
+    Those without a time come last.
+    """
+    asked = select(frames.c.number).where(
         frames.c.map_number == map_number,
-        frames.c.state.in_(_LIVING),
-        frames.c.session == run.session,
-    ]
-    if run.robot is not None:
-        found.append(frames.c.robot == run.robot)
-    if run.captured_after is not None:
-        found.append(frames.c.captured_at >= run.captured_after.timestamp())
-    if run.captured_before is not None:
-        found.append(frames.c.captured_at <= run.captured_before.timestamp())
-    return found
+        frames.c.state == FrameState.INDEXED,
+        frames.c.session == session,
+    )
+    if robot is not None:
+        asked = asked.where(frames.c.robot == robot)
+    time = frames.c.captured_at
+    return list(connection.execute(asked.order_by(time.is_(None), time, frames.c.number)).scalars())
+
+
+def stops_of(connection: Connection, numbers: Iterable[int]) -> dict[int, PathFrame]:
+    """Frames by their numbers; those that are deleted, or not indexed any more, are left out."""
+    asked = select(
+        frames.c.number, frames.c.id, frames.c.robot, frames.c.session, frames.c.captured_at,
+        frames.c.pose_parent, frames.c.pose, frames.c.cloud.is_not(null()),
+    ).where(frames.c.state == FrameState.INDEXED)  # fmt: skip
+    return {
+        row.number: PathFrame(*row)
+        for row in rows_among(connection, asked, frames.c.number, numbers)
+    }
 
 
 # What frames of a map weigh, and which a session brought: for whoever thins it out.
@@ -347,14 +399,7 @@ def _of_session(map_number: int, run: Run) -> list[ColumnElement[bool]]:
 
 @dataclass(frozen=True)
 class Weight:
-    """A frame that is indexed.
-
-    Parameters
-    ----------
-    frame_id : of the frame
-    upload_bytes : of its upload
-    artifact : blob of its geometry
-    """
+    """A frame that is indexed."""
 
     frame_id: str
     upload_bytes: int
@@ -391,11 +436,7 @@ def weights_of(
 # How a map grew, and what its frames weigh: counts over many rows that few are read for.
 
 _OTHERS = tuple(state for state in FrameState if state != FrameState.INDEXED)
-#: Frames in these states have no upload any more.
-_BARE = (FrameState.DELETED, FrameState.REDUNDANT)
-_KEPT = tuple(state for state in FrameState if state not in _BARE)
-#: Numbers that one statement asks for.
-_BLOCK = 500
+_KEPT = tuple(state for state in FrameState if state not in ROOMLESS)
 
 
 def indexed_by_time(
@@ -431,34 +472,12 @@ def indexed_by_time(
     return counts
 
 
-@dataclass(frozen=True)
-class Weighed:
-    """What some frames of a map weigh.
-
-    Parameters
-    ----------
-    upload_bytes, signature_bytes : of all of them
-    artifacts : blobs of their geometry
-    """
-
-    upload_bytes: int
-    signature_bytes: int
-    artifacts: list[str]
-
-
 def frames_with_uploads(
     connection: Connection, map_number: int, most: int
 ) -> tuple[list[int], int]:
-    """Numbers of frames of a map whose uploads are kept, evenly taken, and how many there are.
-
-    Parameters
-    ----------
-    connection : of the database
-    map_number : of the map
-    most : numbers
-    """
+    """Numbers of frames of a map whose uploads are kept, evenly taken, and how many there are."""
     of_map = (frames.c.map_number == map_number) & frames.c.state.in_(_KEPT)
-    total = int(connection.execute(select(func.count()).where(of_map)).scalar_one())
+    total = count_rows(connection, of_map)
     # adding 0, as above: the index that has states holds all of this, and rows are not read
     place = (func.row_number().over(order_by=frames.c.number + 0) - 1).label("place")
     listed = select(frames.c.number, place).where(of_map).subquery()
@@ -490,8 +509,7 @@ def spread_frames(connection: Connection, most: int) -> list[int]:
 
 def count_uploads(connection: Connection) -> int:
     """How many frames of all maps have their uploads."""
-    asked = select(func.count()).where(frames.c.state.in_(_KEPT))
-    return int(connection.execute(asked).scalar_one())
+    return count_rows(connection, frames.c.state.in_(_KEPT))
 
 
 def bytes_of_files(connection: Connection) -> int:
@@ -499,16 +517,12 @@ def bytes_of_files(connection: Connection) -> int:
     return int(connection.execute(select(func.sum(job_files.c.bytes))).scalar() or 0)
 
 
-def weigh(connection: Connection, numbers: Sequence[int]) -> Weighed:
-    """What frames weigh, with what was made of them by whatever model."""
-    uploads = signed = 0
-    artifacts: list[str] = []
-    for first in range(0, len(numbers), _BLOCK):
-        some = numbers[first : first + _BLOCK]
-        held = select(func.sum(frames.c.bytes)).where(frames.c.number.in_(some))
-        uploads += int(connection.execute(held).scalar() or 0)
-        made = select(func.length(signatures.c.vector), signatures.c.geometry)
-        for size, geometry in connection.execute(made.where(signatures.c.frame_number.in_(some))):
-            signed += size
-            artifacts.append(geometry)
-    return Weighed(uploads, signed, artifacts)
+def weigh(connection: Connection, numbers: Sequence[int]) -> tuple[int, int, list[str]]:
+    """Bytes of the uploads of some frames, and of what was made of them by whatever model: bytes of
+    signatures, and blobs of artifacts.
+    """
+    held = rows_among(connection, select(frames.c.bytes), frames.c.number, numbers)
+    asked = select(func.length(signatures.c.vector), signatures.c.geometry)
+    made = list(rows_among(connection, asked, signatures.c.frame_number, numbers))
+    uploads = sum(row.bytes for row in held)
+    return uploads, sum(size for size, _ in made), [geometry for _, geometry in made]

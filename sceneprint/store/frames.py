@@ -9,12 +9,10 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, delete, func, insert, select, update
 
 from sceneprint.errors import UnknownFrame
-from sceneprint.store.batching import among, blocks
 from sceneprint.store.deletion import delete_frames
 from sceneprint.store.events import record_event
-from sceneprint.store.maps import find_map
+from sceneprint.store.maps import ROOMLESS, count_on, find_map
 from sceneprint.store.queue import now
-from sceneprint.store.quotas import ROOMLESS, count_on
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
@@ -23,6 +21,7 @@ from sceneprint.store.tables import (
     frames,
     job_files,
     maps,
+    rows_among,
     signatures,
 )
 from sceneprint_client.api import FrameState
@@ -49,17 +48,13 @@ def add_frame(
         _free(connection, map_number, frame_id)
     pose = values["pose"]
     place = {} if pose is None else {f"pose_{axis}": pose[i][3] for i, axis in enumerate("xyz")}
-    connection.execute(
-        insert(frames).values(
-            id=frame_id, map_number=map_number, state=FrameState.RECEIVED,
-            received_at=now(connection), **values, **place,
-        )
+    made = insert(frames).values(
+        id=frame_id, map_number=map_number, state=FrameState.RECEIVED,
+        received_at=now(connection), **values, **place,
     )  # fmt: skip
+    row = frame_row(connection.execute(made.returning(frames)).mappings().one())
     count_on(connection, map_number, 1, values["bytes"])
-    row = _one(connection, (frames.c.map_number == map_number) & (frames.c.id == frame_id))
-    named = [{"frame_number": row.number, "tag": tag} for tag in sorted(set(row.tags))]
-    if named:
-        connection.execute(insert(frame_tags), named)
+    _write_tags(connection, row.number, row.tags)
     return row
 
 
@@ -98,19 +93,13 @@ def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
     ------
     UnknownFrame : there is none.
     """
-    found = (
-        connection.execute(
-            select(frames).where(frames.c.map_number == row.number, frames.c.id == frame_id)
-        )
-        .mappings()
-        .first()
-    )
+    found = _first(connection, frames.c.map_number == row.number, frames.c.id == frame_id)
     if found is None:
         raise UnknownFrame(
             f"There is no frame {frame_id!r:.80} in map {row.name!r}. List them with "
             f"GET /v1/maps/{row.name}/frames."
         )
-    return frame_row(found)
+    return found
 
 
 def frames_of_content(connection: Connection, map_number: int, content_id: str) -> list[FrameRow]:
@@ -126,32 +115,21 @@ def frames_of_content(connection: Connection, map_number: int, content_id: str) 
 
 def living_frame(connection: Connection, map_number: int, frame_id: str) -> FrameRow | None:
     """The frame of an id in a map, or None where there is none that is not deleted."""
-    found = connection.execute(
-        select(frames).where(
-            frames.c.map_number == map_number,
-            frames.c.id == frame_id,
-            frames.c.state != FrameState.DELETED,
-        )
-    ).mappings().first()  # fmt: skip
-    return None if found is None else frame_row(found)
+    there = frames.c.state != FrameState.DELETED
+    return _first(connection, frames.c.map_number == map_number, frames.c.id == frame_id, there)
 
 
 def frame_of(connection: Connection, number: int) -> FrameRow:
     """The frame of a number that is known to exist."""
-    return _one(connection, frames.c.number == number)
+    asked = select(frames).where(frames.c.number == number)
+    return frame_row(connection.execute(asked).mappings().one())
 
 
 def frames_of(connection: Connection, numbers: Iterable[int]) -> dict[int, FrameRow]:
     """Frames by their numbers; those that are gone are left out."""
-    found: dict[int, FrameRow] = {}
-    for some in blocks(numbers):
-        rows = connection.execute(
-            select(frames).where(
-                among(connection, frames.c.number, some), frames.c.state != FrameState.DELETED
-            )
-        ).mappings()
-        found |= {row["number"]: frame_row(row) for row in rows}
-    return found
+    asked = select(frames).where(frames.c.state != FrameState.DELETED)
+    found = rows_among(connection, asked, frames.c.number, numbers)
+    return {row.number: frame_row(row._mapping) for row in found}
 
 
 def set_state(
@@ -187,32 +165,26 @@ def delete_frame(connection: Connection, row: MapRow, frame: FrameRow) -> list[s
 
 def refers_to(connection: Connection, blob: str) -> bool:
     """Whether a frame that is kept, a signature or a job refers to a blob."""
-    of_frame = select(frames.c.number).where(
-        frames.c.blob == blob,
-        frames.c.state.not_in((FrameState.DELETED, FrameState.REDUNDANT)),
-    )
+    kept = frames.c.state.not_in(ROOMLESS)
+    of_frame = select(frames.c.number).where(frames.c.blob == blob, kept)
     of_artifact = select(signatures.c.frame_number).where(signatures.c.geometry == blob)
     of_job = select(job_files.c.job_number).where(job_files.c.blob == blob)
     return any(connection.execute(one.limit(1)).first() for one in (of_frame, of_artifact, of_job))
 
 
-def count_states(connection: Connection) -> dict[str, int]:
-    """How many frames of all maps are in each state."""
-    rows = connection.execute(select(frames.c.state, func.count()).group_by(frames.c.state))
-    return {row[0]: row[1] for row in rows}
+def count_states(connection: Connection, map_number: int | None = None) -> dict[str, int]:
+    """How many frames are in each state that has any, of one map or of all."""
+    asked = select(frames.c.state, func.count()).group_by(frames.c.state).order_by(frames.c.state)
+    if map_number is not None:
+        asked = asked.where(frames.c.map_number == map_number)
+    return {row[0]: row[1] for row in connection.execute(asked)}
 
 
 def _free(connection: Connection, map_number: int, frame_id: str) -> None:
     """Let a deleted frame give its id up: its row stays, as readers learn of it by its number."""
-    connection.execute(
-        update(frames)
-        .where(
-            frames.c.map_number == map_number,
-            frames.c.id == frame_id,
-            frames.c.state == FrameState.DELETED,
-        )
-        .values(id=uuid.uuid4().hex)
-    )
+    deleted = frames.c.state == FrameState.DELETED
+    own = update(frames).where(frames.c.map_number == map_number, frames.c.id == frame_id, deleted)
+    connection.execute(own.values(id=uuid.uuid4().hex))
 
 
 def _weigh(connection: Connection, number: int, state: FrameState | None, size: int | None) -> None:
@@ -234,8 +206,15 @@ def _weigh(connection: Connection, number: int, state: FrameState | None, size: 
     count_on(connection, map_number, is_now - was, is_now * after - was * before)
 
 
-def _one(connection: Connection, condition: ColumnElement[bool]) -> FrameRow:
-    return frame_row(connection.execute(select(frames).where(condition)).mappings().one())
+def _first(connection: Connection, *conditions: ColumnElement[bool]) -> FrameRow | None:
+    found = connection.execute(select(frames).where(*conditions)).mappings().first()
+    return None if found is None else frame_row(found)
+
+
+def _write_tags(connection: Connection, number: int, tags: Iterable[str]) -> None:
+    named = [{"frame_number": number, "tag": tag} for tag in sorted(set(tags))]
+    if named:
+        connection.execute(insert(frame_tags), named)
 
 
 # What a frame was uploaded on condition of: that its map lacks the place.
@@ -285,9 +264,7 @@ def write_frame(
     connection.execute(update(frames).where(frames.c.number == frame.number).values(**written))
     if "tags" in changed:
         connection.execute(delete(frame_tags).where(frame_tags.c.frame_number == frame.number))
-        named = [{"frame_number": frame.number, "tag": tag} for tag in sorted(set(changed["tags"]))]
-        if named:
-            connection.execute(insert(frame_tags), named)
+        _write_tags(connection, frame.number, changed["tags"])
     record_event(connection, "frame.edited", row.name, frame.id, fields=sorted(changed))
     return frame_of(connection, frame.number)
 

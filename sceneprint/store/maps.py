@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
-from sqlalchemy import Connection, delete, func, insert, select, update
+from sqlalchemy import Connection, func, insert, select, update
 
-from sceneprint.errors import UnknownMap
-from sceneprint.store.deletion import doom_found
-from sceneprint.store.events import record_event
-from sceneprint.store.quotas import inherited, remember
+from sceneprint.errors import QuotaExceeded, UnknownMap
+from sceneprint.store.events import inherited, record_event
 from sceneprint.store.tables import (
     MapRow,
-    frame_tags,
     frames,
-    job_files,
-    job_items,
-    jobs,
     map_row,
     maps,
     models,
-    signatures,
 )
+from sceneprint_client.api import FrameState
 
 
 def find_map(connection: Connection, name: str) -> MapRow:
@@ -94,53 +89,14 @@ def add_map(
     return find_map(connection, name)
 
 
-def next_revision(connection: Connection, map_number: int) -> int:
-    """Count one change of what is searched; commits of one map follow each other in this order."""
-    connection.execute(
-        update(maps).where(maps.c.number == map_number).values(revision=maps.c.revision + 1)
-    )
-    return int(
-        connection.execute(select(maps.c.revision).where(maps.c.number == map_number)).scalar_one()
-    )
+def next_revision(connection: Connection, map_number: int, count: int = 1) -> int:
+    """The last of so many revisions of a map that are taken at once.
 
-
-def count_frames(connection: Connection, map_number: int) -> dict[str, int]:
-    """How many frames are in each state that has any."""
-    rows = connection.execute(
-        select(frames.c.state, func.count())
-        .where(frames.c.map_number == map_number)
-        .group_by(frames.c.state)
-        .order_by(frames.c.state)
-    )
-    return {row[0]: row[1] for row in rows}
-
-
-def remove_map(connection: Connection, row: MapRow) -> list[str]:
-    """Remove a map with all that is in it.
-
-    Returns
-    -------
-    blobs : that it referred to
+    One is a change of what is searched; commits of one map follow each other in this order.
     """
-    own = select(frames.c.number).where(frames.c.map_number == row.number)
-    of_map = select(jobs.c.number).where(jobs.c.map_number == row.number)
-    asked = (
-        select(frames.c.blob).where(frames.c.map_number == row.number),
-        select(signatures.c.geometry).where(signatures.c.frame_number.in_(own)),
-        select(job_files.c.blob).where(job_files.c.job_number.in_(of_map)),
-    )
-    referred = sorted({blob for one in asked for blob in connection.execute(one).scalars()})
-    doom_found(connection, *asked)
-    connection.execute(delete(signatures).where(signatures.c.frame_number.in_(own)))
-    for made in (job_items, job_files):
-        connection.execute(delete(made).where(made.c.job_number.in_(of_map)))
-    connection.execute(delete(jobs).where(jobs.c.map_number == row.number))
-    connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(own)))
-    connection.execute(delete(frames).where(frames.c.map_number == row.number))
-    connection.execute(delete(maps).where(maps.c.number == row.number))
-    record_event(connection, "map.deleted", row.name)
-    remember(connection, row)
-    return referred
+    taken = update(maps).where(maps.c.number == map_number)
+    raised = taken.values(revision=maps.c.revision + count).returning(maps.c.revision)
+    return int(connection.execute(raised).scalar_one())
 
 
 def keep_model(connection: Connection, model_id: str, name: str, content: bytes) -> None:
@@ -163,3 +119,82 @@ def model_content(connection: Connection, model_id: str) -> bytes:
 def model_names(connection: Connection) -> dict[str, str]:
     """Names of all models by their id."""
     return {row.id: row.name for row in connection.execute(select(models.c.id, models.c.name))}
+
+
+# What a map holds and may hold: frames, and bytes of their uploads.
+#
+# Counted are frames that are neither deleted nor redundant, whatever else became of them, and their
+# uploads as they were sent. Not counted is what we make of them: signatures, artifacts, indexes.
+# Two columns of the map count on in the transaction that changes it; writers take turns, so that a
+# quota holds to the frame whoever sends at once.
+
+#: States of frames that take no room: their uploads are removed.
+ROOMLESS = (FrameState.DELETED, FrameState.REDUNDANT)
+
+
+@dataclass(frozen=True)
+class MapUsage:
+    """How much of a map is in use."""
+
+    frames: int
+    bytes: int
+
+
+def use_of(connection: Connection, map_number: int) -> MapUsage:
+    """What a map holds, as it was counted on."""
+    asked = select(maps.c.used_frames, maps.c.used_bytes).where(maps.c.number == map_number)
+    return MapUsage(*connection.execute(asked).one())
+
+
+def count_on(connection: Connection, map_number: int, more: int, more_bytes: int) -> None:
+    """Count that a map holds so many frames and bytes more, or less."""
+    connection.execute(
+        update(maps)
+        .where(maps.c.number == map_number)
+        .values(used_frames=maps.c.used_frames + more, used_bytes=maps.c.used_bytes + more_bytes)
+    )
+
+
+def counted_usage(connection: Connection, map_number: int) -> MapUsage:
+    """What a map holds, counted over all its frames: what `use_of` must say."""
+    asked = select(func.count(), func.coalesce(func.sum(frames.c.bytes), 0)).where(
+        frames.c.map_number == map_number, frames.c.state.not_in(ROOMLESS)
+    )
+    n, size = connection.execute(asked).one()
+    return MapUsage(int(n), int(size))
+
+
+def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> None:
+    """See that a map's quota leaves room for one more frame, or for a larger upload of one.
+
+    Parameters
+    ----------
+    connection : of the transaction that would add it, or of a reading one for a first look
+    row : of the map
+    size : bytes that it takes more
+    new : whether the frame is not counted yet
+
+    Raises
+    ------
+    QuotaExceeded : it does not.
+    """
+    if row.quota_frames is None and row.quota_bytes is None:
+        return
+    use = use_of(connection, row.number)
+    if new and row.quota_frames is not None and use.frames >= row.quota_frames:
+        raise QuotaExceeded(
+            f"Map {row.name!r} holds {use.frames} frames of the {row.quota_frames} that its quota "
+            f"allows, so the frame was not taken. {_todo(row.name)}"
+        )
+    if size > 0 and row.quota_bytes is not None and use.bytes + size > row.quota_bytes:
+        raise QuotaExceeded(
+            f"Map {row.name!r} holds {use.bytes} bytes of uploads of the {row.quota_bytes} that "
+            f"its quota allows, so {size} bytes more were not taken. {_todo(row.name)}"
+        )
+
+
+def _todo(name: str) -> str:
+    return (
+        "Delete frames that are not needed any more, or ask the operator for a larger quota "
+        f"(PATCH /v1/maps/{name})."
+    )

@@ -10,23 +10,13 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, func, insert, select
 
-from sceneprint.store.tables import events, jobs, maps, samples
+from sceneprint.store.tables import count_rows, events, jobs, maps, samples
 from sceneprint_client.api import JobState
 
 
 def count_maps(connection: Connection) -> int:
     """How many maps there are."""
     return int(connection.execute(select(func.count()).select_from(maps)).scalar_one())
-
-
-def count_jobs_of(connection: Connection, map_number: int) -> dict[str, int]:
-    """How many jobs of a map are in each state that has any."""
-    rows = connection.execute(
-        select(jobs.c.state, func.count())
-        .where(jobs.c.map_number == map_number)
-        .group_by(jobs.c.state)
-    )
-    return {row[0]: row[1] for row in rows}
 
 
 def oldest_waiting(connection: Connection, map_number: int | None = None) -> float | None:
@@ -125,12 +115,10 @@ class Sample:
     Parameters
     ----------
     at : end of the time in which it was counted, seconds since 1970
-    process : host and process id
     data : by kind
     """
 
     at: float
-    process: str
     data: dict[str, Any]
 
 
@@ -150,15 +138,10 @@ def add_sample(connection: Connection, kind: str, process: str, data: dict[str, 
 
 def samples_since(connection: Connection, kind: str, at: float) -> list[Sample]:
     """Samples of all processes from a time on, the oldest first."""
-    found = connection.execute(
-        select(samples.c.at, samples.c.process, samples.c.data)
-        .where(samples.c.kind == kind, samples.c.at >= at)
-        .order_by(samples.c.at)
-    )
-    return [Sample(*row) for row in found]
+    of_kind = select(samples.c.at, samples.c.data).where(samples.c.kind == kind, samples.c.at >= at)
+    return [Sample(*row) for row in connection.execute(of_kind.order_by(samples.c.at))]
 
 
 def count_samples(connection: Connection, kind: str, at: float) -> int:
     """How many samples of a kind there are from a time on."""
-    counted = select(func.count()).where(samples.c.kind == kind, samples.c.at >= at)
-    return int(connection.execute(counted).scalar_one())
+    return count_rows(connection, samples.c.kind == kind, samples.c.at >= at)

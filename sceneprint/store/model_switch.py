@@ -14,7 +14,7 @@ from sqlalchemy import ColumnElement, Connection, and_, exists, func, insert, se
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import next_revision
-from sceneprint.store.queue import enqueue, read_clock
+from sceneprint.store.queue import PENDING, enqueue, read_clock
 from sceneprint.store.tables import MapRow, frames, jobs, maps, signatures
 from sceneprint_client.api import FrameState, JobState
 
@@ -24,9 +24,6 @@ REENCODE = "reencode"
 PRIORITY = -10
 #: Rows that one transaction handles, so that writers wait for tenths of a second at most.
 QUEUED_AT_ONCE, REMOVED_AT_ONCE = 2000, 50
-
-#: States of jobs that something may still come of.
-PENDING = (JobState.QUEUED, JobState.RUNNING)
 
 
 @dataclass(frozen=True)
@@ -183,11 +180,7 @@ def switch_model(connection: Connection, row: MapRow) -> list[str]:
     for number, one in rejected.items():
         set_state(connection, number, FrameState.REJECTED, one.error)
         # readers and indexes that hold it, of a time when the map had this model, learn of it
-        connection.execute(
-            update(frames)
-            .where(frames.c.number == number)
-            .values(revision=next_revision(connection, row.number))
-        )
+        touch(connection, row, [number])
         record_event(connection, "frame.rejected", row.name, one.id, one.job_id)
     for number, frame_id in earlier:
         set_state(connection, number, FrameState.RECEIVED)

@@ -1,4 +1,4 @@
-"""Numbers of rows as the outside sees them.
+"""Numbers of rows as the outside sees them: ids of events, and cursors of pages.
 
 Rows are numbered over all maps, so that the numbers themselves, and the gaps between them, would
 tell who may see one map how much happens in the others. A seal is a number under AES-SIV (RFC
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hmac
 import re
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Literal
 
@@ -17,7 +18,7 @@ from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESSIV
 from sqlalchemy import select
 
-from sceneprint.errors import UnusableStore
+from sceneprint.errors import InvalidRequest, UnusableStore
 from sceneprint.store.database import Database
 from sceneprint.store.tables import secrets
 
@@ -28,12 +29,7 @@ START = "0"
 
 
 class OpaqueIds:
-    """The seals of one store.
-
-    Parameters
-    ----------
-    database : that has the secret
-    """
+    """The seals of one store."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -56,6 +52,40 @@ class OpaqueIds:
             return None
         return int.from_bytes(plain, "big")
 
+    def event(self, given: str, place: str = "after") -> int:
+        """The number of the event that an id stands for; 0 for START, which is before all of them.
+
+        Raises
+        ------
+        InvalidRequest : it is the id of no event of this store.
+        """
+        number = self.open("event", given)
+        if number is None:
+            raise InvalidRequest(
+                f"{given!r:.40} is not the id of an event here. Start again: with {START} for all "
+                "stored events, or without an id for new events only.",
+                ((place, "not the id of an event"),),
+            )
+        return number
+
+    def row(self, kind: Kind, cursor: str | None) -> int | None:
+        """The number of the row that a page before ended with, by its cursor; None for the first.
+
+        Raises
+        ------
+        InvalidRequest : it was not given out.
+        """
+        if cursor is None:
+            return None
+        number = None if cursor == START else self.open(kind, cursor)
+        if number is None:
+            raise invalid_cursor(cursor)
+        return number
+
+    def next_cursor(self, kind: Kind, numbers: Sequence[int], limit: int) -> str | None:
+        """The cursor of the page after one of `limit` rows; None: no more were found than these."""
+        return self.seal(kind, numbers[limit - 1]) if len(numbers) > limit else None
+
     @property
     def owner(self) -> str:
         """32 digits that stand for the store itself, and tell nothing of its secret."""
@@ -76,3 +106,25 @@ class OpaqueIds:
                 "folder from a copy."
             )
         return bytes(found)
+
+
+def row_of(cursor: str | None) -> int | None:
+    """The place that a cursor stands for in a list that is numbered by itself.
+
+    Raises
+    ------
+    InvalidRequest : it was not given out.
+    """
+    if cursor is None:
+        return None
+    if not (cursor.isascii() and cursor.isdigit() and len(cursor) < 19):
+        raise invalid_cursor(cursor)
+    return int(cursor)
+
+
+def invalid_cursor(cursor: str) -> InvalidRequest:
+    """What is said of a cursor that was not given out."""
+    return InvalidRequest(
+        f"The cursor {cursor!r:.40} is not valid. Use the `next_cursor` of a page.",
+        (("cursor", "not a cursor of this service"),),
+    )

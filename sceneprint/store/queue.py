@@ -29,7 +29,7 @@ from __future__ import annotations
 import time
 import uuid
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from sqlalchemy import (
@@ -50,8 +50,17 @@ from sqlalchemy import (
 
 from sceneprint.errors import JobOver, LostLease, UnknownJob
 from sceneprint.logs import request_id
-from sceneprint.store.batching import among, blocks
-from sceneprint.store.tables import JobRow, frames, job_files, job_items, job_row, jobs, maps
+from sceneprint.store.tables import (
+    JobRow,
+    count_rows,
+    frames,
+    job_files,
+    job_items,
+    job_row,
+    jobs,
+    maps,
+    rows_among,
+)
 from sceneprint_client.api import JobState
 
 # Jobs, one by one and as a list.
@@ -157,21 +166,17 @@ def last_of(
 
 def jobs_of(connection: Connection, frame_numbers: list[int]) -> dict[int, JobRow]:
     """The latest job of each frame that is to have it indexed, not those that sign it again."""
-    found: dict[int, JobRow] = {}
-    for some in blocks(frame_numbers):
-        rows = connection.execute(
-            select(jobs)
-            .where(among(connection, jobs.c.frame_number, some), jobs.c.kind == "sign")
-            .order_by(jobs.c.number)
-        ).mappings()
-        found |= {row["frame_number"]: job_row(row) for row in rows}
-    return found
+    asked = select(jobs).where(jobs.c.kind == "sign").order_by(jobs.c.number)
+    found = rows_among(connection, asked, jobs.c.frame_number, frame_numbers)
+    return {row.frame_number: job_row(row._mapping) for row in found}
 
 
-def count_jobs(connection: Connection) -> dict[str, int]:
-    """How many jobs are in each state that has any."""
-    rows = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state))
-    return {row[0]: row[1] for row in rows}
+def count_jobs(connection: Connection, map_number: int | None = None) -> dict[str, int]:
+    """How many jobs are in each state that has any, of one map or of all."""
+    asked = select(jobs.c.state, func.count()).group_by(jobs.c.state)
+    if map_number is not None:
+        asked = asked.where(jobs.c.map_number == map_number)
+    return {row[0]: row[1] for row in connection.execute(asked)}
 
 
 # The clock by which leases end and jobs are due: of the database, as those of its hosts differ.
@@ -195,6 +200,8 @@ def read_clock(connection: Connection) -> float:
     return float(connection.execute(select(now(connection))).scalar_one())
 
 
+#: States of jobs that something may still come of.
+PENDING = (JobState.QUEUED, JobState.RUNNING)
 #: Tries that broke down before a job is dead.
 MAXIMUM_FAILURES = 3
 #: Tries in all before it is. More, as a worker that fell silent or was killed may have died of
@@ -202,18 +209,6 @@ MAXIMUM_FAILURES = 3
 MAXIMUM_ATTEMPTS = 10
 #: Seconds before the second try; each further one waits four times as long.
 BACKOFF_S = 2.0
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A job that this worker holds until its lease runs out."""
-
-    job: JobRow
-
-    @property
-    def token(self) -> int:
-        """Of this claim alone."""
-        return self.job.token
 
 
 def enqueue(
@@ -266,7 +261,7 @@ def has_due(connection: Connection) -> bool:
     return connection.execute(asked).first() is not None
 
 
-def claim(connection: Connection, worker: str, lease_s: float) -> Claim | None:
+def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
     """Take the next job: one that waits, or one whose worker fell silent.
 
     Parameters
@@ -294,7 +289,7 @@ def claim(connection: Connection, worker: str, lease_s: float) -> Claim | None:
         )
         .returning(jobs)
     ).mappings().one()  # fmt: skip
-    return Claim(job_row(row))
+    return job_row(row)
 
 
 def _first(
@@ -317,7 +312,7 @@ def _first(
     return None if found is None else (-found.priority, found.attempts, found.number)
 
 
-def renew(connection: Connection, held: Claim, lease_s: float) -> None:
+def renew(connection: Connection, held: JobRow, lease_s: float) -> None:
     """Extend a lease.
 
     Raises
@@ -327,7 +322,7 @@ def renew(connection: Connection, held: Claim, lease_s: float) -> None:
     _hold(connection, held, leased_until=now(connection) + lease_s)
 
 
-def check_held(connection: Connection, held: Claim) -> None:
+def check_held(connection: Connection, held: JobRow) -> None:
     """See that a claim is still the latest, in the transaction that stores a part of its work.
 
     Raises
@@ -341,7 +336,7 @@ def check_held(connection: Connection, held: Claim) -> None:
 
 
 def finish(
-    connection: Connection, held: Claim, state: JobState, error: str | None = None,
+    connection: Connection, held: JobRow, state: JobState, error: str | None = None,
     traceback: str | None = None, **values: object,
 ) -> None:  # fmt: skip
     """End a job, in the transaction that stores what it made; `values`: of its other columns.
@@ -356,7 +351,7 @@ def finish(
     )  # fmt: skip
 
 
-def go_on(connection: Connection, held: Claim, progress: dict[str, Any]) -> None:
+def go_on(connection: Connection, held: JobRow, progress: dict[str, Any]) -> None:
     """Queue a long job again after a part of it, behind those that wait.
 
     However many tries it took, they count no more: it came further.
@@ -373,7 +368,7 @@ def go_on(connection: Connection, held: Claim, progress: dict[str, Any]) -> None
     )  # fmt: skip
 
 
-def fail(connection: Connection, held: Claim, error: str, traceback: str) -> JobState:
+def fail(connection: Connection, held: JobRow, error: str, traceback: str) -> JobState:
     """Queue a job that broke down for another try, or let it be dead.
 
     Raises
@@ -381,9 +376,9 @@ def fail(connection: Connection, held: Claim, error: str, traceback: str) -> Job
     LostLease : as `renew`.
     """
     # not as it was claimed: an earlier worker may have died over the job since
-    known = select(jobs.c.failures).where(jobs.c.number == held.job.number)
+    known = select(jobs.c.failures).where(jobs.c.number == held.number)
     failures = (connection.execute(known).scalar() or 0) + 1
-    if failures >= MAXIMUM_FAILURES or held.job.attempts >= MAXIMUM_ATTEMPTS:
+    if failures >= MAXIMUM_FAILURES or held.attempts >= MAXIMUM_ATTEMPTS:
         finish(connection, held, JobState.DEAD, error, traceback)
         return JobState.DEAD
     _hold(
@@ -398,7 +393,7 @@ def pause_s(failures: int) -> float:
     return BACKOFF_S * 4.0 ** (failures - 1)
 
 
-def give_back(connection: Connection, held: Claim, after_s: float = 0.0) -> None:
+def give_back(connection: Connection, held: JobRow, after_s: float = 0.0) -> None:
     """Queue a job again that was not begun, as if it had not been claimed.
 
     Parameters
@@ -412,32 +407,32 @@ def give_back(connection: Connection, held: Claim, after_s: float = 0.0) -> None
     LostLease : as `renew`.
     """
     _hold(
-        connection, held, state=JobState.QUEUED, attempts=held.job.attempts - 1,
+        connection, held, state=JobState.QUEUED, attempts=held.attempts - 1,
         leased_until=None, worker=None, run_after=now(connection) + after_s,
     )  # fmt: skip
 
 
-def _hold(connection: Connection, held: Claim, **values: object) -> None:
+def _hold(connection: Connection, held: JobRow, **values: object) -> None:
     """Change a job while its claim is the latest."""
     changed = connection.execute(update(jobs).where(*_own(held)).values(**values))
     if changed.rowcount != 1:
         raise _lost(held)
 
 
-def _own(held: Claim) -> tuple[ColumnElement[bool], ...]:
+def _own(held: JobRow) -> tuple[ColumnElement[bool], ...]:
     """What holds of a job while a claim on it does."""
     return (
-        jobs.c.number == held.job.number,
+        jobs.c.number == held.number,
         jobs.c.token == held.token,
         jobs.c.state == JobState.RUNNING,
         # a standby that lacked the claim, and was promoted, may have given its token to another
-        jobs.c.worker == held.job.worker,
+        jobs.c.worker == held.worker,
     )
 
 
-def _lost(held: Claim) -> LostLease:
+def _lost(held: JobRow) -> LostLease:
     return LostLease(
-        f"Job {held.job.id} is no longer held by this worker: its lease ran out, or it was "
+        f"Job {held.id} is no longer held by this worker: its lease ran out, or it was "
         "cancelled. Nothing was stored."
     )
 
@@ -526,21 +521,14 @@ def cancel(connection: Connection, job: JobRow) -> None:
     """
     if job.state.over:
         raise JobOver(f"Job {job.id} is {job.state}: {job.state.sentence} Nothing is left to do.")
-    connection.execute(
-        update(jobs)
-        .where(jobs.c.number == job.number)
-        .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
-    )
+    cancel_jobs(connection, jobs.c.number == job.number)
 
 
-def cancel_of(connection: Connection, frame_number: int) -> None:
-    """Cancel what is still to be done for a frame."""
+def cancel_jobs(connection: Connection, *which: ColumnElement[bool]) -> None:
+    """Cancel those of some jobs that wait or run."""
     connection.execute(
         update(jobs)
-        .where(
-            jobs.c.frame_number == frame_number,
-            jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING)),
-        )
+        .where(*which, jobs.c.state.in_(PENDING))
         .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
     )
 
@@ -583,19 +571,13 @@ class JobFile:
 
 def append_items(connection: Connection, job_number: int, items: list[dict[str, Any]]) -> None:
     """Add to what a job has found."""
-    first = count_items(connection, job_number)
+    first = count_rows(connection, job_items.c.job_number == job_number)
     for start in range(0, len(items), _BLOCK):
         rows = [
             {"job_number": job_number, "number": first + start + i, "data": item}
             for i, item in enumerate(items[start : start + _BLOCK])
         ]
         connection.execute(insert(job_items), rows)
-
-
-def count_items(connection: Connection, job_number: int) -> int:
-    """How many items a job has found: they are numbered from 0."""
-    asked = select(func.count()).where(job_items.c.job_number == job_number)
-    return int(connection.execute(asked).scalar_one())
 
 
 def items_of(
@@ -615,21 +597,14 @@ def add_files(connection: Connection, job_number: int, files: Iterable[JobFile])
     for one in files:
         own = (job_files.c.job_number == job_number) & (job_files.c.name == one.name)
         connection.execute(delete(job_files).where(own))
-        connection.execute(
-            insert(job_files).values(
-                job_number=job_number, name=one.name, blob=one.blob, bytes=one.bytes,
-                media_type=one.media_type,
-            )
-        )  # fmt: skip
+        connection.execute(insert(job_files).values(job_number=job_number, **asdict(one)))
 
 
 def files_of(connection: Connection, job_number: int) -> dict[str, JobFile]:
     """Files of a job by their names."""
-    asked = select(job_files).where(job_files.c.job_number == job_number).order_by(job_files.c.name)
-    return {
-        row["name"]: JobFile(row["name"], row["blob"], row["bytes"], row["media_type"])
-        for row in connection.execute(asked).mappings()
-    }
+    c = job_files.c
+    asked = select(c.name, c.blob, c.bytes, c.media_type).where(c.job_number == job_number)
+    return {row.name: JobFile(*row) for row in connection.execute(asked.order_by(c.name))}
 
 
 def jobs_with_files(connection: Connection, kind: str) -> list[JobRow]:
@@ -678,4 +653,16 @@ def remove_parts(
         own &= job_files.c.name.in_(list(files))
     blobs = list(connection.execute(select(job_files.c.blob).where(own)).scalars())
     connection.execute(delete(job_files).where(own))
+    return blobs
+
+
+def remove_job(connection: Connection, job: JobRow) -> list[str]:
+    """Forget a job with all that it found; a worker that is at it finds its lease lost.
+
+    Returns
+    -------
+    blobs : that it referred to: sweep them when this is committed
+    """
+    blobs = remove_parts(connection, job.number)
+    connection.execute(delete(jobs).where(jobs.c.number == job.number))
     return blobs

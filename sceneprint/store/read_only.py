@@ -9,25 +9,24 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from sqlalchemy import URL, Engine, create_engine, event
 
-from sceneprint.errors import NewerSchema, UnusableStore
-from sceneprint.store.database import Database
-from sceneprint.store.database_errors import database_label
+from sceneprint.errors import UnusableStore
+from sceneprint.store.database import (
+    Database,
+    current_revision,
+    database_url,
+    known_revisions,
+)
 from sceneprint.store.postgres.connection import open_postgres
-from sceneprint.store.schema import database_url, known_revisions, revision_of
+from sceneprint.store.sqlite import begin_sqlite
 
 
 @contextmanager
 def look_at(url: str) -> Iterator[Database]:
     """Open a database that may be in use, and change nothing: no schema, no log, no lock left.
-
-    Parameters
-    ----------
-    url : of SQLAlchemy
 
     Raises
     ------
@@ -46,7 +45,14 @@ def look_at(url: str) -> Iterator[Database]:
     before = None if path is None else _state(path)
     database = Database(engine)
     try:
-        _check_schema(database, engine)
+        head, _ = known_revisions()
+        with database.read() as connection:
+            found = current_revision(connection)
+        if found != head:
+            raise UnusableStore(
+                f"{database.shown} has schema {found}, and this version works with {head}. Any "
+                "other use of it, such as `sceneprint serve`, brings it there."
+            )
         yield database
     finally:
         database.close()
@@ -74,34 +80,12 @@ def _open_engine(url: URL, path: Path) -> tuple[Engine, bool]:
         connection = sqlite3.connect(
             f"{path.as_uri()}?mode=ro{how}", uri=True, timeout=30.0, check_same_thread=False
         )
-        connection.isolation_level = None  # transactions begin where `_begin` says
+        connection.isolation_level = None  # transactions begin where `begin_sqlite` says
         return connection
 
     engine = create_engine(url, creator=connect)
-    event.listen(engine, "begin", _begin)
+    event.listen(engine, "begin", begin_sqlite)
     return engine, alone
-
-
-def _begin(connection: Any) -> None:
-    connection.exec_driver_sql("BEGIN")
-
-
-def _check_schema(database: Database, engine: Engine) -> None:
-    head, known = known_revisions()
-    with database.read() as connection:
-        found = revision_of(connection)
-    if found is not None and found not in known:
-        raise NewerSchema(
-            f"{database_label(engine.url)} has schema {found}, which this version of sceneprint "
-            "does not "
-            "know: a later one wrote it. Use that version, or another data folder."
-        )
-    if found != head:
-        raise UnusableStore(
-            f"{database_label(engine.url)} has schema {found}, and this version works with "
-            f"{head}. Any "
-            "other use of it, such as `sceneprint serve`, brings it there."
-        )
 
 
 def _file_of(url: URL) -> Path | None:

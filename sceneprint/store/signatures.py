@@ -7,22 +7,24 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from zlib import crc32
 
-from sqlalchemy import Connection, delete, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, delete, func, insert, select, update
 
 from sceneprint.errors import DamagedSignature
-from sceneprint.store.batching import among, blocks
+from sceneprint.store import model_switch
 from sceneprint.store.maps import next_revision
-from sceneprint.store.model_switch import (
-    PENDING,
-    QUEUED_AT_ONCE,
-    REENCODE,
-    REMOVED_AT_ONCE,
-    models_of,
-)
 from sceneprint.store.postgres import vectors
-from sceneprint.store.queue import now
-from sceneprint.store.tables import FrameRow, MapRow, frames, jobs, maps, signatures
-from sceneprint_client.api import FrameState, JobState
+from sceneprint.store.queue import PENDING
+from sceneprint.store.tables import (
+    FrameRow,
+    MapRow,
+    count_rows,
+    frames,
+    jobs,
+    maps,
+    rows_among,
+    signatures,
+)
+from sceneprint_client.api import FrameState
 
 
 @dataclass(frozen=True)
@@ -45,14 +47,6 @@ class StoredSignature:
 
 
 @dataclass(frozen=True)
-class PatchCounts:
-    """Patches and ordered pairs of each level of a frame, the finest first."""
-
-    n_patches: tuple[int, ...]
-    n_pairs: tuple[int, ...]
-
-
-@dataclass(frozen=True)
 class SignatureChange:
     """A frame that was indexed, or is searched no more; `vector` is None then, or is damaged.
 
@@ -69,19 +63,7 @@ class SignatureChange:
 def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) -> int:
     """Store a signature and let queries find the frame; returns the map's revision."""
     # a map that goes back to a model may still have what that model once made of the frame
-    connection.execute(
-        delete(signatures).where(
-            signatures.c.frame_number == frame.number, signatures.c.model_id == made.model_id
-        )
-    )
-    connection.execute(
-        insert(signatures).values(
-            frame_number=frame.number, model_id=made.model_id, vector=made.vector,
-            checksum=crc32(made.vector), geometry=made.geometry,
-            n_patches=list(made.n_patches), n_pairs=list(made.n_pairs),
-        )
-    )  # fmt: skip
-    vectors.put(connection, frame.number, made.model_id, len(made.vector))
+    _write_signature(connection, frame, made)
     revision = next_revision(connection, frame.map_number)
     connection.execute(
         update(frames)
@@ -102,21 +84,11 @@ def replace_signature(connection: Connection, frame: FrameRow, made: StoredSigna
     changed : whether the stored bytes were others
     """
     own = (signatures.c.frame_number == frame.number) & (signatures.c.model_id == made.model_id)
-    values = {
-        "vector": made.vector, "checksum": crc32(made.vector), "geometry": made.geometry,
-        "n_patches": list(made.n_patches), "n_pairs": list(made.n_pairs),
-    }  # fmt: skip
     known = connection.execute(select(signatures.c.vector, signatures.c.checksum).where(own))
     before = known.first()
-    if before is None:
-        connection.execute(
-            insert(signatures).values(frame_number=frame.number, model_id=made.model_id, **values)
-        )
-    else:
-        connection.execute(update(signatures).where(own).values(**values))
-    vectors.put(connection, frame.number, made.model_id, len(made.vector))
+    _write_signature(connection, frame, made)
     # a checksum that does not fit made readers pass the frame over, whatever its bytes
-    if before is not None and tuple(before) == (made.vector, values["checksum"]):
+    if before is not None and tuple(before) == (made.vector, crc32(made.vector)):
         return False
     searched = select(maps.c.model_id).where(maps.c.number == frame.map_number)
     if connection.execute(searched).scalar_one() == made.model_id:
@@ -125,6 +97,20 @@ def replace_signature(connection: Connection, frame: FrameRow, made: StoredSigna
             update(frames).where(frames.c.number == frame.number).values(revision=revision)
         )
     return True
+
+
+def _write_signature(connection: Connection, frame: FrameRow, made: StoredSignature) -> None:
+    """Store a signature and its vector in place of those that the model made before."""
+    own = (signatures.c.frame_number == frame.number) & (signatures.c.model_id == made.model_id)
+    connection.execute(delete(signatures).where(own))
+    connection.execute(
+        insert(signatures).values(
+            frame_number=frame.number, model_id=made.model_id, vector=made.vector,
+            checksum=crc32(made.vector), geometry=made.geometry,
+            n_patches=list(made.n_patches), n_pairs=list(made.n_pairs),
+        )
+    )  # fmt: skip
+    vectors.put(connection, frame.number, made.model_id, len(made.vector))
 
 
 def changes_since(
@@ -178,40 +164,29 @@ def count_indexed(
 
 def deleted_since(connection: Connection, map_number: int, revision: int) -> frozenset[int]:
     """Numbers of the frames of a map that are searched no more since a revision."""
-    found = connection.execute(
-        select(frames.c.number).where(
-            frames.c.map_number == map_number,
-            frames.c.revision > revision,
-            frames.c.state != FrameState.INDEXED,
-        )
-    )
-    return frozenset(found.scalars())
+    gone = select(frames.c.number).where(*_gone(map_number, revision))
+    return frozenset(connection.execute(gone).scalars())
 
 
 def count_gone(connection: Connection, map_number: int, revision: int) -> int:
     """How many frames of a map are searched no more since a revision."""
-    counted = connection.execute(
-        select(func.count()).where(
-            frames.c.map_number == map_number,
-            frames.c.revision > revision,
-            frames.c.state != FrameState.INDEXED,
-        )
+    return count_rows(connection, *_gone(map_number, revision))
+
+
+def _gone(map_number: int, revision: int) -> tuple[ColumnElement[bool], ...]:
+    return (
+        frames.c.map_number == map_number,
+        frames.c.revision > revision,
+        frames.c.state != FrameState.INDEXED,
     )
-    return int(counted.scalar_one())
 
 
 def geometry_blobs(connection: Connection, numbers: Iterable[int], model_id: str) -> dict[int, str]:
     """Blobs of the geometry artifacts of frames."""
-    found: dict[int, str] = {}
-    for some in blocks(numbers):
-        rows = connection.execute(
-            select(signatures.c.frame_number, signatures.c.geometry).where(
-                among(connection, signatures.c.frame_number, some),
-                signatures.c.model_id == model_id,
-            )
-        )
-        found |= {row.frame_number: row.geometry for row in rows}
-    return found
+    own = signatures.c.model_id == model_id
+    asked = select(signatures.c.frame_number, signatures.c.geometry).where(own)
+    found = rows_among(connection, asked, signatures.c.frame_number, numbers)
+    return {row.frame_number: row.geometry for row in found}
 
 
 def stored_vector(connection: Connection, number: int, model_id: str) -> bytes | None:
@@ -221,11 +196,9 @@ def stored_vector(connection: Connection, number: int, model_id: str) -> bytes |
     ------
     DamagedSignature : its bytes are not those that were stored.
     """
-    found = connection.execute(
-        select(signatures.c.vector, signatures.c.checksum).where(
-            signatures.c.frame_number == number, signatures.c.model_id == model_id
-        )
-    ).first()
+    own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
+    asked = select(signatures.c.vector, signatures.c.checksum).where(own)
+    found = connection.execute(asked).first()
     if found is None:
         return None
     if crc32(found.vector) != found.checksum:
@@ -236,53 +209,43 @@ def stored_vector(connection: Connection, number: int, model_id: str) -> bytes |
     return bytes(found.vector)
 
 
-def signature_sizes(connection: Connection, number: int, model_id: str) -> PatchCounts | None:
-    """How much of a frame went into its signature, or None where it has none."""
-    found = connection.execute(
-        select(signatures.c.n_patches, signatures.c.n_pairs).where(
-            signatures.c.frame_number == number, signatures.c.model_id == model_id
-        )
-    ).first()
-    return None if found is None else PatchCounts(tuple(found.n_patches), tuple(found.n_pairs))
+def patch_counts(
+    connection: Connection, number: int, model_id: str
+) -> tuple[list[int], list[int]] | None:
+    """Patches and ordered pairs of each level that went into the signature of a frame, the finest
+    first; None where it has none.
+    """
+    asked = select(signatures.c.n_patches, signatures.c.n_pairs).where(
+        signatures.c.frame_number == number, signatures.c.model_id == model_id
+    )
+    found = connection.execute(asked).first()
+    return None if found is None else (found.n_patches, found.n_pairs)
 
 
 def stored_signatures(
     connection: Connection, numbers: Iterable[int], model_id: str
 ) -> dict[int, bytes]:
     """Signatures of frames; those that have none, or a damaged one, are left out."""
-    found: dict[int, bytes] = {}
-    for some in blocks(numbers):
-        rows = connection.execute(
-            select(signatures.c.frame_number, signatures.c.vector, signatures.c.checksum).where(
-                among(connection, signatures.c.frame_number, some),
-                signatures.c.model_id == model_id,
-            )
-        )
-        found |= {n: bytes(vector) for n, vector, checksum in rows if crc32(vector) == checksum}
-    return found
+    asked = select(signatures.c.frame_number, signatures.c.vector, signatures.c.checksum)
+    own = asked.where(signatures.c.model_id == model_id)
+    rows = rows_among(connection, own, signatures.c.frame_number, numbers)
+    return {n: bytes(vector) for n, vector, checksum in rows if crc32(vector) == checksum}
 
 
 # What is left of the models that a map no longer has, nor is to have.
 
 
 def stale_signatures(connection: Connection, row: MapRow, after: int) -> list[tuple[int, str]]:
-    """The next signatures of a map that are of neither of its models: frame, model.
-
-    Parameters
-    ----------
-    connection : of a transaction
-    row : of the map
-    after : number of a frame
-    """
+    """The next signatures of a map that are of neither of its models: frame, model."""
     found = connection.execute(
         select(signatures.c.frame_number, signatures.c.model_id)
         .join(frames, frames.c.number == signatures.c.frame_number)
         .where(
             frames.c.map_number == row.number, frames.c.number > after,
-            signatures.c.model_id.not_in(models_of(row)),
+            signatures.c.model_id.not_in(model_switch.models_of(row)),
         )
         .order_by(frames.c.number)
-        .limit(REMOVED_AT_ONCE)
+        .limit(model_switch.REMOVED_AT_ONCE)
     )  # fmt: skip
     return [(number, model_id) for number, model_id in found]
 
@@ -301,18 +264,9 @@ def stale_jobs(connection: Connection, row: MapRow) -> list[int]:
         select(jobs.c.number)
         .join(frames, frames.c.number == jobs.c.frame_number)
         .where(
-            jobs.c.state.in_(PENDING), jobs.c.kind == REENCODE,
-            jobs.c.model_id.not_in(models_of(row)), frames.c.map_number == row.number,
+            jobs.c.state.in_(PENDING), jobs.c.kind == model_switch.REENCODE,
+            jobs.c.model_id.not_in(model_switch.models_of(row)), frames.c.map_number == row.number,
         )
-        .limit(QUEUED_AT_ONCE)
+        .limit(model_switch.QUEUED_AT_ONCE)
     )  # fmt: skip
     return list(found.scalars())
-
-
-def cancel_jobs(connection: Connection, numbers: list[int]) -> None:
-    """Cancel jobs that wait or run."""
-    connection.execute(
-        update(jobs)
-        .where(jobs.c.number.in_(numbers), jobs.c.state.in_(PENDING))
-        .values(state=JobState.CANCELLED, finished_at=now(connection), leased_until=None)
-    )

@@ -39,12 +39,7 @@ def is_read_only(url: str) -> bool:
 
 
 class ReadOnlyFile:
-    """Reads such a file.
-
-    Parameters
-    ----------
-    path : of the database
-    """
+    """Reads such a file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -6,14 +6,19 @@ Times are seconds since 1970. `number` orders rows as they came and is never giv
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from sqlalchemy import (
+    ARRAY,
     JSON,
     BigInteger,
     Boolean,
     Column,
+    ColumnElement,
+    Connection,
     Float,
     ForeignKey,
     Index,
@@ -21,10 +26,15 @@ from sqlalchemy import (
     LargeBinary,
     MetaData,
     RowMapping,
+    Select,
     String,
     Table,
     Text,
     UniqueConstraint,
+    any_,
+    func,
+    literal,
+    select,
 )
 from sqlalchemy.types import TypeEngine
 
@@ -303,6 +313,44 @@ secrets = Table(
     Column("name", _string(32), primary_key=True),
     Column("value", LargeBinary, nullable=False),
 )
+
+
+# Asking for rows: how many there are, and those of many numbers.
+
+#: Numbers in one list: SQLite takes 32,766 values.
+MOST_ROWS = 10_000
+
+
+def count_rows(connection: Connection, *conditions: ColumnElement[bool]) -> int:
+    """How many rows of a table meet some conditions."""
+    return int(connection.execute(select(func.count()).where(*conditions)).scalar_one())
+
+
+def blocks(numbers: Iterable[int]) -> Iterator[list[int]]:
+    """The numbers, at most `MOST_ROWS` at a time; no list where there are none."""
+    left = iter(numbers)
+    while block := list(islice(left, MOST_ROWS)):
+        yield block
+
+
+def among(
+    connection: Connection, column: Column[int], numbers: Sequence[int]
+) -> ColumnElement[bool]:
+    """That a number is one of a block; for PostgreSQL they are one value, however many they are.
+
+    As 10,000 values of a statement they would take ten times as long to be read.
+    """
+    if connection.dialect.name == "postgresql":
+        return column == any_(literal(list(numbers), ARRAY(BigInteger)))
+    return column.in_(numbers)
+
+
+def rows_among(
+    connection: Connection, asked: Select[Any], column: Column[int], numbers: Iterable[int]
+) -> Iterator[Any]:
+    """Rows that a statement finds where a column is one of some numbers, however many."""
+    for some in blocks(numbers):
+        yield from connection.execute(asked.where(among(connection, column, some)))
 
 
 # Rows as the rest of the package sees them.

@@ -13,6 +13,9 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, Field, ValidationError
 
 from sceneprint import __version__
+from sceneprint.engine.admin import operations
+from sceneprint.engine.jobs import lifecycle
+from sceneprint.engine.maps import model_switch
 from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint.maintenance.snapshot.catalog import SNAPSHOT, SnapshotCatalog
 from sceneprint.store.events import newest_number
@@ -144,7 +147,7 @@ async def create_key(request: Request, here: Here, response: Response) -> MadeKe
 @keys_router.get("/keys", responses=declared(422), dependencies=[Depends(administers)])
 def list_keys(here: Here, cursor: Cursor = None, limit: Limit = 100) -> Page[Key]:
     """Keys by name, without their secrets."""
-    return here.engine.list_keys(cursor, limit)
+    return operations.list_keys(here.engine.store, cursor, limit)
 
 
 @keys_router.get("/keys/me", responses=declared())
@@ -231,7 +234,7 @@ def stats(
 @operations_router.get("/models", responses=declared())
 def models(here: Here, asking: Asking) -> Page[ModelInfo]:
     """Models that a map can be signed with: those that ship, and those that maps have or had."""
-    found = here.engine.operations.models(lambda name: asking.may("read", name))
+    found = here.engine.operations.catalogue.tell(lambda name: asking.may("read", name))
     if not asking.reads_every:  # one that only other maps have tells of them
         found = [one for one in found if one.preset or one.maps]
     return Page[ModelInfo](items=found)
@@ -270,7 +273,7 @@ async def reencode(map_name: str, request: Request, here: Here, asking: Asking) 
 )
 def cancel_reencoding(map_name: str, here: Here) -> Map:
     """Let a map keep the model that it has; what was made for the other is removed."""
-    return here.engine.cancel_reencode(map_name)
+    return model_switch.cancel(here.engine.store, map_name)
 
 
 def _wanted(given: object) -> NewModel:
@@ -297,8 +300,8 @@ def take_snapshot(here: Here, response: Response) -> Job:
     Ask for the job until it has succeeded: `result` is the snapshot then. One that waits its turn
     already is not queued twice. Restoring is for the operator: `sceneprint restore`.
     """
-    waiting = here.engine.list_jobs(JobState.QUEUED, limit=1, kind=SNAPSHOT).items
-    job = waiting[0] if waiting else here.engine.tasks.begin(SNAPSHOT, None, {})
+    waiting = lifecycle.list_jobs(here.engine.store, JobState.QUEUED, limit=1, kind=SNAPSHOT).items
+    job = waiting[0] if waiting else here.engine.tasks.begin(SNAPSHOT, None, {})[0]
     response.headers["Location"] = f"/v1/jobs/{job.job_id}"
     return job
 

@@ -12,7 +12,7 @@ from anyio import to_thread
 from fastapi import Header, Query, Request, Response
 
 from sceneprint.engine.admin.operations import MOST_KINDS, event_record
-from sceneprint.engine.maps.map_frames import event_of, opened_cursor
+from sceneprint.engine.jobs import lifecycle
 from sceneprint.store.events import Wanted
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint_client.api import Job, JobState, Page
@@ -46,7 +46,7 @@ def list_jobs(
         names = (map_name,)
     elif names is None and not asking.may("admin"):
         names = tuple(one.name for one in here.engine.list_maps().items)
-    return here.engine.list_jobs(state, cursor, limit, kind, names)
+    return lifecycle.list_jobs(here.engine.store, state, cursor, limit, kind, names)
 
 
 @router.get("/{job_id}", responses=declared(404))
@@ -59,7 +59,7 @@ def get_job(job_id: str, here: Here, asking: Asking) -> Job:
 def cancel_job(job_id: str, here: Here, asking: Asking) -> Job:
     """Give up a job that is not over; its frame is `failed` then. Asked twice, it stays so."""
     asking.require_job(here.engine.get_job(job_id), "write")
-    return here.engine.cancel_job(job_id)
+    return lifecycle.cancel(here.engine.store, job_id)
 
 
 @router.post(
@@ -141,11 +141,9 @@ async def events(
     last = after if last_event_id is None else last_event_id
 
     def asked() -> tuple[Wanted, int | None]:
-        opened_cursor(
-            seals, "event", cursor
-        )  # a stream has no pages; what is wrong is told all the same
+        seals.row("event", cursor)  # a stream has no pages; what is wrong is told all the same
         wanted = _wanted(here, asking, map_name, kind)
-        return wanted, None if last is None else event_of(seals, last, place)
+        return wanted, None if last is None else seals.event(last, place)
 
     wanted, number = await to_thread.run_sync(asked)
     if MEDIA_TYPE in request.headers.get("accept", ""):

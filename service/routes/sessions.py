@@ -9,7 +9,7 @@ from fastapi import Depends, Query, Request, Response
 from pydantic import ValidationError
 
 from sceneprint.engine.maps.map_frames import growth, list_sessions, trajectory, trajectory_file
-from sceneprint.engine.sessions.pose_graph import MEDIA_TYPES
+from sceneprint.engine.sessions.associations import MEDIA_TYPES
 from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint_client.api import Page
 from sceneprint_client.api.listing import Run, Session, Trajectory

@@ -12,8 +12,8 @@ from sqlalchemy import update
 
 from sceneprint.cli import main
 from sceneprint.engine import Engine
-from sceneprint.index import Generation, Tail, lists, newest, publication, search
-from sceneprint.index.mapped_files import draw
+from sceneprint.index import Generation, Tail, faiss_index, newest, publication, search
+from sceneprint.index.generation_files import draw
 from sceneprint.maintenance.fsck import indexes
 from sceneprint.settings import Settings
 from sceneprint.store.frames import add_frame, frame_of
@@ -89,7 +89,7 @@ def test_recall_counts_what_an_inverted_file_misses(
 ) -> None:
     monkeypatch.setattr(publication.publish, "__kwdefaults__",
                         publication.publish.__kwdefaults__ | {"flat_bytes": 0})  # fmt: skip
-    monkeypatch.setattr(lists, "ENOUGH", 0.1)  # so that it does miss some
+    monkeypatch.setattr(faiss_index, "ENOUGH", 0.1)  # so that it does miss some
     told(capsys, "rebuild", "hall", "--data", data)
     with Engine(Settings(data_dir=data)) as engine:
         stats = indexes.describe_index(engine, "hall", 20, seed=3)
@@ -102,7 +102,7 @@ def test_recall_counts_what_an_inverted_file_misses(
         hits += int((near.distances <= limit).sum())
     assert stats.recall == hits / 200
     assert 0 < stats.recall < 1
-    assert stats.probes == generation.recall.probes > 0
+    assert stats.probes == generation.manifest.recall.probes > 0
     _, out = told(capsys, "stats", "hall", "--data", data)
     assert f", {stats.probes} lists compared (60 frames)" in out
 

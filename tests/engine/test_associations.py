@@ -16,6 +16,7 @@ import pytest
 from sqlalchemy import select, update
 
 from sceneprint.engine import Engine
+from sceneprint.engine.jobs.lifecycle import list_jobs
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.sessions import associations
 from sceneprint.engine.sessions.association_job import Associating
@@ -300,7 +301,7 @@ def test_listed_and_removed(engine: Engine, work_off: Callable[[Engine], Any]) -
     assert engine.associations.list_all("hall").items == []
     with pytest.raises(UnknownMap):
         engine.associations.list_all("nowhere")
-    signing = engine.list_jobs(kind="sign").items[0].job_id
+    signing = list_jobs(engine.store, kind="sign").items[0].job_id
     with pytest.raises(UnknownJob, match="association"):
         engine.associations.get("hall", signing)
 

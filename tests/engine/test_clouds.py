@@ -159,8 +159,9 @@ def test_a_cloud_that_cannot_be_unpacked_here_costs_no_reconstruction(
         JobView("hall", one, i + 1, "strong", still) for i, one in enumerate((cloud_id, image_id))
     ]
     model = empty.get_map("hall").model_id
-    made = fused(empty.store, views, None, None, NewReconstruction(), model, "query.sensor", 1e12)
-    assert [one.frame_id for one in made.coverage.views] == [image_id]
-    assert "is a point cloud" in made.coverage.left_out[0].reason
+    wanted = NewReconstruction()
+    coverage, ply, _ = fused(empty.store, views, None, None, wanted, model, "query.sensor", 1e12)
+    assert [one.frame_id for one in coverage.views] == [image_id]
+    assert "is a point cloud" in coverage.left_out[0].reason
     # nobody knows the axes of the sensor of a cloud
-    assert b"comment frame query.sensor, metres\n" in made.ply[:500]
+    assert b"comment frame query.sensor, metres\n" in ply[:500]

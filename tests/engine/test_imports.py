@@ -15,8 +15,9 @@ from sqlalchemy import update
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest import archive_import
 from sceneprint.engine.ingest import uploads as uploading
+from sceneprint.engine.jobs.lifecycle import cancel, list_jobs
 from sceneprint.engine.jobs.tasks import LongJob
-from sceneprint.engine.upkeep.blob_garbage import collect_blobs
+from sceneprint.engine.upkeep.repair import collect_blobs
 from sceneprint.errors import LostLease, UnknownMap, UnusableStore
 from sceneprint.formats.archive.archive import Archive
 from sceneprint.store.queue import files_of
@@ -100,7 +101,7 @@ def test_an_archive_stays_until_its_import_is_over_and_no_longer(
     begun(empty, data)
     task = claimed(empty)
     with empty.store.database.read() as connection:
-        [file] = files_of(connection, task.claim.job.number).values()
+        [file] = files_of(connection, task.job.number).values()
     assert empty.store.blobs.holds(file.blob)
     assert file.bytes == empty.store.blobs.size(file.blob)
     assert empty.run(task) == JobState.SUCCEEDED
@@ -140,7 +141,7 @@ def test_a_cancelled_import_takes_no_frame_more(
 ) -> None:
     monkeypatch.setattr(archive_import, "_AT_ONCE", 2)
     job = begun(empty, packed(uploads[:4]))
-    until: Any = Between(lambda: empty.cancel_job(job.job_id))
+    until: Any = Between(lambda: cancel(empty.store, job.job_id))
     with pytest.raises(LostLease):
         empty.imports.handle(claimed(empty), until)
     assert len(empty.list_frames("hall").items) == 2
@@ -170,7 +171,7 @@ def test_the_archive_of_an_import_that_was_given_up_is_kept_for_a_day(
     monkeypatch.setattr(archive_import, "TIDY_S", 0.0)
     job = begun(empty, packed(uploads[:1]))
     waiting = begun(empty, packed(uploads[:2]))
-    empty.cancel_job(job.job_id)
+    cancel(empty.store, job.job_id)
     empty.publish_due()
     assert len(list(empty.store.blobs.digests())) == 2
     with empty.store.database.write() as connection:
@@ -197,7 +198,7 @@ def test_an_archive_that_was_swept_before_its_job_was_there_is_not_acknowledged(
     collect_blobs(empty.store, [archive.blob])  # an import of the same archive ends at this moment
     with pytest.raises(UnusableStore, match="Send the archive again"):
         empty.imports.begin("hall", archive, ImportOptions())
-    assert list(empty.list_jobs().items) == []
+    assert list(list_jobs(empty.store).items) == []
 
 
 def test_a_frame_that_memory_does_not_do_for_costs_no_other(

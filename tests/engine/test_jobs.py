@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from sqlalchemy import update
 
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs import signature_job as working
+from sceneprint.engine.jobs.lifecycle import cancel, list_jobs, worker_died
 from sceneprint.errors import CannotRetry, InvalidRequest, JobOver, UnknownJob
 from sceneprint.store import queue
 from sceneprint.store.queue import read_clock
@@ -40,18 +42,18 @@ def claimed(engine: Engine) -> working.Work:
 
 
 def die(engine: Engine, work: working.Work, *, counts: bool = True) -> JobState | None:
-    held = work.claim
-    return engine.worker_died(held.job.id, held.token, "signal 11", "Fatal", counts=counts)
+    held = work.job
+    return worker_died(engine.store, held.id, held.token, "signal 11", "Fatal", counts=counts)
 
 
 def test_a_cancelled_job_is_done_by_nobody_and_can_be_tried_again(
     empty: Engine, uploads: Any, told: Told, work_off: WorkOff
 ) -> None:
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta, 7)
-    cancelled = empty.cancel_job(added.job_id)
+    cancelled = cancel(empty.store, added.job_id)
     assert (cancelled.state, cancelled.priority) == (JobState.CANCELLED, 7)
     assert cancelled.finished_at is not None
-    assert empty.cancel_job(added.job_id) == cancelled  # who asks twice is not refused
+    assert cancel(empty.store, added.job_id) == cancelled  # who asks twice is not refused
     frame = empty.get_frame("hall", added.frame_id)
     assert (frame.state, frame.reason) == (FrameState.FAILED, "its job was cancelled")
     assert work_off(empty) == []
@@ -68,12 +70,12 @@ def test_a_cancelled_job_is_done_by_nobody_and_can_be_tried_again(
     assert work_off(empty) == [JobState.SUCCEEDED]
     assert told(empty)[1:] == ["frame.received", "frame.failed", "frame.received", "frame.indexed"]
     with pytest.raises(JobOver, match=r"is succeeded: Done, .* Nothing is left to do\."):
-        empty.cancel_job(again.job_id)
+        cancel(empty.store, again.job_id)
     with pytest.raises(CannotRetry, match="is succeeded and its frame is indexed"):
         empty.retry_job(again.job_id)
     with pytest.raises(CannotRetry, match=f"was replaced by {again.job_id}, which is succeeded"):
         empty.retry_job(added.job_id)
-    for ask in (empty.cancel_job, empty.retry_job):
+    for ask in (partial(cancel, empty.store), empty.retry_job):
         with pytest.raises(UnknownJob, match="nobody"):
             ask("nobody")
 
@@ -81,7 +83,7 @@ def test_a_cancelled_job_is_done_by_nobody_and_can_be_tried_again(
 def test_what_is_cancelled_while_it_is_signed_is_not_stored(empty: Engine, uploads: Any) -> None:
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work = claimed(empty)
-    assert empty.cancel_job(added.job_id).state == JobState.CANCELLED
+    assert cancel(empty.store, added.job_id).state == JobState.CANCELLED
     assert empty.run(work) is None
     assert empty.get_frame("hall", added.frame_id).state == FrameState.FAILED
     assert empty.get_map("hall").revision == 0
@@ -93,8 +95,8 @@ def test_what_cannot_be_signed_again_is_refused_with_the_reason(
 ) -> None:
     lost, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     gone, _ = empty.add_frame("hall", uploads[1].data, uploads[1].meta)
-    empty.cancel_job(lost.job_id)
-    empty.cancel_job(gone.job_id)
+    cancel(empty.store, lost.job_id)
+    cancel(empty.store, gone.job_id)
     empty.store.blobs.remove(empty.store.blobs.put(uploads[0].data))
     with pytest.raises(CannotRetry, match=f"The upload of frame {lost.frame_id} is missing"):
         empty.retry_job(lost.job_id)
@@ -199,7 +201,7 @@ def test_a_breakdown_counts_the_deaths_since_it_was_claimed(
 def test_a_death_over_what_is_gone_changes_nothing(empty: Engine, uploads: Any, told: Told) -> None:
     cancelled, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work = claimed(empty)
-    empty.cancel_job(cancelled.job_id)
+    cancel(empty.store, cancelled.job_id)
     assert die(empty, work) is None
     assert empty.get_job(cancelled.job_id).state == JobState.CANCELLED
     empty.add_frame("hall", uploads[1].data, uploads[1].meta)
@@ -230,24 +232,24 @@ def test_only_what_nobody_raised_on_purpose_makes_a_process_unsound(
 
 def test_jobs_are_listed_newest_first(empty: Engine, uploads: Any, work_off: WorkOff) -> None:
     added = [empty.add_frame("hall", one.data, one.meta)[0] for one in uploads[:5]]
-    empty.cancel_job(added[1].job_id)
+    cancel(empty.store, added[1].job_id)
     ids = [one.job_id for one in reversed(added)]
-    page = empty.list_jobs()
+    page = list_jobs(empty.store)
     assert ([job.job_id for job in page.items], page.next_cursor) == (ids, None)
     assert page.items[0] == empty.get_job(ids[0])
     assert [job.frame_id for job in page.items] == [one.frame_id for one in reversed(added)]
     seen, cursor = [], None
     for size in (2, 2, 1):
-        page = empty.list_jobs(cursor=cursor, limit=2)
+        page = list_jobs(empty.store, cursor=cursor, limit=2)
         assert len(page.items) == size
         seen += [job.job_id for job in page.items]
         cursor = page.next_cursor
     assert (seen, cursor) == (ids, None)
-    found = empty.list_jobs(JobState.CANCELLED).items
+    found = list_jobs(empty.store, JobState.CANCELLED).items
     assert [job.job_id for job in found] == [added[1].job_id]
-    assert empty.list_jobs(JobState.DEAD).items == []
+    assert list_jobs(empty.store, JobState.DEAD).items == []
     with pytest.raises(InvalidRequest, match="is not valid"):
-        empty.list_jobs(cursor="x")
+        list_jobs(empty.store, cursor="x")
 
 
 def test_a_job_that_signs_again_leaves_the_frame_as_it_is(
@@ -256,9 +258,9 @@ def test_a_job_that_signs_again_leaves_the_frame_as_it_is(
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work_off(empty)
     empty.reencode("hall", "paper")
-    (job,) = empty.list_jobs(JobState.QUEUED).items
+    (job,) = list_jobs(empty.store, JobState.QUEUED).items
     assert (job.kind, job.frame_id) == ("reencode", added.frame_id)
-    empty.cancel_job(job.job_id)
+    cancel(empty.store, job.job_id)
     assert empty.get_frame("hall", added.frame_id).state == FrameState.INDEXED
     again, new = empty.retry_job(job.job_id)
     assert (new, again.kind, again.state) == (True, "reencode", JobState.QUEUED)
@@ -270,7 +272,7 @@ def test_when_there_is_something_to_do_next(empty: Engine, uploads: Any) -> None
     assert empty.due_in_s() is None
     for one in uploads[:3]:
         empty.add_frame("hall", one.data, one.meta)
-    running = claimed(empty).claim.job
+    running = claimed(empty).job
     with empty.store.database.write() as connection:
         start = read_clock(connection)
         connection.execute(update(jobs).values(run_after=start + 50.0))

@@ -75,8 +75,8 @@ def test_what_a_killed_worker_had_in_hand_is_done_once_by_another(
     while (claimed := empty.claim("other")) is None:
         assert time.monotonic() - begun < 60
         time.sleep(0.02)
-    assert (claimed.claim.token, claimed.claim.job.attempts) == (2, 2)
-    assert claimed.claim.job.worker == "other"
+    assert (claimed.job.token, claimed.job.attempts) == (2, 2)
+    assert claimed.job.worker == "other"
     assert empty.run(claimed) == JobState.SUCCEEDED
     assert empty.claim("other") is None
     with empty.store.database.read() as connection:

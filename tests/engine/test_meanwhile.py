@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import select
 
 from sceneprint.engine import Engine
-from sceneprint.engine.search import index_view, local_index, verification
+from sceneprint.engine.search import local_index, map_view, verification
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import DamagedBlob, UnknownMap
@@ -73,7 +73,7 @@ def test_a_damaged_artifact_costs_its_match_and_no_other(
 def test_what_is_deleted_while_a_query_runs_is_not_told(
     full: Engine, uploads: Any, ids: Ids, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names, search = ids(full), index_view.search
+    names, search = ids(full), map_view.search
     gone = [names[6], names[1]]
 
     def then_delete(*given: Any, **more: Any) -> Any:
@@ -82,7 +82,7 @@ def test_what_is_deleted_while_a_query_runs_is_not_told(
             full.delete_frame("hall", gone.pop())
         return hits
 
-    monkeypatch.setattr(index_view, "search", then_delete)
+    monkeypatch.setattr(map_view, "search", then_delete)
     for query, missing in ((Query(), names[1]), (R, names[6])):
         answer = full.query_upload("hall", uploads[1].data, uploads[1].meta, query)
         assert missing not in [m.frame_id for m in answer.matches]

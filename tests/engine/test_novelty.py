@@ -13,8 +13,8 @@ from sqlalchemy import select
 
 from sceneprint.engine import Engine
 from sceneprint.engine.engine import stored_maps
-from sceneprint.engine.ingest import novelty as judging
 from sceneprint.engine.jobs import signature_job as working
+from sceneprint.engine.jobs.signature_job import look
 from sceneprint.errors import InvalidRequest
 from sceneprint.pipeline import Signature, Signer
 from sceneprint.store.signatures import StoredSignature
@@ -178,7 +178,7 @@ def test_of_two_that_are_signed_at_once_one_is_kept(
     looked = threading.Barrier(2)
 
     def together(*given: Any) -> Any:
-        seen = judging.look(*given)
+        seen = look(*given)
         assert seen is not None
         assert seen.nearest is None
         looked.wait(60)
@@ -213,7 +213,7 @@ def test_a_nearest_frame_that_is_deleted_meanwhile_is_looked_for_again(
     looks = []
 
     def interrupted(*given: Any) -> Any:
-        looks.append(judging.look(*given))
+        looks.append(look(*given))
         if len(looks) == 1:
             empty.delete_frame("hall", nearest.frame_id)
         return looks[-1]
@@ -237,11 +237,11 @@ def test_signatures_of_another_model_are_not_compared(
     vector = prepared[1][0].vector.tobytes()
     made = StoredSignature(row.model_id, vector, "00" * 32, [1], [1])
     database, readers = empty.store.database, empty._readers
-    seen = judging.look(database, readers, row, made)
+    seen = look(database, readers, row, made)
     assert seen is not None
     assert seen.nearest is not None
-    assert judging.look(database, readers, row, replace(made, model_id="ab" * 32)) is None
-    assert judging.look(database, readers, replace(row, number=99), made) is None
+    assert look(database, readers, row, replace(made, model_id="ab" * 32)) is None
+    assert look(database, readers, replace(row, number=99), made) is None
 
 
 @pytest.mark.parametrize(

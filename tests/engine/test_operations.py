@@ -120,7 +120,7 @@ def test_what_waits_and_who_works(make_engine, uploads):
     here = f"{os.uname().nodename}:{os.getpid()}"
     assert stats.workers is not None
     assert {one.name: one.job_id for one in stats.workers} == {
-        "far:17": work.claim.job.id, here: None
+        "far:17": work.job.id, here: None
     }  # fmt: skip
     assert engine.operations.statistics.tell(1).workers == [stats.workers[0]]
     engine.put_back(work)
@@ -225,7 +225,7 @@ def test_models_are_listed_with_the_maps_that_may_be_named(make_engine, small_mo
     for name in ("hall", "shop"):
         engine.create_map(NewMap(name=name, model="depth"))
     engine.reencode("shop", small_model)
-    found = {one.name: one for one in engine.operations.models(lambda name: name != "hall")}
+    found = {one.name: one for one in engine.operations.catalogue.tell(lambda name: name != "hall")}
     assert list(found) == [*PRESETS, "small"]
     depth, small = read_model("depth"), found["small"]
     assert found["depth"].maps == ["shop"]

@@ -22,7 +22,7 @@ from sceneprint.engine.upkeep import deletion, index_upkeep
 from sceneprint.engine.upkeep.deletion import Purging
 from sceneprint.errors import BusyIndex, UnknownJob, UnknownQuery
 from sceneprint.index import newest, newest_number
-from sceneprint.index.mapped_files import building
+from sceneprint.index.generation_files import building
 from sceneprint.models import read_model
 from sceneprint.store.frames import delete_frame, find_frame, write_frame
 from sceneprint.store.maps import find_map

@@ -14,7 +14,7 @@ import pytest
 from sqlalchemy import update
 
 from sceneprint.engine import Engine
-from sceneprint.engine.search import index_view, retrieval
+from sceneprint.engine.search import map_view, retrieval
 from sceneprint.engine.search.retrieval import FIRST_S, Deadline
 from sceneprint.errors import UnknownFrame
 from sceneprint.geometry.retrieval.distance import distances, pairwise_distances
@@ -294,7 +294,7 @@ def test_what_an_approximate_index_missed_is_said(
 ) -> None:
     names = ids(full)
     near = [one.frame_id for one in ask(full, names[0], stages=["retrieve"], k=11).matches]
-    real, lost = index_view.search, near[1]
+    real, lost = map_view.search, near[1]
     with full.store.database.read() as connection:
         number = find_frame(connection, find_map(connection, "hall"), lost).number
 
@@ -303,7 +303,7 @@ def test_what_an_approximate_index_missed_is_said(
             return real(*given, dead=dead, exact=True, **more)
         return replace(real(*given, dead=dead | {number}, exact=False, **more), exact=False)
 
-    monkeypatch.setattr(index_view, "search", search)
+    monkeypatch.setattr(map_view, "search", search)
     monkeypatch.setattr(retrieval, "ranking_size", lambda n: min(n, 3))
     for rank, name in enumerate(near, 1):
         answer = ask(full, names[0], explain_frame=name, stages=["retrieve"], k=3)

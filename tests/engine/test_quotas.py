@@ -14,9 +14,8 @@ from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.maps.maps import edit_map
 from sceneprint.errors import InvalidRequest, MapExists, QuotaExceeded
 from sceneprint.store import frames as stored
-from sceneprint.store.idempotency import IdempotentRequest
-from sceneprint.store.maps import find_map
-from sceneprint.store.quotas import MapUsage, counted_usage, use_of
+from sceneprint.store.keys import IdempotentRequest
+from sceneprint.store.maps import MapUsage, counted_usage, find_map, use_of
 from sceneprint.store.tables import frames
 from sceneprint_client.api import FrameState, NewMap
 

@@ -16,7 +16,7 @@ from sqlalchemy import event, select, text
 
 from benchmarks.fleet.bulk import fill, walk
 from sceneprint.engine import Engine
-from sceneprint.engine.search import local_index, pgvector_index
+from sceneprint.engine.search import local_index, map_view
 from sceneprint.engine.search import query as querying
 from sceneprint.errors import InvalidRequest
 from sceneprint.geometry.retrieval.distance import distances
@@ -43,7 +43,7 @@ BOTH = ["hall", "yard"]
 @pytest.fixture
 def make(postgres_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     """Engines on one database, each a node of its own folder, that counts frames each time."""
-    monkeypatch.setattr(pgvector_index, "_COUNTED", 0)
+    monkeypatch.setattr(map_view, "_COUNTED", 0)
     opened: list[Engine] = []
 
     def engine(node: str = "a", search: str = "database", **more: object) -> Engine:
@@ -269,7 +269,7 @@ def test_a_signature_has_its_vector_in_the_same_commit(
 def test_vectors_are_filled_in_beside_queries_and_made_again_where_they_are_lost(
     filled: Engine, places: dict[str, Bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sceneprint.engine.upkeep.vector_tables.STEP_S", 0.0)
+    monkeypatch.setattr("sceneprint.engine.upkeep.index_upkeep.FILL_S", 0.0)
     database, wanted = filled.store.database, nearest(places, "hall-500", ["hall"], 10)
     tables = filled._vector_tables
     blocks = 0
@@ -363,7 +363,7 @@ def test_a_damaged_signature_costs_its_frame_alone(filled: Engine) -> None:
         count = connection.execute(
             select(frames.c.number).where(frames.c.map_number == hall.number)
         ).all()
-    assert isinstance(view, pgvector_index.Stored)
+    assert isinstance(view, map_view.Stored)
     hits = view.search(walk(1, LENGTH, seed=0)[0], 950, dead=frozenset(), exact=True)
     assert (view.damaged, len(hits)) == ({number}, len(count) - 1)
     with filled.store.database.write() as connection:  # of all but the last thirty

@@ -9,11 +9,11 @@ import pytest
 from sqlalchemy import select, update
 
 from sceneprint.engine import Engine
+from sceneprint.engine.jobs.lifecycle import list_jobs
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
-from sceneprint.engine.upkeep.blob_garbage import collect_blobs
+from sceneprint.engine.upkeep.repair import collect_blobs
 from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
-from sceneprint.store.associations import remove_job
-from sceneprint.store.queue import JobFile, files_of, find_job, items_of
+from sceneprint.store.queue import JobFile, files_of, find_job, items_of, remove_job
 from sceneprint.store.tables import events, jobs
 from sceneprint_client.api import Job, JobState, NewMap
 
@@ -51,7 +51,7 @@ def items(engine: Engine, job: Job) -> list[int]:
 
 def test_each_slice_is_kept_and_the_last_one_ends_the_job(engine, work_off):
     engine.tasks.register("count", count_to(engine, 3))
-    job = engine.tasks.begin("count", "hall", {"to": 3})
+    job, _ = engine.tasks.begin("count", "hall", {"to": 3})
     assert (job.kind, job.map, job.frame_id, job.progress) == ("count", "hall", None, None)
     claimed = engine.claim("w")
     assert isinstance(claimed, LongJob)
@@ -74,7 +74,7 @@ def test_each_slice_is_kept_and_the_last_one_ends_the_job(engine, work_off):
 
 def test_a_slice_of_a_worker_that_fell_silent_counts_once(engine, work_off):
     engine.tasks.register("count", count_to(engine, 2))
-    job = engine.tasks.begin("count", "hall", {})
+    job, _ = engine.tasks.begin("count", "hall", {})
     late = engine.claim("silent")
     with engine.store.database.write() as connection:
         connection.execute(update(jobs).values(leased_until=1.0))
@@ -92,7 +92,7 @@ def test_what_cannot_be_done_fails_at_once_and_goes_on_when_retried(engine, work
         return count_to(engine, 3)(task, until)
 
     engine.tasks.register("count", handle)
-    job = engine.tasks.begin("count", "hall", {})
+    job, _ = engine.tasks.begin("count", "hall", {})
     assert work_off(engine) == [JobState.QUEUED, JobState.FAILED]
     failed = engine.get_job(job.job_id)
     assert (failed.error, failed.traceback) == ("the second step is impossible", None)
@@ -111,7 +111,7 @@ def test_what_breaks_down_is_tried_again_until_it_is_dead(engine, work_off):
         raise RuntimeError("no luck")
 
     engine.tasks.register("count", handle)
-    job = engine.tasks.begin("count", None, {})
+    job, _ = engine.tasks.begin("count", None, {})
     states = []
     for _ in range(3):
         with engine.store.database.write() as connection:
@@ -125,7 +125,7 @@ def test_what_breaks_down_is_tried_again_until_it_is_dead(engine, work_off):
 
 
 def test_a_kind_that_nobody_does_says_so(engine, work_off):
-    job = engine.tasks.begin("dance", "hall", {})
+    job, _ = engine.tasks.begin("dance", "hall", {})
     assert work_off(engine) == [JobState.FAILED]
     assert "kind 'dance'" in str(engine.get_job(job.job_id).error)
     with pytest.raises(UnknownMap):
@@ -134,8 +134,8 @@ def test_a_kind_that_nobody_does_says_so(engine, work_off):
 
 def test_a_map_takes_its_long_jobs_and_their_files_along(engine, work_off):
     engine.tasks.register("count", count_to(engine, 2))
-    job = engine.tasks.begin("count", "hall", {})
-    other = engine.tasks.begin("count", None, {})
+    job, _ = engine.tasks.begin("count", "hall", {})
+    other, _ = engine.tasks.begin("count", None, {})
     claimed = engine.claim("w")
     assert engine.run(claimed) == JobState.QUEUED
     with engine.store.database.read() as connection:
@@ -147,8 +147,8 @@ def test_a_map_takes_its_long_jobs_and_their_files_along(engine, work_off):
         engine.get_job(job.job_id)
     assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
     assert engine.get_job(other.job_id).state == JobState.SUCCEEDED
-    assert [one.job_id for one in engine.list_jobs(map_names=["hall"]).items] == []
-    assert [one.job_id for one in engine.list_jobs(kind="count").items] == [other.job_id]
+    assert [one.job_id for one in list_jobs(engine.store, map_names=["hall"]).items] == []
+    assert [one.job_id for one in list_jobs(engine.store, kind="count").items] == [other.job_id]
 
 
 def test_frames_that_wait_are_signed_between_two_slices(
@@ -171,7 +171,7 @@ def test_frames_that_wait_are_signed_between_two_slices(
 
 def test_tries_before_a_slice_that_came_through_count_no_more(engine: Engine) -> None:
     engine.tasks.register("count", count_to(engine, 30))
-    job = engine.tasks.begin("count", "hall", {})
+    job, _ = engine.tasks.begin("count", "hall", {})
     for _ in range(12):  # a machine that is restarted within every other slice
         assert isinstance(engine.claim("killed"), LongJob)
         with engine.store.database.write() as connection:
@@ -187,7 +187,7 @@ def test_a_job_that_is_removed_while_a_slice_runs_is_no_fault_of_its_worker(
 ) -> None:
     def handle(task: LongJob, until: float) -> SliceResult:
         with engine.store.database.write() as connection:
-            remove_job(connection, find_job(connection, task.claim.job.id))
+            remove_job(connection, find_job(connection, task.job.id))
         return count_to(engine, 2)(task, until)
 
     engine.tasks.register("count", handle)
@@ -213,7 +213,7 @@ def test_a_file_that_a_deletion_swept_is_made_again(
         return outcome
 
     engine.tasks.register("count", handle)
-    job = engine.tasks.begin("count", "hall", {})
+    job, _ = engine.tasks.begin("count", "hall", {})
     assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
     assert engine.get_job(job.job_id).attempts == 1
     assert engine.store.blobs.get(swept[0]) == b"part 0"

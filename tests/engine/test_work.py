@@ -144,7 +144,7 @@ def test_a_worker_that_comes_late_changes_nothing(
     due_now(empty)
     second = empty.claim("second")
     assert second is not None
-    assert (first.claim.token, second.claim.token) == (1, 2)
+    assert (first.job.token, second.job.token) == (1, 2)
     assert empty.run(first) is None
     assert changes(empty) == []
     assert empty.get_frame("hall", added.frame_id).state == FrameState.SIGNING
@@ -216,7 +216,7 @@ def test_a_job_that_silences_every_worker_is_given_up(
     for attempt in range(1, 11):
         claimed = empty.claim("w")  # and dies
         assert claimed is not None
-        assert claimed.claim.job.attempts == attempt
+        assert claimed.job.attempts == attempt
         due_now(empty)
     good, _ = empty.add_frame("hall", uploads[1].data, uploads[1].meta)
     claimed = empty.claim("w")

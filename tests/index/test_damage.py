@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index import Generation, mapped_files, newest, newest_number, scrub
-from sceneprint.index.flat import map_index
-from sceneprint.index.lists import map_lists
-from sceneprint.index.manifest import GenerationManifest, manifests, read_manifest
+from sceneprint.index import Generation, generation_files, newest, newest_number, scrub
+from sceneprint.index.faiss_index import map_index, map_lists
+from sceneprint.index.generation_files import GenerationManifest, manifests, read_manifest
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -109,7 +108,7 @@ def test_files_removed_while_they_are_opened_are_not_damaged(
             assert not path.exists() or int(path.name[:10]) > 2
         return read_manifest(path)
 
-    monkeypatch.setattr("sceneprint.index.generation.read_manifest", late)
+    monkeypatch.setattr("sceneprint.index.generation_files.read_manifest", late)
     assert number_of(folder) == 4
     assert caplog.record_tuples == []
 
@@ -208,7 +207,7 @@ def test_scrubbing_names_what_is_damaged(folder: Path, kind: str) -> None:
 
 
 def test_scrubbing_stops_between_blocks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mapped_files, "BLOCK_BYTES", 100)
+    monkeypatch.setattr(generation_files, "BLOCK_BYTES", 100)
     steps = list(scrub(folder))
     sizes = [size for _, size in read_manifest(manifests(folder)[0][1]).files]
     assert len(steps) == sum(-(-size // 100) for size in sizes)

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sceneprint.index import Generation, Tail, lists, newest, search
-from sceneprint.index.lists import Lists, centre_lists, grouped, train_lists
-from sceneprint.index.mapped_files import draw
+from sceneprint.index import Generation, Tail, faiss_index, newest, search
+from sceneprint.index.faiss_index import Lists, centre_lists, grouped, train_lists
+from sceneprint.index.generation_files import draw
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -45,7 +45,8 @@ def test_a_map_that_is_too_large_has_lists(
     keys = np.arange(3000) * 2
     flat = published(keys, signatures, flat_bytes=3000 * LENGTH)
     assert flat.lists is None
-    assert (flat.recall.share, flat.recall.sample, flat.recall.probes) == (1, 0, 0)
+    recall = flat.manifest.recall
+    assert (recall.share, recall.sample, recall.probes) == (1, 0, 0)
     made = published(keys, signatures, flat_bytes=3000 * LENGTH - 1)
     opened = newest(tmp_path / "map", "model", LENGTH)
     assert opened is not None
@@ -54,7 +55,7 @@ def test_a_map_that_is_too_large_has_lists(
         assert is_partition(generation)
         own = lists_of(generation)
         assert (len(own), own.trained_on) == (round(4 * 3000**0.5), 3000)
-        assert own.probes == generation.recall.probes >= 1
+        assert own.probes == generation.manifest.recall.probes >= 1
         assert own.probes & (own.probes - 1) == 0
         query = walk(31, LENGTH, seed=8)[30]
         hits = search_l2(query, generation, EMPTY, 10)
@@ -88,15 +89,15 @@ def test_recall_is_what_searches_find(walk: Walk, published: Publish) -> None:
     """By searches of the frames that were drawn, each without itself, against the exact scan."""
     signatures = walk(4000, LENGTH, walks=30)
     generation = published(np.arange(4000), signatures, flat_bytes=0)
-    recall, found = generation.recall, 0
-    assert (recall.near, recall.sample, recall.frames) == (10, lists.MOST, 4000)
+    recall, found = generation.manifest.recall, 0
+    assert (recall.near, recall.sample, recall.frames) == (10, faiss_index.MOST, 4000)
     for row in draw(4000, recall.sample, 0).tolist():
         itself = frozenset([row])
         right = search_l2(signatures[row], generation, EMPTY, 10, dead=itself, exact=True)
         hits = search_l2(signatures[row], generation, EMPTY, 10, dead=itself)
         found += int((hits.distances <= right.distances[-1]).sum())
     assert recall.share == pytest.approx(found / (10 * recall.sample))
-    assert lists.ENOUGH <= recall.share <= 1
+    assert faiss_index.ENOUGH <= recall.share <= 1
 
 
 def test_no_more_lists_are_probed_than_are_needed(
@@ -105,9 +106,9 @@ def test_no_more_lists_are_probed_than_are_needed(
     signatures = walk(4000, LENGTH, walks=30)
     probes = []
     for enough in (0.0, 0.9, 0.995, 1.0):
-        monkeypatch.setattr(lists, "ENOUGH", enough)
+        monkeypatch.setattr(faiss_index, "ENOUGH", enough)
         folder = tmp_path / str(enough)
-        recall = published(np.arange(4000), signatures, folder=folder, flat_bytes=0).recall
+        recall = published(np.arange(4000), signatures, folder=folder, flat_bytes=0).manifest.recall
         assert recall.share >= enough
         probes.append(recall.probes)
     assert probes[0] == 1
@@ -163,7 +164,7 @@ def test_centroids_stay_until_the_map_has_doubled(
         assert own.trained_on == 400
         assert is_partition(made)
         # as long as the map has hardly grown, what was measured of it holds
-        assert made.recall.frames == (400 if end == 420 else len(made))
+        assert made.manifest.recall.frames == (400 if end == 420 else len(made))
         assert lists_of(newest(tmp_path / "map", "model", LENGTH)).probes == own.probes
     made = published(np.arange(799, 1000), signatures[799:], made, flat_bytes=0)
     assert lists_of(made).trained_on == len(made) == 998
@@ -219,7 +220,7 @@ def test_one_frame_and_equal_frames_have_lists_too(published: Publish, tmp_path:
         made = published(np.arange(n), same, folder=tmp_path / str(n), flat_bytes=0)
         hits = search_l2(same[0], made, EMPTY, 5)
         assert hits.keys.tolist() == list(range(min(n, 5)))
-        assert made.recall.share == 1
+        assert made.manifest.recall.share == 1
 
 
 @pytest.mark.parametrize(("n", "limit"), [(5, 5), (5, 9), (100, 7), (1000, 999)])

@@ -14,8 +14,16 @@ import faiss
 import numpy as np
 import pytest
 
-from sceneprint.index import Generation, clear, newest, newest_number, publication, publish
-from sceneprint.index.mapped_files import Block, building
+from sceneprint.index import (
+    Generation,
+    clear,
+    faiss_index,
+    newest,
+    newest_number,
+    publication,
+    publish,
+)
+from sceneprint.index.generation_files import Block, building
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
@@ -53,8 +61,8 @@ def test_what_is_published_is_what_is_opened(
         assert holds(generation, frames_of(keys, signatures))
         assert generation is not None
         assert (generation.number, generation.revision, generation.model_id) == (1, 41, "model")
-        assert (generation.dimension, len(generation)) == (LENGTH, 300)
-        assert generation.anchor == "an event"
+        assert (generation.manifest.dimension, len(generation)) == (LENGTH, 300)
+        assert generation.manifest.anchor == "an event"
         assert not generation.vectors.flags.writeable
         with pytest.raises(ValueError, match="no frames"):
             generation.vectors_of(np.array([keys[0], 3]))
@@ -174,7 +182,7 @@ def test_what_is_open_is_taken_from_there(
     second = published(np.arange(100, 150), signatures[100:], first)
     read: list[str] = []
     monkeypatch.setattr(
-        "sceneprint.index.generation.check", lambda _, name, __: read.append(name) or iter(())
+        "sceneprint.index.generation_files.check", lambda _, name, __: read.append(name) or iter(())
     )
     found = newest(folder, "model", LENGTH, known=first)
     assert found is not None
@@ -340,8 +348,8 @@ def test_a_disk_that_is_full_is_said_as_it_was(
 
         write(first.index, refuse)
 
-    write = publication.write_index
-    monkeypatch.setattr(publication, "write_index", full)
+    write = faiss_index.write_index
+    monkeypatch.setattr(faiss_index, "write_index", full)
     with pytest.raises(OSError, match="No space left"):
         published(np.arange(10, 20), walk(20)[10:], first)
     assert {name for name in files(tmp_path / "map") if not name.endswith(".keys")} == {

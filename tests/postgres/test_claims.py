@@ -14,7 +14,6 @@ from sqlalchemy import Connection, text, update
 from sceneprint.errors import LostLease
 from sceneprint.store import Store, queue
 from sceneprint.store.maps import add_map, keep_model
-from sceneprint.store.queue import Claim
 from sceneprint.store.tables import JobRow, jobs
 from sceneprint_client.api import JobState
 
@@ -35,12 +34,12 @@ def store(server_store: Store) -> Store:
     return server_store
 
 
-def claim(store: Store, worker: str = "w", lease_s: float = 60.0) -> Claim | None:
+def claim(store: Store, worker: str = "w", lease_s: float = 60.0) -> JobRow | None:
     with store.database.write(turn=False) as connection:
         return queue.claim(connection, worker, lease_s)
 
 
-def claimed(store: Store, worker: str = "w", lease_s: float = 60.0) -> Claim:
+def claimed(store: Store, worker: str = "w", lease_s: float = 60.0) -> JobRow:
     held = claim(store, worker, lease_s)
     assert held is not None
     return held
@@ -99,8 +98,8 @@ def test_a_claim_waits_for_no_turn_and_passes_over_what_another_has_in_hand(stor
         assert claim(store, "d") is None
         commit()
     assert first is not None
-    assert [held.job.number for held in (first, second, third)] == [1, 2, 3]
-    assert [now_is(store, held.job).worker for held in (first, second, third)] == ["a", "b", "c"]
+    assert [held.number for held in (first, second, third)] == [1, 2, 3]
+    assert [now_is(store, held).worker for held in (first, second, third)] == ["a", "b", "c"]
 
 
 def test_what_fell_silent_is_locked_only_by_who_takes_it(store: Store) -> None:
@@ -108,13 +107,13 @@ def test_what_fell_silent_is_locked_only_by_who_takes_it(store: Store) -> None:
     with store.database.write(turn=False) as connection:
         held = queue.claim(connection, "a", 60.0)
         assert held is not None
-        assert held.job.number == 2  # what was not tried yet goes first
+        assert held.number == 2  # what was not tried yet goes first
         with store.database.write(turn=False) as other:
             other.execute(text("SET LOCAL lock_timeout = 1"))
             queue.renew(other, silent, 60.0)  # nobody has it locked
-    turned(store, silent.job, leased_until=0.0)
+    turned(store, silent, leased_until=0.0)
     third, again = claimed(store, "b"), claimed(store, "c")
-    assert (third.job.number, again.job.number, again.token) == (3, 1, 2)
+    assert (third.number, again.number, again.token) == (3, 1, 2)
 
 
 @pytest.mark.parametrize("first", ["claim", "cancel"])
@@ -138,7 +137,7 @@ def test_a_claim_beside_a_cancellation(store: Store, until: Any, first: str) -> 
     else:
         with store.database.write() as connection:
             queue.cancel(connection, job)
-            assert claimed(store).job.number == 2  # passed over, though not committed
+            assert claimed(store).number == 2  # passed over, though not committed
     assert now_is(store, job).state == JobState.CANCELLED
 
 
@@ -166,7 +165,7 @@ def test_an_end_that_comes_late_and_a_claim_take_effect_once(
     with store.database.write() as connection:  # the end is first
         end(connection)
         assert claim(store, "next") is None
-    turned(store, late.job, state=JobState.RUNNING, leased_until=0.0)
+    turned(store, late, state=JobState.RUNNING, leased_until=0.0)
 
     def ends() -> None:
         with store.database.write() as connection:
@@ -178,8 +177,8 @@ def test_an_end_that_comes_late_and_a_claim_take_effect_once(
         commit()
     assert isinstance(done(), LostLease)
     assert held is not None
-    assert now_is(store, late.job).worker == "next"
-    assert now_is(store, late.job) == held.job
+    assert now_is(store, late).worker == "next"
+    assert now_is(store, late) == held
 
 
 def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(
@@ -191,7 +190,7 @@ def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(
     def tell() -> JobRow | None:
         with store.database.write() as connection:
             return queue.fail_of_dead(
-                connection, dead.job.id, dead.token, "died", "trace", counts=False
+                connection, dead.id, dead.token, "died", "trace", counts=False
             )
 
     with uncommitted(store) as (connection, commit):
@@ -200,12 +199,12 @@ def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(
         commit()
     assert done() is None
     assert held is not None
-    assert now_is(store, dead.job) == held.job  # which is not queued again under its worker
+    assert now_is(store, dead) == held  # which is not queued again under its worker
 
 
 def test_a_renewal_beside_the_burial_of_its_job(store: Store, until: Any) -> None:
     held = claimed(store, "w", -1.0)
-    turned(store, held.job, attempts=queue.MAXIMUM_ATTEMPTS)
+    turned(store, held, attempts=queue.MAXIMUM_ATTEMPTS)
 
     def bury() -> list[JobRow]:
         with store.database.write() as connection:
@@ -216,12 +215,12 @@ def test_a_renewal_beside_the_burial_of_its_job(store: Store, until: Any) -> Non
         done = beside(store, until, bury)
         commit()
     assert done() == []
-    assert now_is(store, held.job).state == JobState.RUNNING
+    assert now_is(store, held).state == JobState.RUNNING
 
 
 def test_a_token_that_a_promoted_standby_gave_out_again_is_anothers(store: Store) -> None:
     held = claimed(store, "first")
-    turned(store, held.job, worker="second")  # the same token: the standby lacked the first claim
+    turned(store, held, worker="second")  # the same token: the standby lacked the first claim
     with pytest.raises(LostLease), store.database.write() as connection:
         queue.finish(connection, held, JobState.SUCCEEDED)
 
@@ -233,8 +232,8 @@ def test_the_clock_of_a_host_decides_nothing(
     real = time.time
     monkeypatch.setattr(time, "time", lambda: real() + 3600 * hours)
     held = claimed(store, "w", 60.0)
-    assert held.job.started_at == pytest.approx(real(), abs=30)
-    assert held.job.leased_until == pytest.approx(real() + 60, abs=30)
+    assert held.started_at == pytest.approx(real(), abs=30)
+    assert held.leased_until == pytest.approx(real() + 60, abs=30)
     claimed(store), claimed(store)
     assert claim(store) is None  # no lease is over
     with store.database.read() as connection:
@@ -243,6 +242,6 @@ def test_the_clock_of_a_host_decides_nothing(
         assert queue.read_clock(connection) == pytest.approx(real(), abs=30)
     with store.database.write() as connection:
         queue.give_back(connection, held)
-    assert claimed(store).job.number == held.job.number  # at once
+    assert claimed(store).number == held.number  # at once
     with store.database.write() as connection:
         assert queue.dead_letter(connection) == []

@@ -12,11 +12,9 @@ import pytest
 from sqlalchemy import text
 
 from benchmarks.fleet.postgres import Server
-from sceneprint.store import Store
+from sceneprint.store import Store, wakeup
 from sceneprint.store.database import Database, reach_database
-from sceneprint.store.postgres import notify
-from sceneprint.store.postgres.notify import Notices
-from sceneprint.store.wakeup import process_name
+from sceneprint.store.wakeup import Notices, process_name
 
 #: Seconds after which nothing rings any more, on the slowest machine.
 FOREVER = 60.0
@@ -80,7 +78,7 @@ def test_every_process_that_listens_is_known_by_its_name(ours: Notices) -> None:
     assert ours.listeners() == []
     with ours.listen(), ours.listen():
         assert ours.listeners() == [process_name()] * 2
-    assert len(f"{notify.LISTENS}{'h' * 44}:4194304") == 63  # of which the server keeps all
+    assert len(f"{wakeup.LISTENS}{'h' * 44}:4194304") == 63  # of which the server keeps all
 
 
 def test_the_name_of_a_host_is_cut_at_its_beginning(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,7 +103,7 @@ def test_connections_that_are_lost_are_made_anew(
 def test_where_the_server_is_away_nobody_is_harmed(
     postgres: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(notify, "AGAIN_S", 0.05)
+    monkeypatch.setattr(wakeup, "AGAIN_S", 0.05)
     away = Notices(reach_database("postgresql://nobody@127.0.0.1:1/none"))
     with away.listen() as listener:
         for _ in range(3):
@@ -118,7 +116,7 @@ def test_where_the_server_is_away_nobody_is_harmed(
 
 
 def test_a_server_that_never_answers_holds_up_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(notify, "CLOSING_S", 0.05)
+    monkeypatch.setattr(wakeup, "CLOSING_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         mute = Notices(reach_database(f"postgresql://u@127.0.0.1:{port}/x?connect_timeout=60"))

@@ -10,8 +10,7 @@ import pytest
 
 from sceneprint.errors import Busy
 from sceneprint.store import Database, open_store
-from sceneprint.store.events import EventRow, Wanted, record_event
-from sceneprint.store.retention import remove_events
+from sceneprint.store.events import EventRow, Wanted, record_event, remove_events
 from service import events as feeds
 from service.events import Feed
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sceneprint.engine import Engine
+from sceneprint.engine.jobs.lifecycle import cancel, worker_died
 from sceneprint.settings import Settings
 
 
@@ -57,13 +58,13 @@ def test_dead_jobs_are_listed_with_their_tracebacks(idle, make_map, small_shots,
     path, client = make_map(idle, "dead"), idle.client
     with Engine(Settings(data_dir=idle.folder)) as engine:
         for job in client.get("/v1/jobs", params={"state": "queued"}).json()["items"]:
-            engine.cancel_job(job["job_id"])  # of other tests
+            cancel(engine.store, job["job_id"])  # of other tests
         ids = [sent(idle, path, shot)["job_id"] for shot in small_shots[2:5]]
         for number in range(1, 4):
             work = engine.claim("w")
             for failure in range(3):
-                token = work.claim.token - failure  # as if three had died over it
-                engine.worker_died(work.claim.job.id, token, f"died {number}", "T", counts=True)
+                token = work.job.token - failure  # as if three had died over it
+                worker_died(engine.store, work.job.id, token, f"died {number}", "T", counts=True)
     # two of the three deaths were of workers that had lost it
     found = client.get("/v1/jobs", params={"state": "dead", "limit": 2}).json()
     assert [job["job_id"] for job in found["items"]] == ids[:0:-1]

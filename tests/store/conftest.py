@@ -171,11 +171,11 @@ class Hand:
     def __init__(self, store: Store) -> None:
         self.database = store.database
 
-    def take(self, worker: str = "w", lease_s: float = 60.0) -> queue.Claim | None:
+    def take(self, worker: str = "w", lease_s: float = 60.0) -> JobRow | None:
         with self.database.write() as connection:
             return queue.claim(connection, worker, lease_s)
 
-    def taken(self, worker: str = "w", lease_s: float = 60.0) -> queue.Claim:
+    def taken(self, worker: str = "w", lease_s: float = 60.0) -> JobRow:
         held = self.take(worker, lease_s)
         assert held is not None
         return held
@@ -184,7 +184,7 @@ class Hand:
         with self.database.read() as connection:
             return queue.find_job(connection, job.id)
 
-    def fail(self, held: queue.Claim, error: str = "broke", trace: str = "Trace") -> JobState:
+    def fail(self, held: JobRow, error: str = "broke", trace: str = "Trace") -> JobState:
         with self.database.write() as connection:
             return queue.fail(connection, held, error, trace)
 

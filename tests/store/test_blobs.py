@@ -304,5 +304,5 @@ def test_what_is_there_already_is_made_durable_too(
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", lambda number: synced.append(os.fstat(number).st_ino))
     blobs.put(b"depth")
-    folder = blobs._path(DIGEST).parent
+    folder = blobs.path(DIGEST).parent
     assert folder.stat().st_ino in synced

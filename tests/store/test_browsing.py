@@ -182,11 +182,9 @@ def test_poses_of_a_run_are_those_of_plain_python(
             found, count = poses_of_run(connection, hall.number, run)
             counted = count_run(connection, hall.number, run)
         assert expected
-        assert [(one.frame_id, one.at, one.pose) for one in found] == [
-            (one.id, one.captured_at, one.pose) for one in expected
-        ]
+        assert found == [(one.id, one.captured_at, one.pose) for one in expected]
         assert count == len(found)
-        assert {(one.robot, one.parent): one.count for one in counted} == Counter(
+        assert {(robot, parent): count for robot, parent, count in counted} == Counter(
             (one.robot, one.pose_parent) for one in own
         )
 
@@ -209,8 +207,8 @@ def test_poses_are_taken_evenly(store: Store, hall: MapRow, received: Received) 
             run = Run(session="s", parent_frame="p", most=most)
             found, count = poses_of_run(connection, hall.number, run)
         assert count == 11
-        assert [one.at - START.timestamp() for one in found] == list(places), most
-        assert found[0].frame_id == rows[0].id  # of two of one time, the first that came
+        assert [at - START.timestamp() for _, at, _ in found] == list(places), most
+        assert found[0][0] == rows[0].id  # of two of one time, the first that came
 
 
 SEARCHED = "USING COVERING INDEX ix_frames_searched"

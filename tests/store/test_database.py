@@ -21,8 +21,8 @@ from sqlalchemy import create_engine
 
 from sceneprint.errors import NewerSchema, UnusableStore
 from sceneprint.store import Store, open_database
+from sceneprint.store.database import known_revisions, migration_config, revision_of
 from sceneprint.store.maps import find_map
-from sceneprint.store.schema import known_revisions, migration_config, revision_of
 from sceneprint.store.tables import MapRow, metadata
 
 TABLES = [

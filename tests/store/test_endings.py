@@ -10,7 +10,7 @@ import pytest
 
 from sceneprint.errors import LostLease
 from sceneprint.store import Store, queue
-from sceneprint.store.tables import JobRow
+from sceneprint.store.tables import JobRow, jobs
 from sceneprint_client.api import JobState
 
 Queued = Callable[..., JobRow]
@@ -42,7 +42,7 @@ def test_a_job_that_breaks_waits_longer_each_time_and_is_dead_after_three(
     job = queued("a")
     for attempt, wait in ((1, 2.0), (2, 8.0)):
         held = hand.taken()
-        assert held.job.attempts == attempt
+        assert held.attempts == attempt
         before = time.time()
         assert hand.fail(held, f"error {attempt}", f"trace {attempt}") == JobState.QUEUED
         now = hand.row(job)
@@ -83,7 +83,7 @@ def test_a_job_whose_workers_all_fell_silent_is_buried(
     silent = queued("a")
     for attempt in range(1, 11):
         held = hand.taken()
-        assert (held.job.number, held.job.attempts) == (silent.number, attempt)
+        assert (held.number, held.attempts) == (silent.number, attempt)
         with store.database.write() as connection:  # its last lease still runs
             assert queue.dead_letter(connection) == []
         turned(silent, leased_until=time.time() - 1)
@@ -91,7 +91,7 @@ def test_a_job_whose_workers_all_fell_silent_is_buried(
             with store.database.write() as connection:  # another may try
                 assert queue.dead_letter(connection) == []
     lively = queued("b")
-    assert hand.taken().job.number == lively.number  # and the other not an eleventh time
+    assert hand.taken().number == lively.number  # and the other not an eleventh time
     assert hand.due()  # to be buried
     with store.database.write() as connection:
         (buried,) = queue.dead_letter(connection)
@@ -107,11 +107,11 @@ def test_a_job_whose_workers_all_fell_silent_is_buried(
 def test_what_was_tried_goes_behind_what_was_not(hand: Any, queued: Queued, turned: Turned) -> None:
     """A machine that dies again and again does not use up the tries of the oldest job."""
     first, second = queued("a"), queued("b")
-    assert hand.taken().job.number == first.number
+    assert hand.taken().number == first.number
     turned(first, leased_until=time.time() - 1)
-    assert hand.taken().job.number == second.number
+    assert hand.taken().number == second.number
     turned(second, leased_until=time.time() - 1)
-    assert hand.taken().job.number == first.number
+    assert hand.taken().number == first.number
 
 
 def test_silence_is_not_counted_as_breaking_down(hand: Any, queued: Queued, turned: Turned) -> None:
@@ -132,14 +132,14 @@ def test_cancelling_takes_a_job_from_whoever_has_it(
     running, waiting, over, other = (queued(name) for name in "abcd")
     held = hand.taken()
     with store.database.write() as connection:
-        queue.cancel_of(connection, waiting.frame_number)
+        queue.cancel_jobs(connection, jobs.c.frame_number == waiting.frame_number)
     assert hand.row(waiting).state == JobState.CANCELLED
     done = hand.taken()
-    assert done.job.number == over.number  # not the cancelled one
+    assert done.number == over.number  # not the cancelled one
     with store.database.write() as connection:
         queue.finish(connection, done, JobState.SUCCEEDED)
-        queue.cancel_of(connection, over.frame_number)
-        queue.cancel_of(connection, running.frame_number)
+        queue.cancel_jobs(connection, jobs.c.frame_number == over.frame_number)
+        queue.cancel_jobs(connection, jobs.c.frame_number == running.frame_number)
     assert hand.row(over).state == JobState.SUCCEEDED
     with pytest.raises(LostLease), store.database.write() as connection:
         queue.finish(connection, held, JobState.SUCCEEDED)
@@ -153,7 +153,7 @@ def test_what_is_given_back_was_never_tried(store: Store, hand: Any, queued: Que
     job = queued("a")
     for token in (1, 2, 3, 4, 5):  # as often as workers are stopped
         held = hand.taken()
-        assert (held.token, held.job.attempts) == (token, 1)
+        assert (held.token, held.attempts) == (token, 1)
         with store.database.write() as connection:
             queue.give_back(connection, held)
         now = hand.row(job)

@@ -15,6 +15,7 @@ from sceneprint.store import frames as stored
 from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import signatures as signed
+from sceneprint.store.deletion import remove_map
 from sceneprint.store.tables import FrameRow, MapRow, events, keys, signatures
 from sceneprint_client.api import FrameState
 from sceneprint_client.api.listing import FrameListing
@@ -190,7 +191,7 @@ def test_pages_follow_the_order_of_arrival(
             connection, hall.number, first[-1].number, 9, FrameListing()
         )
         found = frame_queries.list_frames(connection, hall.number, None, 9, done)
-        assert stored_maps.count_frames(connection, hall.number) == {"indexed": 1, "received": 4}
+        assert stored.count_states(connection, hall.number) == {"indexed": 1, "received": 4}
         assert stored.count_states(connection) == {"indexed": 1, "received": 4}
     assert [frame.number for frame in first + rest] == [frame.number for frame in frames]
     assert [frame.number for frame in found] == [frames[3].number]
@@ -207,7 +208,7 @@ def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(
     with store.database.write() as connection:
         job = queue.enqueue(connection, "sign", mine.number)
         kept = queue.enqueue(connection, "sign", theirs.number)
-        blobs = stored_maps.remove_map(connection, hall)
+        blobs = remove_map(connection, hall)
     assert sorted(blobs) == sorted(["11" * 32, f"{mine.number:064d}"])
     with store.database.read() as connection:
         assert [row.name for row in stored_maps.list_maps(connection)] == ["other"]

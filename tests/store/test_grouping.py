@@ -13,7 +13,7 @@ from sqlalchemy import Connection, event, func, select
 from sceneprint.errors import FrameConflict, LostLease, StoreFull
 from sceneprint.logs import of_request, request_id
 from sceneprint.store import Database, Store
-from sceneprint.store.batching import MOST_TOGETHER, Grouping, _Waiting
+from sceneprint.store.database import MOST_TOGETHER, Grouping, _Waiting
 from sceneprint.store.events import record_event
 from sceneprint.store.tables import events
 

@@ -14,10 +14,11 @@ from sqlalchemy import text
 from benchmarks.fleet.postgres import Server
 from sceneprint.store import open_database
 from sceneprint.store.deletion import doomed_blobs
+from sceneprint.store.events import last_event
 from sceneprint.store.frames import add_frame, frame_of
 from sceneprint.store.keys import list_keys
+from sceneprint.store.maps import MapUsage, counted_usage, use_of
 from sceneprint.store.queue import enqueue, find_job
-from sceneprint.store.quotas import MapUsage, counted_usage, last_event, use_of
 from sceneprint.store.tables import frame_tags
 from sceneprint_client.api import FrameState
 

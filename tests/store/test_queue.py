@@ -41,7 +41,7 @@ def test_what_matters_more_comes_first_and_of_equals_what_came_first(
 ) -> None:
     jobs = [queued(str(i), priority) for i, priority in enumerate([0, 5, 0, 5, -1, 9])]
     turned(jobs[2], run_after=1.0)  # waits longest, but came later than the first
-    order = [hand.taken().job.number - jobs[0].number for _ in jobs]
+    order = [hand.taken().number - jobs[0].number for _ in jobs]
     assert order == [5, 1, 3, 0, 2, 4]
     assert hand.take() is None
 
@@ -52,12 +52,12 @@ def test_a_claim_is_a_lease_with_a_token(store: Store, hand: Any, queued: Queued
     before = time.time()
     held = hand.taken("host:7", 45.0)
     after = time.time()
-    assert held.job == hand.row(job)
-    assert (held.job.state, held.job.worker, held.job.attempts) == (JobState.RUNNING, "host:7", 1)
-    assert (held.token, held.job.token) == (1, 1)
-    assert held.job.started_at is not None
-    assert before <= held.job.started_at <= after
-    assert held.job.leased_until == held.job.started_at + 45.0
+    assert held == hand.row(job)
+    assert (held.state, held.worker, held.attempts) == (JobState.RUNNING, "host:7", 1)
+    assert (held.token, held.token) == (1, 1)
+    assert held.started_at is not None
+    assert before <= held.started_at <= after
+    assert held.leased_until == held.started_at + 45.0
     assert not hand.due()
     assert hand.take() is None
 
@@ -69,7 +69,7 @@ def test_a_job_waits_for_its_time(store: Store, hand: Any, queued: Queued, turne
     assert hand.take() is None
     turned(job, run_after=time.time() - 0.001)
     assert hand.due()
-    assert hand.taken().job.number == job.number
+    assert hand.taken().number == job.number
 
 
 def test_a_lease_that_is_over_is_given_to_another_with_a_greater_token(
@@ -82,7 +82,7 @@ def test_a_lease_that_is_over_is_given_to_another_with_a_greater_token(
     turned(job, leased_until=time.time() - 0.001)
     assert hand.due()
     second = hand.taken("second")
-    assert (second.token, second.job.attempts, second.job.worker) == (2, 2, "second")
+    assert (second.token, second.attempts, second.worker) == (2, 2, "second")
     assert second.token > first.token
     for late in (
         lambda c: queue.finish(c, first, JobState.SUCCEEDED),
@@ -93,7 +93,7 @@ def test_a_lease_that_is_over_is_given_to_another_with_a_greater_token(
         lost = pytest.raises(LostLease, match=f"{job.id} is no longer held")
         with lost, store.database.write() as connection:
             late(connection)
-        assert hand.row(job) == second.job
+        assert hand.row(job) == second
 
 
 def test_what_comes_late_leaves_nothing(
@@ -126,11 +126,11 @@ def test_renewing_extends_the_lease_and_nothing_else(
 ) -> None:
     queued("a")
     held = hand.taken("w", 10.0)
-    turned(held.job, leased_until=time.time() - 1)  # late, but nobody else came
+    turned(held, leased_until=time.time() - 1)  # late, but nobody else came
     before = time.time()
     with store.database.write() as connection:
         queue.renew(connection, held, 30.0)
-    now = hand.row(held.job)
+    now = hand.row(held)
     assert now.leased_until is not None
     assert before + 30.0 <= now.leased_until <= time.time() + 30.0
     assert (now.token, now.attempts, now.state) == (1, 1, JobState.RUNNING)

@@ -28,7 +28,7 @@ def work(i):
         with database.write() as connection:
             queue.finish(connection, held, JobState.SUCCEEDED)
             next_revision(connection, int(ARGS[1]))
-        done.append(held.job.number)
+        done.append(held.number)
 """
 
 
@@ -47,7 +47,7 @@ def test_threads_at_one_queue_get_each_job_once(store: Store, hall: MapRow, queu
                 with store.database.write() as connection:
                     queue.finish(connection, held, JobState.SUCCEEDED)
                     next_revision(connection, hall.number)
-                done.append(held.job.number)
+                done.append(held.number)
         except BaseException as error:
             raised.append(error)
 
@@ -94,9 +94,9 @@ def test_threads_that_outlive_their_leases_take_effect_once(
                     with store.database.write() as connection:
                         queue.finish(connection, held, JobState.SUCCEEDED)
                         next_revision(connection, hall.number)
-                    effects.append(held.job.number)
+                    effects.append(held.number)
                 except queue.LostLease:
-                    lost.append(held.job.number)
+                    lost.append(held.number)
         except BaseException as error:
             raised.append(error)
 

@@ -7,10 +7,20 @@ from collections.abc import Collection
 import pytest
 from sqlalchemy import Connection
 
-from sceneprint.store import Store, quotas
-from sceneprint.store.events import Wanted, anchor_of, holds_anchor, list_events, record_event
-from sceneprint.store.maps import add_map, find_map, keep_model, remove_map
-from sceneprint.store.retention import floor_of, floors, remove_events, spent_numbers
+from sceneprint.store import Store, events
+from sceneprint.store.deletion import remove_map
+from sceneprint.store.events import (
+    Wanted,
+    anchor_of,
+    floor_of,
+    floors,
+    holds_anchor,
+    list_events,
+    record_event,
+    remove_events,
+    spent_numbers,
+)
+from sceneprint.store.maps import add_map, find_map, keep_model
 
 
 @pytest.fixture
@@ -109,17 +119,17 @@ def test_of_a_map_that_is_gone_nothing_is_missed_after_its_last_event(filled):
 
 
 def test_names_of_maps_that_are_gone_are_bounded(filled, monkeypatch):
-    monkeypatch.setattr(quotas, "MOST", 3)
+    monkeypatch.setattr(events, "MOST_FORMER", 3)
     with filled.database.write() as connection:
         lasts = {}
         for name in ("limited", "a", "b", "c", "d"):
             limits = {"quota_frames": 7} if name == "limited" else None
             remove_map(connection, add_map(connection, name, None, "m" * 64, limits))
             lasts[name] = numbers_of(connection, name)[-1]
-        known = {name: quotas.last_event(connection, name) for name in lasts}
+        known = {name: events.last_event(connection, name) for name in lasts}
         # of the one that is forgotten it is known that it went before the oldest that is not
         assert known == lasts | {"a": lasts["b"]}
         for name, quota in (("limited", 7), ("b", None), ("a", None)):
             made = add_map(connection, name, None, "m" * 64)
             assert (made.quota_frames, made.quota_bytes) == (quota, None)
-        assert quotas.last_event(connection, "b") == 0  # fewer than can be remembered: none is
+        assert events.last_event(connection, "b") == 0  # fewer than can be remembered: none is

@@ -20,13 +20,12 @@ from sqlalchemy import create_engine, insert, select, text
 from benchmarks.fleet.postgres import Server
 from sceneprint.errors import StoreAway, StoreLocked, UnusableStore
 from sceneprint.store import Database, Store, database, open_database, open_store
-from sceneprint.store.database import is_there, reach_database
+from sceneprint.store.database import is_there, known_revisions, migration_config, reach_database
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import add_frame, frames_of
 from sceneprint.store.keys import KeyChange, create_key, list_changes, list_keys, note
 from sceneprint.store.maps import add_map, find_map, keep_model, list_maps, map_of
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.schema import known_revisions, migration_config
 from sceneprint.store.tables import MapRow, events, maps, metadata
 
 Race = Callable[..., list[Any]]
@@ -141,8 +140,8 @@ def test_the_blobs_of_a_database_that_is_there_are_not_made_up_for(
 def test_a_turn_that_another_process_keeps_is_said(
     served: Database, keeper: Callable[[], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("BUSY_S", "HELD_OF_FLEET_S"):
-        monkeypatch.setattr(database, name, 0.2)
+    monkeypatch.setattr(database, "BUSY_S", 0.2)
+    monkeypatch.setattr(postgres, "HELD_S", 0.2)
     for _ in range(2):  # the second, who comes after one that waited in vain, waits less
         with (
             pytest.raises(StoreLocked, match=r"nothing was stored\. Come back.*pg_stat_activity"),

@@ -22,30 +22,12 @@ from sqlalchemy import Connection, func, select
 from sceneprint.engine.search.local_index import index_folder, is_index_folder
 from sceneprint.engine.serializers import when
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
-from sceneprint.index.manifest import GenerationManifest, manifests, read_manifest
+from sceneprint.index.generation_files import GenerationManifest, manifests, read_manifest
 from sceneprint.settings import Settings
-from sceneprint.store import Blobs, Database, FolderBlobs, Store
+from sceneprint.store import Blobs, Database, FolderBlobs, Store, frame_queries, metrics
 from sceneprint.store.events import anchor_number, newest_number
-from sceneprint.store.frame_queries import (
-    bytes_of_files,
-    count_uploads,
-    frames_with_uploads,
-    spread_frames,
-    weigh,
-)
 from sceneprint.store.frames import count_states
-from sceneprint.store.maps import count_frames, find_map, list_maps
-from sceneprint.store.metrics import (
-    Sample,
-    add_sample,
-    at_work,
-    count_events,
-    count_jobs_of,
-    count_maps,
-    count_samples,
-    oldest_waiting,
-    samples_since,
-)
+from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.queue import count_jobs, read_clock
 from sceneprint.store.signatures import count_indexed
 from sceneprint.store.tables import MapRow
@@ -201,22 +183,14 @@ def sizes(settings: Settings, store: Store) -> Sizes:
 def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRow) -> Sizes:
     """Bytes of what one map takes: of it alone, so that nothing shows of any other.
 
-    A blob that several frames share counts for each of them.
-
-    Parameters
-    ----------
-    connection : of the store's database
-    store : see Store
-    indexes : folder of search indexes
-    row : of the map
-    """
-    numbers, total = frames_with_uploads(connection, row.number, WEIGHED)
-    weight = weigh(connection, numbers)
-    artifacts = _of_artifacts(store.blobs, weight.artifacts)
+    A blob that several frames share counts for each of them."""
+    numbers, total = frame_queries.frames_with_uploads(connection, row.number, WEIGHED)
+    uploads, signed, made = frame_queries.weigh(connection, numbers)
+    artifacts = _of_artifacts(store.blobs, made)
     share = max(len(numbers), 1)
     return Sizes(
-        database=weight.signature_bytes * total // share,
-        blobs=(weight.upload_bytes + artifacts) * total // share,
+        database=signed * total // share,
+        blobs=(uploads + artifacts) * total // share,
         index=sum(_files_of(index_folder(indexes, row), deep=True)),
         free=None,
         disk=None,
@@ -236,11 +210,11 @@ def _of_database(database: Database) -> int | None:
 def _of_objects(store: Store) -> int:
     """Bytes of all blobs in an object store: some of the rows are weighed, nothing is listed."""
     with store.database.read() as connection:
-        some = spread_frames(connection, SPREAD)
-        weight = weigh(connection, some)
-        total = count_uploads(connection)
-        files = bytes_of_files(connection)
-    each = (weight.upload_bytes + _of_artifacts(store.blobs, weight.artifacts)) / max(len(some), 1)
+        some = frame_queries.spread_frames(connection, SPREAD)
+        uploads, _, artifacts = frame_queries.weigh(connection, some)
+        total = frame_queries.count_uploads(connection)
+        files = frame_queries.bytes_of_files(connection)
+    each = (uploads + _of_artifacts(store.blobs, artifacts)) / max(len(some), 1)
     return int(each * total) + files
 
 
@@ -309,38 +283,17 @@ SERVICE, WORKER = "service", "worker"
 
 @dataclass(frozen=True)
 class Figures:
-    """How the whole store is.
-
-    Parameters
-    ----------
-    frames, jobs : number in each state that has any
-    maps : number
-    oldest_waiting_s : see Stats; 0 where none waits
-    indexes, workers, sizes : see Stats
-    began : workers that began in the last hour
-    events : number of the newest event
-    replica : see Stats
+    """How the whole store is: its statistics, workers that began in the last hour, and the number
+    of the newest event.
     """
 
-    frames: dict[str, int]
-    jobs: dict[str, int]
-    maps: int
-    oldest_waiting_s: float
-    indexes: list[IndexState]
-    workers: list[WorkerSeen]
-    sizes: Sizes
+    stats: Stats
     began: int
     events: int
-    replica: ReplicaSeen | None = None
 
 
 class Statistics:
-    """Figures of one store.
-
-    Parameters
-    ----------
-    store, settings, bell : see there
-    """
+    """Figures of one store."""
 
     def __init__(self, store: Store, settings: Settings, bell: Wakeup) -> None:
         self._store, self._settings, self._bell = store, settings, bell
@@ -366,19 +319,22 @@ class Statistics:
         with self._store.database.read() as connection:
             row = None if map_name is None else find_map(connection, map_name)
             kinds = [f"frame.{outcome}" for outcome in OUTCOMES]
-            happened = count_events(connection, kinds, start, MINUTE_S, map_name)
-            samples: list[Sample] | None = None
+            happened = metrics.count_events(connection, kinds, start, MINUTE_S, map_name)
+            samples: list[metrics.Sample] | None = None
             if row is None:
                 frames, jobs = count_states(connection), count_jobs(connection)
-                maps, indexes = count_maps(connection), index_states(connection, self._indexes)
-                samples = samples_since(connection, SERVICE, start)
-                oldest = oldest_waiting(connection)
+                maps, indexes = (
+                    metrics.count_maps(connection),
+                    index_states(connection, self._indexes),
+                )
+                samples = metrics.samples_since(connection, SERVICE, start)
+                oldest = metrics.oldest_waiting(connection)
                 workers = self.workers(connection)
             else:
-                frames = count_frames(connection, row.number)
-                jobs = count_jobs_of(connection, row.number)
+                frames = count_states(connection, row.number)
+                jobs = count_jobs(connection, row.number)
                 maps, indexes = 1, [index_state(connection, self._indexes, row)]
-                oldest, workers = oldest_waiting(connection, row.number), None
+                oldest, workers = metrics.oldest_waiting(connection, row.number), None
             taken = None if row is None else self._sizes_of_map(connection, row)
         return Stats(
             at=when(now),
@@ -420,28 +376,17 @@ class Statistics:
     def began(self, worker: str) -> None:
         """Note that a worker has begun; where that cannot be written, nobody will know."""
         with suppress(SceneprintError), self._store.database.write(turn=False) as connection:
-            add_sample(connection, WORKER, worker, {})
+            metrics.add_sample(connection, WORKER, worker, {})
 
     def _look(self) -> Figures:
-        now = time.time()
+        stats = self.tell(minutes=1)
         with self._store.database.read() as connection:
-            oldest = oldest_waiting(connection)
-            return Figures(
-                frames=count_states(connection),
-                jobs=count_jobs(connection),
-                maps=count_maps(connection),
-                oldest_waiting_s=0.0 if oldest is None else max(now - oldest, 0.0),
-                indexes=index_states(connection, self._indexes),
-                workers=self.workers(connection),
-                sizes=self.sizes(),
-                began=count_samples(connection, WORKER, now - HOUR_S),
-                events=newest_number(connection),
-                replica=self.replica(),
-            )
+            began = metrics.count_samples(connection, WORKER, time.time() - HOUR_S)
+            return Figures(stats, began, newest_number(connection))
 
     def workers(self, connection: Connection) -> list[WorkerSeen]:
         """Processes that wait for jobs, with SQLite on this machine, and those that have one."""
-        busy = at_work(connection, read_clock(connection))
+        busy = metrics.at_work(connection, read_clock(connection))
         names = sorted({*self._bell.listeners(connection), *busy})
         return [WorkerSeen(name=name, job_id=busy.get(name)) for name in names]
 
@@ -473,10 +418,13 @@ def _use(row: MapRow) -> MapUse:
 
 
 def _minutes(
-    happened: Mapping[tuple[int, str], int], samples: list[Sample] | None, start: float, count: int
+    happened: Mapping[tuple[int, str], int],
+    samples: list[metrics.Sample] | None,
+    start: float,
+    count: int,
 ) -> list[Minute]:
     """What happened in each minute; a minute in which nothing did is told too."""
-    of_minute: dict[int, list[Sample]] = {place: [] for place in range(count)}
+    of_minute: dict[int, list[metrics.Sample]] = {place: [] for place in range(count)}
     for sample in samples or ():
         place = int((sample.at - start) // MINUTE_S)
         if place in of_minute:  # a clock that was set back may be ahead of now
@@ -493,7 +441,7 @@ def _minutes(
 
 
 def _recent_counts(
-    happened: Mapping[tuple[int, str], int], places: range, samples: list[Sample] | None
+    happened: Mapping[tuple[int, str], int], places: range, samples: list[metrics.Sample] | None
 ) -> dict[str, Any]:
     """Fields of `Counted` for some minutes."""
     told: dict[str, Any] = {

@@ -15,19 +15,12 @@ from typing import Any
 
 from sqlalchemy import Connection
 
+from sceneprint import errors
 from sceneprint.engine.ingest.uploads import Upload, Uploads, item_of
 from sceneprint.engine.ingest.uploads import UploadResult as UploadOutcome
 from sceneprint.engine.jobs.lifecycle import get_job
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
-from sceneprint.engine.maps.map_frames import row_of
-from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
-from sceneprint.errors import (
-    SceneprintError,
-    StoreError,
-    UnreadableArchive,
-    UnreadableFrame,
-    UnusableStore,
-)
+from sceneprint.engine.upkeep.repair import collect_deleted_blobs
 from sceneprint.formats.archive.archive import Archive, open_archive
 from sceneprint.formats.archive.entries import Inflater
 from sceneprint.formats.dataset import FrameReference
@@ -36,17 +29,9 @@ from sceneprint.formats.dataset.upload_metadata import parent_frame_of, session_
 from sceneprint.store import Store, queue
 from sceneprint.store.blobs.folder import IncomingBlob
 from sceneprint.store.database_errors import unusable
-from sceneprint.store.idempotency import IdempotentRequest
+from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map
-from sceneprint.store.queue import (
-    JobFile,
-    files_of,
-    find_job,
-    finished_with_file,
-    items_of,
-    remove_parts,
-    unknown_job,
-)
+from sceneprint.store.opaque_ids import row_of
 from sceneprint_client.api import Job, Page
 from sceneprint_client.api.frames import ImportItem, ImportOptions
 from sceneprint_client.frame_files import meta_of
@@ -69,13 +54,13 @@ class Step:
     name: str
     sequence: FrameSequence | None = None
     reference: FrameReference | None = None
-    refused: SceneprintError | None = None
+    refused: errors.SceneprintError | None = None
 
 
 def steps_of(archive: Archive, every: int) -> Iterator[Step]:
     """All there is to tell of an archive, in the same order each time."""
     for name, reason in archive.refused:
-        yield Step(name, refused=UnreadableArchive(reason))
+        yield Step(name, refused=errors.UnreadableArchive(reason))
     for sequence in archive.sequences:
         for reference in sequence.frames[::every]:
             yield Step(archive.name_of(reference), sequence, reference)
@@ -95,18 +80,10 @@ def next_of(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[Step
 def take(
     uploads: Uploads, task: LongJob, archive: Archive, steps: Sequence[Step], options: ImportOptions
 ) -> list[ImportItem]:
-    """Take some frames in one commit, as long as the job is this worker's.
-
-    Parameters
-    ----------
-    uploads : what takes them
-    task : of the import
-    archive, steps : see `next_of`
-    options : of the import
-    """
+    """Take some frames in one commit, as long as the job is this worker's."""
 
     def fence(connection: Connection) -> None:  # cancelled, or of a map that was made anew
-        queue.check_held(connection, task.claim)
+        queue.check_held(connection, task.job)
 
     outcomes: list[UploadOutcome | None] = []
     taken = []
@@ -114,9 +91,9 @@ def take(
         try:
             taken.append(_upload(archive, step, options))
             outcomes.append(None)
-        except StoreError:
+        except errors.StoreError:
             raise
-        except SceneprintError as error:
+        except errors.SceneprintError as error:
             outcomes.append(UploadOutcome(None, error=type(error)(archive.told(error))))
         except MemoryError:
             outcomes.append(_too_large())
@@ -144,7 +121,7 @@ def _added(
 def _too_large() -> UploadOutcome:
     return UploadOutcome(
         None,
-        error=UnreadableFrame(
+        error=errors.UnreadableFrame(
             "The frame needs more memory than a worker may use. Send a smaller one."
         ),
     )
@@ -208,11 +185,11 @@ class Receiver:
         for piece in self._inflater.pieces(chunk):
             self._blob.write(piece)
 
-    def end(self) -> JobFile:
+    def end(self) -> queue.JobFile:
         """Keep it, durable; raises as `write`."""
         for piece in self._inflater.end():
             self._blob.write(piece)
-        return JobFile(FILE, self._blob.keep(), self._blob.size, "application/octet-stream")
+        return queue.JobFile(FILE, self._blob.keep(), self._blob.size, "application/octet-stream")
 
 
 class Imports:
@@ -248,7 +225,7 @@ class Imports:
     def begin(
         self,
         map_name: str,
-        archive: JobFile,
+        archive: queue.JobFile,
         options: ImportOptions,
         once: IdempotentRequest | None = None,
     ) -> tuple[Job, bool]:
@@ -261,17 +238,15 @@ class Imports:
 
         Raises
         ------
-        UnknownMap, IdempotencyConflict : see `Tasks.begin_once`; the archive is removed.
+        UnknownMap, IdempotencyConflict : see `Tasks.begin`; the archive is removed.
         UnusableStore : an import of the same archive has just ended, and removed it.
         """
         data = options.model_dump(mode="json")
         try:
-            job, again = self._tasks.begin_once(
-                KIND, map_name, data, options.priority, [archive], once
-            )
+            job, again = self._tasks.begin(KIND, map_name, data, options.priority, [archive], once)
         except Swept as error:
-            raise UnusableStore(f"{error} Send the archive again.") from error
-        except SceneprintError:
+            raise errors.UnusableStore(f"{error} Send the archive again.") from error
+        except errors.SceneprintError:
             collect_deleted_blobs(self._store, [archive.blob])
             raise
         if again:
@@ -284,7 +259,7 @@ class Imports:
             find_map(connection, map_name)
         job = get_job(self._store, job_id)
         if job.kind != KIND or job.map != map_name:
-            raise unknown_job(job_id)
+            raise queue.unknown_job(job_id)
         return job
 
     def items(
@@ -300,8 +275,8 @@ class Imports:
         self.get(map_name, job_id)
         first = row_of(cursor) or 0
         with self._store.database.read() as connection:
-            number = find_job(connection, job_id).number
-            found = items_of(connection, number, first, limit + 1)
+            number = queue.find_job(connection, job_id).number
+            found = queue.items_of(connection, number, first, limit + 1)
         more = str(first + limit) if len(found) > limit else None
         return Page[ImportItem](
             items=[ImportItem(**one) for one in found[:limit]], next_cursor=more
@@ -311,19 +286,19 @@ class Imports:
         """Import a part of an archive: frames until the time is over, at least some."""
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
-            file = files_of(connection, task.claim.job.number).get(FILE)
+            file = queue.files_of(connection, task.job.number).get(FILE)
         if file is None:
-            raise UnreadableArchive(
+            raise errors.UnreadableArchive(
                 "The archive was removed because its import failed or was cancelled too long "
                 "ago. Send it again."
             )
         try:
             with self._opened(file, options.name) as archive:
                 return self._slice(task, archive, options, until)
-        except UnreadableArchive:  # trying again cannot help, and it may be large
+        except errors.UnreadableArchive:  # trying again cannot help, and it may be large
             with self._store.database.write() as connection:
-                number = task.claim.job.number
-                gone = remove_parts(connection, number, items=False, files=[FILE])
+                number = task.job.number
+                gone = queue.remove_parts(connection, number, items=False, files=[FILE])
             collect_deleted_blobs(self._store, gone)
             raise
 
@@ -339,23 +314,23 @@ class Imports:
         self._tidied = time.monotonic()
         long_ago = time.time() - KEPT_S
         with self._store.database.read() as connection:  # most often there is none: no lock
-            if not finished_with_file(connection, KIND, FILE, long_ago):
+            if not queue.finished_with_file(connection, KIND, FILE, long_ago):
                 return 0
         with self._store.database.write() as connection:
             gone = [
                 blob
-                for number in finished_with_file(connection, KIND, FILE, long_ago)
-                for blob in remove_parts(connection, number, items=False, files=[FILE])
+                for number in queue.finished_with_file(connection, KIND, FILE, long_ago)
+                for blob in queue.remove_parts(connection, number, items=False, files=[FILE])
             ]
         collect_deleted_blobs(self._store, gone)
         return len(gone)
 
     @contextmanager
-    def _opened(self, file: JobFile, name: str) -> Iterator[Archive]:
+    def _opened(self, file: queue.JobFile, name: str) -> Iterator[Archive]:
         try:
             opened = self._store.blobs.open(file.blob)
         except FileNotFoundError as error:
-            raise UnreadableArchive(
+            raise errors.UnreadableArchive(
                 "The archive is missing from the store. Send it again."
             ) from error
         except OSError as error:

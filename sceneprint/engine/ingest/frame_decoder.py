@@ -13,15 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from sceneprint import errors
 from sceneprint.engine.serializers import pose_matrix
-from sceneprint.errors import (
-    InvalidRequest,
-    MissingDependency,
-    SceneprintError,
-    UnreadableCloud,
-    UnreadableFrame,
-    UnsupportedType,
-)
 from sceneprint.formats.dataset import decode_frame
 from sceneprint.formats.points import UNSAID, decode_cloud, decode_scan, format_of
 from sceneprint.store.tables import FrameRow
@@ -207,10 +200,12 @@ def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None) -> Read:
             units_per_metre=meta.units_per_metre,
             pose=pose,
         )
-    except MissingDependency as error:  # of this machine, and yet it is the file that asks for it
-        raise UnsupportedType(str(error)) from error
+    except (
+        errors.MissingDependency
+    ) as error:  # of this machine, and yet it is the file that asks for it
+        raise errors.UnsupportedType(str(error)) from error
     if scan.file_format != _packing(data):  # it could not be read again without what was said
-        raise UnreadableCloud(
+        raise errors.UnreadableCloud(
             f"The file is read as {scan.file_format.upper()} but does not start like one. Write "
             "the file again."
         )
@@ -230,25 +225,25 @@ def _refuse(meta: FrameMeta, kind: str, defaults: dict[str, object]) -> None:
     """See that nothing is said of a frame that would have no effect on it; InvalidRequest."""
     said = [name for name, default in defaults.items() if getattr(meta, name) != default]
     if said:
-        raise InvalidRequest(
+        raise errors.InvalidRequest(
             f"The frame is a {kind}, and {' and '.join(f'`{name}`' for name in said)} would have "
             "no effect. Leave it out, or check that you sent the right file.",
             tuple((name, f"does not apply to a {kind}") for name in said),
         )
 
 
-def _without_camera(data: bytes) -> SceneprintError:
+def _without_camera(data: bytes) -> errors.SceneprintError:
     """Why an upload without intrinsics is not read."""
     if data.startswith((b"\x89PNG", b"\x93NUMPY")):
-        return InvalidRequest(
+        return errors.InvalidRequest(
             "The frame is a depth image, but its intrinsics are missing. Send width, height, "
             "fx, fy, cx and cy of the camera. If it is a point cloud as NPY, give it the shape "
             "(N, 3) or (N, 4).",
             (("intrinsics", "needed for a depth image"),),
         )
     if not data:
-        return UnreadableFrame("The file is empty. Write it again.")
-    return UnreadableFrame(
+        return errors.UnreadableFrame("The file is empty. Write it again.")
+    return errors.UnreadableFrame(
         "The file is neither a depth image (PNG or NPY) nor a point cloud (PLY, PCD, LAS, LAZ "
         "or NPY). For a KITTI file, set format=kitti."
     )

@@ -18,25 +18,14 @@ from sqlalchemy import Connection, select
 
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upload
-from sceneprint.engine.upkeep.blob_garbage import collect_blobs, collect_deleted_blobs
-from sceneprint.engine.upkeep.repair import take_upload, without_loss
-from sceneprint.errors import (
-    FrameConflict,
-    InvalidRequest,
-    QuotaExceeded,
-    SceneprintError,
-    StoreError,
-    UnknownMap,
-    UnusableStore,
-)
+from sceneprint.engine.upkeep import repair
 from sceneprint.store import Store
-from sceneprint.store.batching import Grouping
+from sceneprint.store.database import Grouping
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import add_frame, frames_of_content, living_frame, loosen, renew_frame
-from sceneprint.store.idempotency import IdempotentRequest
-from sceneprint.store.maps import find_map
+from sceneprint.store.keys import IdempotentRequest
+from sceneprint.store.maps import find_map, require_room
 from sceneprint.store.queue import enqueue, jobs_of
-from sceneprint.store.quotas import require_room
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Added, FrameMeta, FrameState
@@ -75,7 +64,7 @@ def find_duplicate(
             return None
         differing = _differing(frame, {"content_id": content, **known})
         if differing:
-            raise FrameConflict(
+            raise errors.FrameConflict(
                 f"Frame {frame.id} of map {row.name} already exists with a different "
                 f"{', '.join(differing)}. Delete it first, send it unchanged, or use another id."
             )
@@ -85,7 +74,7 @@ def find_duplicate(
         if not _differing(frame, known):
             return frame
     if found:
-        raise FrameConflict(
+        raise errors.FrameConflict(
             f"Frame {found[0].id} has the same content, but a different "
             f"{', '.join(_differing(found[0], known))}. A map stores the same content once: "
             "delete that frame first, send it unchanged, or PUT it under its own id."
@@ -107,11 +96,6 @@ def _given_value(name: str, value: Any) -> Any:
     Its viewpoint is part of its content.
     """
     return value["units_per_metre"] if name == "cloud" and value is not None else value
-
-
-def being_signed(state: FrameState) -> bool:
-    """Whether a frame waits for a worker, or has one."""
-    return state in (FrameState.RECEIVED, FrameState.SIGNING)
 
 
 def is_retried(state: FrameState) -> bool:
@@ -138,7 +122,7 @@ class UploadResult:
 
     added: Added | None
     new: bool = False
-    error: SceneprintError | None = None
+    error: errors.SceneprintError | None = None
 
     @property
     def taken(self) -> Added:
@@ -162,11 +146,6 @@ def upload_response(connection: Connection, frame: FrameRow) -> Added:
     return Added(frame_id=frame.id, job_id=job.id, state=frame.state, reason=frame.reason)
 
 
-def stored_response(outcomes: Sequence[UploadResult]) -> dict[str, Any]:
-    """What came of uploads, as JSON that is remembered."""
-    return {"frames": [_stored_outcome(one) for one in outcomes]}
-
-
 def replayed(
     connection: Connection, row: MapRow, data: dict[str, Any]
 ) -> list[UploadResult] | None:
@@ -187,16 +166,17 @@ def replayed(
 
 
 def _stored_outcome(outcome: UploadResult) -> dict[str, Any]:
+    """What came of an upload, as JSON that is remembered."""
     if outcome.added is not None:
         return {"frame_id": outcome.added.frame_id, "new": outcome.new}
     error = outcome.error
-    fields = error.fields if isinstance(error, InvalidRequest) else ()
+    fields = error.fields if isinstance(error, errors.InvalidRequest) else ()
     return {"error": type(error).__name__, "detail": str(error), "fields": fields}
 
 
-def _error(kept: dict[str, Any]) -> SceneprintError:
-    kind: type[SceneprintError] = getattr(errors, kept["error"])
-    if issubclass(kind, InvalidRequest):
+def _error(kept: dict[str, Any]) -> errors.SceneprintError:
+    kind: type[errors.SceneprintError] = getattr(errors, kept["error"])
+    if issubclass(kind, errors.InvalidRequest):
         return kind(kept["detail"], tuple((place, reason) for place, reason in kept["fields"]))
     return kind(kept["detail"])
 
@@ -303,9 +283,9 @@ class Uploads:
         for i, upload in enumerate(uploads):
             try:
                 ready[i] = self._prepared(upload)
-            except StoreError:
+            except errors.StoreError:
                 raise
-            except SceneprintError as error:
+            except errors.SceneprintError as error:
                 outcomes[i] = UploadResult(None, error=error)
         for i in list(ready):
             found = self._settled(map_name, ready[i])
@@ -342,14 +322,19 @@ class Uploads:
                     require_room(connection, row, len(ready.upload.data))
                 if frame is None or is_retried(frame.state):
                     return None
-                if being_signed(frame.state) and frame.novelty is not None:
+                waits = frame.state in (FrameState.RECEIVED, FrameState.SIGNING)
+                if waits and frame.novelty is not None:
                     return None  # its condition may have to be loosened
                 there = upload_response(connection, frame)
-        except (StoreError, UnknownMap):
+        except (errors.StoreError, errors.UnknownMap):
             raise
-        except SceneprintError as error:
+        except errors.SceneprintError as error:
             return UploadResult(None, error=error)
-        return UploadResult(self._healed(map_name, there, ready.upload.data))
+        # what came takes the place of an upload that was lost
+        left = repair.take_upload(self._store, map_name, there.frame_id, ready.upload.data)
+        if left:
+            repair.collect_blobs(self._store, left)
+        return UploadResult(there.model_copy(update={"reason": repair.without_loss(there.reason)}))
 
     def _write(
         self, map_name: str, ready: dict[int, _Prepared], known: list[UploadResult | None],
@@ -382,8 +367,10 @@ class Uploads:
             outcomes = [written.get(i, one) for i, one in enumerate(known)]
             came = [one for one in outcomes if one is not None]
             # what had no room may have it when it is sent again
-            if once is not None and not any(isinstance(one.error, QuotaExceeded) for one in came):
-                once.keep(connection, stored_response(came))
+            if once is not None and not any(
+                isinstance(one.error, errors.QuotaExceeded) for one in came
+            ):
+                once.keep(connection, {"frames": [_stored_outcome(one) for one in came]})
             return outcomes, False
 
         while True:
@@ -391,20 +378,13 @@ class Uploads:
                 for data in blobs.values():
                     self._store.blobs.put(data)
                 found = self._writes.run(do)
-            except SceneprintError:
-                with suppress(UnusableStore):  # leave nothing, on a full disk least of all
-                    collect_blobs(self._store, list(blobs))
+            except errors.SceneprintError:
+                with suppress(errors.UnusableStore):  # leave nothing, on a full disk least of all
+                    repair.collect_blobs(self._store, list(blobs))
                 raise
             if found is not None:
-                collect_deleted_blobs(self._store, left)
+                repair.collect_deleted_blobs(self._store, left)
                 return found
-
-    def _healed(self, map_name: str, there: Added, data: bytes) -> Added:
-        """The frame that is there; what came takes the place of an upload that was lost."""
-        left = take_upload(self._store, map_name, there.frame_id, data)
-        if left:
-            collect_blobs(self._store, left)
-        return there.model_copy(update={"reason": without_loss(there.reason)})
 
 
 def _before(
@@ -420,7 +400,7 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
     upload = ready.upload
     try:  # once more: another upload may have been first
         frame = find_duplicate(connection, row, ready.content, ready.known, upload.frame_id)
-    except FrameConflict as error:
+    except errors.FrameConflict as error:
         left.append(ready.blob)
         return UploadResult(None, error=error)
     if frame is not None and not is_retried(frame.state):
@@ -432,7 +412,7 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
     held = 0 if frame is None or new else frame.bytes
     try:
         require_room(connection, row, len(upload.data) - held, new=new)
-    except QuotaExceeded as error:
+    except errors.QuotaExceeded as error:
         left.append(ready.blob)
         return UploadResult(None, error=error)
     of_blob = {"blob": ready.blob, "bytes": len(upload.data), "novelty": upload.if_novel}

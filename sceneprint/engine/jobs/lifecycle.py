@@ -12,10 +12,8 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection
 
-from sceneprint.engine.maps.map_frames import opened_cursor
 from sceneprint.engine.serializers import job_record
-from sceneprint.engine.upkeep.blob_garbage import collect_blobs
-from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError, UnusableStore
+from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError
 from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import frame_of, set_state
@@ -23,7 +21,6 @@ from sceneprint.store.maps import map_of
 from sceneprint.store.model_switch import REENCODE
 from sceneprint.store.queue import fail_of_dead
 from sceneprint.store.queue import list_jobs as list_stored
-from sceneprint.store.signatures import StoredSignature
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
 from sceneprint_client.api import FrameState, Job, JobState, Page
 
@@ -39,23 +36,23 @@ class Work:
 
     Parameters
     ----------
-    claim : on the job
+    job : as it was claimed
     frame, map : that it is about
     """
 
-    claim: queue.Claim
+    job: JobRow
     frame: FrameRow
     map: MapRow
 
     @property
     def again(self) -> bool:
         """Whether the frame is indexed, stays so all the while, and is signed once more."""
-        return self.claim.job.kind == REENCODE
+        return self.job.kind == REENCODE
 
     @property
     def model_id(self) -> str:
         """Of the model to sign with."""
-        return self.claim.job.model_id or self.map.model_id
+        return self.job.model_id or self.map.model_id
 
 
 class Outdated(Exception):
@@ -65,20 +62,9 @@ class Outdated(Exception):
 def put_back(store: Store, work: Work, after_s: float = 0.0) -> None:
     """Queue again what was claimed and not begun, as when a worker is told to stop."""
     with suppress(LostLease), store.database.write() as connection:
-        queue.give_back(connection, work.claim, after_s)
+        queue.give_back(connection, work.job, after_s)
         if not work.again:
             set_state(connection, work.frame.number, FrameState.RECEIVED)
-
-
-def leave(store: Store, work: Work, made: StoredSignature | None) -> None:
-    """Give a job back, as far as the store lets us; else its lease runs out.
-
-    Others go before it: it may be its own folder of blobs alone that cannot be written.
-    """
-    with suppress(UnusableStore):
-        put_back(store, work, LEFT_S)
-        if made is not None:
-            collect_blobs(store, [made.geometry])
 
 
 def restart_jobs(store: Store, work: Work) -> JobState | None:
@@ -88,7 +74,7 @@ def restart_jobs(store: Store, work: Work) -> JobState | None:
         return JobState.QUEUED
     try:
         with store.database.write() as connection:
-            queue.finish(connection, work.claim, JobState.CANCELLED)
+            queue.finish(connection, work.job, JobState.CANCELLED)
     except LostLease:
         return None
     return JobState.CANCELLED
@@ -96,7 +82,7 @@ def restart_jobs(store: Store, work: Work) -> JobState | None:
 
 def record_job_event(connection: Connection, kind: str, work: Work) -> None:
     """Note what has become of a job."""
-    record_event(connection, kind, work.map.name, work.frame.id, work.claim.job.id)
+    record_event(connection, kind, work.map.name, work.frame.id, work.job.id)
 
 
 def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
@@ -104,7 +90,7 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
     reason = str(error).removeprefix(f"{work.frame.id}: ")
     try:
         with store.database.write() as connection:
-            queue.finish(connection, work.claim, JobState.FAILED, reason)
+            queue.finish(connection, work.job, JobState.FAILED, reason)
             if not work.again:
                 if map_of(connection, work.frame.map_number).model_id != work.model_id:
                     raise Outdated
@@ -119,35 +105,37 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
 
 def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
     """Queue a job again over which something went wrong, or let it be dead."""
-    reason = (
-        str(error) if isinstance(error, SceneprintError) else f"{type(error).__name__}: {error}"
-    )
-    trace = "".join(traceback.format_exception(error))
+    reason, trace = failure_texts(error)
     log.error("job raised an exception", extra=about(work, error=reason, traceback=trace))
     try:
         with store.database.write() as connection:
-            state = queue.fail(connection, work.claim, reason, trace)
+            state = queue.fail(connection, work.job, reason, trace)
             if work.again:
                 return state
             dead = state == JobState.DEAD
             after = FrameState.FAILED if dead else FrameState.RECEIVED
             set_state(connection, work.frame.number, after, reason if dead else None)
             if dead:
-                record_event(
-                    connection, "frame.failed", work.map.name, work.frame.id, work.claim.job.id
-                )
+                record_job_event(connection, "frame.failed", work)
     except LostLease:
         return None
     return state
 
 
+def failure_texts(error: Exception) -> tuple[str, str]:
+    """What a job says of an error that it broke down over, and its traceback."""
+    known = isinstance(error, SceneprintError)
+    reason = str(error) if known else f"{type(error).__name__}: {error}"
+    return reason, "".join(traceback.format_exception(error))
+
+
 def about(work: Work, **more: object) -> dict[str, object]:
     """What a line of the log says of a job."""
     return {
-        "job_id": work.claim.job.id,
+        "job_id": work.job.id,
         "frame_id": work.frame.id,
         "map": work.map.name,
-        "attempt": work.claim.job.attempts,
+        "attempt": work.job.attempts,
         **more,
     }
 
@@ -156,7 +144,7 @@ def about(work: Work, **more: object) -> dict[str, object]:
 
 
 @contextmanager
-def renewed(store: Store, claim: queue.Claim, lease_s: float, longest_s: float) -> Iterator[None]:
+def renewed(store: Store, claim: JobRow, lease_s: float, longest_s: float) -> Iterator[None]:
     """Renew a lease from a thread of its own while the work goes on."""
     done = threading.Event()
 
@@ -188,29 +176,22 @@ _GIVEN_UP = (FrameState.FAILED, FrameState.REJECTED)
 
 
 def list_jobs(
-    store: Store, state: JobState | None, cursor: str | None, limit: int, kind: str | None = None,
-    map_names: Collection[str] | None = None,
+    store: Store, state: JobState | None = None, cursor: str | None = None, limit: int = 100,
+    kind: str | None = None, map_names: Collection[str] | None = None,
 ) -> Page[Job]:  # fmt: skip
-    """Jobs, the newest first.
-
-    Parameters
-    ----------
-    store : see Store
-    state, kind : that are wanted; default: all
-    cursor, limit : of the page
-    map_names : whose jobs are wanted; default: of all maps, and of none
+    """A page of jobs, the newest first; see `queue.list_jobs`.
 
     Raises
     ------
     InvalidRequest : a cursor that was not given out.
     """
-    before = opened_cursor(store.seals, "job", cursor)
+    before = store.seals.row("job", cursor)
     with store.database.read() as connection:
         found = list_stored(connection, before, limit + 1, state, kind, map_names)
     items = [
         job_record(one.job, one.frame_id, one.map_name, one.followed_by) for one in found[:limit]
     ]
-    more = store.seals.seal("job", found[limit - 1].job.number) if len(found) > limit else None
+    more = store.seals.next_cursor("job", [one.job.number for one in found], limit)
     return Page[Job](items=items, next_cursor=more)
 
 
@@ -234,7 +215,7 @@ def cancel(store: Store, job_id: str) -> Job:
         job = queue.find_job(connection, job_id)
         if job.state != JobState.CANCELLED:
             queue.cancel(connection, job)
-            _fail_frame(connection, job, CANCELLED)
+            fail_frame(connection, job, CANCELLED)
         return _job_record(connection, queue.find_job(connection, job_id))
 
 
@@ -291,16 +272,8 @@ def worker_died(
 ) -> JobState | None:
     """Take a job from a worker that died over it, now and not when its lease runs out.
 
-    Parameters
-    ----------
-    store : see Store
-    job_id, token : of the dead worker's claim
-    error, traceback : what is known of its death
-    counts : whether the job may have been the cause
-
-    Returns
-    -------
-    state : of the job; None where the death changed nothing
+    Parameters are those of `queue.fail_of_dead`. Returns the state of the job; None where the death
+    changed nothing.
     """
     with store.database.write() as connection:
         job = fail_of_dead(connection, job_id, token, error, traceback, counts=counts)
@@ -309,7 +282,7 @@ def worker_died(
         if job.frame_number is None:
             pass  # it is of no single frame
         elif job.state == JobState.DEAD:
-            _fail_frame(connection, job, error)
+            fail_frame(connection, job, error)
         elif frame_of(connection, job.frame).state == FrameState.SIGNING:
             set_state(connection, job.frame, FrameState.RECEIVED)
     about = {"job_id": job_id, "state": job.state, "attempt": job.attempts, "error": error}
@@ -317,7 +290,7 @@ def worker_died(
     return job.state
 
 
-def _fail_frame(connection: Connection, job: JobRow, reason: str) -> None:
+def fail_frame(connection: Connection, job: JobRow, reason: str | None) -> None:
     """A frame that will not be signed; one that is indexed, or gone, stays so."""
     if job.frame_number is None:
         return

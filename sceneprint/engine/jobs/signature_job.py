@@ -6,45 +6,35 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 
+import numpy as np
+from sqlalchemy import Connection
+
+from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_stored
-from sceneprint.engine.ingest.novelty import Stale, judge, look
-from sceneprint.engine.jobs.lifecycle import (
-    Outdated,
-    Work,
-    about,
-    break_down,
-    leave,
-    record_job_event,
-    reject,
-    renewed,
-    restart_jobs,
-)
+from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.models import Signers
 from sceneprint.engine.search.local_index import Readers
-from sceneprint.engine.upkeep.blob_garbage import collect_blobs
-from sceneprint.errors import (
-    DamagedBlob,
-    FrameError,
-    LostLease,
-    SceneprintError,
-    StoreAway,
-    UnusableStore,
-)
+from sceneprint.engine.upkeep.repair import collect_blobs
 from sceneprint.formats.artifact import write_geometry
+from sceneprint.geometry.retrieval.distance import Metric, distance_share, distances
+from sceneprint.models import Model
 from sceneprint.pipeline import prepare
-from sceneprint.store import Store, queue
-from sceneprint.store.events import record_event
+from sceneprint.store import Database, Store, queue
 from sceneprint.store.frames import frame_of, set_state
-from sceneprint.store.maps import map_of
+from sceneprint.store.maps import find_map, map_of
 from sceneprint.store.model_switch import REENCODE, enqueue_all, models_of
 from sceneprint.store.signatures import (
     StoredSignature,
+    changes_since,
     geometry_blobs,
     index_frame,
     replace_signature,
 )
+from sceneprint.store.tables import FrameRow, MapRow
+from sceneprint.types import Bytes
 from sceneprint_client.api import FrameState, JobState
 
 log = logging.getLogger(__name__)
@@ -54,51 +44,36 @@ log = logging.getLogger(__name__)
 AWAY_S, AGAIN_S = 12.0, 0.5
 
 
-def claim(store: Store, worker: str, lease_s: float) -> Work | LongJob | None:
+def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob | None:
     """Take the next job, or None where there is none; gives up those that kill every worker.
 
-    A job of no single frame comes as a Task.
-
-    Parameters
-    ----------
-    store : see Store
-    worker : who asks
-    lease_s : seconds until the lease must be renewed
+    A job of no single frame comes as a LongJob. See also `queue.claim`.
     """
     with store.database.read() as connection:
         if not queue.has_due(connection):
             return None
         given_up = queue.is_given_up(connection)
-    if given_up:
-        _abandon(store)
+    if given_up:  # jobs that kill every worker, and their frames
+        with store.database.write() as connection:
+            for job in queue.dead_letter(connection):
+                if job.kind != REENCODE:
+                    lifecycle.fail_frame(connection, job, job.error)
     with store.database.write(turn=False) as connection:
         held = queue.claim(connection, worker, lease_s)
         if held is None:
             return None
-        if held.job.frame_number is None:
-            number = held.job.map_number
+        if held.frame_number is None:
+            number = held.map_number
             return LongJob(held, None if number is None else map_of(connection, number))
-        frame = frame_of(connection, held.job.frame)
-        if held.job.kind != REENCODE:
+        frame = frame_of(connection, held.frame)
+        if held.kind != REENCODE:
             set_state(connection, frame.number, FrameState.SIGNING)
-        return Work(held, frame, map_of(connection, frame.map_number))
-
-
-def _abandon(store: Store) -> None:
-    """Give up jobs that kill every worker, and their frames."""
-    with store.database.write() as connection:
-        for job in queue.dead_letter(connection):
-            if job.kind == REENCODE or job.frame_number is None:
-                continue
-            frame = frame_of(connection, job.frame)
-            set_state(connection, frame.number, FrameState.FAILED, job.error)
-            name = map_of(connection, frame.map_number).name
-            record_event(connection, "frame.failed", name, frame.id, job.id)
+        return lifecycle.Work(held, frame, map_of(connection, frame.map_number))
 
 
 def run(
-    store: Store, signers: Signers, readers: Readers, work: Work, lease_s: float, longest_s: float,
-    broke: Callable[[], None] | None = None,
+    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, lease_s: float,
+    longest_s: float, broke: Callable[[], None] | None = None,
 ) -> JobState | None:  # fmt: skip
     """Sign a claimed frame.
 
@@ -121,23 +96,27 @@ def run(
     made: StoredSignature | None = None
     gone: list[str] = []
     try:
-        with renewed(store, work.claim, lease_s, longest_s):
+        with lifecycle.renewed(store, work.job, lease_s, longest_s):
             made = _sign(store, signers, work)
             gone = _store_patiently(store, signers, readers, work, made)
         state = JobState.SUCCEEDED
-    except LostLease as error:
-        log.warning("lease lost", extra=about(work, error=str(error)))
+    except errors.LostLease as error:
+        log.warning("lease lost", extra=lifecycle.about(work, error=str(error)))
         state = None
-    except Outdated:
-        state = restart_jobs(store, work)
-    except FrameError as error:
-        state = reject(store, work, error)
-    except UnusableStore:  # a full disk is no fault of the frame's, and costs it no try
-        leave(store, work, made)
+    except lifecycle.Outdated:
+        state = lifecycle.restart_jobs(store, work)
+    except errors.FrameError as error:
+        state = lifecycle.reject(store, work, error)
+    except errors.UnusableStore:  # a full disk is no fault of the frame's, and costs it no try
+        with suppress(errors.UnusableStore):  # else its lease runs out
+            # others go before it: it may be its own folder of blobs alone that cannot be written
+            lifecycle.put_back(store, work, lifecycle.LEFT_S)
+            if made is not None:
+                collect_blobs(store, [made.geometry])
         raise
     except Exception as error:
-        state = break_down(store, work, error)
-        if broke is not None and not isinstance(error, SceneprintError):
+        state = lifecycle.break_down(store, work, error)
+        if broke is not None and not isinstance(error, errors.SceneprintError):
             broke()
     if made is not None and state != JobState.SUCCEEDED:
         gone = [made.geometry]  # nothing came to refer to it
@@ -146,13 +125,13 @@ def run(
     if state is None:
         return None
     milliseconds = round(1e3 * (time.perf_counter() - start), 1)
-    log.info("job %s", state, extra=about(work, state=state, milliseconds=milliseconds))
+    log.info("job %s", state, extra=lifecycle.about(work, state=state, milliseconds=milliseconds))
     return state
 
 
-def _sign(store: Store, signers: Signers, work: Work) -> StoredSignature:
+def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> StoredSignature:
     if work.model_id not in models_of(work.map):
-        raise Outdated
+        raise lifecycle.Outdated
     frame = read_stored(store.blobs.get(work.frame.blob), work.frame)
     signature, geometry = prepare(frame, signers(work.model_id))
     return StoredSignature(
@@ -165,7 +144,7 @@ def _sign(store: Store, signers: Signers, work: Work) -> StoredSignature:
 
 
 def _store_patiently(
-    store: Store, signers: Signers, readers: Readers, work: Work, made: StoredSignature
+    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, made: StoredSignature
 ) -> list[str]:
     """As `_store`, while another server takes the place of one that fell.
 
@@ -175,14 +154,14 @@ def _store_patiently(
     while True:
         try:
             return _store(store, signers, readers, work, made)
-        except StoreAway:
+        except errors.StoreAway:
             if time.monotonic() > until:
                 raise
             time.sleep(AGAIN_S)
 
 
 def _store(
-    store: Store, signers: Signers, readers: Readers, work: Work, made: StoredSignature
+    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, made: StoredSignature
 ) -> list[str]:
     """Signature, artifact, state and end of the job in one commit.
 
@@ -197,27 +176,29 @@ def _store(
         if work.frame.novelty is not None:
             seen = look(store.database, readers, work.map, made)
         with suppress(Stale), store.database.write() as connection:
-            queue.finish(connection, work.claim, JobState.SUCCEEDED)
+            queue.finish(connection, work.job, JobState.SUCCEEDED)
             row = map_of(connection, work.frame.map_number)
             if row.model_id != made.model_id:
-                raise Outdated
+                raise lifecycle.Outdated
             reason = None
             if seen is not None:
                 reason = judge(connection, work.frame, made, seen, signers(made.model_id).model)
             if reason is not None:
                 set_state(connection, work.frame.number, FrameState.REDUNDANT, reason)
-                record_job_event(connection, "frame.redundant", work)
+                lifecycle.record_job_event(connection, "frame.redundant", work)
                 return [work.frame.blob, made.geometry]
             if not store.blobs.holds(made.geometry):  # nothing referred to it until now
-                raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
+                raise errors.DamagedBlob(
+                    "A deletion elsewhere swept the artifact: it must be made again."
+                )
             index_frame(connection, work.frame, made)
             if row.next_model_id is not None:
                 enqueue_all(connection, row, [work.frame.number])
-            record_job_event(connection, "frame.indexed", work)
+            lifecycle.record_job_event(connection, "frame.indexed", work)
             return []
 
 
-def _replace_signature(store: Store, work: Work, made: StoredSignature) -> list[str]:
+def _replace_signature(store: Store, work: lifecycle.Work, made: StoredSignature) -> list[str]:
     """Signature and artifact of an indexed frame, beside those of another model or in the place
     of damaged ones, and the end of the job in one commit.
 
@@ -227,14 +208,116 @@ def _replace_signature(store: Store, work: Work, made: StoredSignature) -> list[
     """
     number = work.frame.number
     with store.database.write() as connection:
-        queue.finish(connection, work.claim, JobState.SUCCEEDED)
+        queue.finish(connection, work.job, JobState.SUCCEEDED)
         row = map_of(connection, work.frame.map_number)
         indexed = frame_of(connection, number).state == FrameState.INDEXED
         if not indexed or made.model_id not in models_of(row):
-            raise Outdated
+            raise lifecycle.Outdated
         if not store.blobs.holds(made.geometry):
-            raise DamagedBlob("A deletion elsewhere swept the artifact: it must be made again.")
+            raise errors.DamagedBlob(
+                "A deletion elsewhere swept the artifact: it must be made again."
+            )
         before = geometry_blobs(connection, [number], made.model_id).values()
         replace_signature(connection, work.frame, made)
-        record_job_event(connection, "frame.reencoded", work)
+        lifecycle.record_job_event(connection, "frame.reencoded", work)
         return [blob for blob in before if blob != made.geometry]
+
+
+# Whether a map has the place of a frame already, as `if_novel` of an upload asks.
+#
+# signature  --look-->  Look, as of a revision  --judge, in the commit-->  Near, or None to keep it
+#
+# The search holds no lock. What was indexed between it and the commit is compared in the commit,
+# so that of two frames of one place that are signed at once only one is kept.
+
+
+@dataclass(frozen=True)
+class Look:
+    """The frame of a map that is nearest as of one revision, and how far its signature is; None in
+    an empty map.
+    """
+
+    revision: int
+    nearest: tuple[int, int] | None
+
+
+class Stale(Exception):
+    """The nearest frame was deleted since the look, and nobody knows the next one."""
+
+
+def look(database: Database, readers: Readers, row: MapRow, made: StoredSignature) -> Look | None:
+    """Search a map for the nearest frame.
+
+    Parameters
+    ----------
+    database, readers : see there
+    row : of the map, as it was
+    made : of the frame
+
+    Returns
+    -------
+    look : None where the map has come to have another model: nothing can be compared
+
+    Raises
+    ------
+    LostLease : the map is gone, and the job with it.
+    """
+    with database.read() as connection:
+        try:
+            now = find_map(connection, row.name)
+        except errors.UnknownMap as error:
+            raise errors.LostLease(str(error)) from error
+        if now.number != row.number or now.model_id != made.model_id:
+            return None
+        (view,) = readers.views(connection, database, [now])
+    hits = view.search(_vector(made), 1, dead=view.dead)
+    if len(hits) == 0:
+        return Look(view.revision, None)
+    return Look(view.revision, (int(hits.keys[0]), int(hits.distances[0])))
+
+
+def judge(
+    connection: Connection, frame: FrameRow, made: StoredSignature, seen: Look | None, model: Model
+) -> str | None:
+    """Why a frame is not kept, in the transaction that would index it; None where it is.
+
+    Raises
+    ------
+    Stale : look again.
+    """
+    novelty = frame_of(connection, frame.number).novelty  # another upload may have loosened it
+    row = map_of(connection, frame.map_number)
+    if novelty is None or seen is None or row.model_id != made.model_id:
+        return None
+    nearest = _nearest_now(connection, row, _vector(made), seen, model.metric)
+    if nearest is None:
+        return None
+    apart = np.array(nearest[1])
+    share = float(distance_share(apart, model.unrelated_distance, model.metric))
+    if share > novelty:
+        return None
+    there = frame_of(connection, nearest[0]).id
+    return (
+        f"the map already has this place: frame {there} is at {share:.3f} of the distance of "
+        f"unrelated frames (required: more than {novelty:g})"
+    )
+
+
+def _nearest_now(
+    connection: Connection, row: MapRow, vector: Bytes, seen: Look, metric: Metric
+) -> tuple[int, int] | None:
+    nearest = seen.nearest
+    for block in changes_since(connection, row, seen.revision):
+        for change in block:
+            if nearest is not None and change.number == nearest[0]:
+                raise Stale
+            if change.vector is not None:
+                stored = np.frombuffer(change.vector, np.uint8)
+                distance = int(distances(vector, stored[None], metric)[0])
+                if nearest is None or distance < nearest[1]:
+                    nearest = change.number, distance
+    return nearest
+
+
+def _vector(made: StoredSignature) -> Bytes:
+    return np.frombuffer(made.vector, np.uint8)

@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import logging
 import time
-import traceback
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from sceneprint.engine.jobs.lifecycle import renewed
+from sceneprint.engine.jobs.lifecycle import LEFT_S, failure_texts, renewed
 from sceneprint.engine.serializers import job_record
-from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs
+from sceneprint.engine.upkeep.repair import collect_deleted_blobs
 from sceneprint.errors import (
     Conflict,
     FrameError,
@@ -34,18 +33,9 @@ from sceneprint.errors import (
 )
 from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
-from sceneprint.store.idempotency import IdempotentRequest
+from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map, map_of
-from sceneprint.store.queue import (
-    Claim,
-    JobFile,
-    add_files,
-    append_items,
-    files_of,
-    find_job,
-    remove_parts,
-)
-from sceneprint.store.tables import MapRow
+from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Job, JobState
 
@@ -63,28 +53,28 @@ class LongJob:
 
     Parameters
     ----------
-    claim : on the job
+    job : as it was claimed
     map : that it is about; None where it is of none
     """
 
-    claim: Claim
+    job: JobRow
     map: MapRow | None
 
     @property
     def data(self) -> dict[str, Any]:
         """What was asked for."""
-        return self.claim.job.data or {}
+        return self.job.data or {}
 
     @property
     def progress(self) -> dict[str, Any]:
         """How far the slices before have come: of the last `Outcome`; empty before the first."""
-        return self.claim.job.progress or {}
+        return self.job.progress or {}
 
     @property
     def of_map(self) -> MapRow:
         """The map, of a kind of job that always has one."""
         if self.map is None:
-            raise ValueError(f"job {self.claim.job.id} has no map")
+            raise ValueError(f"job {self.job.id} has no map")
         return self.map
 
 
@@ -106,7 +96,7 @@ class SliceResult:
     over: bool
     progress: dict[str, Any]
     items: list[dict[str, Any]] = field(default_factory=list)
-    files: list[JobFile] = field(default_factory=list)
+    files: list[queue.JobFile] = field(default_factory=list)
     result: dict[str, Any] | None = None
     drop: Collection[str] = ()
     event: str | None = None
@@ -120,19 +110,12 @@ log = logging.getLogger(__name__)
 
 #: Seconds of a slice: frames that wait to be signed come between two.
 SLICE_S = 15.0
-#: Seconds until a job is tried again whose result could not be stored.
-LEFT_S = 5.0
 #: Errors that trying again cannot help: what was asked for cannot be done.
 HOPELESS = (FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, SnapshotError)
 
 
 class Tasks:
-    """Kinds of long jobs, each with what does it.
-
-    Parameters
-    ----------
-    store, bell : see there
-    """
+    """Kinds of long jobs, each with what does it."""
 
     def __init__(self, store: Store, bell: Wakeup) -> None:
         self._store, self._bell = store, bell
@@ -157,8 +140,8 @@ class Tasks:
 
     def begin(
         self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
-        files: Collection[JobFile] = (),
-    ) -> Job:  # fmt: skip
+        files: Collection[queue.JobFile] = (), once: IdempotentRequest | None = None,
+    ) -> tuple[Job, bool]:  # fmt: skip
         """Queue a job of a kind.
 
         Parameters
@@ -168,22 +151,17 @@ class Tasks:
         data : what is asked for, as JSON
         priority : as of frames
         files : that it works on
+        once : the request that is to take effect once
+
+        Returns
+        -------
+        job : the job
+        replayed : whether `once` began it before; it is told as it is
 
         Raises
         ------
         UnknownMap : no such map.
         Swept : a file is gone; put it once more.
-        """
-        return self.begin_once(kind, map_name, data, priority, files)[0]
-
-    def begin_once(
-        self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
-        files: Collection[JobFile] = (), once: IdempotentRequest | None = None,
-    ) -> tuple[Job, bool]:  # fmt: skip
-        """As `begin`, with a flag: True where `once` began it before, and it is told as it is.
-
-        Raises
-        ------
         IdempotencyConflict : something else was asked with the key of `once`.
         """
         with self._store.database.write() as connection:
@@ -191,12 +169,12 @@ class Tasks:
             before = None if once is None else once.found(connection)
             if before is not None:
                 with suppress(UnknownJob):  # its map may have been deleted and made anew
-                    there = find_job(connection, before["job_id"])
+                    there = queue.find_job(connection, before["job_id"])
                     return job_record(there, None, map_name), True
             self._check(files)
             number = None if row is None else row.number
             job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
-            add_files(connection, job.number, files)
+            queue.add_files(connection, job.number, files)
             if once is not None:
                 once.keep(connection, {"job_id": job.id})
         self._bell.ring()
@@ -210,11 +188,11 @@ class Tasks:
         broke: Callable[[], None] | None = None,
     ) -> JobState | None:
         """Do a slice of a claimed job; see `signature_job.run` for the rest."""
-        start, job = time.perf_counter(), task.claim.job
+        start, job = time.perf_counter(), task.job
         state: JobState | None
         try:
             longest_s = self.longest_s(job.kind, longest_s)
-            with renewed(self._store, task.claim, lease_s, longest_s):
+            with renewed(self._store, task.job, lease_s, longest_s):
                 handler = self._handlers.get(job.kind)
                 if handler is None:
                     raise MissingDependency(
@@ -245,7 +223,7 @@ class Tasks:
     def put_back(self, task: LongJob, after_s: float = 0.0) -> None:
         """Return a claimed job undone."""
         with suppress(LostLease, UnusableStore), self._store.database.write() as connection:
-            queue.give_back(connection, task.claim, after_s)
+            queue.give_back(connection, task.job, after_s)
 
     def _keep(self, task: LongJob, outcome: SliceResult) -> JobState:
         try:
@@ -260,11 +238,11 @@ class Tasks:
 
     def _stored(self, task: LongJob, outcome: SliceResult) -> list[str]:
         """What a slice came to, in one commit; returns blobs that may be of no use any more."""
-        job = task.claim.job
+        job = task.job
         with self._store.database.write() as connection:
             if outcome.over:
                 queue.finish(
-                    connection, task.claim, JobState.SUCCEEDED, progress=outcome.progress,
+                    connection, task.job, JobState.SUCCEEDED, progress=outcome.progress,
                     result=outcome.result,
                 )  # fmt: skip
                 if outcome.event is not None:
@@ -273,16 +251,16 @@ class Tasks:
                         connection, outcome.event, name, None, job.id, **(outcome.result or {})
                     )
             else:
-                queue.go_on(connection, task.claim, outcome.progress)
+                queue.go_on(connection, task.job, outcome.progress)
             self._check(outcome.files)
             # after the job: it may be gone, and nothing can be of one that is
-            append_items(connection, job.number, outcome.items)
-            before = files_of(connection, job.number)
-            add_files(connection, job.number, outcome.files)
-            gone = remove_parts(connection, job.number, items=False, files=outcome.drop)
+            queue.append_items(connection, job.number, outcome.items)
+            before = queue.files_of(connection, job.number)
+            queue.add_files(connection, job.number, outcome.files)
+            gone = queue.remove_parts(connection, job.number, items=False, files=outcome.drop)
             return gone + [before[one.name].blob for one in outcome.files if one.name in before]
 
-    def _check(self, files: Collection[JobFile]) -> None:
+    def _check(self, files: Collection[queue.JobFile]) -> None:
         """See that files are there, in the transaction that comes to refer to them."""
         for one in files:
             if not self._store.blobs.holds(one.blob):
@@ -293,25 +271,23 @@ class Tasks:
     def _fail(self, task: LongJob, reason: str) -> JobState | None:
         try:
             with self._store.database.write() as connection:
-                queue.finish(connection, task.claim, JobState.FAILED, reason)
+                queue.finish(connection, task.job, JobState.FAILED, reason)
         except LostLease:
             return None
         return JobState.FAILED
 
     def _break_down(self, task: LongJob, error: Exception) -> JobState | None:
-        known = isinstance(error, SceneprintError)
-        reason = str(error) if known else f"{type(error).__name__}: {error}"
-        trace = "".join(traceback.format_exception(error))
+        reason, trace = failure_texts(error)
         log.error("job raised an exception", extra=_about(task, error=reason, traceback=trace))
         try:
             with self._store.database.write() as connection:
-                return queue.fail(connection, task.claim, reason, trace)
+                return queue.fail(connection, task.job, reason, trace)
         except LostLease:
             return None
 
 
 def _about(task: LongJob, **more: object) -> dict[str, object]:
     """What a line of the log says of a job."""
-    job = task.claim.job
+    job = task.job
     name = None if task.map is None else task.map.name
     return {"job_id": job.id, "kind": job.kind, "map": name, "attempt": job.attempts, **more}

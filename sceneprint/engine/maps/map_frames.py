@@ -15,19 +15,11 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_stored
 from sceneprint.engine.models import Signers
 from sceneprint.engine.serializers import frame_records, model_label, sensor_of, tag_of, when
 from sceneprint.engine.upkeep.repair import resign_frames
-from sceneprint.errors import (
-    Busy,
-    DamagedBlob,
-    DamagedSignature,
-    InvalidRequest,
-    NotIndexed,
-    UnknownFrame,
-    UnreadableGeometry,
-)
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.formats.points.ply_export import points_of, write_ply
@@ -36,10 +28,10 @@ from sceneprint.previews import depth_view, normals_view, onto, patches_view, pi
 from sceneprint.signing import hierarchy_of, see
 from sceneprint.store import Store, frame_queries
 from sceneprint.store.frame_queries import Held, count_run, indexed_by_time, list_runs, poses_of_run
-from sceneprint.store.frames import find_frame
-from sceneprint.store.maps import count_frames, find_map, model_names
-from sceneprint.store.opaque_ids import START, Kind, OpaqueIds
-from sceneprint.store.signatures import PatchCounts, geometry_blobs, signature_sizes, stored_vector
+from sceneprint.store.frames import count_states, find_frame
+from sceneprint.store.maps import find_map, model_names
+from sceneprint.store.opaque_ids import invalid_cursor
+from sceneprint.store.signatures import geometry_blobs, patch_counts, stored_vector
 from sceneprint.store.tables import FrameRow, MapRow
 from sceneprint.types import Geometry, Hierarchy, Intrinsics, Ints32, Patches, Surface
 from sceneprint_client.api import Frame, FrameState, Page
@@ -89,7 +81,7 @@ def find_indexed(store: Store, map_name: str, frame_id: str) -> IndexedFrame:
         artifacts = geometry_blobs(connection, [frame.number], row.model_id)
         label = model_label(model_names(connection)[row.model_id], row.model_id)
     if frame.state != FrameState.INDEXED or frame.number not in artifacts:
-        raise NotIndexed(
+        raise errors.NotIndexed(
             f"Frame {frame.id} is {frame.state}: {frame.state.sentence} Derived data is "
             "available once the frame is indexed."
         )
@@ -99,7 +91,7 @@ def find_indexed(store: Store, map_name: str, frame_id: str) -> IndexedFrame:
 def living(row: MapRow, frame: FrameRow) -> FrameRow:
     """The frame; UnknownFrame where it was deleted."""
     if frame.state == FrameState.DELETED:
-        raise UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted.")
+        raise errors.UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted.")
     return frame
 
 
@@ -113,7 +105,7 @@ def geometry_of(store: Store, found: IndexedFrame) -> Geometry:
     """
     try:
         return read_geometry(store.blobs.get(found.artifact))
-    except (DamagedBlob, UnreadableGeometry):
+    except (errors.DamagedBlob, errors.UnreadableGeometry):
         check_unchanged(store, found)
         resign_frames(store, found.row, [found.frame.number], found.row.model_id)
         raise
@@ -129,71 +121,9 @@ def check_unchanged(store: Store, found: IndexedFrame) -> None:
     """
     now = find_indexed(store, found.row.name, found.frame.id)
     if (now.frame.number, now.artifact) != (found.frame.number, found.artifact):
-        raise Busy(
+        raise errors.Busy(
             f"Frame {found.frame.id} was signed with another model in the meantime. Try again."
         )
-
-
-# Cursors of pages: where a page ended, as those who read it are told.
-
-
-def row_of(cursor: str | None) -> int | None:
-    """The place that a cursor stands for in a list that is numbered by itself.
-
-    Raises
-    ------
-    InvalidRequest : it was not given out.
-    """
-    if cursor is None:
-        return None
-    if not (cursor.isascii() and cursor.isdigit() and len(cursor) < 19):
-        raise _not_given_out(cursor)
-    return int(cursor)
-
-
-def opened_cursor(seals: OpaqueIds, kind: Kind, cursor: str | None) -> int | None:
-    """The number of the row that a cursor stands for, where rows count over all maps.
-
-    Raises
-    ------
-    InvalidRequest : it was not given out.
-    """
-    if cursor is None:
-        return None
-    number = None if cursor == START else seals.open(kind, cursor)
-    if number is None:
-        raise _not_given_out(cursor)
-    return number
-
-
-def event_of(seals: OpaqueIds, given: str, place: str = "after") -> int:
-    """The number of the event that an id stands for; 0 for START, which is before all of them.
-
-    Parameters
-    ----------
-    seals : of the store
-    given : the id
-    place : where it was given
-
-    Raises
-    ------
-    InvalidRequest : it is the id of no event of this store.
-    """
-    number = seals.open("event", given)
-    if number is None:
-        raise InvalidRequest(
-            f"{given!r:.40} is not the id of an event here. Start again: with {START} for all "
-            "stored events, or without an id for new events only.",
-            ((place, "not the id of an event"),),
-        )
-    return number
-
-
-def _not_given_out(cursor: str) -> InvalidRequest:
-    return InvalidRequest(
-        f"The cursor {cursor!r:.40} is not valid. Use the `next_cursor` of a page.",
-        (("cursor", "not a cursor of this service"),),
-    )
 
 
 #: Most poses of one trajectory: more are asked for in parts.
@@ -212,12 +142,12 @@ def list_frames(
     UnknownMap : no such map.
     InvalidRequest : a cursor that was not given out.
     """
-    beyond = opened_cursor(store.seals, "frame", cursor)
+    beyond = store.seals.row("frame", cursor)
     with store.database.read() as connection:
         row = find_map(connection, map_name)
         found = frame_queries.list_frames(connection, row.number, beyond, limit + 1, wanted)
         items = frame_records(connection, row, found[:limit])
-    more = store.seals.seal("frame", found[limit - 1].number) if len(found) > limit else None
+    more = store.seals.next_cursor("frame", [one.number for one in found], limit)
     return Page[Frame](items=items, next_cursor=more)
 
 
@@ -250,12 +180,12 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
     with store.database.read() as connection:
         row = find_map(connection, map_name)
         counted = count_run(connection, row.number, run)
-        robot = _only("robot", run.robot, {one.robot for one in counted}, run.session)
-        parents = {one.parent for one in counted if one.parent is not None}
+        robot = _only("robot", run.robot, {one for one, _, _ in counted}, run.session)
+        parents = {one for _, one, _ in counted if one is not None}
         parent = _only("parent_frame", run.parent_frame, parents, run.session)
-        total = sum(one.count for one in counted)
+        total = sum(count for _, _, count in counted)
         if run.most is None and total > MOST_POSES:
-            raise InvalidRequest(
+            raise errors.InvalidRequest(
                 f"Session {run.session!r:.140} has {total} frames, but a trajectory has at most "
                 f"{MOST_POSES}. Limit it with `most`, or select a part with `captured_after` and "
                 "`captured_before`.",
@@ -268,8 +198,8 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
         session=run.session,
         robot=robot,
         parent_frame=parent,
-        frame_ids=[one.frame_id for one in kept],
-        poses=[trajectory_row(one.at, np.array(one.pose)) for one in kept],
+        frame_ids=[frame_id for frame_id, _, _ in kept],
+        poses=[trajectory_row(at, np.array(pose)) for _, at, pose in kept],
         posed=posed,
         left_out=total - len(kept),
     )
@@ -297,7 +227,7 @@ def _only(what: str, asked: str | None, found: Iterable[str | None], session: st
     names = sorted(set(found), key=lambda name: name or "")
     if len(names) > 1:
         told = ", ".join("none" if name is None else repr(name)[:60] for name in names[:5])
-        raise InvalidRequest(
+        raise errors.InvalidRequest(
             f"Session {session!r:.140} has frames with {len(names)} values of `{what}` ({told}), "
             f"but a trajectory covers one. Choose it with `{what}`.",
             ((what, "required, as there are several"),),
@@ -331,10 +261,7 @@ def _names_of(cursor: str) -> tuple[str, str]:
             return session, robot
     except (ValueError, TypeError, RecursionError):  # whatever else somebody may think up
         pass
-    raise InvalidRequest(
-        f"The cursor {cursor!r:.40} is not valid. Use the `next_cursor` of a page.",
-        (("cursor", "not a cursor of this service"),),
-    )
+    raise invalid_cursor(cursor)
 
 
 # How a map grew: frames by the hour or the day in which they were indexed.
@@ -345,22 +272,13 @@ WIDTHS_S: dict[By, float] = {"hour": 3600.0, "day": 86400.0}
 def growth(store: Store, map_name: str, by: By = "day", last: int = 30) -> Growth:
     """How many of a map's frames were indexed in each of the last hours or days, of UTC.
 
-    Parameters
-    ----------
-    store : see Store
-    map_name : of the map
-    by : what is counted by
-    last : hours or days, with the one that is not over
-
-    Raises
-    ------
-    UnknownMap : no such map.
+    `last` is how many, with the one that is not over. UnknownMap where there is no such map.
     """
     width = WIDTHS_S[by]
     start = (time.time() // width - last + 1) * width
     with store.database.read() as connection:
         row = find_map(connection, map_name)
-        indexed = count_frames(connection, row.number).get(FrameState.INDEXED, 0)
+        indexed = count_states(connection, row.number).get(FrameState.INDEXED, 0)
         counts = indexed_by_time(connection, row.number, start, width)
     ahead = sum(n for place, n in counts.items() if place >= last)
     counts[last - 1] += ahead  # by a clock that was set back since
@@ -436,13 +354,7 @@ def npy_of(vector: bytes) -> bytes:
 
 
 class FrameFiles:
-    """What frames are made of.
-
-    Parameters
-    ----------
-    store : see Store
-    signers : of the store's models
-    """
+    """What frames are made of."""
 
     def __init__(self, store: Store, signers: Signers) -> None:
         self._store, self._signers = store, signers
@@ -526,15 +438,15 @@ class FrameFiles:
         found = find_indexed(self._store, map_name, frame_id)
 
         def make() -> FrameSignature:
-            vector, sizes = self._signature(found)
+            vector, (n_patches, n_pairs) = self._signature(found)
             return FrameSignature(
                 frame_id=found.frame.id,
                 map=found.row.name,
                 model=found.label,
                 model_id=found.row.model_id,
                 length=len(vector),
-                n_patches=list(sizes.n_patches),
-                n_pairs=list(sizes.n_pairs),
+                n_patches=n_patches,
+                n_pairs=n_pairs,
                 base64=base64.b64encode(vector).decode(),
             )
 
@@ -563,7 +475,7 @@ class FrameFiles:
             row = find_map(connection, map_name)
             frame = living(row, find_frame(connection, row, frame_id))
         if frame.state == FrameState.REDUNDANT:
-            raise NotIndexed(
+            raise errors.NotIndexed(
                 f"Frame {frame.id} is redundant, so its upload was not stored. "
                 f"{frame.reason or ''} Upload it without `if_novel` to store it."
             )
@@ -586,18 +498,18 @@ class FrameFiles:
         drawn = geometry_of(self._store, found).surface
         return onto(vista_of(drawn), drawn, seen.points.reshape(-1, 3), labels.ravel())
 
-    def _signature(self, found: IndexedFrame) -> tuple[bytes, PatchCounts]:
+    def _signature(self, found: IndexedFrame) -> tuple[bytes, tuple[list[int], list[int]]]:
         number, model_id = found.frame.number, found.row.model_id
         try:
             with self._store.database.read() as connection:
                 vector = stored_vector(connection, number, model_id)
-                sizes = signature_sizes(connection, number, model_id)
-        except DamagedSignature:
+                sizes = patch_counts(connection, number, model_id)
+        except errors.DamagedSignature:
             resign_frames(self._store, found.row, [number], model_id)
             raise
         if vector is None or sizes is None:
             check_unchanged(self._store, found)
-            raise DamagedSignature(
+            raise errors.DamagedSignature(
                 f"The signature of frame {found.frame.id} is missing. Run `sceneprint fsck` to "
                 "find out why."
             )
@@ -620,7 +532,7 @@ def placed(frame: FrameRow, within: CloudFrame) -> tuple[str, list[list[float]]]
     }[within]
     if matrix is None or name is None:
         lacking = "pose" if within == "parent" else "T_base_sensor"
-        raise InvalidRequest(
+        raise errors.InvalidRequest(
             f"Frame {frame.id} has no {lacking}, so its points are available only in {optical}. "
             "Use frame=optical, or add one with PATCH.",
             (("frame", f"it has no {lacking}"),),

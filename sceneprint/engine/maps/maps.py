@@ -11,23 +11,9 @@ import numpy as np
 from pydantic import ValidationError
 from sqlalchemy import Connection, select
 
+from sceneprint import errors
+from sceneprint.engine import serializers
 from sceneprint.engine.ingest.frame_decoder import base_of, columns, viewpoint_of
-from sceneprint.engine.serializers import (
-    frame_records,
-    frame_tag,
-    map_record,
-    map_tag,
-    pose_matrix,
-    transform,
-    when,
-)
-from sceneprint.errors import (
-    InvalidRequest,
-    MapExists,
-    PreconditionFailed,
-    UnknownFrame,
-    UnreadableModel,
-)
 from sceneprint.models import PRESETS, Model, parse_model, read_model, write_model
 from sceneprint.store import Database, Store
 from sceneprint.store.frames import find_frame, write_frame, write_map
@@ -60,14 +46,14 @@ def create_map(store: Store, new: NewMap) -> tuple[Map, bool]:
         if there is None:
             keep_model(connection, model.id, model.name, write_model(model))
             row = add_map(connection, new.name, new.title, model.id, limits)
-            return map_record(connection, row), True
+            return serializers.map_record(connection, row), True
         other = any(getattr(there, name) != value for name, value in limits.items())
         if other or (there.title, there.model_id) != (new.title, model.id):
-            raise MapExists(
+            raise errors.MapExists(
                 f"Map {new.name!r} already exists with a different title, model or limits. Use "
                 "it as it is, delete it, or choose another name."
             )
-        return map_record(connection, there), False
+        return serializers.map_record(connection, there), False
 
 
 # Metadata of frames and maps, edited by a JSON merge patch (RFC 7396).
@@ -115,10 +101,10 @@ def edit_frame(
         row = find_map(connection, map_name)
         frame = find_frame(connection, row, frame_id)
         if frame.state == FrameState.DELETED:
-            raise UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted before.")
-        _check_tag(f"Frame {frame.id}", frame_tag(frame), if_match)
+            raise errors.UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted before.")
+        _check_tag(f"Frame {frame.id}", serializers.frame_tag(frame), if_match)
         now = write_frame(connection, row, frame, edited(frame, patch))
-        return frame_records(connection, row, [now])[0]
+        return serializers.frame_records(connection, row, [now])[0]
 
 
 def edit_map(
@@ -137,10 +123,10 @@ def edit_map(
     values = change.model_dump(include=change.model_fields_set)
     with store.database.read() if dry_run else store.database.write() as connection:
         row = find_map(connection, map_name)
-        _check_tag(f"Map {row.name!r}", map_tag(row), if_match)
+        _check_tag(f"Map {row.name!r}", serializers.map_tag(row), if_match)
         if dry_run:
-            return map_record(connection, replace(row, **values))
-        return map_record(connection, write_map(connection, row, values))
+            return serializers.map_record(connection, replace(row, **values))
+        return serializers.map_record(connection, write_map(connection, row, values))
 
 
 def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
@@ -151,7 +137,7 @@ def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
     InvalidRequest, InvalidPose : see `edit_frame`.
     """
     meta = _merged(frame, patch)
-    pose = None if meta.pose is None else pose_matrix(meta.pose)
+    pose = None if meta.pose is None else serializers.pose_matrix(meta.pose)
     known = columns(meta, pose, base_of(meta.T_base_sensor, viewpoint_of(frame)))
     found = {name: known[name] for field in patch for name in _COLUMNS[field]}
     for field, column in (("pose", "pose"), ("T_base_sensor", "base")):
@@ -166,7 +152,7 @@ def _merged(frame: FrameRow, patch: Mapping[str, Any]) -> FrameMeta:
     now = {
         "robot": frame.robot,
         "session": frame.session,
-        "captured_at": when(frame.captured_at),
+        "captured_at": serializers.when(frame.captured_at),
         "tags": frame.tags,
         "pose": _relative_transform(frame.pose, "parent_frame", frame.pose_parent),
         "T_base_sensor": _relative_transform(frame.base, "base_frame", frame.base_frame),
@@ -191,7 +177,7 @@ def _with(now: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str, 
     """A transform after a patch; it is given in one way, so the other one goes."""
     kept = dict(now or {})
     if "matrix" in kept and ("translation" in given or "rotation" in given):
-        T = transform(np.array(kept.pop("matrix")), "", "")
+        T = serializers.transform(np.array(kept.pop("matrix")), "", "")
         kept |= {"translation": T.translation.model_dump(), "rotation": T.rotation.model_dump()}
     merged = {**kept, **given}
     return {name: value for name, value in merged.items() if value is not None}
@@ -200,13 +186,13 @@ def _with(now: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str, 
 def _check_fields(patch: Mapping[str, Any]) -> None:
     for name in patch:
         if name in _CONTENT:
-            raise InvalidRequest(
+            raise errors.InvalidRequest(
                 f"`{name}` is part of the identity of the frame and cannot be edited. Delete the "
                 "frame, and upload it again with the right value.",
                 ((name, "cannot be edited"),),
             )
         if name not in FrameEdit.model_fields:
-            raise InvalidRequest(
+            raise errors.InvalidRequest(
                 f"The edit of the frame has an unknown field {name!r:.80}. Its fields are "
                 f"{', '.join(FrameEdit.model_fields)}.",
                 ((name[:80], "unknown"),),
@@ -215,19 +201,19 @@ def _check_fields(patch: Mapping[str, Any]) -> None:
 
 def _check_tag(what: str, tag: str, if_match: Collection[str] | None) -> None:
     if if_match is not None and tag not in if_match:
-        raise PreconditionFailed(
+        raise errors.PreconditionFailed(
             f'{what} was edited after you read it: its ETag is now "{tag}". Read it again, and '
             "send the edit with the new ETag in If-Match."
         )
 
 
-def _invalid(error: ValidationError, what: str) -> InvalidRequest:
+def _invalid(error: ValidationError, what: str) -> errors.InvalidRequest:
     found = tuple(
         (".".join(str(part) for part in one["loc"])[:80], one["msg"].removeprefix("Value error, "))
         for one in error.errors(include_url=False, include_input=False)[:20]
     )
     told = "; ".join(f"{place or 'it'}: {reason}" for place, reason in found[:3])
-    return InvalidRequest(f"{what} is not valid: {told}. See /docs.", found)
+    return errors.InvalidRequest(f"{what} is not valid: {told}. See /docs.", found)
 
 
 # The models that a map can be signed with: those of the store, and the presets that ship.
@@ -297,7 +283,7 @@ class Catalogue:
         for model in known:
             if name in (model.id, model.label):
                 return model
-        raise InvalidRequest(
+        raise errors.InvalidRequest(
             f"There is no model {name!r:.80} here. Give {' or '.join(PRESETS)}, or the id of one "
             "that GET /v1/models lists; `sceneprint reencode --model FILE` adds a new one.",
             (("model", "no such model"),),
@@ -310,7 +296,7 @@ class Catalogue:
                 try:
                     content = model_content(connection, model_id)
                     self._known[model_id] = parse_model(content, f"model {model_id[:12]}")
-                except UnreadableModel:
+                except errors.UnreadableModel:
                     continue  # another version stored it; `sceneprint fsck` says so
         return [self._known[model_id] for model_id in ids if model_id in self._known]
 

@@ -15,22 +15,18 @@ from pathlib import Path
 
 import numpy as np
 
+from sceneprint import errors
 from sceneprint.engine.search.local_index import trusted
 from sceneprint.engine.serializers import map_record, model_label
-from sceneprint.engine.upkeep.blob_garbage import collect_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
-from sceneprint.errors import (
-    BusyIndex,
-    Conflict,
-    SceneprintError,
-    UnknownMap,
-)
+from sceneprint.engine.upkeep.repair import collect_blobs
 from sceneprint.index import Generation
 from sceneprint.models import Model, read_model, write_model
 from sceneprint.store import Store, signatures
 from sceneprint.store import model_switch as stored
 from sceneprint.store.maps import find_map, keep_model, list_maps, model_names
-from sceneprint.store.tables import MapRow
+from sceneprint.store.queue import cancel_jobs
+from sceneprint.store.tables import MapRow, jobs
 from sceneprint_client.api import Map
 
 log = logging.getLogger(__name__)
@@ -59,12 +55,12 @@ def begin(store: Store, map_name: str, model: str | Path | Model) -> Map:
         row = find_map(connection, map_name)
         if row.next_model_id not in (None, wanted.id):
             label = model_label(model_names(connection)[row.next_model_id], row.next_model_id)
-            raise Conflict(
+            raise errors.Conflict(
                 f"Map {row.name!r} is already switching to {label}. Wait until it has switched, "
                 f"or cancel with `sceneprint reencode {row.name} --cancel`."
             )
         if row.next_model_id is None and row.model_id == wanted.id:
-            raise Conflict(
+            raise errors.Conflict(
                 f"Map {row.name!r} is already signed with {wanted.label}. There is nothing to do."
             )
         if row.next_model_id is None:
@@ -87,7 +83,7 @@ def cancel(store: Store, map_name: str) -> Map:
     with store.database.write() as connection:
         row = find_map(connection, map_name)
         if row.next_model_id is None:
-            raise Conflict(
+            raise errors.Conflict(
                 f"Map {row.name!r} is not switching to another model, so there is nothing to "
                 "cancel. To undo a finished switch, run it again with --model and the previous "
                 "model."
@@ -122,9 +118,9 @@ class ModelSwitches:
                     models = (row.next_model_id,)
                 if self._tidied.get(row.number) != models and _tidy(self._store, row, TIDY_S):
                     self._tidied[row.number] = models
-            except UnknownMap:
+            except errors.UnknownMap:
                 pass  # deleted in the meantime
-            except SceneprintError as error:
+            except errors.SceneprintError as error:
                 log.error("map not reencoded", extra={"map": row.name, "error": str(error)})
 
     def _go_on(self, row: MapRow) -> bool:
@@ -139,15 +135,14 @@ class ModelSwitches:
                 return False  # jobs that broke down: somebody must say what is to become of them
         try:
             generation = self._upkeep.ahead(row)
-        except BusyIndex:
+        except errors.BusyIndex:
             return False  # next time
         return self._switch(row, generation)
 
     def _switch(self, row: MapRow, generation: Generation | None) -> bool:
         with self._store.database.write() as connection:
             now = find_map(connection, row.name)
-            same = (now.number, now.next_model_id) == (row.number, row.next_model_id)
-            if not same or not stored.is_complete(connection, now):
+            if not _still(now, row) or not stored.is_complete(connection, now):
                 return False  # a frame was indexed meanwhile, or somebody was first
             found = trusted(connection, now, generation)
             if found is not None:
@@ -187,7 +182,8 @@ def _tidy(store: Store, row: MapRow, at_most_s: float = math.inf) -> bool:
                 break
         with store.database.write() as connection:
             now = find_map(connection, row.name)
-            signatures.cancel_jobs(connection, signatures.stale_jobs(connection, now))
+            stale = signatures.stale_jobs(connection, now)
+            cancel_jobs(connection, jobs.c.number.in_(stale))
     after = 0
     while True:
         with store.database.read() as connection:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sceneprint import errors
 from sceneprint.engine.maps.map_frames import FORM, Output, find_indexed, geometry_of, placed
 from sceneprint.engine.models import Signers
 from sceneprint.engine.results.stored_results import StoredResult, StoredResults
@@ -22,13 +23,6 @@ from sceneprint.engine.search.response import uncertainty_record, validation_rec
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import query_sensor, sensor_of, tag_of, transform
 from sceneprint.engine.upkeep.repair import resign_frames
-from sceneprint.errors import (
-    DamagedBlob,
-    InvalidRequest,
-    NotIndexed,
-    UnknownFrame,
-    UnreadableGeometry,
-)
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.points.ply_export import points_of, write_ply
 from sceneprint.formats.points.web import LIMIT, encode_points, thinned
@@ -102,13 +96,7 @@ class StoredPair:
 
 
 class Pairs:
-    """Matches of answers that are kept.
-
-    Parameters
-    ----------
-    store, signers : of the engine
-    kept : the answers
-    """
+    """Matches of answers that are kept."""
 
     def __init__(self, store: Store, signers: Signers, kept: StoredResults) -> None:
         self._store, self._signers, self._kept = store, signers, kept
@@ -133,7 +121,7 @@ class Pairs:
         if frame.state == FrameState.DELETED or frame.number not in kept.ranked:
             raise _deleted(match)
         if frame.number not in blobs:
-            raise NotIndexed(
+            raise errors.NotIndexed(
                 f"Map {match.map!r} has changed its model since the query, and frames of "
                 "different models cannot be compared. Send the query again."
             )
@@ -150,7 +138,7 @@ class Pairs:
         query = geometry_of_query(pair.kept)
         try:
             return query, read_geometry(self._store.blobs.get(pair.blob))
-        except (DamagedBlob, UnreadableGeometry):
+        except (errors.DamagedBlob, errors.UnreadableGeometry):
             with self._store.database.read() as connection:
                 if not refers_to(connection, pair.blob):
                     raise _deleted(pair.match) from None
@@ -196,12 +184,12 @@ class _ValidationCache:
         return found.result()
 
 
-def check_geometry(kept: StoredResult) -> bytes:
+def check_geometry(kept: StoredResult, needs: str = "the stage") -> bytes:
     """The bytes of a query's artifact; NotIndexed where it was asked without validation."""
     if kept.geometry is None:
-        raise NotIndexed(
+        raise errors.NotIndexed(
             f"Query {kept.answer.query_id} ran without validation, so its points were not "
-            "stored. Send the query again with the stage `validate`."
+            f"stored. Send the query again with {needs} `validate`."
         )
     return kept.geometry
 
@@ -211,8 +199,8 @@ def geometry_of_query(kept: StoredResult) -> Geometry:
     return read_geometry(check_geometry(kept))
 
 
-def _deleted(match: ToldMatch) -> UnknownFrame:
-    return UnknownFrame(
+def _deleted(match: ToldMatch) -> errors.UnknownFrame:
+    return errors.UnknownFrame(
         f"Frame {match.frame_id} of map {match.map!r} was deleted after the query matched it."
     )
 
@@ -221,7 +209,7 @@ def _match_of(kept: StoredResult, frame_id: str, map_name: str | None) -> ToldMa
     for one in kept.answer.matches:
         if one.frame_id == frame_id and map_name in (None, one.map):
             return one
-    raise UnknownFrame(
+    raise errors.UnknownFrame(
         f"Query {kept.answer.query_id} has no match "
         f"{frame_id!r:.80}{'' if map_name is None else f' in map {map_name!r:.80}'}. Its answer "
         "lists the matches."
@@ -229,13 +217,7 @@ def _match_of(kept: StoredResult, frame_id: str, map_name: str | None) -> ToldMa
 
 
 class Inspection:
-    """Answers that are kept, and what is behind them.
-
-    Parameters
-    ----------
-    store, signers : of the engine
-    kept : the answers
-    """
+    """Answers that are kept, and what is behind them."""
 
     def __init__(self, store: Store, signers: Signers, kept: StoredResults) -> None:
         self._store, self._signers, self._kept = store, signers, kept
@@ -349,7 +331,7 @@ class Inspection:
             found = v.T_match_query if by == "aligned" else v.T_rival
             if found is None:
                 what = "no transform" if by == "aligned" else "no rival"
-                raise InvalidRequest(
+                raise errors.InvalidRequest(
                     f"Frame {frame_id} has {what} with query {query_id}: {v.reason}. Use "
                     "transform=none to see both as they are.",
                     (("transform", f"there is {what}"),),
@@ -402,13 +384,7 @@ def _triples(rows: Floats) -> list[Triple]:
 
 
 class PointClouds:
-    """Points to be drawn.
-
-    Parameters
-    ----------
-    store, pairs : of the engine
-    kept : the answers
-    """
+    """Points to be drawn."""
 
     def __init__(self, store: Store, pairs: Pairs, kept: StoredResults) -> None:
         self._store, self._pairs, self._kept = store, pairs, kept
@@ -478,7 +454,7 @@ class PointClouds:
                 v = self._pairs.validated(pair, query, match)
                 T = v.T_match_query if by == "aligned" else v.T_rival
             if by == "rival" and T is None:
-                raise InvalidRequest(
+                raise errors.InvalidRequest(
                     f"Frame {frame_id} has no rival with query {query_id}: {v.reason}. Use "
                     "transform=aligned.",
                     (("transform", "there is no rival"),),

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
+from sceneprint.engine.results.inspection import check_geometry
 from sceneprint.engine.results.stored_results import StoredResult, StoredResults
 from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, PreparedQuery, check_taken
@@ -29,13 +30,7 @@ from sceneprint_client.api.results import Question, View
 
 
 class Rerun:
-    """Kept queries, asked once more.
-
-    Parameters
-    ----------
-    store, kept : of the engine
-    queries : answers them
-    """
+    """Kept queries, asked once more."""
 
     def __init__(self, store: Store, kept: StoredResults, queries: Queries) -> None:
         self._store, self._kept, self._queries = store, kept, queries
@@ -71,7 +66,7 @@ class Rerun:
                 "The patches of a query are not stored. Use view=depth or view=normals.",
                 (("view", "not stored for a query"),),
             )
-        surface = read_geometry(_artifact(kept)).surface
+        surface = read_geometry(check_geometry(kept, "the frame and the stage")).surface
         colours, text = (depth_view if view == "depth" else normals_view)(surface)
         return picture(colours, width, {"view": view, "model": kept.answer.model, **text})
 
@@ -144,15 +139,6 @@ def _given_options(kept: StoredResult) -> dict[str, Any]:
     return {name: value for name, value in told.items() if name in Query.model_fields}
 
 
-def _artifact(kept: StoredResult) -> bytes:
-    if kept.geometry is None:
-        raise NotIndexed(
-            f"Query {kept.answer.query_id} ran without validation, so its points were not "
-            "stored. Send the query again with the frame and the stage `validate`."
-        )
-    return kept.geometry
-
-
 def _ready(kept: StoredResult, query: Query) -> PreparedQuery:
     """As `ask_upload` made it."""
     artifact = kept.geometry
@@ -160,7 +146,7 @@ def _ready(kept: StoredResult, query: Query) -> PreparedQuery:
     return PreparedQuery(
         kept.model_id,
         kept.vector,
-        read_geometry(_artifact(kept)) if validates else None,
+        read_geometry(check_geometry(kept, "the frame and the stage")) if validates else None,
         check_taken(kept.taken, query),
         None,
         0.0,

@@ -18,11 +18,13 @@ import struct
 import threading
 import time
 import zlib
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -38,6 +40,8 @@ from sceneprint.store.frame_queries import QueryOrigin
 from sceneprint.store.tables import frames, maps
 from sceneprint.types import Bytes, Floats
 from sceneprint_client.api import Answer, FrameState, Query
+
+log = logging.getLogger(__name__)
 
 #: Most answers that are kept, however small: a folder is read again for every few.
 MOST_QUERIES = 10_000
@@ -86,9 +90,21 @@ class StoredResult:
 Stands = Callable[[StoredResult], bool]
 
 
-class StoredResults(Protocol):
-    """Where answers are kept, in a folder (`ResultFolder`) or in objects (`ResultObjects`)."""
+class StoredResults(ABC):
+    """Where answers are kept, in a folder (`ResultFolder`) or in objects (`ResultObjects`).
 
+    Parameters
+    ----------
+    seconds : how long each is kept
+    most_bytes : of all together; 0 keeps none
+    stands : whether one that is found may still be looked at
+    """
+
+    def __init__(self, seconds: float, most_bytes: int, stands: Stands = lambda _: True) -> None:
+        self._seconds, self._most, self._stands = seconds, most_bytes, stands
+        self._refused = False  # whether the last answer could not be kept
+
+    @abstractmethod
     def keep(self, kept: StoredResult) -> bool:
         """Keep an answer; False where that cannot be done, which is nobody's error."""
 
@@ -100,7 +116,14 @@ class StoredResults(Protocol):
         UnknownQuery : there is none, or no longer, or it cannot be read.
         UnusableStore : the object store is away.
         """
+        if ID.fullmatch(query_id):
+            with suppress(OSError, *DAMAGED):
+                found = self._read(query_id)
+                if found is not None and self._stands(found):
+                    return found
+        raise unknown_query(query_id)
 
+    @abstractmethod
     def forget(self, stands: Stands) -> int:
         """Remove what is too old, or does not stand; returns how many.
 
@@ -108,6 +131,16 @@ class StoredResults(Protocol):
         ------
         UnusableStore : the object store is away.
         """
+
+    @abstractmethod
+    def _read(self, query_id: str) -> StoredResult | None:
+        """The answer that lies under an id; None where it is too old."""
+
+    def _refuse(self, error: Exception) -> None:
+        """Log that answers cannot be kept: once, and not with every query."""
+        if not self._refused:
+            log.warning("query results cannot be stored", extra={"error": str(error)})
+        self._refused = True
 
 
 def unknown_query(query_id: str) -> UnknownQuery:
@@ -187,8 +220,6 @@ def _of(head: dict[str, Any], vector: Bytes, geometry: bytes | None) -> StoredRe
 
 # Answers that are kept in a folder which the processes of one machine share.
 
-log = logging.getLogger(__name__)
-
 #: Answers after which a process looks at the folder again, for what others have put there.
 _LOOK = 16
 #: Share of the bounds that is left after removing: not every answer should remove one.
@@ -197,29 +228,25 @@ _LEAVE = 0.9
 _ABANDONED_S = 60.0
 
 
-class ResultFolder:
-    """A folder of answers.
+class ResultFolder(StoredResults):
+    """A folder of answers; see also StoredResults.
 
     Parameters
     ----------
     folder : made when the first answer is kept
-    seconds : how long each is kept
-    most_bytes : of all together; 0 keeps none
-    stands : whether one that is found may still be looked at
     """
 
     def __init__(
         self, folder: Path, seconds: float, most_bytes: int, stands: Stands = lambda _: True
     ) -> None:
-        self._stands = stands
-        self._folder, self._seconds, self._most = folder, seconds, most_bytes
+        super().__init__(seconds, most_bytes, stands)
+        self._folder = folder
         self._lock = threading.Lock()
         self._left = 0  # answers until the folder is looked at again
         self._room = 0  # bytes until then
-        self._refused = False  # whether the last answer could not be kept
 
     def keep(self, kept: StoredResult) -> bool:
-        """Keep an answer; False where that cannot be done, which is nobody's error."""
+        """Keep an answer; see `StoredResults.keep`."""
         data = written(kept)
         if len(data) > self._most:
             return False
@@ -228,25 +255,15 @@ class ResultFolder:
             self._make_room(len(data))
             write_whole(self._folder / kept.answer.query_id, data)
         except OSError as error:  # a full disk, a folder that may only be read
-            if not self._refused:  # once, and not with every query
-                log.warning("query results cannot be stored", extra={"error": str(error)})
-            self._refused = True
+            self._refuse(error)
             return False
         self._refused = False
         return True
 
-    def find(self, query_id: str) -> StoredResult:
-        """The answer of that id; see `StoredResults.find`."""
-        if ID.fullmatch(query_id):
-            try:
-                path = self._folder / query_id
-                if path.stat().st_mtime + self._seconds > time.time():
-                    found = read(path.read_bytes())
-                    if self._stands(found):
-                        return found
-            except (OSError, *DAMAGED):
-                pass
-        raise unknown_query(query_id)
+    def _read(self, query_id: str) -> StoredResult | None:
+        path = self._folder / query_id
+        keeps = path.stat().st_mtime + self._seconds > time.time()
+        return read(path.read_bytes()) if keeps else None
 
     def forget(self, stands: Stands) -> int:
         """Remove what is too old, or does not stand; see `StoredResults.forget`."""
@@ -289,7 +306,7 @@ class ResultFolder:
                     whole = ID.fullmatch(entry.name) is not None
                     age = now - found.st_mtime
                     if age > (self._seconds if whole else _ABANDONED_S):
-                        _remove(entry.path)
+                        Path(entry.path).unlink(missing_ok=True)
                     elif whole:
                         files.append((found.st_mtime_ns, found.st_size, entry.path))
             files.sort(reverse=True)
@@ -303,12 +320,8 @@ class ResultFolder:
                     fits -= 1
                     total -= files[fits][1]
             for _, _, path in files[fits:]:
-                _remove(path)
+                Path(path).unlink(missing_ok=True)
             self._left, self._room = _LOOK, self._most - total
-
-
-def _remove(path: str) -> None:
-    Path(path).unlink(missing_ok=True)
 
 
 # Answers that are kept in the object store of a fleet: any API process finds what another gave.
@@ -329,29 +342,26 @@ _UNDER_WAY = 16
 _AT_ONCE, _SHARE = 500, 0.9
 
 
-class ResultObjects:
-    """Answers under the prefix of an object store.
+class ResultObjects(StoredResults):
+    """Answers under the prefix of an object store; see also StoredResults.
 
     Parameters
     ----------
     objects : of the prefix
-    seconds : how long each is kept
-    most_bytes : of those of each process, and of all when they are gone through; 0 keeps none
+    most_bytes : of those of each process, and of all when they are gone through
     purge_s : seconds after which nothing is left of what does not stand
-    stands : whether one that is found may still be looked at
     """
 
     def __init__(
         self, objects: Objects, seconds: float, most_bytes: int, purge_s: float = 3600.0,
         stands: Stands = lambda _: True,
     ) -> None:  # fmt: skip
-        self._objects, self._seconds, self._most = objects, seconds, most_bytes
-        self._purge_s, self._stands = purge_s, stands
+        super().__init__(seconds, most_bytes, stands)
+        self._objects, self._purge_s = objects, purge_s
         self._slots = threading.BoundedSemaphore(_UNDER_WAY)
         self._lock = threading.Lock()
         self._own: deque[ListedObject] = deque()  # the oldest first
         self._bytes = 0  # of those
-        self._refused = False  # whether the last answer could not be kept
 
     def keep(self, kept: StoredResult) -> bool:
         """Keep an answer; False where that is not done in time. See `StoredResults.keep`."""
@@ -380,9 +390,7 @@ class ResultObjects:
             if gone:
                 self._objects.delete(*gone)
         except UnusableStore as error:
-            if not self._refused:  # once, and not with every query
-                log.warning("query results cannot be stored", extra={"error": str(error)})
-            self._refused = True
+            self._refuse(error)
         finally:
             self._slots.release()
 
@@ -403,16 +411,9 @@ class ResultObjects:
                 gone.append(one.key)
         return gone
 
-    def find(self, query_id: str) -> StoredResult:
-        """The answer of that id; see `StoredResults.find`."""
-        if ID.fullmatch(query_id):
-            try:
-                found = read(self._objects.get(_FOLDER + query_id))
-                if found.at + self._seconds > time.time() and self._stands(found):
-                    return found
-            except (FileNotFoundError, *DAMAGED):
-                pass
-        raise unknown_query(query_id)
+    def _read(self, query_id: str) -> StoredResult | None:
+        found = read(self._objects.get(_FOLDER + query_id))
+        return found if found.at + self._seconds > time.time() else None
 
     def forget(self, stands: Stands) -> int:
         """Remove what is too old, too much, or does not stand; see `StoredResults.forget`.
@@ -465,14 +466,7 @@ class ResultObjects:
 def open_results(
     settings: Settings, blobs: Blobs, stands: Stands = lambda _: True
 ) -> StoredResults:
-    """Answers as the settings want them kept.
-
-    Parameters
-    ----------
-    settings : see Settings
-    blobs : of the store
-    stands : whether one that is found may still be looked at
-    """
+    """Answers as the settings want them kept; `stands`: see StoredResults."""
     if isinstance(blobs, ObjectBlobs):
         return ResultObjects(
             blobs.objects, settings.query_s, settings.query_bytes, settings.purge_s, stands
@@ -484,12 +478,7 @@ def open_results(
 
 
 class ResultValidity:
-    """Looks frames and maps up, once each: of one moment, so make a new one for the next.
-
-    Parameters
-    ----------
-    store : see Store
-    """
+    """Looks frames and maps up, once each: of one moment, so make a new one for the next."""
 
     def __init__(self, store: Store) -> None:
         self._store = store

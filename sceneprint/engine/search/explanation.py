@@ -10,14 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sceneprint.engine.search import retrieval
 from sceneprint.engine.search.response import Candidates, validation_record
-from sceneprint.engine.search.retrieval import (
-    Deadline,
-    MapSearch,
-    PreparedQuery,
-    Searched,
-    rank_among_all,
-)
 from sceneprint.engine.search.verification import NOT_ASKED, Validated, thresholds
 from sceneprint.engine.serializers import sensor_of, transform
 from sceneprint.errors import DamagedBlob, UnknownFrame, UnreadableGeometry
@@ -65,16 +59,14 @@ def figures(v: ValidationRecord) -> str:
     """What a validation found, in one line: its reason, and the numbers it rests on."""
     if v.residual is None:
         return f"{v.status}: {v.reason}"
+    share = v.free_space_violations
+    violations = "unknown" if share is None else f"{share:.3g}"
     return (
         f"{v.status}: {v.reason} (the directions disagree by {v.residual.translation_m:.3g} m, "
         f"{v.residual.rotation_deg:.3g} deg; overlap {v.overlap:.3g}, by planes "
-        f"{v.plane_overlap:.3g}; violations {_or_unknown(v.free_space_violations)}; ambiguity "
+        f"{v.plane_overlap:.3g}; violations {violations}; ambiguity "
         f"{v.ambiguity:.3g})"
     )
-
-
-def _or_unknown(share: float | None) -> str:
-    return "unknown" if share is None else f"{share:.3g}"
 
 
 def _each(
@@ -140,13 +132,13 @@ class ExplainedQuery:
     """
 
     store: Store
-    searched: Searched
-    asked: PreparedQuery
+    searched: retrieval.Searched
+    asked: retrieval.PreparedQuery
     query: Query
     found: Candidates
     tried: Validated
     model: Model
-    deadline: Deadline
+    deadline: retrieval.Deadline
 
 
 def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
@@ -168,7 +160,7 @@ def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
     view, number = part.place.view, np.array([row.number], np.int64)
     stored = view.signatures(number)
     distance = distances(asking.asked.vector, stored, view.metric)
-    rank = rank_among_all(asking.searched, asking.asked, row.number, int(distance[0]))
+    rank = retrieval.rank_among_all(asking.searched, asking.asked, row.number, int(distance[0]))
     at = np.flatnonzero(asking.searched.ranking.indices == row.number).tolist()
     passes = part.among is None or row.number in part.among
     # an approximate index cannot be asked what it compared: what it should have ranked, it did not
@@ -206,7 +198,7 @@ def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
     )  # fmt: skip
 
 
-def _locate_frame(asking: ExplainedQuery, frame_id: str) -> tuple[MapSearch, FrameRow]:
+def _locate_frame(asking: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapSearch, FrameRow]:
     """The frame, and what is searched of its map: the first that has one which can be found."""
     parts, own = asking.searched.parts, asking.asked.frame
     held, missing = [], None
@@ -228,7 +220,9 @@ def _locate_frame(asking: ExplainedQuery, frame_id: str) -> tuple[MapSearch, Fra
     )
 
 
-def _absent(asking: ExplainedQuery, part: MapSearch, row: FrameRow) -> tuple[Lost, str] | None:
+def _absent(
+    asking: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
+) -> tuple[Lost, str] | None:
     """Why a frame is not searched at all."""
     view, asked = part.place.view, asking.asked
     if asked.frame is not None and asked.frame[0] == row.number:
@@ -270,7 +264,7 @@ def _lost(
 
 
 def _aligned(
-    asking: ExplainedQuery, part: MapSearch, row: FrameRow
+    asking: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
 ) -> tuple[ToldValidation | None, np.ndarray | None]:
     """What aligning the query with a frame comes to, whether or not the query did."""
     geometry = asking.asked.geometry

@@ -18,15 +18,14 @@ import time
 from collections import OrderedDict
 from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, select
 
 from sceneprint.engine.models import Signers
-from sceneprint.engine.search.index_view import IndexView, MapView
-from sceneprint.engine.search.pgvector_index import StoredMaps
-from sceneprint.engine.upkeep.vector_tables import READ_MOST, Setting
+from sceneprint.engine.search.map_view import IndexView, MapView, StoredMaps
 from sceneprint.errors import UnusableStore
 from sceneprint.index import Generation, Tail, newest, newest_number
 from sceneprint.models import Model
@@ -158,6 +157,10 @@ def _nameless(folder: Path, size: int) -> mmap.mmap:
 
 log = logging.getLogger(__name__)
 
+Setting = Literal["auto", "local", "database"]
+
+#: Frames that a node reads of maps before it would ask the database instead, if it can.
+READ_MOST = 20_000
 #: Memory of all tails above which maps that were not asked for long are forgotten.
 HELD_BYTES = 1 << 30
 #: Seconds between two looks for a newer generation, and until one that is damaged, or out of reach
@@ -185,22 +188,14 @@ def trusted(connection: Connection, row: MapRow, found: Generation | None) -> Ge
     """A generation, unless the database was put back to a state before it, and went on."""
     if found is None:
         return None
-    if found.revision <= row.revision and holds_anchor(connection, found.anchor):
+    if found.revision <= row.revision and holds_anchor(connection, found.manifest.anchor):
         return found
     require_primary("the state of an index")
     return None
 
 
 class Reader:
-    """One map, searched by many threads.
-
-    Parameters
-    ----------
-    connection : of the database
-    row : of the map
-    folder : of its index
-    model : of the map
-    """
+    """One map, searched by many threads."""
 
     def __init__(self, connection: Connection, row: MapRow, folder: Path, model: Model) -> None:
         self._folder, self._model = folder, model
@@ -328,7 +323,7 @@ class Reader:
         size = len(generation or ()) + len(tail) - both - len(dead)
         model, damaged = self._model, frozenset(self._damaged)
         self._view = IndexView(
-            model.id, model.metric, revision, generation, tail, dead, size, damaged
+            model.id, model.metric, revision, size, dead, damaged, generation, tail
         )
 
 

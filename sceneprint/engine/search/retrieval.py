@@ -13,21 +13,14 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_upload
-from sceneprint.engine.search.index_view import MapView
-from sceneprint.engine.search.pgvector_index import Stored, search_stored
+from sceneprint.engine.search.map_view import MapView, Stored, search_stored
 from sceneprint.engine.upkeep.repair import resign_frames
-from sceneprint.errors import (
-    DamagedBlob,
-    DamagedSignature,
-    InvalidRequest,
-    UnknownFrame,
-    UnreadableGeometry,
-)
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.retrieval.distance import Ranking, ranking_size, similarity
 from sceneprint.index import SearchHits
-from sceneprint.index.mapped_files import Keys
+from sceneprint.index.generation_files import Keys
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, prepare, sign
 from sceneprint.store import Store
@@ -122,11 +115,11 @@ def prepare_stored(store: Store, map_name: str, frame_id: str, query: Query) -> 
             frame = find_frame(connection, row, frame_id)
             vector = stored_vector(connection, frame.number, row.model_id)
             blobs = geometry_blobs(connection, [frame.number], row.model_id)
-    except DamagedSignature:
+    except errors.DamagedSignature:
         resign_frames(store, row, [frame.number], row.model_id)
         raise
     if vector is None:
-        raise InvalidRequest(
+        raise errors.InvalidRequest(
             f"Frame {frame_id} is {frame.state}: {frame.state.sentence} Only an indexed frame "
             "can be a query.",
             (("frame_id", f"is {frame.state}"),),
@@ -139,10 +132,10 @@ def prepare_stored(store: Store, map_name: str, frame_id: str, query: Query) -> 
         try:
             artifact = store.blobs.get(blobs[frame.number])
             geometry = read_geometry(artifact)
-        except (DamagedBlob, UnreadableGeometry):
+        except (errors.DamagedBlob, errors.UnreadableGeometry):
             with store.queried.read() as connection:
                 if not refers_to(connection, blobs[frame.number]):
-                    raise UnknownFrame(
+                    raise errors.UnknownFrame(
                         f"Frame {frame_id} of map {map_name!r} was deleted during the query."
                     ) from None
             resign_frames(store, row, [frame.number], row.model_id)
@@ -159,7 +152,7 @@ def check_taken(taken: QueryOrigin, query: Query) -> QueryOrigin:
     if query.filter is not None and query.filter.not_within_s is not None:
         missing = [name for name in ("session", "captured_at") if getattr(taken, name) is None]
         if missing:
-            raise InvalidRequest(
+            raise errors.InvalidRequest(
                 "The filter has `not_within_s`, but the query frame has no "
                 f"{' and no '.join(missing)}. Send the frame with both in its meta, or leave "
                 "`not_within_s` out.",
@@ -325,17 +318,13 @@ def _searched(
         )
         if stored else ()
     )  # fmt: skip
+    # the database counts the query itself, where it is of the map
     return tuple(
-        _count_searched(next(found), part)
+        replace(hits := next(found), compared=min(hits.compared, part.passed))
         if isinstance(part.place.view, Stored)
         else part.place.view.search(vector, size, dead=part.dead, among=part.among, exact=exact)
         for part in parts
     )
-
-
-def _count_searched(hits: SearchHits, part: MapSearch) -> SearchHits:
-    """The database counts the query itself, where it is of the map."""
-    return replace(hits, compared=min(hits.compared, part.passed))
 
 
 def _part(store: Store, place: SearchedMap, asked: PreparedQuery, query: Query) -> MapSearch:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import time
 from collections import OrderedDict
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
 from sceneprint.engine.models import Signers
-from sceneprint.engine.search.index_view import MapView
 from sceneprint.engine.search.local_index import Readers
+from sceneprint.engine.search.map_view import MapView
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import transform
 from sceneprint.engine.sessions.associations import Plan, eligible, runs_of
@@ -43,7 +42,7 @@ from sceneprint.geometry.retrieval.dpp import diversify
 from sceneprint.matches import PairMatch, associate
 from sceneprint.models import Model
 from sceneprint.store import Store
-from sceneprint.store.associations import PathFrame, stops_of
+from sceneprint.store.frame_queries import PathFrame, stops_of
 from sceneprint.store.frames import frames_of
 from sceneprint.store.maps import find_map, unknown_map
 from sceneprint.store.queue import items_of
@@ -60,26 +59,10 @@ from sceneprint_client.api.sessions import Join, NewAssociation
 _WEAK = 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class Conclusion:
-    """What is told when an association is over.
-
-    Parameters
-    ----------
-    verdicts : one of each edge, in their order, as items
-    counts : consistent, inconsistent, unchecked
-    joins : as JSON
-    """
-
-    verdicts: list[dict[str, Any]]
-    counts: dict[str, int]
-    joins: list[dict[str, Any]]
-
-
 def finish_association(
     found: list[dict[str, Any]], source: list[int], target: list[int], stops: dict[int, PathFrame],
     asked: NewAssociation,
-) -> Conclusion:  # fmt: skip
+) -> tuple[list[dict[str, Any]], dict[str, int], list[dict[str, Any]]]:  # fmt: skip
     """Check edges against each other, and let those that stand vote.
 
     Parameters
@@ -88,6 +71,12 @@ def finish_association(
     source, target : numbers of the frames of both runs, in the order of time
     stops : what is known of them; deleted ones are missing
     asked : see NewAssociation
+
+    Returns
+    -------
+    verdicts : one of each edge, in their order, as items
+    counts : consistent, inconsistent, unchecked
+    joins : as JSON
     """
     named = sorted({stop.parent for stop in stops.values() if stop.parent is not None})
     parents = {name: i for i, name in enumerate(named)}
@@ -111,7 +100,7 @@ def finish_association(
             judged.kept.tolist(), judged.loops.tolist(), judged.closed.tolist(), strict=True
         )
     ]
-    return Conclusion(told, counts, _joins(found, edges, runs, judged, stops, asked))
+    return told, counts, _joins(found, edges, runs, judged, stops, asked)
 
 
 def _run(numbers: list[int], stops: dict[int, PathFrame], parents: dict[str, int]) -> RobotPath:
@@ -163,12 +152,7 @@ _OPENED = 64
 
 
 class Associating:
-    """The handler of the jobs.
-
-    Parameters
-    ----------
-    store, signers, readers : of the engine
-    """
+    """The handler of the jobs."""
 
     def __init__(self, store: Store, signers: Signers, readers: Readers) -> None:
         self._store, self._signers, self._readers = store, signers, readers
@@ -189,17 +173,15 @@ class Associating:
             if time.monotonic() >= until:
                 return SliceResult(False, progress, items)
         with self._store.database.read() as connection:
-            found = items_of(connection, task.claim.job.number) + items
+            found = items_of(connection, task.job.number) + items
             stops = stops_of(connection, {*plan.source, *plan.target})
-        end = finish_association(found, plan.source, plan.target, stops, asked)
+        judged, counts, joins = finish_association(found, plan.source, plan.target, stops, asked)
         result = {
             "frames": len(plan.source), "skipped": progress["skipped"],
-            "validated": progress["validated"], "edges": len(found), **end.counts,
-            "joins": end.joins,
+            "validated": progress["validated"], "edges": len(found), **counts,
+            "joins": joins,
         }  # fmt: skip
-        return SliceResult(
-            True, progress, items + end.verdicts, result=result, event="association.found"
-        )
+        return SliceResult(True, progress, items + judged, result=result, event="association.found")
 
     def _begin(self, task: LongJob, asked: NewAssociation) -> dict[str, Any]:
         runs = runs_of(self._store, task.of_map, asked)

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 from sceneprint.engine.reconstruction import ReconstructionJobs
 from sceneprint.engine.results.stored_results import ResultValidity, StoredResults
-from sceneprint.engine.upkeep.blob_garbage import collect_deleted_blobs, collect_doomed_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
+from sceneprint.engine.upkeep.repair import collect_deleted_blobs, collect_doomed_blobs
 from sceneprint.errors import BusyIndex, SceneprintError, UnknownJob, UnknownMap
 from sceneprint.store import Store
 from sceneprint.store.deletion import DAY_S, aging_maps, delete_frames, old_frames
@@ -102,13 +102,9 @@ ReconstructionJobs,
                 return do()
             except (UnknownMap, UnknownJob):
                 return 0  # deleted meanwhile: the next time
-            except BusyIndex as error:
-                log.info("purge incomplete", extra={"error": str(error)})
-                if failed is not None:
-                    failed.append(error)
-                return 0
             except (SceneprintError, OSError, ValueError) as error:
-                log.error("purge incomplete", extra={"error": str(error)})
+                level = logging.INFO if isinstance(error, BusyIndex) else logging.ERROR
+                log.log(level, "purge incomplete", extra={"error": str(error)})
                 if failed is not None:
                     failed.append(error)
                 return 0
@@ -150,12 +146,7 @@ REASON = "retention"
 
 
 class Retention:
-    """Deletes what is too old; any number of processes may.
-
-    Parameters
-    ----------
-    store : see Store
-    """
+    """Deletes what is too old; any number of processes may."""
 
     def __init__(self, store: Store) -> None:
         self._store = store

@@ -6,25 +6,35 @@ import logging
 import os
 import shutil
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection
+from sqlalchemy.exc import SQLAlchemyError
 
 from sceneprint.engine.models import Signers
-from sceneprint.engine.search.local_index import index_folder, is_index_folder, trusted
+from sceneprint.engine.search.local_index import (
+    READ_MOST,
+    Setting,
+    index_folder,
+    is_index_folder,
+    trusted,
+)
 from sceneprint.engine.upkeep.repair import resign_frames
-from sceneprint.errors import BusyIndex, InvalidRequest, SceneprintError, UnknownMap
+from sceneprint.errors import BusyIndex, InvalidRequest, ModelError, SceneprintError, UnknownMap
 from sceneprint.geometry.retrieval.distance import Metric
 from sceneprint.index import Generation, clear, manifests, newest, newest_number, publish, scrub
 from sceneprint.store import Store
 from sceneprint.store.events import anchor_of
 from sceneprint.store.maps import find_map, list_maps
-from sceneprint.store.model_switch import is_complete
+from sceneprint.store.model_switch import is_complete, models_of
+from sceneprint.store.postgres import vectors
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.signatures import changes_since, count_gone, count_indexed, deleted_since
 from sceneprint.store.tables import MapRow
@@ -66,7 +76,7 @@ class Scrubber:
         if self._round is None:
             if not self._is_time():
                 return None
-            self._round = _all(folders)
+            self._round = chain.from_iterable(map(scrub, folders))
         until = time.monotonic() + STEP_S
         while time.monotonic() < until:
             try:
@@ -96,11 +106,6 @@ class Scrubber:
         except OSError:
             return False  # a cache that cannot be written cannot be healed either
         return True
-
-
-def _all(folders: Sequence[Path]) -> Iterator[Path | None]:
-    for folder in folders:
-        yield from scrub(folder)
 
 
 log = logging.getLogger(__name__)
@@ -153,13 +158,14 @@ class Upkeep:
                 published += self._tried(row, anyway=True)
         return published
 
-    def rebuild(self, row: MapRow) -> Generation | None:
-        """Publish the index of a map from nothing; None where another process is building it.
+    def rebuild(self, row: MapRow) -> Generation:
+        """Publish the index of a map from nothing.
 
         Raises
         ------
         UnknownMap : the map is gone.
         InvalidRequest : there is no indexed frame in it, or its model's signatures are psi itself.
+        BusyIndex : another process is building it.
         OSError : it cannot be written; what was there stays.
         """
         if self._signers(row.model_id).model.metric != "l2":
@@ -168,7 +174,12 @@ class Upkeep:
                 "vectors, and queries compare all of them. If the map is too large for that, "
                 "switch its model with `sceneprint reencode`."
             )
-        return self._publish(row, anyway=True, anew=True)
+        generation = self._publish(row, anyway=True, anew=True)
+        if generation is None:
+            raise BusyIndex(
+                f"The index of map {row.name!r} is being built by another process. Try again later."
+            )
+        return generation
 
     def ahead(self, row: MapRow) -> Generation | None:
         """Publish the index of the model that a map is about to switch to, where that is due.
@@ -381,3 +392,82 @@ def _blocks(
         if made:
             rows = np.stack([np.frombuffer(vector, np.uint8) for _, vector in made])
             yield np.array([number for number, _ in made], np.int64), rows
+
+
+# Vectors of signatures in PostgreSQL, made and filled by workers beside everything else.
+#
+# models of the maps  -->  a table for each dimension  --fill, block by block-->  complete, a graph
+
+#: Seconds for which a worker adds vectors before it looks for frames to sign again.
+FILL_S = 2.0
+#: Seconds between two looks for what is missing.
+LOOK_S = 10.0
+#: Seconds until another try where the database has no pgvector, and after any other error.
+AGAIN_S, PAUSE_S = 600.0, 30.0
+
+
+class VectorTables:
+    """Keeps a table of vectors for each dimension that the maps of this database need.
+
+    Parameters
+    ----------
+    signers : that know the models, and the database
+    setting : with `local` there are none; with `auto` none that no node would ask
+    """
+
+    def __init__(self, signers: Signers, setting: Setting) -> None:
+        self._signers, self._database, self._setting = signers, signers.database, setting
+        self._not_before = 0.0
+
+    def run(self) -> bool:
+        """Do a little of what is due; returns whether there is more to do at once."""
+        database = self._database
+        if database.is_sqlite or database.read_only or self._setting == "local":
+            return False
+        if time.monotonic() < self._not_before:
+            return False
+        try:
+            until = time.monotonic() + FILL_S
+            more = [self._bring_on(dimension, until) for dimension in self._wanted()]
+        except (SceneprintError, SQLAlchemyError) as error:  # it costs nobody anything but time
+            self._not_before = time.monotonic() + PAUSE_S
+            log.error("vector table update failed", extra={"error": f"{error!s:.500}"})
+            return False
+        if not any(more) and time.monotonic() > self._not_before:
+            self._not_before = time.monotonic() + LOOK_S
+        return any(more)
+
+    def _wanted(self) -> list[int]:
+        """Dimensions of the models in use whose signatures are compared by L2."""
+        frames: Counter[int] = Counter()
+        with self._database.read() as connection:
+            rows = list_maps(connection)
+        for row in rows:
+            for model_id in models_of(row):
+                try:
+                    model = self._signers(model_id).model
+                except ModelError:  # its maps can be neither signed nor searched; `warm` says so
+                    continue
+                if model.metric == "l2":
+                    frames[model.signature_bytes] += row.used_frames
+        least = READ_MOST if self._setting == "auto" else -1
+        return sorted(dimension for dimension, n in frames.items() if n > least)
+
+    def _bring_on(self, dimension: int, until: float) -> bool:
+        with self._database.read() as connection:
+            complete = dimension in vectors.complete_dimensions(connection)
+        if not complete:
+            with self._database.write() as connection:
+                reason = vectors.make_table(connection, dimension)
+            if reason is not None:
+                self._not_before = time.monotonic() + AGAIN_S
+                log.warning("database search disabled: %s", reason)
+                return False
+        while not complete:
+            with self._database.write() as connection:
+                complete = vectors.fill(connection, dimension)
+            if time.monotonic() >= until:
+                break
+        if complete and vectors.add_graph(self._database, dimension):
+            log.info("vector index built", extra={"dimension": dimension})
+        return not complete

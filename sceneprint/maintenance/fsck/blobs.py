@@ -14,8 +14,7 @@ from pathlib import Path
 from sqlalchemy import Connection, Text, cast, delete, func, select, update
 from sqlalchemy.exc import DBAPIError
 
-from sceneprint.engine.upkeep.blob_garbage import collect_blobs
-from sceneprint.engine.upkeep.repair import PRIORITY, is_known_loss, reason_of_loss
+from sceneprint.engine.upkeep.repair import PRIORITY, collect_blobs, is_known_loss, reason_of_loss
 from sceneprint.errors import StoreError
 from sceneprint.maintenance.fsck.findings import Finding, Folder, each
 from sceneprint.maintenance.fsck.repair import (
@@ -31,7 +30,7 @@ from sceneprint.store.blobs.folder import PART, BlobEntry, Condition
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import refers_to
 from sceneprint.store.model_switch import REENCODE
-from sceneprint.store.queue import cancel_of, enqueue, remove_parts
+from sceneprint.store.queue import cancel_jobs, enqueue, remove_parts
 from sceneprint.store.tables import frames, job_files, jobs, maps, signatures
 from sceneprint_client.api import FrameState, JobState
 
@@ -194,7 +193,7 @@ def _repair_upload(folder: Folder, one: _Reference) -> str:
             .values(state=state, reason=loss if own is None else f"{own}; {loss}")
         )
         if now.state in _BEING_SIGNED:
-            cancel_of(connection, one.number)
+            cancel_jobs(connection, jobs.c.frame_number == one.number)
             record_event(connection, "frame.failed", one.map, one.frame_id)
         return f"{moved}the frame stays {state}" if state == now.state else f"{moved}it is {state}"
 

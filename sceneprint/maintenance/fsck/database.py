@@ -8,17 +8,15 @@ from functools import partial
 
 from sqlalchemy import Connection, ForeignKeyConstraint, and_, delete, insert, select, text, update
 
-from sceneprint.engine.upkeep.blob_garbage import collect_blobs
-from sceneprint.engine.upkeep.repair import is_known_loss, without_loss
+from sceneprint.engine.upkeep.repair import collect_blobs, is_known_loss, without_loss
 from sceneprint.errors import UnreadableModel, UnusableStore
 from sceneprint.maintenance.fsck.findings import Finding, Folder, each, is_of_rows
 from sceneprint.maintenance.fsck.repair import GONE, sign_from_upload
 from sceneprint.maintenance.snapshot.database_copy import Form
 from sceneprint.models import PRESETS, parse_model, read_model, write_model
-from sceneprint.store.maps import list_maps
+from sceneprint.store.maps import counted_usage, list_maps, use_of
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.queue import enqueue
-from sceneprint.store.quotas import counted_usage, use_of
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,

@@ -20,8 +20,15 @@ from sqlalchemy import select
 from sceneprint.engine.search.local_index import index_folder, is_index_folder, trusted
 from sceneprint.errors import DamagedIndex, StoreError
 from sceneprint.index import Generation, newest, signatures_of
-from sceneprint.index.manifest import GenerationManifest, manifests, read_manifest
-from sceneprint.index.mapped_files import building, check, draw, is_ours
+from sceneprint.index.generation_files import (
+    GenerationManifest,
+    building,
+    check,
+    draw,
+    is_ours,
+    manifests,
+    read_manifest,
+)
 from sceneprint.maintenance.fsck.blobs import WRITING_S, changed_at
 from sceneprint.maintenance.fsck.findings import Finding, Folder
 from sceneprint.store.maps import find_map, list_maps
@@ -33,7 +40,7 @@ if TYPE_CHECKING:
     from sqlalchemy import Connection
 
     from sceneprint.engine import Engine
-    from sceneprint.engine.search.index_view import IndexView
+    from sceneprint.engine.search.map_view import IndexView
 
 #: Neighbours by which recall is told, and farther ones whose distance tells how hard it is.
 NEAR, FAR = 10, 100
@@ -122,7 +129,7 @@ def describe_index(
         artifact_bytes=sizes[1],
         index_bytes=round(on_disk / max(len(generation or ()), 1)),
         sample=looked_up,
-        probes=0 if generation is None else generation.recall.probes,
+        probes=0 if generation is None else generation.manifest.recall.probes,
         recall=recall,
         spread=spread,
     )

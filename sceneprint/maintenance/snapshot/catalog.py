@@ -273,7 +273,7 @@ def snapshot_handler(settings: Settings) -> Callable[[LongJob, float], SliceResu
 
     def handle(task: LongJob, until: float) -> SliceResult:
         del until
-        job = task.claim.job
+        job = task.job
         begun = datetime.fromtimestamp(job.created_at, UTC)
         made = SnapshotCatalog(settings).take(f"{begun:%Y%m%dT%H%M%SZ}-{job.id[:8]}")
         return SliceResult(

@@ -34,10 +34,9 @@ from sqlalchemy.exc import ArgumentError
 
 from sceneprint.errors import NewerSchema, SnapshotError, UnusableStore
 from sceneprint.maintenance.snapshot.format import BlobUse
-from sceneprint.store.database import Database, open_database
+from sceneprint.store.database import Database, known_revisions, open_database
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.read_only import look_at
-from sceneprint.store.schema import known_revisions
 from sceneprint.store.sqlite import ReadOnlyFile, read_only_file
 from sceneprint.store.tables import metadata
 from sceneprint_client.api import FrameState

@@ -8,12 +8,13 @@ import hashlib
 import os
 import re
 import secrets
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
-from typing import BinaryIO, Literal, Protocol
+from typing import BinaryIO, Literal
 
 from sceneprint.atomic_files import make_folder, sync_folder, write_durable
 from sceneprint.errors import DamagedBlob, UnusableStore
@@ -25,25 +26,26 @@ from sceneprint.store.database_errors import unusable
 # server that of a connection.
 
 
-class Locks(Protocol):
+class Locks(ABC):
     """The lock of some blobs; see `Blobs.kept` and `Blobs.removing`."""
 
-    @contextmanager
-    def kept(self) -> Iterator[None]:
+    @abstractmethod
+    def kept(self) -> AbstractContextManager[None]:
         """Hold it with others who need all blobs kept."""
 
-    @contextmanager
-    def removing(self) -> Iterator[bool]:
+    @abstractmethod
+    def removing(self) -> AbstractContextManager[bool]:
         """Hold it alone, if that can be had at once."""
 
     def removals(self) -> int | None:
         """A number that any removal changes; None where it cannot be told, or one is under way."""
+        return None
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027  (most hold nothing)
         """Give back what it holds open."""
 
 
-class FileLocks:
+class FileLocks(Locks):
     """Of the processes of one machine: the lock of a folder, or of a file that is made.
 
     Parameters
@@ -84,13 +86,6 @@ class FileLocks:
             yield True
         finally:
             os.close(descriptor)
-
-    def removals(self) -> int | None:
-        """It is not told."""
-        return None
-
-    def close(self) -> None:
-        """Nothing is held open."""
 
     def _lock(self, how: int) -> int:
         # of this call alone: flock then keeps out other threads as well as other processes
@@ -183,9 +178,13 @@ class BlobEntry:
     unfinished: bool = False
 
 
-class Blobs(Protocol):
+class Blobs(ABC):
     """Where blobs are kept; safe to share between threads."""
 
+    def __init__(self, locks: Locks) -> None:
+        self._locks = locks
+
+    @abstractmethod
     def put(self, data: bytes) -> str:
         """Keep bytes; when this returns nothing that the store promises to survive loses them.
 
@@ -199,6 +198,7 @@ class Blobs(Protocol):
         UnusableStore : it may not be written, or is not there.
         """
 
+    @abstractmethod
     def incoming(self) -> AbstractContextManager[IncomingBlob]:
         """Take a blob in parts, such as one that does not fit into memory.
 
@@ -209,6 +209,7 @@ class Blobs(Protocol):
         StoreFull, UnusableStore : as `put`, also from `write` and `keep`.
         """
 
+    @abstractmethod
     def get(self, digest: str) -> bytes:
         """The bytes of a digest, checked against it.
 
@@ -218,6 +219,7 @@ class Blobs(Protocol):
         UnusableStore : the store is away.
         """
 
+    @abstractmethod
     def open(self, digest: str) -> BinaryIO:
         """A blob as a file that can be sought in, unchecked; FileNotFoundError where it is missing.
 
@@ -226,9 +228,11 @@ class Blobs(Protocol):
         OSError, UnusableStore : it cannot be read, now or later.
         """
 
+    @abstractmethod
     def holds(self, digest: str) -> bool:
         """Whether there is a blob of that digest."""
 
+    @abstractmethod
     def size(self, digest: str) -> int | None:
         """Bytes of a blob as it lies there, unchecked; None where it is missing."""
 
@@ -241,6 +245,7 @@ class Blobs(Protocol):
         ------
         UnusableStore : it cannot be locked.
         """
+        return self._locks.kept()
 
     def removing(self) -> AbstractContextManager[bool]:
         """Hold the right to remove blobs; False where somebody needs them kept, or removes some.
@@ -248,10 +253,13 @@ class Blobs(Protocol):
         Ask for it within a writing transaction: removers then come one after the other, and leave
         room between them for who waits in `kept`.
         """
+        return self._locks.removing()
 
+    @abstractmethod
     def remove(self, digest: str) -> None:
         """Forget a blob that nothing refers to; only within `removing`."""
 
+    @abstractmethod
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
         """Whether a blob is as it was stored; read in parts, so that memory is bounded.
 
@@ -265,6 +273,7 @@ class Blobs(Protocol):
         UnusableStore : it may not be read by this user, or the store is away.
         """
 
+    @abstractmethod
     def quarantine(self, digest: str, folder: Path) -> Path | None:
         """Move what lies under a digest out of the way, durably; None where there is nothing.
 
@@ -274,16 +283,19 @@ class Blobs(Protocol):
         folder : to move it to; made where missing
         """
 
+    @abstractmethod
     def place(self, digest: str) -> str:
         """Where a blob lies, for people to look at."""
 
+    @abstractmethod
     def digests(self) -> Iterator[str]:
         """All blobs, in no order."""
 
+    @abstractmethod
     def entries(self) -> Iterator[BlobEntry]:
         """All that lies where blobs are kept, in no order."""
 
-    def check(self) -> None:
+    def check(self) -> None:  # noqa: B027
         """See that a store on the network answers, or did two seconds ago; a folder has nothing
         to be asked.
 
@@ -294,13 +306,14 @@ class Blobs(Protocol):
 
     def close(self) -> None:
         """Give back what it holds open."""
+        self._locks.close()
 
 
 #: What a writer that was killed leaves behind.
 PART = re.compile(r"\.[0-9a-f]{12}\.part")
 
 
-class FolderBlobs:
+class FolderBlobs(Blobs):
     """A folder of blobs, in 256 folders by their first two digits.
 
     Parameters
@@ -314,9 +327,9 @@ class FolderBlobs:
     """
 
     def __init__(self, folder: Path, *, make: bool = True) -> None:
-        self._folder = folder
         # the folder itself is the lock, so that there is none to make or to clear away
-        self._locks = FileLocks(folder)
+        super().__init__(FileLocks(folder))
+        self._folder = folder
         self._durable: set[str] = set()  # folders in it that this process has synced it for
         try:
             if make:
@@ -325,19 +338,9 @@ class FolderBlobs:
             raise unusable(f"{folder}: the folder cannot be made", error) from error
 
     def put(self, data: bytes) -> str:
-        """Keep bytes; when this returns they survive the loss of power.
-
-        Returns
-        -------
-        digest : 64 hexadecimal digits
-
-        Raises
-        ------
-        StoreFull : the disk is full; nothing is left behind.
-        UnusableStore : it may not be written, or is not there.
-        """
+        """Keep bytes; when this returns they survive the loss of power. See `Blobs.put`."""
         digest = hashlib.sha256(data).hexdigest()
-        path = self._path(digest)
+        path = self.path(digest)
         try:  # also where it is there: that one may be damaged, not yet durable, or being removed
             new = self._made(path.parent)
             write_durable(path, data, folder_is_new=new)
@@ -348,14 +351,7 @@ class FolderBlobs:
 
     @contextmanager
     def incoming(self) -> Iterator[IncomingBlob]:
-        """Take a blob in parts, such as one that does not fit into memory.
-
-        What is not kept by the end of it is removed.
-
-        Raises
-        ------
-        StoreFull, UnusableStore : as `put`, also from `write` and `keep`.
-        """
+        """Take a blob in parts; see `Blobs.incoming`."""
         part = self._folder / f".{secrets.token_hex(6)}.part"
         what = f"{self._folder}: a blob cannot be written"
         try:
@@ -372,7 +368,7 @@ class FolderBlobs:
     def _keep(self, file: FileIO, part: Path, digest: str) -> None:
         """Sync a file that is written, and give it the name of its content."""
         os.fsync(file.fileno())
-        path = self._path(digest)
+        path = self.path(digest)
         self._made(path.parent)
         os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
         sync_folder(path.parent)
@@ -387,14 +383,9 @@ class FolderBlobs:
         return True
 
     def get(self, digest: str) -> bytes:
-        """The bytes of a digest, checked against it.
-
-        Raises
-        ------
-        DamagedBlob : they are missing, or others than were stored.
-        """
+        """The bytes of a digest, checked against it; see `Blobs.get`."""
         try:
-            data = self._path(digest).read_bytes()
+            data = self.path(digest).read_bytes()
         except OSError as error:
             raise DamagedBlob(
                 f"The blob {digest[:12]} cannot be read ({error.strerror}). Restore the data "
@@ -409,64 +400,36 @@ class FolderBlobs:
 
     def holds(self, digest: str) -> bool:
         """Whether there is a blob of that digest."""
-        return self._path(digest).exists()
+        return self.path(digest).exists()
 
     def size(self, digest: str) -> int | None:
         """Bytes of a blob as it lies there, unchecked; None where it is missing."""
         try:
-            return self._path(digest).stat().st_size
+            return self.path(digest).stat().st_size
         except OSError:
             return None
 
     def open(self, digest: str) -> BinaryIO:
-        """A blob as a file that can be sought in, unchecked; FileNotFoundError where it is missing.
-
-        Raises
-        ------
-        OSError : it cannot be read.
-        """
-        return self._path(digest).open("rb")
-
-    def kept(self) -> AbstractContextManager[None]:
-        """See that no blob is removed meanwhile; waits for who is removing some.
-
-        Raises
-        ------
-        UnusableStore : the folder cannot be locked.
-        """
-        return self._locks.kept()
-
-    def removing(self) -> AbstractContextManager[bool]:
-        """Hold the right to remove blobs; see `Blobs.removing`."""
-        return self._locks.removing()
+        """A blob as a file that can be sought in; see `Blobs.open`."""
+        return self.path(digest).open("rb")
 
     def remove(self, digest: str) -> None:
         """Forget a blob that nothing refers to; only within `removing`."""
-        self._path(digest).unlink(missing_ok=True)
+        self.path(digest).unlink(missing_ok=True)
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
-        """Whether a blob is as it was stored; read in parts, so that memory is bounded.
-
-        Parameters
-        ----------
-        digest : of the blob; what is no digest names none
-        quick : see only whether it is there
-
-        Raises
-        ------
-        UnusableStore : it may not be read by this user.
-        """
+        """Whether a blob is as it was stored; see `Blobs.condition`."""
         if not DIGEST.fullmatch(digest):
             return "missing"
         try:
-            with self._path(digest).open("rb") as file:
+            with self.path(digest).open("rb") as file:
                 if quick or hashlib.file_digest(file, "sha256").hexdigest() == digest:
                     return "sound"
         except FileNotFoundError:
             return "missing"
         except PermissionError as error:
             raise UnusableStore(
-                f"{self._path(digest)}: may not be read. Run it as the user who owns the data "
+                f"{self.path(digest)}: may not be read. Run it as the user who owns the data "
                 "folder."
             ) from error
         except OSError:  # the disk cannot read it, or a folder has its name
@@ -474,14 +437,8 @@ class FolderBlobs:
         return "damaged"
 
     def quarantine(self, digest: str, folder: Path) -> Path | None:
-        """Move what lies under a digest out of the way, durably; None where there is nothing.
-
-        Parameters
-        ----------
-        digest : of a blob that was found damaged; only within `removing`
-        folder : to move it to; made where missing
-        """
-        path, place = self._path(digest), folder / f"blob-{digest}"
+        """Move what lies under a digest out of the way; see `Blobs.quarantine`."""
+        path, place = self.path(digest), folder / f"blob-{digest}"
         folder.mkdir(parents=True, exist_ok=True)
         try:
             os.replace(path, place)  # noqa: PTH105  (the one call that is atomic by contract)
@@ -496,13 +453,9 @@ class FolderBlobs:
             sync_folder(each)
         return place
 
-    def path(self, digest: str) -> Path:
-        """Where a blob lies, for people to look at."""
-        return self._folder / digest[:2] / digest
-
     def place(self, digest: str) -> str:
         """As `path`, whatever keeps the blobs."""
-        return str(self.path(digest))
+        return str(self._folder / digest[:2] / digest)
 
     def digests(self) -> Iterator[str]:
         """All blobs, in no order."""
@@ -530,12 +483,7 @@ class FolderBlobs:
                     part = PART.fullmatch(one.name) is not None
                     yield BlobEntry(one.path, one.name if own else None, changed_at, part)
 
-    def check(self) -> None:
-        """There is nothing to be asked."""
-
-    def close(self) -> None:
-        """Nothing is held open."""
-
-    def _path(self, digest: str) -> Path:
+    def path(self, digest: str) -> Path:
+        """Where a blob lies; ValueError for what is no digest."""
         require_digest(digest)
         return self._folder / digest[:2] / digest

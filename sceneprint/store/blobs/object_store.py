@@ -19,7 +19,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -28,6 +28,7 @@ from sceneprint.errors import DamagedBlob, UnusableStore
 from sceneprint.store.blobs.folder import (
     DIGEST,
     BlobEntry,
+    Blobs,
     Condition,
     IncomingBlob,
     Locks,
@@ -51,10 +52,6 @@ MARK = "sceneprint.json"
 
 class BucketOwner:
     """The mark of a prefix.
-
-    Parameters
-    ----------
-    objects : of the prefix
 
     Every method raises UnusableStore where the prefix is another's, or cannot be used.
     """
@@ -212,7 +209,7 @@ _KNOWN = 4_096
 CHECK_S = 2.0
 
 
-class ObjectBlobs:
+class ObjectBlobs(Blobs):
     """Blobs under the prefix of an object store.
 
     Parameters
@@ -226,9 +223,10 @@ class ObjectBlobs:
     def __init__(
         self, objects: Objects, locks: Locks, owner: Callable[[], str], purge_s: float = 3600.0
     ) -> None:
+        super().__init__(locks)
         self.objects = objects
         self._recent = Recent(purge_s)
-        self._locks, self._owner = locks, owner
+        self._owner = owner
         self._claimed = False
         self._put: OrderedDict[str, int] = OrderedDict()  # removals until then, by digest
         self._lock = threading.Lock()
@@ -238,10 +236,6 @@ class ObjectBlobs:
 
     def claim(self, *, anew: bool = True) -> None:
         """See that the prefix is this store's, and mark it where it is nobody's yet.
-
-        Parameters
-        ----------
-        anew : mark it
 
         Raises
         ------
@@ -335,14 +329,6 @@ class ObjectBlobs:
         require_digest(digest)
         return self.objects.size(_key(digest))
 
-    def kept(self) -> AbstractContextManager[None]:
-        """See that no blob is removed meanwhile; see `Blobs.kept`."""
-        return self._locks.kept()
-
-    def removing(self) -> AbstractContextManager[bool]:
-        """Hold the right to remove blobs; see `Blobs.removing`."""
-        return self._locks.removing()
-
     def remove(self, digest: str) -> None:
         """Forget a blob that nothing refers to; only within `removing`."""
         require_digest(digest)
@@ -432,7 +418,7 @@ class ObjectBlobs:
 
     def close(self) -> None:
         """Give back the connections of its locks, and what was read lately."""
-        self._locks.close()
+        super().close()
         self._recent.close()
 
 

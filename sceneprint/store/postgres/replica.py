@@ -23,8 +23,7 @@ from sqlalchemy import text
 from sqlalchemy.exc import SQLAlchemyError
 
 from sceneprint.errors import FrameError, SceneprintError, StoreAway, StoreError, UnusableStore
-from sceneprint.store.database import Database, reach_database
-from sceneprint.store.schema import known_revisions
+from sceneprint.store.database import Database, known_revisions, reach_database
 
 log = logging.getLogger(__name__)
 

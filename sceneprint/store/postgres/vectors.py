@@ -83,12 +83,7 @@ def make_table(connection: Connection, dimension: int) -> str | None:
 
 
 def drop_tables(connection: Connection) -> None:
-    """Drop all tables of vectors, before signatures are written past `put`; workers make them anew.
-
-    Parameters
-    ----------
-    connection : of a writing transaction
-    """
+    """Drop the tables of vectors before signatures are written past `put`; workers make others."""
     if _exists(connection, "vector_tables"):
         for dimension in connection.execute(text("SELECT dimension FROM vector_tables")).scalars():
             connection.execute(text(f"DROP TABLE IF EXISTS {table_of(dimension)}"))

@@ -26,7 +26,7 @@ def made(settings: Settings) -> tuple[str, str]:
     """A job with two files; ids of the job and of the first blob."""
     with Engine(settings) as engine:
         engine.create_map(NewMap(name="hall", model="depth"))
-        job = engine.tasks.begin("reconstruct", "hall", {})
+        job, _ = engine.tasks.begin("reconstruct", "hall", {})
         blob = engine.store.blobs.put(b"a mesh")
         other = engine.store.blobs.put(b"a picture")
         with engine.store.database.write() as connection:

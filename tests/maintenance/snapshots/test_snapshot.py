@@ -22,6 +22,7 @@ from pathlib import Path
 import pytest
 
 from sceneprint.engine import Engine
+from sceneprint.engine.admin.operations import list_keys
 from sceneprint.errors import SnapshotError, UnusableStore
 from sceneprint.maintenance.snapshot import creation
 from sceneprint.maintenance.snapshot.creation import take_snapshot
@@ -103,7 +104,7 @@ def test_what_is_restored_is_what_was_there(
         assert work is not None
         assert engine.run(work) == "succeeded"
         assert engine.get_map("hall").frames == {"deleted": 1, "indexed": 5}
-        assert [key.name for key in engine.list_keys().items] == ["robot"]
+        assert [key.name for key in list_keys(engine.store).items] == ["robot"]
     assert snapshot.manifest.n_frames == 5
 
 

@@ -1,32 +1,149 @@
-"""Maps searched in PostgreSQL, by a node that does not hold their signatures.
+"""Maps as queries see them: as of one revision, held by this node or in the database.
 
-query  --nearest vectors of pgvector-->  candidates  --signatures-->  Hits
+    a map as of now  --Readers.views-->  MapView  --search-->  Hits
 
-All maps of a query are asked in one statement, as of one state of the database: a frame that is
-deleted there is found by none of it.
+`IndexView` is a map that this node holds, `Stored` one that PostgreSQL searches. Exact
+distances of signatures decide in both, so that where both compare the same frames their answers
+are the same.
 """
 
 from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection
 
-from sceneprint.engine.search.index_view import Kind
 from sceneprint.errors import UnknownFrame
 from sceneprint.geometry.retrieval.distance import Metric, distances
-from sceneprint.index import SearchHits
-from sceneprint.index.mapped_files import Keys
+from sceneprint.index import Generation, SearchHits, Tail, search, signatures_of
+from sceneprint.index.generation_files import Keys
 from sceneprint.models import Model
 from sceneprint.store import Database
 from sceneprint.store.postgres import vectors
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Bytes
+
+#: Where a map is searched: by this node, or by the database.
+Kind = Literal["local", "database"]
+
+
+@dataclass(frozen=True, eq=False)
+class MapView(ABC):
+    """A map that can be searched, as of one revision or later.
+
+    Parameters
+    ----------
+    model_id : of the model that made all signatures
+    metric : how they are compared
+    revision : of the map
+    size : frames that can be found
+    dead : frames that it holds and that are deleted
+    damaged : frames that were passed over, as their signature is damaged
+    """
+
+    #: Who searches it.
+    kind: ClassVar[Kind]
+
+    model_id: str
+    metric: Metric
+    revision: int
+    size: int
+    dead: frozenset[int]
+    damaged: Set[int]
+
+    @property
+    def number(self) -> int:
+        """Of the generation of the index; 0 where none is used."""
+        return 0
+
+    @abstractmethod
+    def search(
+        self, query: Bytes, size: int, *, dead: frozenset[int], among: Keys | None = None,
+        exact: bool = False,
+    ) -> SearchHits:  # fmt: skip
+        """The nearest frames by exact distance; see `index.search`."""
+
+    @abstractmethod
+    def nearer(
+        self, query: Bytes, key: int, distance: int, *, dead: frozenset[int],
+        among: Keys | None = None,
+    ) -> int:  # fmt: skip
+        """How many frames come before one in the order of exact distance, equal ones by key."""
+
+    @abstractmethod
+    def signatures(self, keys: Keys) -> Bytes:
+        """Signatures (r, D) of frames that it has."""
+
+    @abstractmethod
+    def has(self, keys: Keys) -> NDArray[np.bool_]:
+        """Which frames (n,) can be found."""
+
+
+@dataclass(frozen=True, eq=False)
+class IndexView(MapView):
+    """A map as of one revision, held by this node: an index, and the frames that are newer.
+
+    Parameters
+    ----------
+    generation : of its index, or None
+    tail : frames newer than it
+    """
+
+    kind: ClassVar[Kind] = "local"
+
+    generation: Generation | None
+    tail: Tail
+
+    @property
+    def number(self) -> int:
+        """See MapView."""
+        return 0 if self.generation is None else self.generation.number
+
+    def search(
+        self, query: Bytes, size: int, *, dead: frozenset[int], among: Keys | None = None,
+        exact: bool = False,
+    ) -> SearchHits:  # fmt: skip
+        """See `index.search`."""
+        return search(
+            query, self.generation, self.tail, size, metric=self.metric, dead=dead, among=among,
+            exact=exact,
+        )  # fmt: skip
+
+    def nearer(
+        self, query: Bytes, key: int, distance: int, *, dead: frozenset[int],
+        among: Keys | None = None,
+    ) -> int:  # fmt: skip
+        """See MapView."""
+        hits = self.search(query, max(self.size, 1), dead=dead, among=among, exact=True)
+        same = (hits.distances == distance) & (hits.keys < key)
+        return int(((hits.distances < distance) | same).sum())
+
+    def signatures(self, keys: Keys) -> Bytes:
+        """See `index.signatures_of`."""
+        return signatures_of(keys, self.generation, self.tail)
+
+    def has(self, keys: Keys) -> NDArray[np.bool_]:
+        """See MapView."""
+        known = self.tail.places.of(keys) >= 0
+        if self.generation is not None:
+            known |= self.generation.places.of(keys) >= 0
+        alive: NDArray[np.bool_] = known & ~np.isin(keys, list(self.dead))
+        return alive
+
+
+# Maps searched in PostgreSQL, by a node that does not hold their signatures.
+#
+# query  --nearest vectors of pgvector-->  candidates  --signatures-->  Hits
+#
+# All maps of a query are asked in one statement, as of one state of the database: a frame that is
+# deleted there is found by none of it.
 
 #: Least number of candidates that pgvector is asked for, where it goes through its graph.
 LEAST_CANDIDATES = 200
@@ -34,29 +151,23 @@ LEAST_CANDIDATES = 200
 _COUNTED = 20
 
 
-@dataclass(eq=False)
-class Stored:
-    """A map in the database: the MapView of one query.
+@dataclass(frozen=True, eq=False)
+class Stored(MapView):
+    """A map in the database, as one query sees it; `damaged` are of those that were looked at.
 
     Parameters
     ----------
     database : to read from
-    map_number, model_id, revision, size : of the map
+    map_number : of the map
     length : bytes of a signature
-    damaged : see MapView; of those that were looked at
     """
 
+    kind: ClassVar[Kind] = "database"
+
+    damaged: set[int]
     database: Database
     map_number: int
-    model_id: str
-    revision: int
-    size: int
     length: int
-    damaged: set[int] = field(default_factory=set)
-    kind: Kind = "database"
-    metric: Metric = "l2"
-    dead: frozenset[int] = frozenset()  # what is deleted is not in the database
-    number: int = 0
     _held: dict[int, Bytes] = field(default_factory=dict)  # signatures that were read
 
     def search(
@@ -122,9 +233,9 @@ class StoredMaps:
             until = time.monotonic() + _COUNTED * (time.monotonic() - now)
             self._sizes |= {r.number: (r.revision, until, counted[r.number]) for r in changed}
         return {
-            row.number: Stored(
-                database, row.number, row.model_id, row.revision, self._sizes[row.number][2],
-                model.signature_bytes,
+            row.number: Stored(  # what is deleted is not in the database
+                row.model_id, "l2", row.revision, self._sizes[row.number][2], frozenset(), set(),
+                database, row.number, model.signature_bytes,
             )
             for row in rows
         }  # fmt: skip

@@ -1,27 +1,151 @@
-"""The inverted file of a very large map: which signatures are compared with a query.
+"""FAISS over stored signatures: bytes as they are, squared Euclidean distance, all compared, or
+those in the nearest lists.
 
-Signatures lie in lists, each with a centroid; a query is compared with those of the lists whose
-centroids are nearest. How many lists is measured when a generation is published.
+Of what FAISS offers this kind was measured to be right, and nobody else names one: some kinds are
+silently wrong, some abort the process. Its codes are the signatures themselves, so its distances
+are those of `geometry.retrieval`, integers as long as 32 bits of floating point hold them.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import DamagedIndex
+from sceneprint.types import Bytes
+
+if TYPE_CHECKING:
+    from faiss import IndexScalarQuantizer
+import struct
+from dataclasses import dataclass, replace
+from functools import cached_property
+
 from sceneprint.geometry.retrieval.distance import distances
-from sceneprint.index.flat import library
-from sceneprint.index.manifest import Recall
-from sceneprint.index.mapped_files import BLOCK_BYTES, draw, mapped
-from sceneprint.types import Bytes, Floats32, Ints32
+from sceneprint.index.generation_files import BLOCK_BYTES, Recall, draw, mapped
+from sceneprint.types import Floats32, Ints32
+
+#: Distances from here on may be rounded: the first integers that 32 bits of floats do not all hold.
+ROUNDED = 1 << 24
+
+
+def library() -> Any:
+    """FAISS, on one thread: requests are what runs side by side. Imported late: it takes 0.3 s."""
+    import faiss  # its own stubs contradict it
+
+    faiss.omp_set_num_threads(1)  # of this thread
+    return faiss
+
+
+def allocate(n: int, dimension: int) -> tuple[IndexScalarQuantizer, Bytes]:
+    """An index of n signatures that are yet to be written, and where: (n, d) uint8."""
+    faiss = library()
+    index = faiss.IndexScalarQuantizer(
+        dimension, faiss.ScalarQuantizer.QT_8bit_direct, faiss.METRIC_L2
+    )
+    index.codes.resize(n * dimension)
+    index.ntotal = n
+    return index, _view(index, read_only=False)
+
+
+def codes_of(index: IndexScalarQuantizer) -> Bytes:
+    """The signatures (n, d) of an index, where they are: read-only, and keeps the index alive."""
+    return _view(index, read_only=True)
+
+
+class _Codes:
+    """What numpy is told of the memory of an index."""
+
+    def __init__(self, index: Any, read_only: bool) -> None:
+        self._index = index
+        self.__array_interface__ = {
+            "version": 3,
+            "typestr": "|u1",
+            "shape": (index.ntotal, index.d),
+            "data": (int(index.codes.data()), read_only),
+        }
+
+
+def _view(index: Any, *, read_only: bool) -> Bytes:
+    if index.ntotal == 0:  # of no memory
+        return np.empty((0, index.d), np.uint8)
+    return np.asarray(_Codes(index, read_only))
+
+
+def write_index(index: IndexScalarQuantizer, take: Callable[[bytes], None]) -> None:
+    """Give an index as bytes, block by block.
+
+    Raises
+    ------
+    Exception : of `take`
+    """
+    faiss = library()
+    faiss.write_index(index, faiss.PyCallbackIOWriter(take))
+
+
+def map_index(path: Path, n: int, dimension: int) -> IndexScalarQuantizer:
+    """Map an index into memory that processes share; it survives the unlinking of its file.
+
+    Parameters
+    ----------
+    path : of a file whose checksum the caller has checked: FAISS crashes on bytes that mean harm
+    n, dimension : that it must have
+
+    Raises
+    ------
+    DamagedIndex : missing, another kind or shape, or of a FAISS that this one cannot read.
+    """
+    faiss = library()
+    try:
+        index: Any = faiss.read_index(str(path), faiss.IO_FLAG_MMAP_IFC)
+    except RuntimeError as error:
+        raise DamagedIndex(f"{path}: FAISS cannot read it: {error}") from error
+    if (
+        not isinstance(index, faiss.IndexScalarQuantizer)
+        or (index.d, index.ntotal, index.metric_type) != (dimension, n, faiss.METRIC_L2)
+        or index.sq.qtype != faiss.ScalarQuantizer.QT_8bit_direct
+        or index.codes.size() != n * dimension
+    ):
+        raise DamagedIndex(f"{path}: no FAISS index of {n} signatures of {dimension} bytes.")
+    found: IndexScalarQuantizer = index
+    return found
+
+
+def nearest(
+    index: IndexScalarQuantizer, query: Bytes, count: int, free: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+    """The rows nearest to a query, and their distances, in no order that is promised.
+
+    Parameters
+    ----------
+    query : (d,) uint8
+    count : of rows; there must be so many
+    free : (n,) which rows may be found; all of them if None
+
+    Returns
+    -------
+    (count,) rows, of which the earlier wins where distances are equal, and (count,) distances;
+    None where FAISS may have rounded one of them
+    """
+    if count == 0:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    faiss, parameters = library(), None
+    if free is not None:
+        selector = faiss.IDSelectorBitmap(np.packbits(free, bitorder="little"))
+        parameters = faiss.SearchParameters(sel=selector)
+    found, rows = index.search(query[None].astype(np.float32), count, params=parameters)
+    if found.max() >= ROUNDED:
+        return None
+    return rows[0], found[0].astype(np.int64)
+
+
+# The inverted file of a very large map: which signatures are compared with a query.
+#
+# Signatures lie in lists, each with a centroid; a query is compared with those of the lists whose
+# centroids are nearest. How many lists is measured when a generation is published.
 
 #: Lists of N signatures: this many times the square root of N.
 LISTS = 4
@@ -169,12 +293,6 @@ def _assigned(centroids: Floats32, vectors: Bytes, rows: NDArray[np.int64]) -> I
 
 def measure_lists(lists: Lists, vectors: Bytes, seed: int = 0) -> tuple[Lists, Recall]:
     """Look up some frames, and probe so many lists that a search finds ENOUGH of the nearest.
-
-    Parameters
-    ----------
-    lists : of the signatures
-    vectors : (N, d)
-    seed : of the choice of frames
 
     Returns
     -------
