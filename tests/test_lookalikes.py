@@ -193,12 +193,12 @@ def test_scans_of_a_corridor_of_equal_doors_are_not_believed(
 
 
 def test_scans_of_a_hall_of_equal_bays_are_seldom_believed(scans_model: Model) -> None:
-    """Turned by 180 degrees an empty hall is the same: what tells is no more than its ends."""
+    """Half a turn maps an empty hall onto itself: what tells is no more than noise."""
     room = corridor(10, 6.0, 14.0, 6.0)
     counted = outcomes_of(scan_pairs(room, 6.0, 24, 31), 24, "bays", scans_model)
     assert counted.total() == 24
-    assert not_believed(counted) >= 0.9  # measured: see docs/clouds.md
-    assert counted["accepted strong, right"] >= 4
+    assert not_believed(counted) >= 0.95  # measured: one of 24, and one of 24 of another seed
+    assert counted["ambiguous"] >= 8
 
 
 @pytest.mark.thorough

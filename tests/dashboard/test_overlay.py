@@ -239,7 +239,7 @@ def test_an_ambiguous_match_has_its_rival(
     assert axe(page) == []
     # of a scrap of wall there is no hypothesis at all
     v, u = np.mgrid[:240, :320]
-    scrap = np.where((abs(u - 160) < 30) & (abs(v - 120) < 30), 1500, 0).astype(np.uint16)
+    scrap = np.where((abs(u - 160) < 16) & (abs(v - 120) < 16), 1500, 0).astype(np.uint16)
     file, form = io.BytesIO(), box(0)
     Image.fromarray(scrap).save(file, "PNG")
     form["files"] = {"frame": ("scrap.png", file.getvalue(), "image/png")}

@@ -54,8 +54,12 @@ LIES = {
     "endless values": (b"COUNT 3 1", b"COUNT 99999999999 1", "99999999999 of TYPE"),
     "other counts": (b"POINTS 12", b"POINTS 13", "says 13 and 12"),
     "fifty million": (b"12\nHEIGHT 1\n", b"50000000\n", "50000000"),
-    "more than there are": (b"12\nHEIGHT 1\nV", b"1\nHEIGHT 12\nDATA binary\nV", "points of 30"),
-    "floats for doubles": (b"SIZE 4 4 4 8 2", b"SIZE 4 4 4 4 2", "of 312 bytes follow"),
+    "more than there are": (
+        b"12\nHEIGHT 1\nV",
+        b"1\nHEIGHT 12\nDATA binary\nV",
+        "from the viewpoint",
+    ),
+    "doubles for floats": (b"SIZE 4 4 4 8 2", b"SIZE 8 4 4 8 2", "360 of 504 bytes follow"),
     "a negative count": (b"WIDTH 12", b"WIDTH -12", "WIDTH '-12'"),
     "an unknown form": (b"DATA binary", b"DATA zipped", "DATA 'zipped'"),
     "twice": (b"HEIGHT 1", b"WIDTH 12", "line 'WIDTH 12'"),
@@ -86,6 +90,13 @@ def test_a_header_alone_asks_for_nothing(count: int) -> None:
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("form", ["binary", "binary_compressed"])
+def test_bytes_after_the_points_are_passed_over(pcd: Write, points: np.ndarray, form: str) -> None:
+    """Some programs pad their files; PCL reads them as well."""
+    for rest in (b"\0", b"\0" * 4096, b"more"):
+        np.testing.assert_array_equal(decode_cloud(pcd(form=form) + rest).points, points)
 
 
 def test_truncated(pcd: Write) -> None:

@@ -148,7 +148,8 @@ def test_stages_and_k_are_as_asked(served, rooms, moved):
         assert match["validation"] == {
             "status": "skipped", "strength": None, "reason": "not requested", "residual": None,
             "overlap": None, "plane_overlap": None, "free_space_violations": None,
-            "inliers": None, "ambiguity": None,
+            "planes": None, "plane_violations": None, "inliers": None, "ambiguity": None,
+            "search": None, "directions": [],
         }  # fmt: skip
         assert (match["selected"], match["diversity_gain"]) == (None, None)
         assert (match["transform"], match["pose_in_map"]) == (None, None)

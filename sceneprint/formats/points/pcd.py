@@ -152,7 +152,7 @@ def read_pcd(data: bytes) -> FilePoints:
     if form == "ascii":
         blocks = _written_out(data, start, count, fields)
     elif form == "binary":
-        if len(data) - start != count * width:
+        if len(data) - start < count * width:  # some programs pad their files
             raise UnreadableCloud(
                 f"The PCD header announces {count} points of {width} bytes, and "
                 f"{len(data) - start} of {count * width} bytes follow. {_AGAIN}"
@@ -195,7 +195,7 @@ def _compressed(data: bytes, start: int, count: int, fields: list[Field]) -> Ite
     if len(data) - start < 8:
         raise UnreadableCloud(f"The PCD file ends before its compressed points. {_AGAIN}")
     packed, inflated = struct.unpack_from("<II", data, start)
-    if inflated != size or packed != len(data) - start - 8:
+    if inflated != size or packed > len(data) - start - 8:
         raise UnreadableCloud(
             f"The PCD header announces {size} bytes of points, and {inflated} packed into "
             f"{packed} follow, of which {len(data) - start - 8} are there. {_AGAIN}"
