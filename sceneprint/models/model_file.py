@@ -62,6 +62,10 @@ BOUNDS = {
     "rounds of a hypothesis": (0, 1000),
     "neighbours in a sequence": (1, 1000),
     "correspondences of sequences": (1, 10_000),
+    "cells along a plan": (16, 512),
+    "yaws of a plan": (1, 720),
+    "heights of a plan": (1, 10_000),
+    "hypotheses of plans": (1, 1000),
 }
 
 
@@ -108,6 +112,10 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
     sequence = alignment.sequence
     refinements = (alignment.coarse, alignment.fine, rivals.first, rivals.then)
     strides = [p.validation.agreement.stride, *(one.stride for one in refinements)]
+    strides += [alignment.fine_stride, alignment.score_stride]
+    plan = alignment.plan
+    if not (plan.cell > 0 and plan.voxel > 0 and 0 < plan.height_step <= plan.height_range < 1e6):
+        raise ValueError("cells, voxels and heights of a plan should have a size")
     counts = {
         "bins of the table": t.n_bins,
         "levels": p.hierarchy.n_levels,
@@ -126,15 +134,19 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
         "patches of a cloud for validation": p.cloud.maximum_validation_patches,
         "gap of a cloud": p.cloud.gap_px,
         "neighbours in a cloud": p.cloud.maximum_pixels * (2 * p.cloud.radius_px + 1) ** 2,
-        "hypotheses": max(alignment.n_refined, alignment.consensus.n_seeds),
+        "hypotheses": max(alignment.n_refined, alignment.n_fine, alignment.consensus.n_seeds),
         "correspondences": alignment.matching.n_sources * alignment.matching.n_nearest,
-        "rivals": max(rivals.n_axes, rivals.n_planes, rivals.n_shifts),
+        "rivals": max(rivals.n_axes, rivals.n_planes, rivals.n_shifts, rivals.n_proposed),
         "iterations of a refinement": max(one.iterations for one in refinements),
         "stride": min(strides),
         "pixels about an edge": p.validation.agreement.edge_px,
         "rounds of a hypothesis": alignment.consensus.rounds,
         "neighbours in a sequence": sequence.n_neighbours,
         "correspondences of sequences": sequence.n_sources * sequence.n_nearest,
+        "cells along a plan": plan.side,
+        "yaws of a plan": max(plan.n_yaws, plan.kept_yaws),
+        "heights of a plan": round(plan.height_range / plan.height_step),
+        "hypotheses of plans": max(plan.n_kept * plan.n_heights, plan.kept_yaws * plan.n_peaks),
     }
     for what, (least, most) in BOUNDS.items():
         if not least <= counts[what] <= most:

@@ -98,6 +98,12 @@ def test_what_would_take_for_ever_is_refused(small_model: Model, cloud: CloudPar
         ("alignment.sequence.n_neighbours", 1_000_000_000),
         ("alignment.sequence.n_sources", 1_000_000_000),
         ("rivals.then.iterations", 1_000_000_000),
+        ("rivals.n_proposed", 1_000_000_000),
+        ("alignment.plan.side", 1_000_000_000),
+        ("alignment.plan.n_yaws", 1_000_000_000),
+        ("alignment.plan.height_step", 1e-9),
+        ("alignment.plan.n_peaks", 1_000_000_000),
+        ("alignment.fine_stride", 0),
     ],
 )
 def test_validation_that_would_take_for_ever_is_refused(

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.pose.rigid import distinct
@@ -95,16 +94,43 @@ def up_of(normals: Floats, axis: Floats, tilt: float) -> Floats:
     if not len(candidates):
         return axis
     candidates = candidates[:: max(len(candidates) // _MOST_CANDIDATES, 1)]
-    along = np.abs(normals[:: max(len(normals) // _MOST_VOTERS, 1)] @ candidates.T)
-    votes = (along > _ALONG).sum(axis=0) + 0.5 * (along < _ACROSS).sum(axis=0)
+    votes = np.empty(len(candidates))
+    _vote(normals[:: max(len(normals) // _MOST_VOTERS, 1)], candidates, _ALONG, _ACROSS, votes)
     up: Floats = candidates[int(np.argmax(votes))]
+    spread = np.empty((3, 3))
     for _ in range(_POLISHES):
-        cosines = normals @ up
-        flat = normals[np.abs(cosines) > _NEAR]
-        upright = normals[np.abs(cosines) < _LEVEL]
-        _, vectors = np.linalg.eigh(flat.T @ flat - 0.5 * upright.T @ upright)
+        _gather(normals, up, _NEAR, _LEVEL, spread)
+        _, vectors = np.linalg.eigh(spread)
         up = vectors[:, -1] * math.copysign(1.0, float(vectors[:, -1] @ up))
     return up
+
+
+@kernel
+def _vote(normals: Floats, candidates: Floats, along: float, across: float, votes: Floats) -> None:
+    """For each candidate: the normals along it, and half of those across it."""
+    for k in range(len(candidates)):
+        a, b, c = candidates[k, 0], candidates[k, 1], candidates[k, 2]
+        total = 0.0
+        for i in range(len(normals)):
+            cosine = abs(normals[i, 0] * a + normals[i, 1] * b + normals[i, 2] * c)
+            if cosine > along:
+                total += 1.0
+            elif cosine < across:
+                total += 0.5
+        votes[k] = total
+
+
+@kernel
+def _gather(normals: Floats, up: Floats, near: float, level: float, spread: Floats) -> None:
+    """n n^T of the normals along a direction, less half of that of the normals across it."""
+    spread[:] = 0.0
+    for i in range(len(normals)):
+        cosine = abs(normals[i, 0] * up[0] + normals[i, 1] * up[1] + normals[i, 2] * up[2])
+        weight = 1.0 if cosine > near else (-0.5 if cosine < level else 0.0)
+        if weight != 0.0:
+            for a in range(3):
+                for b in range(3):
+                    spread[a, b] += weight * normals[i, a] * normals[i, b]
 
 
 def plan_of(
@@ -251,8 +277,7 @@ def _spectrum(plan: ScanPlan, yaw: float, p: PlanParameters) -> NDArray[np.compl
     """Fourier transform of a plan's image turned by a yaw: (3, side, side / 2 + 1)."""
     image = np.zeros((3, p.side, p.side), np.float32)
     _draw(plan.points, plan.normals, math.cos(yaw), math.sin(yaw), p.cell, p.flat_weight, image)
-    result: NDArray[np.complex64] = fft.rfft2(image)
-    return result
+    return np.fft.rfft2(image).astype(np.complex64, copy=False)
 
 
 def plan_hypotheses(plans: Plans, p: PlanParameters) -> Floats:
@@ -279,7 +304,7 @@ def _laid(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> tuple[Floats
     yaws = np.arange(p.n_yaws)
     ways = [float(np.roll(source.azimuths, k) @ target.azimuths) for k in yaws]
     kept = np.argsort(-np.array(ways), kind="stable")[: p.kept_yaws]
-    lines = fft.fftfreq(p.side)[:, None] ** 2 + fft.rfftfreq(p.side)[None] ** 2
+    lines = np.fft.fftfreq(p.side)[:, None] ** 2 + np.fft.rfftfreq(p.side)[None] ** 2
     # both images are blurred: the square of a Gaussian's transform
     blurred = _spectrum(target, 0.0, p) * np.exp(-((2 * math.pi * p.blur) ** 2) * lines)
     blurred = blurred.astype(np.complex64)
@@ -287,7 +312,8 @@ def _laid(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> tuple[Floats
     cells = np.empty((len(values), 2), np.int32)
     for place, k in enumerate(kept):
         spectrum = _spectrum(source, 2 * math.pi * k / p.n_yaws, p)
-        scores = fft.irfft2((blurred * spectrum.conj()).sum(axis=0), s=(p.side, p.side))
+        product = (blurred * spectrum.conj()).sum(axis=0)
+        scores = np.fft.irfft2(product, s=(p.side, p.side)).astype(np.float32, copy=False)
         own = slice(place * p.n_peaks, (place + 1) * p.n_peaks)
         _take_peaks(scores, p.n_peaks, values[own], cells[own])
     flat = np.tile(np.eye(4), (len(values), 1, 1))
