@@ -111,7 +111,7 @@ def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status,
         return "rejected", f"{share:.1%} lies where the other frame saw through"
     if e.planes < p.planes:
         return "ambiguous", (
-            f"only {e.planes:.0f} distinct planes agree, as they may in many corridors"
+            f"only {e.planes:.0f} distinct planes agree, too few to tell corridors apart"
         )
     if e.stiffness < p.stiffness:
         return "ambiguous", "what the frames share leaves a direction free, as a plane does"
