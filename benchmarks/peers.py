@@ -23,14 +23,19 @@ from tqdm import tqdm
 
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.geometry.pose.rigid import difference, inverse
-from sceneprint.geometry.validation.icp import refined_all
-from sceneprint.geometry.validation.validation import refined_at
-from sceneprint.lab.evaluation.pairs.pair_run import BINS, inside, points_of, register, scale_of
+from sceneprint.lab.evaluation.pairs.pair_run import (
+    BINS,
+    inside,
+    peer_points,
+    refined_by_us,
+    register,
+    scale_of,
+)
 from sceneprint.lab.evaluation.protocol import overlap, view_of
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
-from sceneprint.types import AnyFrame, Cloud, Floats, Geometry
+from sceneprint.types import AnyFrame, Floats
 
 #: Points of a query and of a match (N, 3), metres, to T_match_query (4, 4), by name.
 Method = Callable[[Floats, Floats], dict[str, Floats]]
@@ -104,14 +109,6 @@ def drawn_pairs(
     return found
 
 
-def points(frame: AnyFrame, model: Model) -> Floats:
-    """What peers are given: all points, of a depth image those within the model's range."""
-    if isinstance(frame, Cloud):
-        return frame.points.astype(float)
-    depth = model.parameters.depth
-    return points_of(frame, depth.minimum_depth, depth.maximum_depth)
-
-
 def measure(
     frames: Sequence[AnyFrame], pairs: Sequence[tuple[str, int, int]], model: Model,
     peers: dict[str, Method], right: tuple[float, float],
@@ -143,18 +140,12 @@ def measure(
         note("geometry of both, ours", None, 1e3 * (middle - start))
         for method in peers.values():
             start = time.process_time()
-            results = method(points(query, model), points(match, model))
+            results = method(peer_points(query, model), peer_points(match, model))
             spent = 1e3 * (time.process_time() - start)
             for title, T in results.items():
                 note(title, T, spent)
                 note(f"{title}, refined by us", refined_by_us(ours, its, T, p), spent)
     return told
-
-
-def refined_by_us(query: Geometry, match: Geometry, T: Floats, p: Any) -> Floats | None:
-    """Another's transform refined as our own hypotheses are."""
-    coarse = refined_all(query.surface, match.surface, T[None], p.coarse)
-    return refined_at(query, match, coarse[0] if len(coarse) else T, p.fine)
 
 
 def report(told: dict[str, dict[str, list[tuple[bool, float]]]]) -> str:

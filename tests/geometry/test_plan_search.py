@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.pose.rigid import difference, distinct, inverse, moved
+from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.validation.plan_search import (
     PlanParameters,
     _lifts,
@@ -18,7 +19,12 @@ from sceneprint.geometry.validation.plan_search import (
     plan_of,
     up_of,
 )
-from sceneprint.types import Floats, Sphere, Surface
+from sceneprint.lab.synth import synthesise_survey
+from sceneprint.matches import associate
+from sceneprint.models import Model, read_model
+from sceneprint.pipeline import geometry_of, validate
+from sceneprint.signing import see
+from sceneprint.types import Cloud, Floats, Sphere, Surface
 
 P = PlanParameters(cell=0.5, voxel=0.2, height_step=0.25, height_range=15.0)
 
@@ -142,3 +148,42 @@ def test_distinct_by_hand() -> None:
     assert distinct(transforms, np.array([3.0, 4, 1, 2]), 0.5, math.radians(10), 9) == [1, 3, 2]
     assert distinct(transforms, np.array([3.0, 4, 1, 2]), 0.5, math.radians(10), 2) == [1, 3]
     assert distinct(transforms[:0], np.empty(0), 0.5, 0.1, 5) == []
+
+
+@pytest.fixture(scope="module")
+def hall() -> tuple[Model, list[Cloud]]:
+    """Two scans of a synthetic hall that are aligned where both scanners stand upright."""
+    return read_model("lidar"), list(synthesise_survey(7100, 0, 2, kind="hall").clouds)
+
+
+def turned_cloud(cloud: Cloud, R: Floats) -> Cloud:
+    """The same points as a scanner sees them that is turned in its mount."""
+    assert cloud.pose is not None
+    T = cloud.pose.copy()
+    T[:3, :3] = cloud.pose[:3, :3] @ R.T
+    return replace(cloud, points=(cloud.points @ R.T).astype(np.float32), pose=T)
+
+
+def test_a_query_upside_down_is_found_when_nothing_else_is_accepted(
+    hall: tuple[Model, list[Cloud]],
+) -> None:
+    model, (first, second) = hall
+    match, upright = (geometry_of(see(one, model.parameters), model) for one in (first, second))
+    ranking = Ranking(np.array([0]), np.array([1]), np.array([0.5]))
+    assert first.pose is not None
+    assert second.pose is not None
+    [found] = associate(upright, ranking, [0], lambda _: match)
+    assert found.validation.status == "accepted"
+    over = turned_cloud(second, Rotation.from_euler("x", 180, degrees=True).as_matrix())
+    query = geometry_of(see(over, model.parameters), model)
+    assert validate(query, match).status != "accepted"
+    [found] = associate(query, ranking, [0], lambda _: match)
+    assert found.validation.status == "accepted"
+    assert over.pose is not None
+    assert found.validation.T_match_query is not None
+    metres, radians = difference(found.validation.T_match_query, inverse(first.pose) @ over.pose)
+    assert metres < 0.3
+    assert radians < math.radians(3)
+    # a known up says at once what the other axes had to be tried for
+    told = validate(query, match, ups=(np.array([0.0, 0, -1]), np.array([0.0, 0, 1])))
+    assert told.status == "accepted"

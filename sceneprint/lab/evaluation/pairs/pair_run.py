@@ -476,15 +476,15 @@ def _others(
     ours, its = (geometry_of(see(frame, p), bench.model) for frame in (query, match))
     spent = 1e3 * (time.perf_counter() - start)
     found = register(
-        _points(query, bench.model),
-        _points(match, bench.model),
+        peer_points(query, bench.model),
+        peer_points(match, bench.model),
         bench.o3d,
         seed=bench.judging.seed,
         scale=scale_of(p),
     )
     others = {}
     for name, one in found.items():
-        refined = _refined_by_us(ours, its, one.start, bench.judging.p.alignment)
+        refined = refined_by_us(ours, its, one.start, bench.judging.p.alignment)
         others[name] = Other(
             _error(one.start, true),
             _error(one.refined, true),
@@ -499,7 +499,7 @@ def scale_of(p: ModelParameters) -> float:
     return p.properties.radius / PropertyParameters().radius
 
 
-def _points(frame: AnyFrame, model: Model) -> Floats:
+def peer_points(frame: AnyFrame, model: Model) -> Floats:
     """What baselines are given: all points, of a depth image those within the model's range."""
     if isinstance(frame, Cloud):
         return frame.points.astype(np.float64)
@@ -507,7 +507,7 @@ def _points(frame: AnyFrame, model: Model) -> Floats:
     return points_of(frame, p.minimum_depth, p.maximum_depth)
 
 
-def _refined_by_us(
+def refined_by_us(
     query: Geometry, match: Geometry, T: Floats, p: AlignmentParameters
 ) -> Floats | None:
     """Our refinement of another's transform: with wide gates first, as our own hypotheses get."""
