@@ -10,9 +10,25 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.pose.rigid import difference, inverse, inverses, moved
-from sceneprint.geometry.validation.ambiguity import AmbiguityParameters, far_from, symmetries
-from sceneprint.geometry.validation.overlap import plane_view, plane_weights
-from sceneprint.types import Floats, Geometry, Intrinsics, Patches, Surface
+from sceneprint.geometry.validation.ambiguity import (
+    AmbiguityParameters,
+    best_alternative,
+    far_from,
+    symmetries,
+)
+from sceneprint.geometry.validation.overlap import (
+    OverlapParameters,
+    explained,
+    plane_view,
+    plane_weights,
+)
+from sceneprint.lab.synth import KINECT, take
+from sceneprint.lab.synth.dataset import room_and_rng
+from sceneprint.lab.synth.trajectories import trajectory
+from sceneprint.models import read_model
+from sceneprint.pipeline import geometry_of
+from sceneprint.signing import see
+from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics, Patches, Surface
 
 P = AmbiguityParameters()
 
@@ -142,3 +158,27 @@ def test_inverses() -> None:
     assert inverses(transforms[:0]).shape == (0, 4, 4)
     for i, j in product(range(3), range(3)):
         assert inverses(inverses(transforms))[0, i, j] == transforms[0, i, j]
+
+
+def test_free_space_refutes_no_rival_for_what_it_holds_against_the_transform_too() -> None:
+    model, overlap_p = read_model("depth"), OverlapParameters()
+    room, rng = room_and_rng(11, 0)
+    poses = trajectory(room, 61, rng)[12:36:12]
+    frames = [DepthFrame(take(room, T, KINECT, rng), KINECT) for T in poses]
+    made = [geometry_of(see(frame, model.parameters), model) for frame in frames]
+    views = [plane_view(one, P.planes) for one in made]
+    T = inverse(poses[1]) @ poses[0]
+    # slid by 0.3 m each way along each axis: they agree with what lies along it, and violate
+    shifts = np.tile(np.eye(4), (6, 1, 1))
+    shifts[:, :3, 3] = 0.3 * np.concatenate([np.eye(3), -np.eye(3)])
+    voted = shifts @ T
+    seen = explained(*views, voted, overlap_p)
+    assert (seen.violations > P.refuted).any()
+    none = np.empty((0, 4, 4))
+    told = [
+        best_alternative(*views, T, violations, voted, none, P, overlap_p)[0]
+        for violations in (0.0, 1.0)
+    ]
+    # of a transform that violates everything no rival is refuted: the one that agrees most counts
+    assert told[1] >= seen.share.max()
+    assert told[0] < seen.share.max()
