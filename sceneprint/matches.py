@@ -82,7 +82,7 @@ def associate(
     Returns
     -------
     matches : all that were tried, of scans the first few once more for other axes where nothing
-        was accepted: C_vld first, strong before weak, then by overlap (of scans
+        was accepted: C_vld first, strong before weak, then by expected error (of scans
         all around, the nearest first); then those that were not accepted
 
     Raises

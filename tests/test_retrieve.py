@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from sceneprint.geometry.pose.average import average_poses
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.retrieval.dpp import diversify as select
 from sceneprint.geometry.signature.segmentation import patches_of, segment
-from sceneprint.geometry.validation.association import preferred, voters
+from sceneprint.geometry.validation.association import expected_error, preferred, voters
 from sceneprint.geometry.validation.patch_descriptors import compress, patch_descriptors
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.lab.synth import KINECT, take, trajectory
@@ -267,10 +268,19 @@ def test_preferred() -> None:
     assert preferred([strong, strong]) == [0, 1]  # equals: the order of R
 
 
-def test_of_cameras_what_shares_most_goes_first() -> None:
-    little, much = (replace(outcome(), overlap=share) for share in (0.4, 0.8))
-    weak = replace(outcome(strength="weak"), overlap=0.9)
-    assert preferred([little, weak, much, outcome("rejected")]) == [2, 0, 1]
+def test_of_cameras_the_least_expected_error_goes_first() -> None:
+    turned = np.eye(4)
+    turned[:2, :2] = [[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]]
+    # deviations of 1 and 3 cm, and 4 cm for each radian between the views
+    near, far, aside = (
+        replace(outcome(T=T), covariance=np.eye(6) * deviation**2 / 3)
+        for T, deviation in ((shifted(2.0), 0.01), (np.eye(4), 0.03), (turned, 0.01))
+    )
+    errors = [expected_error(one) for one in (near, far, aside)]
+    np.testing.assert_allclose(errors, [0.01, 0.03, math.hypot(0.01, 0.02)], rtol=1e-12)
+    weak = replace(near, strength="weak")
+    assert preferred([far, weak, near, aside, outcome("rejected")]) == [2, 3, 0, 1]
+    assert expected_error(outcome()) == math.inf  # nothing is known of its precision
 
 
 def test_of_scans_all_around_the_nearest_goes_first() -> None:

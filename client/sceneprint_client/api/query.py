@@ -156,7 +156,7 @@ class Answer(ApiRecord):
         "before a match was accepted."
     )
     matches: list[Match] = Field(
-        description="Accepted ones first, strong before weak, then by overlap, or, of scans "
+        description="Accepted ones first, strong before weak, then the most precise, or, of scans "
         "all around, the nearest first; then the others that were tried."
     )
     location: Location | None = Field(description="Where accepted matches have poses.")
