@@ -20,7 +20,7 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.pose.rigid import inverses
 from sceneprint.geometry.surface.camera import camera_of, depth_at, grown, project
 from sceneprint.geometry.surface.cloud import mixed
-from sceneprint.types import Floats, Floats32, Geometry, Ints32, Patches, Sphere, Surface
+from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches, Sphere, Surface
 
 # Sec. III-E, a surface made ready to be looked up: by its camera, or by place where it has none.
 #
@@ -224,17 +224,21 @@ def sampled(surface: Surface, stride: int) -> Floats32:
     return np.ascontiguousarray(np.concatenate([points, normals], axis=1))
 
 
+#: What a target says of a point: nothing, that it lies on its surface, or that it saw through.
+UNKNOWN, AGREES, VIOLATES = 0, 1, 2
+
+
 @kernel
-def _weigh_seen(
-    source: Floats32, weights: Floats32, points: Floats32, normals: Floats32, camera: Floats,
-    T: Floats, tolerances: Floats,
-) -> tuple[float, float]:  # fmt: skip
-    """Weight of inliers and of violations of the source (N, 6) on the target's maps under T."""
+def _look_up_seen(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
+    tolerances: Floats, said: Bytes,
+) -> None:  # fmt: skip
+    """What the maps of a target with a camera say of the source's points (N, 6) under T, (N,)."""
     height, width = points.shape[0], points.shape[1]
     on_surface, on_point, least_cosine = tolerances[0], tolerances[1], tolerances[2]
     margin, reference, edge = tolerances[3], tolerances[4], int(tolerances[5])
-    inliers, violations = 0.0, 0.0
     for i in range(len(source)):
+        said[i] = UNKNOWN
         px, py, pz = source[i, 0], source[i, 1], source[i, 2]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
@@ -259,7 +263,7 @@ def _weigh_seen(
             )
             gate = on_point * grow
             if cosine > least_cosine and dx * dx + dy * dy + dz * dz < gate * gate:
-                inliers += weights[i]
+                said[i] = AGREES
                 continue
         if depth - seen < -margin * grow and plane > margin * grow:
             # at an edge, a pixel near by may show the surface that the point is on
@@ -275,19 +279,18 @@ def _weigh_seen(
                     if there > 0:
                         nearest = min(nearest, there)
             if depth < nearest - margin * grow:
-                violations += weights[i]
-    return inliers, violations
+                said[i] = VIOLATES
 
 
 @kernel
-def _weigh_near(
-    source: Floats32, weights: Floats32, points: Floats32, normals: Floats32, camera: Floats,
-    heads: Ints32, chain: Ints32, T: Floats, tolerances: Floats,
-) -> float:  # fmt: skip
-    """Weight of inliers on a target whose points are in no order."""
-    inliers = 0.0
+def _look_up_near(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
+    chain: Ints32, T: Floats, tolerances: Floats, said: Bytes,
+) -> None:  # fmt: skip
+    """The same of a target whose points are in no order."""
     at, facing = np.empty(3), np.empty(3)
     for i in range(len(source)):
+        said[i] = UNKNOWN
         for a in range(3):
             at[a] = T[a, 3]
             facing[a] = 0.0
@@ -301,8 +304,19 @@ def _weigh_near(
         for a in range(3):
             plane += (at[a] - points[0, n, a]) * normals[0, n, a]
         if abs(plane) < tolerances[0]:
-            inliers += weights[i]
-    return inliers
+            said[i] = AGREES
+
+
+@kernel
+def _look_up(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
+    chain: Ints32, T: Floats, tolerances: Floats, said: Bytes,
+) -> None:  # fmt: skip
+    """What a target says of each point of the source (N, 6) under T, (N,)."""
+    if camera[0] == 2:
+        _look_up_near(source, points, normals, camera, heads, chain, T, tolerances, said)
+    else:
+        _look_up_seen(source, points, normals, camera, T, tolerances, said)
 
 
 @kernel
@@ -311,10 +325,15 @@ def weigh_overlap(
     heads: Ints32, chain: Ints32, T: Floats, tolerances: Floats,
 ) -> tuple[float, float]:  # fmt: skip
     """Weight of inliers and of violations of the source (N, 6) on a target under T."""
-    if camera[0] == 2:
-        inliers = _weigh_near(source, weights, points, normals, camera, heads, chain, T, tolerances)
-        return inliers, 0.0
-    return _weigh_seen(source, weights, points, normals, camera, T, tolerances)
+    said = np.empty(len(source), np.uint8)
+    _look_up(source, points, normals, camera, heads, chain, T, tolerances, said)
+    inliers, violations = 0.0, 0.0
+    for i in range(len(source)):
+        if said[i] == AGREES:
+            inliers += weights[i]
+        elif said[i] == VIOLATES:
+            violations += weights[i]
+    return inliers, violations
 
 
 @kernel
@@ -374,6 +393,29 @@ def agreements(
         np.ascontiguousarray(transforms), tolerances(p), out,
     )  # fmt: skip
     return out
+
+
+def look_up(
+    source: Floats32, target: LookupTarget, T_target_source: Floats, tolerances: Floats
+) -> Bytes:
+    """What a target says of each point of a source under one transform.
+
+    Parameters
+    ----------
+    source : (N, 6) float32
+    target : of `looked_up`
+    tolerances : of `tolerances`
+
+    Returns
+    -------
+    (N,) uint8: UNKNOWN, AGREES or VIOLATES
+    """
+    said = np.empty(len(source), np.uint8)
+    _look_up(
+        source, target.points, target.normals, target.camera, target.heads, target.chain,
+        np.ascontiguousarray(T_target_source), tolerances, said,
+    )  # fmt: skip
+    return said
 
 
 def overlap_counts(

@@ -73,6 +73,7 @@ class ValidationParameters:
     """The numbers of every step."""
 
     minimum_patches: int = 10  #: of either frame
+    n_hypotheses: int = 4  #: of each direction, beside what was found, that a map may confirm
     acceptance: AcceptanceParameters = field(default_factory=AcceptanceParameters)
     rivals: AmbiguityParameters = field(default_factory=AmbiguityParameters)
     alignment: AlignmentParameters = field(default_factory=AlignmentParameters)
@@ -114,6 +115,8 @@ class PairValidation:
     search : what proposed the transform: correspondences of patches, or the plans of two scans
     directions : of the search, in which the transform was found: of an accepted one, both
     T_other : (4, 4) where the two directions disagree, what the other one found; else None
+    hypotheses : (n, 4, 4) T_match_query of the best that either direction refined, and of
+        `T_rival`: what the frames may stand to each other, for the map to decide between
     """
 
     status: Status
@@ -136,6 +139,7 @@ class PairValidation:
     search: Search = "correspondences"
     directions: tuple[Direction, ...] = ()
     T_other: Floats | None = None
+    hypotheses: Floats = field(default_factory=lambda: _NONE)
 
 
 def middle(a: Floats, b: Floats) -> Floats:
@@ -280,7 +284,21 @@ def _decided(
         e.violations, inliers, ambiguity, T_rival, seed, covariance,
         _sees_around(query.geometry) and _sees_around(match.geometry),
         e.planes, e.plane_violations, both[0].search, directions, T_other,
+        _hypotheses(there, back, transforms, T_rival, p.n_hypotheses),
     )  # fmt: skip
+
+
+def _hypotheses(
+    there: Alignment | None, back: Alignment | None, found: Sequence[Floats],
+    T_rival: Floats | None, each: int,
+) -> Floats:  # fmt: skip
+    """What was found, the rival, and the next best of each direction: T_match_query (n, 4, 4)."""
+    told = [*found] if T_rival is None else [*found, T_rival]
+    if there is not None:
+        told += [*there.others[:each]]
+    if back is not None:
+        told += [*inverses(back.others[:each])]
+    return np.array(told)
 
 
 def _estimates(

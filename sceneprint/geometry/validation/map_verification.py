@@ -1,0 +1,332 @@
+"""Validation in the map: poses of a query compared on all frames that would see the same surfaces.
+
+    query, poses, MapViews  --compare_poses-->  ScoredPose, the best of each place first
+
+Two frames can agree under a wrong transform: a cabinet looks alike from both sides. The frames
+around it then tell the poses apart, as each shows what the query would have to see from there.
+So a pose is scored on many views at once. A surface of the query that one view does not show
+another may, and what most of the views saw through speaks against the pose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sceneprint.geometry.pose.average import average_poses
+from sceneprint.geometry.pose.rigid import difference, distinct, inverse
+from sceneprint.geometry.validation.icp import COARSE, RefinementParameters
+from sceneprint.geometry.validation.overlap import (
+    AGREES,
+    VIOLATES,
+    LookupTarget,
+    OverlapParameters,
+    PlaneParameters,
+    PlaneView,
+    look_up,
+    looked_up,
+    plane_view,
+    tolerances,
+)
+from sceneprint.geometry.validation.validation import refined_at
+from sceneprint.types import Floats, Geometry, Sphere
+
+
+@dataclass(frozen=True)
+class MapParameters:
+    """The numbers of verification in the map."""
+
+    n_views: int = 12  #: that a pose is scored on, at most
+    look_ahead: float = 1.5  #: of a camera, to the middle of what it sees, metres
+    reach: float = 3.5  #: between the middles of two views that may share surfaces, metres
+    around_reach: float = 15.0  #: the same of sensors that see all around
+    least_agreeing: float = 0.03  #: share of the query's points, below which a view has no say
+    violation_weight: float = 2.0  #: of the violations of either side, in the score
+    n_poses: int = 40  #: that are scored
+    n_refined: int = 3  #: places whose pose is refined
+    n_refining: int = 3  #: views that a pose is refined on
+    n_noise: int = 4  #: frames of the map whose own violations are taken for noise
+    same_m: float = 0.1  #: poses this near are one
+    same_rad: float = math.radians(6.0)
+    place_m: float = 0.25  #: poses farther apart are of two places
+    place_rad: float = math.radians(15.0)
+    refinement: RefinementParameters = COARSE
+    planes: PlaneParameters = field(default_factory=PlaneParameters)
+
+
+@dataclass(frozen=True, eq=False)
+class MapFrame:
+    """A posed frame as poses are scored on it.
+
+    Parameters
+    ----------
+    geometry : of the frame
+    planes : see PlaneView
+    target : its surface, to be looked up
+    T : (4, 4) T_parent_sensor; of a frame of the query T_query_sensor
+    """
+
+    geometry: Geometry
+    planes: PlaneView
+    target: LookupTarget
+    T: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredPose:
+    """A pose of the query, and how the map's frames bear it out.
+
+    Parameters
+    ----------
+    T : (4, 4) T_parent_query
+    score : `share`, less for violations; 1 where all that the query sees is in the map
+    share : of the query's surface that the map shows there, every plane counting the same
+    planes : distinct planes of a frame of the query that agree, on average
+    violations : share of the query's surface that the map saw through, of what is decided
+    hidden : the same of the map's surfaces, which the query saw through
+    noise : violations that the map's frames about the pose show among themselves; 0 where it
+        was not asked for
+    views : frames of the query with positions of map frames that agree, most shared first
+    """
+
+    T: Floats
+    score: float
+    share: float
+    planes: float
+    violations: float
+    hidden: float
+    views: tuple[tuple[int, int], ...]
+    noise: float = 0.0
+
+
+class MapViews:
+    """The frames of one parent frame that may see what a query sees, opened when needed."""
+
+    def __init__(
+        self, poses: Floats, open_geometry: Callable[[int], Geometry | None],
+        p: MapParameters, overlap_p: OverlapParameters,
+    ) -> None:  # fmt: skip
+        """Hold frames by their poses.
+
+        Parameters
+        ----------
+        poses : (n, 4, 4) T_parent_sensor
+        open_geometry : the artifact of the i-th; None where it cannot be read
+        p, overlap_p : see there
+        """
+        self.poses, self._open, self._p, self._overlap = poses, open_geometry, p, overlap_p
+        self._frames: dict[int, MapFrame | None] = {}
+
+    def __getitem__(self, i: int) -> MapFrame | None:
+        """The i-th frame, or None where its artifact cannot be read."""
+        if i not in self._frames:
+            geometry = self._open(i)
+            self._frames[i] = None if geometry is None else map_frame(
+                geometry, self.poses[i], self._p, self._overlap
+            )  # fmt: skip
+        return self._frames[i]
+
+    def near(self, T: Floats, around: bool) -> list[int]:
+        """The frames that most likely see what a sensor at T sees, nearest first.
+
+        Parameters
+        ----------
+        T : (4, 4) T_parent_sensor
+        around : whether it sees all around; else directions count beside distance
+        """
+        p = self._p
+        ahead = 0.0 if around else p.look_ahead
+        axes = self.poses[:, :3, 2]
+        middles = self.poses[:, :3, 3] + ahead * axes
+        apart = np.linalg.norm(middles - (T[:3, 3] + ahead * T[:3, 2]), axis=1)
+        if not around:
+            apart += p.look_ahead * (1.0 - axes @ T[:3, 2])
+        order = np.argsort(apart, kind="stable")[: p.n_views]
+        near: list[int] = order[apart[order] < (p.around_reach if around else p.reach)].tolist()
+        return near
+
+
+def map_frame(
+    geometry: Geometry, T: Floats, p: MapParameters, overlap_p: OverlapParameters
+) -> MapFrame:
+    """A frame made ready to be compared with others of its parent frame.
+
+    Parameters
+    ----------
+    geometry : of the frame
+    T : (4, 4), see MapFrame
+    p, overlap_p : see there
+    """
+    target = looked_up(geometry.surface, overlap_p)
+    return MapFrame(geometry, plane_view(geometry, p.planes), target, T)
+
+
+def sees_around(geometry: Geometry) -> bool:
+    """Whether the sensor sees all around, or its viewpoint is not known."""
+    camera = geometry.surface.camera
+    return camera is None or (isinstance(camera, Sphere) and camera.sees_around)
+
+
+def score_pose(
+    frames: Sequence[MapFrame], T: Floats, views: MapViews, p: MapParameters,
+    overlap_p: OverlapParameters, *, without: int | None = None,
+) -> ScoredPose:  # fmt: skip
+    """How the map's frames bear a pose of the query out.
+
+    Parameters
+    ----------
+    frames : of the query, of `map_frame`: each with its T_query_sensor, the identity for one
+    T : (4, 4) T_parent_query
+    views : of the same parent frame
+    p, overlap_p : see there
+    without : position of a frame that has no say
+    """
+    limits = tolerances(overlap_p)
+    total = agreeing = violating = seen = through = 0.0
+    shared: list[tuple[int, int, int]] = []
+    for number, frame in enumerate(frames):
+        points, weights = frame.planes.points, frame.planes.weights
+        agree, violate = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+        T_parent_sensor = T @ frame.T
+        for i in views.near(T_parent_sensor, sees_around(frame.geometry)):
+            view = views[i]
+            if view is None or i == without:
+                continue
+            T_view_sensor = inverse(view.T) @ T_parent_sensor
+            said = look_up(points, view.target, T_view_sensor, limits)
+            count = int((said == AGREES).sum())
+            agree += said == AGREES
+            violate += said == VIOLATES
+            if count < p.least_agreeing * len(points):
+                continue
+            shared.append((-count, number, i))
+            back = look_up(view.planes.points, frame.target, inverse(T_view_sensor), limits)
+            seen += float(view.planes.weights[back == AGREES].sum(dtype=float))
+            through += float(view.planes.weights[back == VIOLATES].sum(dtype=float))
+        total += float(weights.sum(dtype=float))
+        agreeing += float(weights[agree > violate].sum(dtype=float))
+        violating += float(weights[violate > agree].sum(dtype=float))
+    share = agreeing / max(total, 1e-9)
+    violations = violating / max(agreeing + violating, 1e-9)
+    hidden = through / max(seen + through, 1e-9)
+    score = share * (1.0 - p.violation_weight * (violations + hidden))
+    pairs = tuple((number, i) for _, number, i in sorted(shared))
+    return ScoredPose(T, score, share, agreeing / len(frames), violations, hidden, pairs)
+
+
+def map_noise(
+    pose: ScoredPose, views: MapViews, p: MapParameters, overlap_p: OverlapParameters
+) -> float:
+    """Violations that the map's frames about a pose show among themselves: their median.
+
+    Poses that drift and things that were moved let free space speak against right poses too.
+
+    Parameters
+    ----------
+    pose : of `score_pose`
+    views, p, overlap_p : see there
+    """
+    found = []
+    for _, i in pose.views[: p.n_noise]:
+        view = views[i]
+        if view is not None:
+            alone = replace(view, T=np.eye(4))
+            own = score_pose([alone], view.T, views, p, overlap_p, without=i)
+            found.append(own.violations + own.hidden)
+    return float(np.median(found)) if found else 0.0
+
+
+def refined_pose(
+    frames: Sequence[MapFrame], pose: ScoredPose, views: MapViews, p: MapParameters
+) -> Floats | None:
+    """A pose refined on the views that share most with it, and averaged: (4, 4), or None."""
+    found = []
+    for number, i in pose.views[: p.n_refining]:
+        frame, view = frames[number], views[i]
+        if view is None:
+            continue
+        start = inverse(view.T) @ pose.T @ frame.T
+        T = refined_at(frame.geometry, view.geometry, start, p.refinement)
+        if T is not None:
+            found.append(view.T @ T @ inverse(frame.T))
+    return average_poses(np.stack(found)).T if found else None
+
+
+def starts_about(T: Floats, covariance: Floats) -> Floats:
+    """A pose and six about it, a deviation away along each axis: (7, 4, 4).
+
+    Parameters
+    ----------
+    T : (4, 4) T_parent_sensor that is believed
+    covariance : (6, 6) of it, metres before radians; shifts are half a metre at most, as farther
+        off nothing is refined
+    """
+    starts = np.tile(T, (7, 1, 1))
+    deviations = np.minimum(np.sqrt(np.diag(covariance)[:3]), 0.5)
+    for axis in range(3):
+        starts[1 + 2 * axis, axis, 3] += deviations[axis]
+        starts[2 + 2 * axis, axis, 3] -= deviations[axis]
+    return starts
+
+
+def refined_starts(
+    frames: Sequence[MapFrame], starts: Floats, views: MapViews, p: MapParameters,
+    overlap_p: OverlapParameters,
+) -> Floats:  # fmt: skip
+    """Where the map draws poses (n, 4, 4) that are believed beforehand: (m, 4, 4)."""
+    found = []
+    for start in starts:
+        T = refined_pose(frames, score_pose(frames, start, views, p, overlap_p), views, p)
+        if T is not None:
+            found.append(T)
+    return np.array(found).reshape(-1, 4, 4)
+
+
+def compare_poses(
+    frames: Sequence[MapFrame], poses: Floats, views: MapViews, p: MapParameters,
+    overlap_p: OverlapParameters,
+) -> list[ScoredPose]:  # fmt: skip
+    """Poses of the query, the best of each place, best first.
+
+    The first few places are refined on the map before they are compared, as a pose that is off
+    by a few centimetres shows violations that the right one has not.
+
+    Parameters
+    ----------
+    frames : of the query, as in `score_pose`
+    poses : (n, 4, 4) T_parent_query, those to believe most first; beyond `n_poses` distinct ones
+        the rest is left out
+    views : of the same parent frame
+    p, overlap_p : see there
+    """
+    first = -np.arange(len(poses), dtype=float)
+    chosen = distinct(poses, first, p.same_m, p.same_rad, p.n_poses)
+    scored = [score_pose(frames, poses[i], views, p, overlap_p) for i in chosen]
+    places = best_of_places(scored, p)
+    for pose in places[: p.n_refined]:
+        T = refined_pose(frames, pose, views, p)
+        if T is not None:
+            scored.append(score_pose(frames, T, views, p, overlap_p))
+    places = best_of_places(scored, p)
+    for k, pose in enumerate(places[: p.n_refined]):
+        if pose.violations + pose.hidden > 0:
+            places[k] = replace(pose, noise=map_noise(pose, views, p, overlap_p))
+    return places
+
+
+def best_of_places(scored: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
+    """The best pose of each place, best first; equals in the order they came."""
+    places: list[ScoredPose] = []
+    for one in sorted(scored, key=lambda pose: -pose.score):
+        if not any(same_place(one.T, other.T, p) for other in places):
+            places.append(one)
+    return places
+
+
+def same_place(a: Floats, b: Floats, p: MapParameters) -> bool:
+    """Whether two poses (4, 4) are one answer."""
+    metres, radians = difference(a, b)
+    return metres <= p.place_m and radians <= p.place_rad

@@ -1,0 +1,479 @@
+"""Validated matches to where the query was taken: found, ambiguous, or not found.
+
+matches, poses, MapViews  --localize-->  PoseEstimate
+
+Accepted matches vote with their poses. Their votes are clustered, and the best cluster is the
+answer only where nothing comes near it: neither another cluster, nor any other pose that the
+candidates suggest, judged on all frames of the map that would see it. Where the matches decide
+nothing, the map alone may, if one pose explains the query far better than every other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from sceneprint.geometry.pose.average import PoseAverage, average_poses
+from sceneprint.geometry.pose.rigid import difference, inverse
+from sceneprint.geometry.validation.acceptance import Strength
+from sceneprint.geometry.validation.association import preferred
+from sceneprint.geometry.validation.icp import error_of, place_covariance, transported
+from sceneprint.geometry.validation.map_verification import (
+    MapParameters,
+    MapViews,
+    ScoredPose,
+    compare_poses,
+    map_frame,
+    refined_starts,
+    same_place,
+    starts_about,
+)
+from sceneprint.geometry.validation.overlap import OverlapParameters
+from sceneprint.matches import PairMatch
+from sceneprint.types import Floats, Geometry
+
+LocalizationStatus = Literal["found", "ambiguous", "not_found"]
+#: What decided: the votes of accepted matches; the map's frames, where these did not suffice; or
+#: what the robot believed before, where the map bears it out as well as any other pose.
+Verifier = Literal["matches", "map", "prior"]
+
+
+@dataclass(frozen=True)
+class LocalizationParameters:
+    """The numbers of the answer; how they were chosen: docs/trust.md."""
+
+    views: int = 5  #: votes that are averaged, at most
+    weak: float = 0.4  #: weight of a weak or ambiguous match; a strong one counts 1
+    outweigh: float = 2.0  #: times as much weight as any other place
+    rival: float = 0.9  #: of the winner's score, above which another pose makes it ambiguous
+    violations: float = 0.04  #: most, beyond the map's own, for each unit of weight of a pose
+    map_score: float = 0.3  #: least score of a pose that the map confirms without a strong match
+    map_rival: float = 0.3  #: and most of it that another pose may reach
+    map_planes: float = 12.0  #: and least number of distinct planes that agree
+    map_views: int = 8  #: and least number of frames of the map that agree
+    prior_planes: float = 6.0  #: that agree at a pose that the prior decides for, at least
+    prior_rival: float = 0.65  #: of its score that another pose near the prior may reach
+    most_noise: float = 0.2  #: violations of the map's own that are believed
+    map: MapParameters = field(default_factory=MapParameters)
+
+
+@dataclass(frozen=True, eq=False)
+class QueryFrame:
+    """A frame of a query, and what came of its candidates.
+
+    Parameters
+    ----------
+    geometry : artifact of the frame
+    matches : of `associate`, accepted or not
+    T : (4, 4) T_query_sensor, by odometry; the identity for the frame that is to be placed
+    """
+
+    geometry: Geometry
+    matches: Sequence[PairMatch]
+    T: Floats = field(default_factory=lambda: np.eye(4))
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What a robot believes of its pose before it asks.
+
+    Parameters
+    ----------
+    parent : frame in which it is given
+    T : (4, 4) T_parent_query
+    covariance : (6, 6) of errors (x, y, z, rx, ry, rz) in the parent's axes: metres, radians
+    """
+
+    parent: str
+    T: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """A pose that the evidence supports.
+
+    Parameters
+    ----------
+    T : (4, 4) T_parent_query
+    weight : of its votes: 1 for a strong match, 0.4 for a weak or an ambiguous one
+    support : matches from different viewpoints that vote for it
+    score : how far the map bears it out, 1 at most; None where it was not asked
+    """
+
+    T: Floats
+    weight: float
+    support: int
+    score: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """Where a query was taken, and how sure that is.
+
+    Parameters
+    ----------
+    status : found, ambiguous, or not_found
+    reason : a short sentence
+    parent : frame in which the poses are given
+    average : T_parent_query with the spread of the votes and how many agree; None unless found
+    covariance : (6, 6) of it, as `place_covariance` orders it; None where a vote has none
+    strength : of the matches that vote for it; None unless found
+    verified_by : what decided; None unless found
+    alternatives : the poses that the evidence supports, the answer among them, best first; more
+        than one only where the answer is ambiguous
+    rival_ratio : the next best place's score by that of the best; None where no map was asked
+    members : rows of the matches that vote for the answer
+    """
+
+    status: LocalizationStatus
+    reason: str
+    parent: str
+    average: PoseAverage | None
+    covariance: Floats | None
+    strength: Strength | None
+    verified_by: Verifier | None
+    alternatives: tuple[Alternative, ...]
+    rival_ratio: float | None
+    members: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Vote:
+    """A pose that a match speaks for, and from where: both (4, 4) in the parent frame."""
+
+    match: PairMatch
+    T: Floats
+    covariance: Floats | None
+    viewpoint: Floats
+    weight: float
+
+    @property
+    def accepted(self) -> bool:
+        return self.match.validation.status == "accepted"
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """The votes for one place, those to believe most first, and how the map bears it out."""
+
+    votes: list[_Vote]
+    weight: float
+    support: int
+    scored: ScoredPose | None = None
+
+    @property
+    def accepted(self) -> bool:
+        return any(vote.accepted for vote in self.votes)
+
+    @property
+    def strong(self) -> bool:
+        return any(vote.match.validation.strength == "strong" for vote in self.votes)
+
+    @property
+    def pose(self) -> Floats:
+        if self.scored is not None and not self.accepted:
+            return self.scored.T
+        return self.votes[0].T
+
+    @property
+    def score(self) -> float:
+        return 0.0 if self.scored is None else self.scored.score
+
+
+#: Gives the frames of a parent frame that may see what a query at poses (n, 4, 4) sees.
+ViewsOf = Callable[[str, Floats], MapViews]
+
+
+def localize(
+    frames: Sequence[QueryFrame],
+    poses: Sequence[Floats] | Mapping[int, Floats],
+    parents: Sequence[str] | Mapping[int, str] | None = None,
+    views_of: ViewsOf | None = None,
+    prior: Prior | None = None,
+    p: LocalizationParameters | None = None,
+    overlap_p: OverlapParameters | None = None,
+) -> PoseEstimate | None:
+    """Where a query was taken: the poses that its matches and the map support, compared.
+
+    Parameters
+    ----------
+    frames : of the query, one or more
+    poses : T_parent_sensor (4, 4) of every row of the database, or by the rows of the matches
+    parents : parent frame of every row; default: one for all. Poses are compared within one
+        parent frame only: that of the prior, or that of most of the matches
+    views_of : see ViewsOf; None: pairs alone decide
+    prior : what the robot believed before
+    p, overlap_p : see there
+
+    Returns
+    -------
+    estimate : or None where nothing suggests a pose
+    """
+    p, overlap_p = p or LocalizationParameters(), overlap_p or OverlapParameters()
+    parent = _parent(frames, parents) if prior is None else prior.parent
+    own = [
+        replace(frame, matches=[
+            m for m in frame.matches if parents is None or parents[m.index] == parent
+        ])
+        for frame in frames
+    ]  # fmt: skip
+    suggested = _suggested(own, poses)
+    scored: list[ScoredPose] = []
+    if views_of is not None and (len(suggested) or prior is not None):
+        ready = [map_frame(one.geometry, one.T, p.map, overlap_p) for one in frames]
+        starts = _NONE if prior is None else starts_about(prior.T, prior.covariance)
+        views = views_of(parent, np.concatenate([starts[:1], suggested]))
+        near = refined_starts(ready, starts, views, p.map, overlap_p)
+        scored = compare_poses(ready, np.concatenate([near, suggested]), views, p.map, overlap_p)
+    places = _places(_votes(own, poses, p), scored, p)
+    if not places:
+        return None
+    blind = all(frame.geometry.surface.camera is None for frame in frames)
+    return _estimate(parent, places, prior, bool(scored), blind, p)
+
+
+_NONE = np.empty((0, 4, 4))
+
+
+def _parent(frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None) -> str:
+    """The parent frame with most strong matches, of equals with most accepted, with most at all."""
+    counts: dict[str, tuple[int, int, int]] = {}
+    for frame in frames:
+        for match in frame.matches:
+            name = "" if parents is None else parents[match.index]
+            strong, accepted, tried = counts.get(name, (0, 0, 0))
+            v = match.validation
+            counts[name] = (
+                strong + (v.strength == "strong"), accepted + (v.status == "accepted"), tried + 1
+            )  # fmt: skip
+    # the first of equals: dicts keep the order in which parents came
+    return max(counts, key=counts.__getitem__, default="")
+
+
+def _suggested(
+    frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats]
+) -> Floats:
+    """Every pose (n, 4, 4) that a candidate suggests: the best of each, then the next best."""
+    of_each = [
+        poses[match.index] @ match.validation.hypotheses @ inverse(frame.T)
+        for frame in frames
+        for match in frame.matches
+        if len(match.validation.hypotheses)
+    ]
+    most = max(map(len, of_each), default=0)
+    told = [one[rank] for rank in range(most) for one in of_each if rank < len(one)]
+    return np.array(told).reshape(-1, 4, 4)
+
+
+def _votes(
+    frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats],
+    p: LocalizationParameters,
+) -> list[_Vote]:  # fmt: skip
+    """Votes of accepted matches in the order of belief, then those of ambiguous ones."""
+    votes: list[_Vote] = []
+    for frame in frames:
+        first = preferred([match.validation for match in frame.matches])
+        unsure = [i for i, m in enumerate(frame.matches) if m.validation.status == "ambiguous"]
+        for match in [frame.matches[i] for i in [*first, *unsure]]:
+            v, viewpoint = match.validation, poses[match.index]
+            if v.T_match_query is None:
+                continue
+            covariance = v.covariance
+            if covariance is not None:
+                covariance = transported(covariance, viewpoint[:3, :3], np.zeros(3))
+            weight = 1.0 if v.strength == "strong" else p.weak
+            T = viewpoint @ v.T_match_query @ inverse(frame.T)
+            votes.append(_Vote(match, T, covariance, viewpoint, weight))
+    if len(frames) > 1:
+        order = preferred([vote.match.validation for vote in votes])
+        votes = [votes[i] for i in order] + [vote for vote in votes if not vote.accepted]
+    return votes
+
+
+def _places(
+    votes: Sequence[_Vote], scored: Sequence[ScoredPose], p: LocalizationParameters
+) -> list[_Place]:
+    """Votes and scored poses by place: those with votes first, then by score."""
+    groups: list[list[_Vote]] = []
+    for vote in votes:
+        for group in groups:
+            if same_place(group[0].T, vote.T, p.map):
+                group.append(vote)
+                break
+        else:
+            groups.append([vote])
+    left = list(scored)
+    places = []
+    for group in groups:
+        own = next((one for one in left if same_place(group[0].T, one.T, p.map)), None)
+        left = [one for one in left if one is not own]
+        distinct = _from_different_views(group, p.map)
+        places.append(_Place(group, sum(vote.weight for vote in distinct), len(distinct), own))
+    return places + [_Place([], 0.0, 0, one) for one in left]
+
+
+def _from_different_views(votes: Sequence[_Vote], p: MapParameters) -> list[_Vote]:
+    """The first vote from each viewpoint: a copy of a view is no second vote."""
+    kept: list[_Vote] = []
+    for vote in votes:
+        apart = [difference(vote.viewpoint, other.viewpoint) for other in kept]
+        if all(metres > p.same_m or radians > p.same_rad for metres, radians in apart):
+            kept.append(vote)
+    return kept
+
+
+def _estimate(
+    parent: str, places: Sequence[_Place], prior: Prior | None, mapped: bool, blind: bool,
+    p: LocalizationParameters,
+) -> PoseEstimate:  # fmt: skip
+    """The verdict on places, one or more."""
+    by_score = sorted(places, key=lambda place: -place.score)
+    best, ratio = by_score[0], None
+    if mapped:
+        next_best = by_score[1].score if len(by_score) > 1 else 0.0
+        ratio = min(max(next_best / best.score, 0.0), 1.0) if best.score > 0 else 1.0
+    voted = max(places, key=lambda place: (place.accepted, place.weight, place.score))
+    against = _against_votes(voted, places, mapped, blind, p)
+    if against is None:
+        return _found(parent, voted, places, "matches", ratio, p)
+    if mapped and _map_confirms(best, places, p):
+        return _found(parent, best, places, "map", ratio, p)
+    if prior is not None and mapped:
+        inside = _confirmed_by_prior(by_score, prior, p)
+        if inside is not None:
+            return _found(parent, inside, places, "prior", ratio, p)
+    told = [
+        place for place in sorted(places, key=lambda one: (-one.weight, -one.score))
+        if place.votes or (place.score >= p.map_score and _planes(place) >= p.map_planes)
+    ]  # fmt: skip
+    alternatives = tuple(
+        Alternative(one.pose, one.weight, one.support, one.score if mapped else None)
+        for one in told[: p.views]
+    )
+    status: LocalizationStatus = "ambiguous" if told else "not_found"
+    return PoseEstimate(status, against, parent, None, None, None, None, alternatives, ratio)
+
+
+def _against_votes(
+    voted: _Place, places: Sequence[_Place], mapped: bool, blind: bool,
+    p: LocalizationParameters,
+) -> str | None:  # fmt: skip
+    """Why the place with most votes is not the answer; None where it is."""
+    others = [place for place in places if place is not voted]
+    if not voted.accepted:
+        return "no candidate is accepted"
+    heaviest = max((place.weight for place in others), default=0.0)
+    if heaviest * p.outweigh > voted.weight:
+        return "the matches disagree: none of their poses has twice the weight of the next"
+    if mapped:
+        score = max((place.score for place in others), default=0.0)
+        if score > p.rival * voted.score:
+            return "another pose explains the frame as well: the place repeats, or has a symmetry"
+        excess = _excess(voted, p)
+        if excess > p.violations * max(voted.weight, 1.0):
+            return (
+                f"the matches agree, but {excess:.0%} of what should be in sight is not there: "
+                "another place may look like this one, or this one has changed"
+            )
+    if not voted.strong and not blind:
+        return "the accepted matches are weak, and the map's other frames do not confirm them"
+    return None
+
+
+def _map_confirms(best: _Place, places: Sequence[_Place], p: LocalizationParameters) -> bool:
+    """Whether the map alone decides for the place with the best score."""
+    if best.scored is None:
+        return False
+    others = [place for place in places if place is not best]
+    frames = {i for _, i in best.scored.views}
+    return (
+        best.score >= p.map_score
+        and max((place.score for place in others), default=0.0) <= p.map_rival * best.score
+        and best.scored.planes >= p.map_planes
+        and len(frames) >= p.map_views
+        and max((place.weight for place in others), default=0.0) < 1.0
+        and _excess(best, p) <= p.violations
+    )
+
+
+def _confirmed_by_prior(
+    by_score: Sequence[_Place], prior: Prior, p: LocalizationParameters
+) -> _Place | None:
+    """The one place near the prior that the map bears out as well as any other."""
+    inside = [place for place in by_score if is_expected(place.pose, prior)]
+    if not inside or inside[0].scored is None:
+        return None
+    best = inside[0]
+    next_best = inside[1].score if len(inside) > 1 else 0.0
+    sure = (
+        best.score >= p.map_score
+        and _planes(best) >= p.prior_planes
+        and next_best <= p.prior_rival * best.score
+        and best.score >= p.rival * by_score[0].score
+        and _excess(best, p) <= p.violations
+    )
+    return best if sure else None
+
+
+def is_expected(T: Floats, prior: Prior) -> bool:
+    """Whether a pose lies where the prior has 99.9 % of its mass."""
+    off = error_of(prior.T, T)
+    return float(off @ np.linalg.solve(prior.covariance, off)) <= _CHI_SQUARE_6
+
+
+#: 99.9 % of a chi-square of six degrees of freedom.
+_CHI_SQUARE_6 = 22.458
+
+
+def _planes(place: _Place) -> float:
+    return 0.0 if place.scored is None else place.scored.planes
+
+
+def _excess(place: _Place, p: LocalizationParameters) -> float:
+    """Violations of both sides, less those that the map's own frames show."""
+    if place.scored is None:
+        return 1.0
+    one = place.scored
+    return one.violations + one.hidden - min(one.noise, p.most_noise)
+
+
+def _found(
+    parent: str, place: _Place, places: Sequence[_Place], verified_by: Verifier,
+    ratio: float | None, p: LocalizationParameters,
+) -> PoseEstimate:  # fmt: skip
+    accepted = [vote for vote in place.votes if vote.accepted]
+    votes = accepted[: p.views]
+    told = [vote.covariance for vote in votes if vote.covariance is not None]
+    average = average_poses(np.stack([vote.T for vote in votes] or [place.pose]))
+    covariance = None
+    if votes and len(told) == len(votes):
+        poses = np.stack([vote.T for vote in votes])
+        covariance = place_covariance(average, poses, np.stack(told))
+    total = sum(vote.accepted for one in places for vote in one.votes)
+    reason = _found_reason(average, len(accepted), total, place.support, verified_by)
+    strength: Strength = "strong" if place.strong else "weak"
+    return PoseEstimate(
+        "found", reason, parent, average, covariance, strength, verified_by, (), ratio,
+        tuple(vote.match.index for vote in accepted),
+    )  # fmt: skip
+
+
+def _found_reason(
+    average: PoseAverage, agreeing: int, accepted: int, support: int, verified_by: Verifier
+) -> str:
+    if verified_by == "map":
+        return "the map's frames confirm this pose, and no other comes near"
+    if verified_by == "prior":
+        return "several poses fit, and only this one lies where the prior expects the robot"
+    spread = (
+        f", within {average.spread_m:.2g} m and {math.degrees(average.spread_rad):.2g} deg"
+        if average.support > 1
+        else ""
+    )
+    told = f"{agreeing} of {accepted} matches agree on the pose{spread}"
+    return f"{told}; one view, unconfirmed" if support == 1 else told
