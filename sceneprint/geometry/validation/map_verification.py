@@ -39,13 +39,14 @@ from sceneprint.types import Floats, Geometry, Sphere
 class MapParameters:
     """The numbers of verification in the map."""
 
-    n_views: int = 12  #: that a pose is scored on, at most
+    n_views: int = 10  #: that a pose is scored on, at most
     look_ahead: float = 1.5  #: of a camera, to the middle of what it sees, metres
     reach: float = 3.5  #: between the middles of two views that may share surfaces, metres
     around_reach: float = 15.0  #: the same of sensors that see all around
     least_agreeing: float = 0.03  #: share of the query's points, below which a view has no say
     violation_weight: float = 2.0  #: of the violations of either side, in the score
-    n_poses: int = 40  #: that are scored
+    n_poses: int = 40  #: that are scored on the candidates
+    n_places: int = 6  #: places, the best of these, that are scored on all frames
     n_refined: int = 3  #: places whose pose is refined
     n_refining: int = 3  #: views that a pose is refined on
     n_noise: int = 4  #: frames of the map whose own violations are taken for noise
@@ -107,7 +108,7 @@ class MapViews:
 
     def __init__(
         self, poses: Floats, open_geometry: Callable[[int], Geometry | None],
-        p: MapParameters, overlap_p: OverlapParameters,
+        p: MapParameters, overlap_p: OverlapParameters, candidates: Sequence[int] = (),
     ) -> None:  # fmt: skip
         """Hold frames by their poses.
 
@@ -116,8 +117,11 @@ class MapViews:
         poses : (n, 4, 4) T_parent_sensor
         open_geometry : the artifact of the i-th; None where it cannot be read
         p, overlap_p : see there
+        candidates : positions of those that poses are first compared on, being open already;
+            none: all
         """
         self.poses, self._open, self._p, self._overlap = poses, open_geometry, p, overlap_p
+        self.candidates = np.array(candidates, np.intp)
         self._frames: dict[int, MapFrame | None] = {}
 
     def __getitem__(self, i: int) -> MapFrame | None:
@@ -129,23 +133,27 @@ class MapViews:
             )  # fmt: skip
         return self._frames[i]
 
-    def near(self, T: Floats, around: bool) -> list[int]:
+    def near(self, T: Floats, around: bool, *, first: bool = False) -> list[int]:
         """The frames that most likely see what a sensor at T sees, nearest first.
 
         Parameters
         ----------
         T : (4, 4) T_parent_sensor
         around : whether it sees all around; else directions count beside distance
+        first : look among the candidates alone
         """
         p = self._p
         ahead = 0.0 if around else p.look_ahead
-        axes = self.poses[:, :3, 2]
-        middles = self.poses[:, :3, 3] + ahead * axes
+        some = first and len(self.candidates) > 0
+        poses = self.poses[self.candidates] if some else self.poses
+        axes = poses[:, :3, 2]
+        middles = poses[:, :3, 3] + ahead * axes
         apart = np.linalg.norm(middles - (T[:3, 3] + ahead * T[:3, 2]), axis=1)
         if not around:
             apart += p.look_ahead * (1.0 - axes @ T[:3, 2])
         order = np.argsort(apart, kind="stable")[: p.n_views]
-        near: list[int] = order[apart[order] < (p.around_reach if around else p.reach)].tolist()
+        order = order[apart[order] < (p.around_reach if around else p.reach)]
+        near: list[int] = (self.candidates[order] if some else order).tolist()
         return near
 
 
@@ -172,7 +180,7 @@ def sees_around(geometry: Geometry) -> bool:
 
 def score_pose(
     frames: Sequence[MapFrame], T: Floats, views: MapViews, p: MapParameters,
-    overlap_p: OverlapParameters, *, without: int | None = None,
+    overlap_p: OverlapParameters, *, without: int | None = None, first: bool = False,
 ) -> ScoredPose:  # fmt: skip
     """How the map's frames bear a pose of the query out.
 
@@ -183,6 +191,7 @@ def score_pose(
     views : of the same parent frame
     p, overlap_p : see there
     without : position of a frame that has no say
+    first : score on the candidates alone
     """
     limits = tolerances(overlap_p)
     total = agreeing = violating = seen = through = 0.0
@@ -191,7 +200,7 @@ def score_pose(
         points, weights = frame.planes.points, frame.planes.weights
         agree, violate = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
         T_parent_sensor = T @ frame.T
-        for i in views.near(T_parent_sensor, sees_around(frame.geometry)):
+        for i in views.near(T_parent_sensor, sees_around(frame.geometry), first=first):
             view = views[i]
             if view is None or i == without:
                 continue
@@ -291,6 +300,7 @@ def compare_poses(
 ) -> list[ScoredPose]:  # fmt: skip
     """Poses of the query, the best of each place, best first.
 
+    All are compared on the candidates first, and the best places on all frames that would see them.
     The first few places are refined on the map before they are compared, as a pose that is off
     by a few centimetres shows violations that the right one has not.
 
@@ -304,7 +314,9 @@ def compare_poses(
     """
     first = -np.arange(len(poses), dtype=float)
     chosen = distinct(poses, first, p.same_m, p.same_rad, p.n_poses)
-    scored = [score_pose(frames, poses[i], views, p, overlap_p) for i in chosen]
+    scored = [score_pose(frames, poses[i], views, p, overlap_p, first=True) for i in chosen]
+    places = best_of_places(scored, p)[: p.n_places]
+    scored = [score_pose(frames, place.T, views, p, overlap_p) for place in places]
     places = best_of_places(scored, p)
     for pose in places[: p.n_refined]:
         T = refined_pose(frames, pose, views, p)
