@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import Annotated, Any, Generic, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationError,
+    model_validator,
+)
 
 from sceneprint_client.errors import InvalidRequest
 
@@ -77,6 +85,14 @@ class Vector(ApiRecord):
     z: float
 
 
+class Direction(ApiRecord):
+    """A unit vector."""
+
+    x: float
+    y: float
+    z: float
+
+
 class Quaternion(ApiRecord):
     """Unit quaternion, w >= 0."""
 
@@ -96,6 +112,45 @@ class Transform(ApiRecord):
     translation: Vector
     rotation: Quaternion
     matrix: list[list[float]] = Field(description="4 x 4, row by row.")
+
+
+# Which way is up, as a caller gives it.
+
+#: How far from 1 the length of a given direction may be.
+_UNIT = 1e-2
+
+
+class GivenDirection(Given):
+    """A unit vector, as `{x, y, z}` or as a list of three numbers."""
+
+    x: float
+    y: float
+    z: float
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_list(cls, given: object) -> object:
+        if isinstance(given, list | tuple):
+            if len(given) != len("xyz"):
+                raise ValueError(f"{len(given)} numbers; give x, y and z")
+            return dict(zip("xyz", given, strict=True))
+        return given
+
+    @model_validator(mode="after")
+    def _of_unit_length(self) -> GivenDirection:
+        length = math.hypot(self.x, self.y, self.z)
+        if not abs(length - 1.0) <= _UNIT:
+            raise ValueError(
+                f"its length is {length:.3g}, not 1; divide it by its length, as an "
+                "accelerometer at rest measures 9.81 upwards"
+            )
+        return self
+
+    @property
+    def unit(self) -> list[float]:
+        """Its three numbers, of length 1 as exactly as can be."""
+        length = math.hypot(self.x, self.y, self.z)
+        return [self.x / length, self.y / length, self.z / length]
 
 
 # The states of frames and jobs.
