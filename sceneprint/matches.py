@@ -15,6 +15,7 @@ from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.alignment import are_scans
 from sceneprint.geometry.validation.association import preferred, voters
+from sceneprint.geometry.validation.gravity import Ups
 from sceneprint.geometry.validation.icp import place_covariance, transported
 from sceneprint.geometry.validation.sequence_alignment import Matching
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
@@ -121,8 +122,10 @@ def associate(
         if accepted == k:
             break
     if not accepted and mode == "full":
-        retry = _retry_tilted if up is None else _retry_without_up
-        retry(query, tried, open_geometry, seed, p, go_on)
+        if up is not None:
+            _retry_without_up(query, tried, open_geometry, seed, p, go_on)
+        if all(match.validation.status != "accepted" for match in tried):
+            _retry_tilted(query, tried, open_geometry, seed, p, go_on)
     first = preferred([match.validation for match in tried])
     rest = [i for i in range(len(tried)) if i not in first]
     rest.sort(key=lambda i: not tried[i].validation.contradicts_up)
@@ -145,9 +148,15 @@ def _retry_tilted(
         geometry = open_geometry(before.index)
         if geometry is None or not are_scans(query, geometry) or not go_on():
             return
+        if _both_known(before.validation.ups):
+            continue
         validation = validate(query, geometry, seed, p, other_axes=True)
         if validation.status == "accepted":
             tried[place] = replace(before, validation=validation)
+
+
+def _both_known(ups: Ups) -> bool:
+    return ups[0] is not None and ups[1] is not None
 
 
 def _retry_without_up(
@@ -159,7 +168,7 @@ def _retry_without_up(
         geometry, ups = open_geometry(before.index), before.validation.ups
         if geometry is None or not go_on():
             return
-        if None in ups and not are_scans(query, geometry):  # it took no part
+        if not _both_known(ups) and not are_scans(query, geometry):  # it took no part
             continue
         validation = validate_without_up(query, geometry, seed, p, ups)
         if validation is not None:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Generic, TypeVar
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     StringConstraints,
@@ -121,20 +122,11 @@ _UNIT = 1e-2
 
 
 class GivenDirection(Given):
-    """A unit vector, as `{x, y, z}` or as a list of three numbers."""
+    """A unit vector."""
 
     x: float
     y: float
     z: float
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_list(cls, given: object) -> object:
-        if isinstance(given, list | tuple):
-            if len(given) != len("xyz"):
-                raise ValueError(f"{len(given)} numbers; give x, y and z")
-            return dict(zip("xyz", given, strict=True))
-        return given
 
     @model_validator(mode="after")
     def _of_unit_length(self) -> GivenDirection:
@@ -151,6 +143,27 @@ class GivenDirection(Given):
         """Its three numbers, of length 1 as exactly as can be."""
         length = math.hypot(self.x, self.y, self.z)
         return [self.x / length, self.y / length, self.z / length]
+
+
+def _from_list(given: object) -> object:
+    if isinstance(given, list | tuple) and len(given) == len("xyz"):
+        return dict(zip("xyz", given, strict=True))
+    if not isinstance(given, GivenDirection | dict):
+        raise ValueError(  # noqa: TRY004  (pydantic wants it)
+            "neither {x, y, z} nor a list of three numbers"
+        )
+    return given
+
+
+#: A direction as `{x, y, z}`, or as a list of three numbers.
+Up = Annotated[
+    GivenDirection,
+    BeforeValidator(
+        _from_list,
+        json_schema_input_type=GivenDirection
+        | Annotated[list[float], Field(min_length=3, max_length=3)],
+    ),
+]
 
 
 # The states of frames and jobs.

@@ -13,10 +13,10 @@ from sceneprint_client.api.base import (
     Direction,
     FrameState,
     Given,
-    GivenDirection,
     Label,
     Problem,
     Transform,
+    Up,
     Vector,
 )
 from sceneprint_client.errors import (
@@ -139,7 +139,7 @@ class FrameMeta(Given):
         "A cloud with a `viewpoint` that is not its origin has the base frame `cloud` without it: "
         "the coordinates as they were sent.",
     )
-    up: GivenDirection | None = Field(
+    up: Up | None = Field(
         default=None,
         description="Up as an IMU has it: a unit vector in the sensor's axes, of a camera x right, "
         "y down, z forward. A camera held level has (0, -1, 0). Transforms that tilt a query "
@@ -312,7 +312,7 @@ class ImportOptions(Given):
     T_base_sensor: GivenBase | None = Field(
         default=None, description="Where the sensor sits on the robot."
     )
-    up: GivenDirection | None = Field(
+    up: Up | None = Field(
         default=None,
         description="Up in the sensor's axes, of all frames: where the sensor is carried level.",
     )

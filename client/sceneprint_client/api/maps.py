@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, WithJsonSchema
 
-from sceneprint_client.api.base import ApiRecord, Direction, Given, GivenDirection, Note
+from sceneprint_client.api.base import ApiRecord, Direction, Given, Note, Up
 
 #: Names of the models that ship with the service, the default first.
 PRESETS = ("depth", "lidar", "paper")
@@ -65,7 +65,7 @@ class NewMap(Given):
         description="Days after which a frame is deleted, counted from when it was received; "
         "null: never.",
     )
-    up: GivenDirection | None = Field(
+    up: Up | None = Field(
         default=None,
         description="Up in the parent frames of its poses, (0, 0, 1) where z points up: what a "
         "frame with a pose and no `up` of its own has. Null: learnt from frames that have both.",
