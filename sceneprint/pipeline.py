@@ -24,10 +24,12 @@ from sceneprint.geometry.retrieval.dpp import diversify as select
 from sceneprint.geometry.surface.range_image import range_image
 from sceneprint.geometry.surface.voxels import Voxels
 from sceneprint.geometry.validation.acceptance import Mode
+from sceneprint.geometry.validation.gravity import NO_UPS, Ups
 from sceneprint.geometry.validation.patch_descriptors import compress, patch_descriptors
 from sceneprint.geometry.validation.sequence_alignment import Matching
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.geometry.validation.validation import validate as validate_geometry
+from sceneprint.geometry.validation.validation import validate_without_up as check_up
 from sceneprint.models import PRESETS, Model, read_model
 from sceneprint.signing import (
     Signature,
@@ -38,7 +40,7 @@ from sceneprint.signing import (
     patches_for_validation,
     see,
 )
-from sceneprint.types import AnyFrame, Bytes, Floats, Geometry, Surface
+from sceneprint.types import AnyFrame, Bytes, Geometry, Surface
 
 __all__ = [
     "Signature",
@@ -51,6 +53,7 @@ __all__ = [
     "retrieve",
     "sign",
     "validate",
+    "validate_without_up",
 ]
 
 
@@ -170,7 +173,7 @@ def validate(
     mode: Mode = "full",
     matching: Matching = "histograms",
     *,
-    ups: tuple[Floats | None, Floats | None] = (None, None),
+    ups: Ups = NO_UPS,
     other_axes: bool = False,
 ) -> PairValidation:
     """Whether two frames see one place, and the transform between them: Sec. III-E.
@@ -182,8 +185,7 @@ def validate(
     p : default: those of the model that made them, `model.parameters.validation`
     mode : "full", or "paper" for the paper's test alone
     matching : "histograms", or "sequence" for correspondences as the paper finds them: slower
-    ups : (3,) unit vectors, up in the query's and in the match's coordinates where they are known;
-        of scans
+    ups : (3,) unit vectors, up in the query's and in the match's coordinates where they are known
     other_axes : whether the scanners may have stood otherwise than upright; of scans
 
     Raises
@@ -194,6 +196,21 @@ def validate(
     _same_model(query, match)
     p = p or _numbers_of(query)
     return validate_geometry(query, match, seed, p, mode, matching, ups=ups, other_axes=other_axes)
+
+
+def validate_without_up(
+    query: Geometry, match: Geometry, seed: int, p: ValidationParameters | None, ups: Ups
+) -> PairValidation | None:
+    """Ask the surfaces alone, of a query that found nothing with `up`: Sec. III-E.
+
+    See `sceneprint.geometry.validation.validation.validate_without_up`.
+
+    Raises
+    ------
+    ModelMismatch : see `validate`.
+    """
+    _same_model(query, match)
+    return check_up(query, match, seed, p or _numbers_of(query), ups)
 
 
 #: Of models that this process has used, by id: an artifact names its model, and holds no more.

@@ -57,7 +57,7 @@ _PLAIN = (
     "depth_scale", "depth_along_ray", "units_per_metre", "format", "robot", "session",
     "captured_at",
 )  # fmt: skip
-_OTHERS = ("viewpoint", "tags", "pose", "parent_frame", "base", "base_frame")
+_OTHERS = ("viewpoint", "tags", "pose", "parent_frame", "base", "base_frame", "up")
 _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
@@ -93,6 +93,7 @@ def parameters() -> list[dict[str, Any]]:
         "parent_frame": (text, "what `pose` leads to; default: ROBOT/SESSION."),
         "base": (text, "T_base_sensor, written as `pose`: where the sensor sits on the robot."),
         "base_frame": (text, "what the robot calls its base; default: base_link."),
+        "up": (text, "up in the sensor's axes as x,y,z: a unit vector."),
     }
     return [
         {
@@ -216,7 +217,14 @@ def _fields(given: Mapping[str, str], head: bytes) -> dict[str, Any]:
         found["tags"] = given["tags"].split(",")
     add_transform(found, given, "pose", "pose", "parent_frame")
     add_transform(found, given, "base", "T_base_sensor", "base_frame")
+    add_up(found, given)
     return found
+
+
+def add_up(found: dict[str, Any], given: Mapping[str, str]) -> None:
+    """Add `up` where the query string has it; the record sees whether it is a direction."""
+    if "up" in given:
+        found["up"] = given["up"].split(",")
 
 
 def add_transform(

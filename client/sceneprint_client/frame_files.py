@@ -7,7 +7,7 @@ bytes | Path | FrameFile  --sendable-->  bytes, FrameMeta
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint_client.api.base import checked
+from sceneprint_client.api.base import GivenDirection, checked
 from sceneprint_client.api.frames import CameraIntrinsics, FrameMeta, GivenBase, GivenPose
 from sceneprint_client.errors import DatasetError, UnreadableCloud, UnreadableFrame
 from sceneprint_client.file_formats import (
@@ -142,6 +142,7 @@ def meta_of(
     with_pose: bool = True,
     parent_frame: str | None = None,
     base: GivenBase | None = None,
+    up: Sequence[float] | None = None,
 ) -> FrameMeta:
     """What a data set knows of one of its frames, as it is sent with an upload.
 
@@ -154,12 +155,16 @@ def meta_of(
     parent_frame : what its pose leads to; default: the session's name. Sequences of one scene
         share it: `Sequence.parent_frame`
     base : where the sensor sits on the robot
+    up : unit vector in the sensor's axes; default: of the sidecar, for all of its frames
 
     Raises
     ------
     InvalidPose : the file of the pose holds none.
     InvalidRequest : a name is empty, too long or not printable.
     """
+    if up is None:
+        source = reference.camera or reference.cloud
+        up = None if source is None else source.up
     sequence = reference.name.rpartition("/")[0] or reference.path.absolute().parent.name
     T_parent_sensor = reference.pose if with_pose else None
     stamp, pose = reference.timestamp, None
@@ -177,8 +182,16 @@ def meta_of(
         captured_at=None if stamp is None else datetime.fromtimestamp(stamp, timezone.utc),
         pose=pose,
         T_base_sensor=base,
+        up=_direction(up),
         tags=list(tags),
     )
+
+
+def _direction(up: Sequence[float] | None) -> GivenDirection | None:
+    """Three numbers as they are sent; InvalidRequest where they are no unit vector."""
+    if up is None:
+        return None
+    return checked(GivenDirection, "The up vector", **dict(zip("xyz", up, strict=False)))
 
 
 def _of_depth(camera: Camera) -> dict[str, Any]:
@@ -214,9 +227,12 @@ def _of_cloud(reference: FrameFile) -> dict[str, Any]:
 
 
 def sendable(
-    frame: bytes | Path | FrameFile, meta: FrameMeta | None, *, with_pose: bool
-) -> tuple[bytes, FrameMeta]:
+    frame: bytes | Path | FrameFile, meta: FrameMeta | None, *, with_pose: bool,
+    up: Sequence[float] | None = None,
+) -> tuple[bytes, FrameMeta]:  # fmt: skip
     """Bytes of a frame and what is known of it; a path's camera is looked for beside it.
+
+    Where `up` is given, it stands in the place of what `meta` or a sidecar says.
 
     Raises
     ------
@@ -225,10 +241,12 @@ def sendable(
     InvalidIntrinsics, InvalidPose : what is beside it is none.
     TypeError : bytes without metadata, and of no point cloud.
     """
+    if meta is not None and up is not None:
+        meta = meta.model_copy(update={"up": _direction(up)})
     if isinstance(frame, bytes):
         if meta is None and format_of(frame) is None:
             raise TypeError("the bytes of a depth image need its `meta`, at least the intrinsics")
-        return frame, meta or FrameMeta()
+        return frame, meta or FrameMeta(up=_direction(up))
     if isinstance(frame, FrameFile):
         found = frame
     elif meta is not None:
@@ -236,7 +254,7 @@ def sendable(
     else:
         found = _named(frame)
     data = _read(found.path, is_cloud=found.kind == "cloud")
-    return data, meta_of(found, with_pose=with_pose) if meta is None else meta
+    return data, meta_of(found, with_pose=with_pose, up=up) if meta is None else meta
 
 
 def _named(path: Path) -> FrameFile:

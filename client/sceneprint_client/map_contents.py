@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from typing import Any, Literal
 
@@ -31,13 +31,15 @@ class MapMethods(ServiceConnection):
     """Maps, their frames, and what is made of these."""
 
     def create_map(
-        self, name: str, title: str | None = None, model: str = "depth", **limits: float | None
-    ) -> Map:
+        self, name: str, title: str | None = None, model: str = "depth",
+        up: Sequence[float] | None = None, **limits: float | None,
+    ) -> Map:  # fmt: skip
         """Make a map, or find that it is there as wanted.
 
         Parameters
         ----------
         name, title, model : of the map
+        up : unit vector in the parent frames of its poses; default: learnt from its frames
         limits : `quota_frames` and `quota_bytes`, which are the operator's to set, and
             `retention_days`; see NewMap
 
@@ -47,7 +49,8 @@ class MapMethods(ServiceConnection):
         MapExists : there is one of that name with another title or model, or other limits.
         Forbidden : a quota is given, and the key has not `admin` for `*`.
         """
-        new = checked(NewMap, "The map", name=name, title=title, model=model, **limits)
+        known: dict[str, Any] = limits if up is None else {**limits, "up": list(up)}
+        new = checked(NewMap, "The map", name=name, title=title, model=model, **known)
         return self._ask(Map, "POST", "/v1/maps", json=new.model_dump(exclude_unset=True))
 
     def maps(self) -> list[Map]:
@@ -62,7 +65,7 @@ class MapMethods(ServiceConnection):
         self, map_name: str, changes: Mapping[str, Any], if_match: str | None = None, *,
         dry_run: bool = False,
     ) -> Map:  # fmt: skip
-        """Change title, quotas and retention of a map; parameters and errors as of `edit_frame`.
+        """Change title, limits and up of a map; parameters and errors as of `edit_frame`.
 
         Quotas are the operator's: they ask for a key with `admin` for `*`, else Forbidden. With
         `dry_run` nothing is changed, and the map told as it would be: `overdue` is how many frames

@@ -4,7 +4,7 @@ their answers rest on.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,7 +61,8 @@ class QueryMethods(ServiceConnection):
     def query(
         self, map_name: str | None = None, frame: bytes | Path | FrameFile | None = None,
         meta: FrameMeta | None = None, *, frame_id: str | None = None,
-        maps: str | Iterable[str] | None = None, **how: Unpack[QueryOptions],
+        maps: str | Iterable[str] | None = None, up: Sequence[float] | None = None,
+        **how: Unpack[QueryOptions],
     ) -> Answer:  # fmt: skip
         """Where was this frame taken? The frame is not added to the map.
 
@@ -72,6 +73,7 @@ class QueryMethods(ServiceConnection):
         frame_id : of a frame of the map, in place of `frame`; it does not find itself
         maps : names of maps of one model that are asked as one, or `*` for all, in place of
             `map_name`; with `frame_id`, `map_name` says which map that frame is of
+        up : unit vector in the sensor's axes, of an IMU; default: as `meta` or a sidecar says
         how : k, stages, exact, filter, seed and the rest of the fields of Query; a filter, and
             what else has fields, as a dictionary or a record
 
@@ -84,14 +86,14 @@ class QueryMethods(ServiceConnection):
         TypeError : not one of `frame` and `frame_id`, no map, or an option that there is not.
         """
         if maps is None:
-            name, wanted = named_or_sent(map_name, frame, meta, frame_id)
+            name, wanted = named_or_sent(map_name, frame, meta, frame_id, up)
             query = query_of(Query, how)
             return self._ask(
                 Answer, "POST", f"{map_path(name)}/queries", **_query_request(wanted, query)
             )
         if (frame_id is None) != (map_name is None):
             raise TypeError("with `maps`, give `map_name` where `frame_id` names a frame of it")
-        _, wanted = named_or_sent(map_name or "", frame, meta, frame_id)
+        _, wanted = named_or_sent(map_name or "", frame, meta, frame_id, up)
         named = wanted if isinstance(wanted, NamedFrame) else None
         asked = maps if isinstance(maps, str) else list(maps)
         several = query_of(SeveralQuery, how, maps=asked, frame=named)
@@ -103,10 +105,11 @@ class QueryMethods(ServiceConnection):
 
     def localize(
         self, map_name: str, frame: bytes | Path | FrameFile | None = None,
-        meta: FrameMeta | None = None, *, frame_id: str | None = None, **how: Unpack[QueryOptions],
+        meta: FrameMeta | None = None, *, frame_id: str | None = None,
+        up: Sequence[float] | None = None, **how: Unpack[QueryOptions],
     ) -> Localization:  # fmt: skip
         """Where in a map was this frame taken? One status and one pose; see `query`."""
-        name, wanted = named_or_sent(map_name, frame, meta, frame_id)
+        name, wanted = named_or_sent(map_name, frame, meta, frame_id, up)
         request = _query_request(wanted, query_of(Query, how))
         return self._ask(Localization, "POST", f"{map_path(name)}/localize", **request)
 

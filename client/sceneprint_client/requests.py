@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
@@ -44,12 +44,13 @@ def given(**parameters: Any) -> dict[str, Any]:
 
 
 def frame_bytes(
-    frame: bytes | Path | FrameFile, meta: FrameMeta | None, *, with_pose: bool
-) -> tuple[bytes, FrameMeta]:
+    frame: bytes | Path | FrameFile, meta: FrameMeta | None, *, with_pose: bool,
+    up: Sequence[float] | None = None,
+) -> tuple[bytes, FrameMeta]:  # fmt: skip
     """Bytes of a frame and what is known of it; see `frame_files.sendable`."""
     from sceneprint_client.frame_files import sendable  # it takes numpy
 
-    return sendable(frame, meta, with_pose=with_pose)
+    return sendable(frame, meta, with_pose=with_pose, up=up)
 
 
 def frame_form(data: bytes, meta: FrameMeta) -> dict[str, Any]:
@@ -145,16 +146,18 @@ def query_of(kind: type[Any], how: QueryOptions, **more: Any) -> Any:
 
 def named_or_sent(
     map_name: str | None, frame: bytes | Path | FrameFile | None, meta: FrameMeta | None,
-    frame_id: str | None,
+    frame_id: str | None, up: Sequence[float] | None = None,
 ) -> tuple[str, QueryFrame]:  # fmt: skip
     """The frame that is asked for, of the map that it is asked of."""
     if map_name is None:
         raise TypeError("give `map_name`, or `maps`")
     if frame_id is not None and frame is None:
+        if up is not None:
+            raise TypeError("a stored frame has the `up` that it was uploaded with")
         return map_name, NamedFrame.model_construct(map=map_name, frame_id=frame_id)
     if frame is None or frame_id is not None:
         raise TypeError("give either `frame` or `frame_id`")
-    return map_name, frame_bytes(frame, meta, with_pose=False)
+    return map_name, frame_bytes(frame, meta, with_pose=False, up=up)
 
 
 def compared_frame(

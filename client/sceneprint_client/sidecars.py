@@ -20,6 +20,14 @@ from sceneprint_client.api.frames import CloudFormat
 from sceneprint_client.errors import DatasetError, InvalidIntrinsics, InvalidPose, naming
 from sceneprint_client.files import read_object, read_text
 
+#: A place, metres, or a direction.
+Position = tuple[float, float, float]
+
+_TOLERANCE = 1e-2  #: how far a written rotation may be from a true one, or a length from 1
+_NO_UP = (
+    "up is {}, no direction. Write a list of three numbers of length 1 in the sensor's axes, such "
+    "as [0, -1, 0] of a camera that is held level."
+)
 _PARENTS = 4  #: folders above the frames that are looked into
 _MAXIMUM_BYTES = 65_536
 
@@ -112,7 +120,7 @@ _INTRINSICS_EXAMPLE = (
     '"depth_scale": 1000}'
 )
 _REQUIRED = ("width", "height", "fx", "fy", "cx", "cy")
-_OPTIONAL = ("depth_scale", "distortion", "depth_along_ray")
+_OPTIONAL = ("depth_scale", "distortion", "depth_along_ray", "up")
 
 
 @dataclass(frozen=True)
@@ -124,15 +132,17 @@ class Camera:
     intrinsics : of the depth images, with their distortion
     depth_scale : stored units per metre
     along_ray : depth is the range along the pixel's ray and not z
+    up : unit vector in the camera's axes, of one that is carried level; None where not known
 
     Raises
     ------
-    InvalidIntrinsics : the depth scale is no positive number.
+    InvalidIntrinsics : the depth scale is no positive number, or `up` not of length 1.
     """
 
     intrinsics: Intrinsics
     depth_scale: float = 1000.0
     along_ray: bool = False
+    up: Position | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.depth_scale) and self.depth_scale > 0):
@@ -140,6 +150,13 @@ class Camera:
                 f"The depth scale {self.depth_scale} is not a positive number. "
                 "Give the stored units per metre, 1000 for millimetres."
             )
+        if self.up is not None and not is_unit(self.up):
+            raise InvalidIntrinsics(_NO_UP.format(self.up))
+
+
+def is_unit(vector: Position) -> bool:
+    """Whether three numbers are of length 1, to a hundredth."""
+    return abs(math.hypot(*vector) - 1.0) <= _TOLERANCE
 
 
 def find_camera(folder: Path) -> Camera:
@@ -166,7 +183,7 @@ def read_camera(path: Path) -> Camera:
     """Return the camera that a JSON file describes.
 
     Fields: width, height, fx, fy, cx, cy in pixels; and, if they differ from what is said
-    here, depth_scale (1000), distortion (none), depth_along_ray (false).
+    here, depth_scale (1000), distortion (none), depth_along_ray (false), up (not known).
 
     Raises
     ------
@@ -209,7 +226,17 @@ def _camera(fields: dict[str, object]) -> Camera:
         ),
         depth_scale=_intrinsics_number("depth_scale", fields.get("depth_scale", 1000)),
         along_ray=along_ray,
+        up=_camera_up(fields.get("up")),
     )
+
+
+def _camera_up(told: object) -> Position | None:
+    if told is None:
+        return None
+    if not isinstance(told, list) or len(told) != len("xyz"):
+        raise InvalidIntrinsics(_NO_UP.format(f"{told!r:.60}"))
+    x, y, z = (_intrinsics_number("up", value) for value in told)
+    return x, y, z
 
 
 def _whole(fields: dict[str, object], name: str) -> int:
@@ -238,11 +265,8 @@ CLOUDS_FILE = "clouds.json"
 _CLOUDS_EXAMPLE = (
     '{"viewpoint": {"x": 0, "y": 0, "z": 1.7}, "units_per_metre": 1, "format": "kitti"}'
 )
-_FIELDS = ("viewpoint", "units_per_metre", "format")
+_FIELDS = ("viewpoint", "units_per_metre", "format", "up")
 _FORMATS: tuple[CloudFormat, ...] = get_args(CloudFormat)
-
-
-Position = tuple[float, float, float]
 
 
 class Unsaid(Enum):
@@ -264,11 +288,13 @@ class CloudSource:
     viewpoint : where the sensor was, metres in the file's axes; None for points of many views;
         UNSAID: as the file says, else the origin
     units_per_metre : of its coordinates
+    up : unit vector in the file's axes, of a sensor that is carried level; None where not known
     """
 
     file_format: CloudFormat | None = None
     viewpoint: Position | Unsaid | None = UNSAID
     units_per_metre: float = 1.0
+    up: Position | None = None
 
 
 def find_cloud_source(folder: Path) -> CloudSource:
@@ -302,7 +328,17 @@ def _read_source(path: Path) -> CloudSource:
         units = _cloud_number("units_per_metre", fields.get("units_per_metre", 1.0))
         if not units > 0.0:
             raise DatasetError(f"units_per_metre is {units}. Write 1000 for millimetres.")
-        return CloudSource(told, _viewpoint(fields), units)
+        return CloudSource(told, _viewpoint(fields), units, _cloud_up(fields.get("up")))
+
+
+def _cloud_up(told: object) -> Position | None:
+    if told is None:
+        return None
+    if isinstance(told, list) and len(told) == len("xyz"):
+        x, y, z = (_cloud_number("up", value) for value in told)
+        if is_unit((x, y, z)):
+            return x, y, z
+    raise DatasetError(_NO_UP.format(f"{told!r:.60}"))
 
 
 def _viewpoint(fields: dict[str, object]) -> Position | Unsaid | None:
@@ -336,7 +372,6 @@ def _cloud_number(name: str, value: object) -> float:
 
 # Poses.
 
-_TOLERANCE = 1e-2  #: how far a written rotation may be from a true one
 _MAXIMUM_POSE_BYTES = 65_536
 
 

@@ -35,7 +35,7 @@ class UploadMethods(ServiceConnection):
     def upload(
         self, map_name: str, frame: bytes | Path | FrameFile, meta: FrameMeta | None = None,
         *, wait_s: float | None = None, priority: int = 0,
-        if_novel: float | bool | None = None,
+        if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> Added:  # fmt: skip
         """Take a frame into a map; it is safe when this returns, and signed soon after.
 
@@ -49,6 +49,7 @@ class UploadMethods(ServiceConnection):
         if_novel : keep it only if the map lacks the place: if its nearest frame is farther than
             this share of the distance of unrelated frames, or than 0.3 of it where just True;
             else the frame ends `redundant`, and `reason` says which frame is near
+        up : unit vector in the sensor's axes, of an IMU; default: as `meta` or a sidecar says
 
         Returns
         -------
@@ -63,14 +64,14 @@ class UploadMethods(ServiceConnection):
         """
         until = time.monotonic() + (wait_s or 0.0)
         added, _ = self.add(
-            map_name, frame, meta, wait_s=wait_s, priority=priority, if_novel=if_novel
+            map_name, frame, meta, wait_s=wait_s, priority=priority, if_novel=if_novel, up=up
         )
         return self._settled(map_name, added, until)
 
     def add(
         self, map_name: str, frame: bytes | Path | FrameFile, meta: FrameMeta | None = None,
         *, wait_s: float | None = None, priority: int = 0,
-        if_novel: float | bool | None = None,
+        if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> tuple[Added, bool]:  # fmt: skip
         """As `upload`, with a flag: False where the map had the frame already.
 
@@ -78,13 +79,13 @@ class UploadMethods(ServiceConnection):
         """
         return self._upload(
             "POST", f"{map_path(map_name)}/frames", frame, meta, wait_s or 0.0,
-            _upload_fields(priority, if_novel),
+            _upload_fields(priority, if_novel), up,
         )  # fmt: skip
 
     def put_frame(
         self, map_name: str, frame_id: str, frame: bytes | Path | FrameFile,
         meta: FrameMeta | None = None, *, wait_s: float | None = None, priority: int = 0,
-        if_novel: float | bool | None = None,
+        if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> Added:  # fmt: skip
         """Take a frame into a map under an id of your own; sent again, it is the one there.
 
@@ -93,7 +94,7 @@ class UploadMethods(ServiceConnection):
         map_name : of the map
         frame_id : up to 64 letters, digits, dots, hyphens and underscores, the first a letter or
             digit
-        frame, meta, wait_s, priority, if_novel : as for `upload`
+        frame, meta, wait_s, priority, if_novel, up : as for `upload`
 
         Raises
         ------
@@ -105,7 +106,7 @@ class UploadMethods(ServiceConnection):
         until = time.monotonic() + (wait_s or 0.0)
         added, _ = self._upload(
             "PUT", frame_path(map_name, frame_id), frame, meta, wait_s or 0.0,
-            _upload_fields(priority, if_novel),
+            _upload_fields(priority, if_novel), up,
         )  # fmt: skip
         return self._settled(map_name, added, until)
 
@@ -151,10 +152,10 @@ class UploadMethods(ServiceConnection):
 
     def _upload(
         self, method: str, path: str, frame: bytes | Path | FrameFile, meta: FrameMeta | None,
-        wait_s: float, fields: dict[str, str],
+        wait_s: float, fields: dict[str, str], up: Sequence[float] | None,
     ) -> tuple[Added, bool]:  # fmt: skip
         """Send a frame; the service does not wait for one it had already."""
-        sent = frame_form(*frame_bytes(frame, meta, with_pose=True))
+        sent = frame_form(*frame_bytes(frame, meta, with_pose=True, up=up))
         sent["data"] |= fields
         # where this process is the worker, nobody would sign it meanwhile
         wait = 0 if self._worker is not None else min(int(wait_s), _LONGEST_WAIT_S)

@@ -18,6 +18,7 @@ from sceneprint.cli.options import (
     one_line,
     open_client,
     positive,
+    up_of,
     whole_number,
 )
 from sceneprint.errors import CannotRetry, InvalidRequest
@@ -416,7 +417,7 @@ def add_maps(commands: Any) -> None:
     choice.add_argument(
         "--create", metavar="NAME", help="create a map; its name may contain a-z, 0-9, - and _"
     )
-    choice.add_argument("--edit", metavar="NAME", help="edit the title or limits of a map")
+    choice.add_argument("--edit", metavar="NAME", help="edit title, limits or up of a map")
     choice.add_argument("--delete", metavar="NAME", help="delete a map with all its frames")
     command.add_argument("--title", help="human-readable title of the map")
     command.add_argument(
@@ -430,6 +431,13 @@ def add_maps(commands: Any) -> None:
         command.add_argument(
             name, metavar=metavar, type=_limit(kind), help=f"{told}; `{NONE}` for no limit"
         )
+    command.add_argument(
+        "--up",
+        metavar="X,Y,Z",
+        type=_map_up,
+        help="up in the parent frames of the poses, 0,0,1 where z points up; "
+        f"`{NONE}` to learn it from frames",
+    )
     command.add_argument("--yes", action="store_true", help="confirm a deletion")
     command.add_argument("--json", action="store_true", help="print JSON")
     add_service_options(command)
@@ -438,7 +446,7 @@ def add_maps(commands: Any) -> None:
 
 def run_maps(options: argparse.Namespace) -> int:
     """List, make, change or delete."""
-    names = ("title", "quota_frames", "quota_bytes", "retention_days")
+    names = ("title", "quota_frames", "quota_bytes", "retention_days", "up")
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     limits = {n: None if value == NONE else value for n, value in given.items() if n != "title"}
     if options.create is None and options.model is not None:
@@ -472,9 +480,13 @@ def _limit(kind: type[int] | type[float]) -> Any:
     return read
 
 
+def _map_up(given: str) -> list[float] | str:
+    return NONE if given == NONE else up_of(given)
+
+
 def _edit(client: Client, name: str, changes: dict[str, Any], *, sure: bool) -> Map:
     if not changes:
-        raise InvalidRequest("There is nothing to change. Add --title or a limit.")
+        raise InvalidRequest("There is nothing to change. Add --title, --up or a limit.")
     if changes.get("retention_days") is not None and not sure:
         told = client.edit_map(name, changes, dry_run=True)
         if told.overdue:
@@ -511,6 +523,8 @@ def _limits(one: Map) -> str:
         parts.append(f"{one.used_bytes / 1e6:.1f} of {one.quota_bytes / 1e6:.1f} MB")
     if one.retention_days is not None:
         parts.append(f"kept {one.retention_days:g} days")
+    if one.up is not None:
+        parts.append(f"up {one.up.x:g},{one.up.y:g},{one.up.z:g}")
     return ", ".join(parts)
 
 

@@ -184,6 +184,28 @@ def base_of(text: str) -> GivenBase:
         ) from error
 
 
+def up_of(text: str) -> list[float]:
+    """Three numbers; whether they are of length 1, the frame's record sees."""
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not three comma-separated numbers"
+        ) from error
+    return [x, y, z]
+
+
+def add_up_option(command: argparse.ArgumentParser) -> None:
+    """`--up`."""
+    command.add_argument(
+        "--up",
+        type=up_of,
+        metavar="X,Y,Z",
+        help="up in the sensor's axes, a unit vector, as 0,-1,0 for a camera held level (write "
+        "--up=-1,0,0 if it starts with a minus)",
+    )
+
+
 def priority_of(text: str) -> int:
     """A whole number from -10 to 10."""
     if text.removeprefix("-") not in {str(number) for number in range(MOST_PRIORITY + 1)}:

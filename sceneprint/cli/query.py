@@ -14,6 +14,7 @@ from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli.options import (
     add_asking_options,
     add_service_options,
+    add_up_option,
     explained_lines,
     one_line,
     open_client,
@@ -125,6 +126,7 @@ def add_query(commands: Any) -> None:
         ),
     )
     command.add_argument("--json", action="store_true", help="print one JSON answer per line")
+    add_up_option(command)
     add_asking_options(command)
     add_overlay_options(command)
     add_service_options(command)
@@ -143,7 +145,9 @@ def run_query(options: argparse.Namespace) -> int:
     with open_client(options) as client:
         for reference in references:
             try:
-                answer = client.query(None if several else options.map, reference, **how)
+                answer = client.query(
+                    None if several else options.map, reference, up=options.up, **how
+                )
             except (FrameError, MissingDependency, TooLarge) as error:  # of this file alone
                 failed += 1
                 print(f"{one_line(reference.name)}: {one_line(str(error))}", file=sys.stderr)
@@ -270,6 +274,7 @@ def add_localize(commands: Any) -> None:
         "--frame", metavar="N|FILE", help="frame of a folder: index from 0, or name (default: 0)"
     )
     command.add_argument("--json", action="store_true", help="print JSON")
+    add_up_option(command)
     add_asking_options(command)
     add_service_options(command)
     command.set_defaults(run=run_localize)
@@ -280,7 +285,7 @@ def run_localize(options: argparse.Namespace) -> int:
     reference = query_frames(options.path, options.frame)[0]
     how: dict[str, Any] = options_of(options)
     with open_client(options) as client:
-        there = client.localize(options.map, reference, **how)
+        there = client.localize(options.map, reference, up=options.up, **how)
     if options.json:
         print(there.model_dump_json())
     else:

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from sceneprint.cli.options import (
     add_service_options,
+    add_up_option,
     base_of,
     one_line,
     open_client,
@@ -193,6 +194,7 @@ def import_all(
             with_poses=not options.no_pose,
             every=options.every,
             T_base_sensor=options.base,
+            up=options.up,
             priority=options.priority,
             if_novel=options.if_novel,
         )
@@ -294,6 +296,7 @@ def add_upload(commands: Any) -> None:
     command.add_argument(
         "--base-frame", metavar="NAME", help="name of the robot's base frame (default: base_link)"
     )
+    add_up_option(command)
     command.add_argument(
         "--create",
         action=argparse.BooleanOptionalAction,
@@ -447,6 +450,7 @@ def _send(
         tags=options.tag,
         with_pose=not options.no_pose,
         base=options.base,
+        up=options.up,
         parent_frame=options.parent_frame or parent_frame_of(sequence, options.robot),
     )
     return client.add(

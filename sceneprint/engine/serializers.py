@@ -35,11 +35,12 @@ from sceneprint_client.api import (
     Transform,
     Vector,
 )
+from sceneprint_client.api.base import Direction
 from sceneprint_client.api.frames import GivenTransform, Kind
 
 # Entity tags: short texts that change when what they stand for does.
 
-#: Columns of a frame that can be edited.
+#: Columns of a frame that can be edited, beside `up`.
 EDITABLE = (
     "robot", "session", "captured_at", "tags", "pose_parent", "pose", "base_frame", "base",
 )  # fmt: skip
@@ -53,14 +54,17 @@ def tag_of(*parts: object) -> str:
 
 def frame_tag(frame: FrameRow) -> str:
     """Stands for all of a frame that can be edited."""
-    return tag_of("frame", [getattr(frame, name) for name in EDITABLE])
+    # as it was where there is no `up`: a tag that somebody holds outlives the upgrade
+    up = [] if frame.up is None else [frame.up]
+    return tag_of("frame", [getattr(frame, name) for name in EDITABLE] + up)
 
 
 def map_tag(row: MapRow) -> str:
     """Stands for all of a map that can be edited."""
     limits = row.quota_frames, row.quota_bytes, row.retention_days
     # as it was where there are none: a tag that somebody holds outlives the upgrade
-    return tag_of("map", row.name, row.title, *(() if limits == (None,) * 3 else limits))
+    known = () if limits == (None,) * 3 else limits
+    return tag_of("map", row.name, row.title, *known, *([] if row.up is None else [row.up]))
 
 
 # Transforms and poses between matrices and JSON.
@@ -178,6 +182,7 @@ def map_record(connection: Connection, row: MapRow) -> Map:
         quota_frames=row.quota_frames,
         quota_bytes=row.quota_bytes,
         retention_days=row.retention_days,
+        up=_direction(row.up),
         overdue=overdue,
         etag=map_tag(row),
     )
@@ -239,9 +244,14 @@ def _frame(row: MapRow, frame: FrameRow, job: JobRow) -> Frame:
         pose=pose,
         base_frame=frame.base_frame,
         T_base_sensor=base,
+        up=_direction(frame.up),
         tags=frame.tags,
         etag=frame_tag(frame),
     )
+
+
+def _direction(up: Sequence[float] | None) -> Direction | None:
+    return None if up is None else Direction(**dict(zip("xyz", up, strict=True)))
 
 
 def _sensor_record(frame: FrameRow) -> dict[str, Any]:

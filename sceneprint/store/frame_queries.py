@@ -31,6 +31,7 @@ from sceneprint.store.tables import (
     frame_tags,
     frames,
     job_files,
+    maps,
     rows_among,
     signatures,
 )
@@ -392,6 +393,40 @@ def stops_of(connection: Connection, numbers: Iterable[int]) -> dict[int, PathFr
         row.number: PathFrame(*row)
         for row in rows_among(connection, asked, frames.c.number, numbers)
     }
+
+
+# Which way is up in frames, and in the parent frames of their poses.
+
+
+@dataclass(frozen=True)
+class FrameUp:
+    """What is stored of a frame's up.
+
+    Parameters
+    ----------
+    number, map_number : of the frame
+    parent, pose : its parent frame and T_parent_sensor, 4 rows of 4; None without a pose
+    up : unit vector in its sensor's axes, as it was sent
+    map_up : unit vector in the parent frames of its map
+    """
+
+    number: int
+    map_number: int
+    parent: str | None
+    pose: list[list[float]] | None
+    up: list[float] | None
+    map_up: list[float] | None
+
+
+def frame_ups(connection: Connection, numbers: Iterable[int]) -> list[FrameUp]:
+    """What frames say of up; those that are deleted, or can say nothing of it, are left out."""
+    c = frames.c
+    asked = (
+        select(c.number, c.map_number, c.pose_parent, c.pose, c.up, maps.c.up.label("map_up"))
+        .join(maps, maps.c.number == c.map_number)
+        .where(c.state != FrameState.DELETED, c.up.is_not(null()) | c.pose.is_not(null()))
+    )
+    return [FrameUp(*row) for row in rows_among(connection, asked, c.number, numbers)]
 
 
 # What frames of a map weigh, and which a session brought: for whoever thins it out.

@@ -270,7 +270,7 @@ def write_frame(
 
 
 def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) -> MapRow:
-    """Change columns of a map: title, quotas, retention."""
+    """Change columns of a map: title, quotas, retention, up."""
     changed = {name: new for name, new in values.items() if getattr(row, name) != new}
     if not changed:
         return row

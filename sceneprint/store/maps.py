@@ -67,7 +67,7 @@ def list_maps(connection: Connection) -> list[MapRow]:
 
 def add_map(
     connection: Connection, name: str, title: str | None, model_id: str,
-    limits: Mapping[str, float | None] | None = None,
+    limits: Mapping[str, object] | None = None,
 ) -> MapRow:  # fmt: skip
     """Make a map; its name must be free.
 
@@ -75,9 +75,9 @@ def add_map(
     ----------
     connection : of a writing transaction
     name, title, model_id : of the map
-    limits : `quota_frames`, `quota_bytes`, `retention_days`, where they are given; quotas that are
-        not are those of the map that had this name before: whoever may delete a map and make it
-        anew does not get rid of its quota
+    limits : `quota_frames`, `quota_bytes`, `retention_days`, `up`, where they are given; quotas
+        that are not are those of the map that had this name before: whoever may delete a map and
+        make it anew does not get rid of its quota
     """
     connection.execute(
         insert(maps).values(

@@ -86,6 +86,7 @@ maps = Table(
     # what it holds: frames that are neither deleted nor redundant, and bytes of their uploads
     Column("used_frames", BigInteger, nullable=False, server_default="0"),
     Column("used_bytes", BigInteger, nullable=False, server_default="0"),
+    Column("up", JSON(none_as_null=True)),  # unit vector in the parent frames; null: learnt
     sqlite_autoincrement=True,
 )
 
@@ -119,6 +120,7 @@ frames = Table(
     Column("indexed_at", Float),
     Column("revision", WHOLE),
     Column("cloud", JSON(none_as_null=True)),  # what its points are; null: it is a depth image
+    Column("up", JSON(none_as_null=True)),  # unit vector in the sensor's axes
     UniqueConstraint("map_number", "id"),
     Index(None, "map_number", "content_id"),
     Index(None, "map_number", "revision"),
@@ -372,6 +374,7 @@ class MapRow:
     retention_days: float | None = None
     used_frames: int = 0
     used_bytes: int = 0
+    up: list[float] | None = None
 
 
 @dataclass(frozen=True)
@@ -405,6 +408,7 @@ class FrameRow:
     indexed_at: float | None
     revision: int | None
     cloud: dict[str, Any] | None
+    up: list[float] | None = None
 
     @property
     def kind(self) -> Kind:

@@ -285,7 +285,7 @@ TYPES = (
 #: Bytes that are written at once.
 _CHUNK = 1 << 20
 _TEXTS = ("name", "robot", "session", "parent_frame", "every", "with_poses")
-_PARAMETERS = (*_TEXTS, "tags", "base", "base_frame", "priority", "if_novel")
+_PARAMETERS = (*_TEXTS, "tags", "base", "base_frame", "up", "priority", "if_novel")
 
 
 def _described_import() -> dict[str, Any]:
@@ -409,6 +409,7 @@ def _options(request: Request) -> ImportOptions:
     if given.get("tags"):
         fields["tags"] = given["tags"].split(",")
     bodies.add_transform(fields, given, "base", "T_base_sensor", "base_frame")
+    bodies.add_up(fields, given)
     if "priority" in given:
         fields["priority"] = given["priority"]
     fields["if_novel"] = novelty_of(given.get("if_novel"))

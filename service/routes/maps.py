@@ -148,7 +148,7 @@ async def patch_map(
     map_name: str, request: Request, here: Here, asking: Asking, response: Response,
     dry_run: DryRun = False,
 ) -> Map:  # fmt: skip
-    """Change title, quotas and retention of a map (JSON merge patch, RFC 7396).
+    """Change title, quotas, retention and up of a map (JSON merge patch, RFC 7396).
 
     Quotas are the operator's: `quota_frames` and `quota_bytes` ask for `admin` for `*`.
     """

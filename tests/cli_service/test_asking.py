@@ -30,6 +30,26 @@ def maps(service_url: str, rooms: Path) -> dict[str, list[str]]:
     return found
 
 
+def test_up_goes_with_uploads_and_queries(sceneprint: Run, service_url: str, rooms: Path) -> None:
+    frame, other = (rooms / "room-0" / "seq-01" / f"frame-00000{i}.depth.png" for i in (0, 1))
+    sceneprint("upload", "level", frame, "--up", "0.6,-0.8,0")
+    with Client(service_url) as client:
+        [one] = client.frames("level")
+        assert one.up is not None
+        assert (one.up.x, one.up.y, one.up.z) == pytest.approx((0.6, -0.8, 0.0))
+    said = sceneprint("query", "level", other, "--up=0,0,1", "--json").stdout
+    [match] = json.loads(said)["matches"]
+    assert match["validation"]["status"] == "rejected"
+    lost = sceneprint("localize", "level", other, "--up=0,0,1", expect=1).stdout
+    assert "not found; " in lost
+    line = sceneprint("maps", "--edit", "level", "--up=0,0,1").stdout
+    assert line.endswith(", up 0,0,1\n")
+    assert "up 0" not in sceneprint("maps", "--edit", "level", "--up", "none").stdout
+    assert "length is 2" in sceneprint("query", "level", other, "--up", "0,2,0", expect=2).stderr
+    with pytest.raises(SystemExit):
+        sceneprint("query", "level", other, "--up", "0,1")
+
+
 def test_a_query_says_where_frames_were_lost(
     sceneprint: Run, maps: dict[str, list[str]], rooms: Path
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -52,6 +53,33 @@ def test_a_path_is_sent_with_the_camera_beside_it(
         sendable(references[2].path.parent, None, with_pose=False)
     with pytest.raises(errors.UnreadableFrame, match="cannot be read"):
         sendable(tmp_path / "absent.png", meta, with_pose=False)
+
+
+def test_up_is_sent_as_given_or_as_beside_the_frame(
+    references: tuple[FrameReference, ...], tmp_path: Path
+) -> None:
+    assert meta_of(references[0]).up is None
+    told = meta_of(references[0], up=(0, -1, 0)).up
+    assert told is not None
+    assert told.unit == [0.0, -1.0, 0.0]
+    for name in (references[0].path.name, "intrinsics.json"):
+        source = references[0].path.with_name(name)
+        shutil.copy(source if source.is_file() else source.parents[1] / name, tmp_path / name)
+    beside = json.loads((tmp_path / "intrinsics.json").read_text())
+    (tmp_path / "intrinsics.json").write_text(json.dumps(beside | {"up": [0.6, -0.8, 0]}))
+    path = tmp_path / references[0].path.name
+    for up, expected in ((None, [0.6, -0.8, 0.0]), ([0, 0, 1], [0.0, 0.0, 1.0])):
+        _, meta = sendable(path, None, with_pose=False, up=up)
+        assert meta.up is not None
+        assert meta.up.unit == pytest.approx(expected)
+    _, bare = sendable(path, None, with_pose=False)
+    data, other = sendable(path.read_bytes(), bare, with_pose=False, up=[1, 0, 0])
+    assert other == bare.model_copy(update={"up": other.up})
+    assert other.up is not None
+    assert other.up.x == 1.0
+    for wrong in ([0, 0, 2], [0, 1], []):
+        with pytest.raises(errors.InvalidRequest, match="The up vector"):
+            sendable(data, bare, with_pose=False, up=wrong)
 
 
 def test_a_query_needs_no_pose(

@@ -95,6 +95,8 @@ def test_what_clouds_json_says(hall: Path) -> None:
     np.testing.assert_allclose(
         points_of(frames[0]), (POINTS + 1.0) / 1000 - (1.0, 0.0, -2.5), atol=1e-6
     )
+    (hall / "clouds.json").write_text('{"up": [0, 0.6, 0.8]}')
+    assert find_cloud_source(hall) == CloudSource(up=(0.0, 0.6, 0.8))
     (hall / "clouds.json").write_text('{"viewpoint": null, "format": "kitti"}')
     assert find_cloud_source(hall) == CloudSource("kitti", None, 1.0)
     inner = hall / "a" / "b"

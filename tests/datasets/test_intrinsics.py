@@ -26,16 +26,27 @@ def test_the_least_that_is_needed(tmp_path: Path) -> None:
 def test_all_that_may_be_said(tmp_path: Path) -> None:
     fields = GOOD | {
         "depth_scale": 5000, "distortion": [0.1, -0.2, 0, 1e-3, 4], "depth_along_ray": True,
+        "up": [0, -1, 0.001],
     }  # fmt: skip
     camera = read_camera(write(tmp_path / "intrinsics.json", fields))
     assert camera.intrinsics.distortion == (0.1, -0.2, 0.0, 0.001, 4.0)
     assert (camera.depth_scale, camera.along_ray) == (5000.0, True)
+    assert camera.up == (0.0, -1.0, 0.001)
+
+
+@pytest.mark.parametrize("up", [[0, 0, 9.81], [0, -1], {"x": 0}, [0, "a", 1], 1, [0, 0, True]])
+def test_an_up_that_is_no_direction(up: object, tmp_path: Path) -> None:
+    path = write(tmp_path / "intrinsics.json", GOOD | {"up": up})
+    with pytest.raises(InvalidIntrinsics, match="up is") as caught:
+        read_camera(path)
+    assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize("k", [(), (0.1, -0.2, 0.3, 1 / 3)])
 @pytest.mark.parametrize("along_ray", [True, False])
 def test_written_is_read(k: tuple[float, ...], along_ray: bool, tmp_path: Path) -> None:
-    camera = Camera(Intrinsics(64, 48, 52.1, 1 / 3, 0.1, -7.0, k), 1234.5, along_ray)
+    up = (0.6, -0.8, 0.0) if along_ray else None
+    camera = Camera(Intrinsics(64, 48, 52.1, 1 / 3, 0.1, -7.0, k), 1234.5, along_ray, up)
     assert read_camera(write_intrinsics(tmp_path, camera)) == camera
     assert [file.name for file in tmp_path.iterdir()] == ["intrinsics.json"]
 

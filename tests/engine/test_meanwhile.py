@@ -123,8 +123,8 @@ def test_matches_that_are_deleted_while_they_are_validated_are_not_found(
     work_off(empty)
     (name,) = ids(empty)
 
-    def then_delete(*arguments: Any) -> Any:
-        found = associate(*arguments)
+    def then_delete(*arguments: Any, **named: Any) -> Any:
+        found = associate(*arguments, **named)
         assert [match.validation.status for match in found] == ["accepted"]
         empty.delete_frame("hall", name)
         return found

@@ -149,7 +149,7 @@ def test_stages_and_k_are_as_asked(served, rooms, moved):
             "status": "skipped", "strength": None, "reason": "not requested", "residual": None,
             "overlap": None, "plane_overlap": None, "free_space_violations": None,
             "planes": None, "plane_violations": None, "inliers": None, "ambiguity": None,
-            "search": None, "directions": [],
+            "search": None, "directions": [], "tilt_deg": None,
         }  # fmt: skip
         assert (match["selected"], match["diversity_gain"]) == (None, None)
         assert (match["transform"], match["pose_in_map"]) == (None, None)

@@ -15,9 +15,10 @@ from benchmarks.fleet.postgres import Server
 from sceneprint.store import open_database
 from sceneprint.store.deletion import doomed_blobs
 from sceneprint.store.events import last_event
-from sceneprint.store.frames import add_frame, frame_of
+from sceneprint.store.frame_queries import frame_ups
+from sceneprint.store.frames import add_frame, frame_of, write_frame, write_map
 from sceneprint.store.keys import list_keys
-from sceneprint.store.maps import MapUsage, counted_usage, use_of
+from sceneprint.store.maps import MapUsage, counted_usage, find_map, use_of
 from sceneprint.store.queue import enqueue, find_job
 from sceneprint.store.tables import frame_tags
 from sceneprint_client.api import FrameState
@@ -130,6 +131,25 @@ def test_what_a_map_held_before_there_were_quotas_is_counted(
         assert use_of(connection, 1) == counted_usage(connection, 1) == MapUsage(1, 10)
         assert doomed_blobs(connection, 10) == ["blob-2"]
         assert (last_event(connection, "gone"), last_event(connection, "never")) == (3, 0)
+    database.close()
+
+
+def test_what_is_there_before_there_was_gravity_knows_no_up(
+    old: Path, bring_to: Callable[[str, str], None]
+) -> None:
+    bring_to(f"sqlite:///{old}", "0008")
+    database = open_database(f"sqlite:///{old}")
+    with database.write() as connection:
+        rows = [frame_of(connection, number) for number in (1, 2, 3)]
+        assert [(row.pose, row.up) for row in rows] == [(pose, None) for _, pose in FRAMES]
+        assert find_map(connection, "hall").up is None
+        assert [(one.number, one.up, one.map_up) for one in frame_ups(connection, (1, 2, 3))] \
+            == [(1, None, None)]  # fmt: skip
+        up = [0.0, 0.6, 0.8]
+        assert write_frame(connection, find_map(connection, "hall"), rows[1], {"up": up}).up == up
+        assert write_map(connection, find_map(connection, "hall"), {"up": up}).up == up
+        assert [(one.number, one.up, one.map_up) for one in frame_ups(connection, (1, 2, 3))] \
+            == [(1, None, up), (2, up, up)]  # fmt: skip
     database.close()
 
 

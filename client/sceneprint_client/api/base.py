@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import Annotated, Any, Generic, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationError,
+    model_validator,
+)
 
 from sceneprint_client.errors import InvalidRequest
 
@@ -77,6 +86,14 @@ class Vector(ApiRecord):
     z: float
 
 
+class Direction(ApiRecord):
+    """A unit vector."""
+
+    x: float
+    y: float
+    z: float
+
+
 class Quaternion(ApiRecord):
     """Unit quaternion, w >= 0."""
 
@@ -96,6 +113,57 @@ class Transform(ApiRecord):
     translation: Vector
     rotation: Quaternion
     matrix: list[list[float]] = Field(description="4 x 4, row by row.")
+
+
+# Which way is up, as a caller gives it.
+
+#: How far from 1 the length of a given direction may be.
+_UNIT = 1e-2
+
+
+class GivenDirection(Given):
+    """A unit vector."""
+
+    x: float
+    y: float
+    z: float
+
+    @model_validator(mode="after")
+    def _of_unit_length(self) -> GivenDirection:
+        length = math.hypot(self.x, self.y, self.z)
+        if not abs(length - 1.0) <= _UNIT:
+            raise ValueError(
+                f"its length is {length:.3g}, not 1; divide it by its length, as an "
+                "accelerometer at rest measures 9.81 upwards"
+            )
+        return self
+
+    @property
+    def unit(self) -> list[float]:
+        """Its three numbers, of length 1 as exactly as can be."""
+        length = math.hypot(self.x, self.y, self.z)
+        return [self.x / length, self.y / length, self.z / length]
+
+
+def _from_list(given: object) -> object:
+    if isinstance(given, list | tuple) and len(given) == len("xyz"):
+        return dict(zip("xyz", given, strict=True))
+    if not isinstance(given, GivenDirection | dict):
+        raise ValueError(  # noqa: TRY004  (pydantic wants it)
+            "neither {x, y, z} nor a list of three numbers"
+        )
+    return given
+
+
+#: A direction as `{x, y, z}`, or as a list of three numbers.
+Up = Annotated[
+    GivenDirection,
+    BeforeValidator(
+        _from_list,
+        json_schema_input_type=GivenDirection
+        | Annotated[list[float], Field(min_length=3, max_length=3)],
+    ),
+]
 
 
 # The states of frames and jobs.

@@ -10,11 +10,13 @@ from pydantic import AwareDatetime, Field, StringConstraints, field_validator, m
 
 from sceneprint_client.api.base import (
     ApiRecord,
+    Direction,
     FrameState,
     Given,
     Label,
     Problem,
     Transform,
+    Up,
     Vector,
 )
 from sceneprint_client.errors import (
@@ -137,6 +139,12 @@ class FrameMeta(Given):
         "A cloud with a `viewpoint` that is not its origin has the base frame `cloud` without it: "
         "the coordinates as they were sent.",
     )
+    up: Up | None = Field(
+        default=None,
+        description="Up as an IMU has it: a unit vector in the sensor's axes, of a camera x right, "
+        "y down, z forward. A camera held level has (0, -1, 0). Transforms that tilt a query "
+        "against a frame are impossible then.",
+    )
     tags: list[Label] = Field(default=[], max_length=32)
 
     @field_validator("captured_at")
@@ -201,6 +209,7 @@ class Frame(ApiRecord):
     T_base_sensor: Transform | None = Field(
         default=None, description="Where the sensor sits on the robot, as it was sent."
     )
+    up: Direction | None = Field(default=None, description="Up in the sensor's axes, as sent.")
     tags: list[str]
     etag: str | None = Field(
         default=None,
@@ -302,6 +311,10 @@ class ImportOptions(Given):
     every: int = Field(default=1, ge=1, description="Take every Nth frame of a sequence.")
     T_base_sensor: GivenBase | None = Field(
         default=None, description="Where the sensor sits on the robot."
+    )
+    up: Up | None = Field(
+        default=None,
+        description="Up in the sensor's axes, of all frames: where the sensor is carried level.",
     )
     priority: int = Field(
         default=0, ge=-MOST_PRIORITY, le=MOST_PRIORITY, description="Of the frames' jobs."

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AwareDatetime, BeforeValidator, Field, ValidationInfo, field_validator
 from pydantic_core import from_json
 
-from sceneprint_client.api.base import ApiRecord, FrameState, Given, Label, Note
+from sceneprint_client.api.base import ApiRecord, FrameState, Given, Label, Note, Up
 from sceneprint_client.api.frames import GivenBase, GivenPose, GivenVector
 from sceneprint_client.api.maps import Days, Quota
 
@@ -230,6 +230,7 @@ class FrameEdit(Given):
     T_base_sensor: GivenBase | None = Field(
         default=None, description="Where the sensor sits on the robot; parts of it as of `pose`."
     )
+    up: Up | None = Field(default=None, description="Up in the sensor's axes.")
 
 
 class MapEdit(Given):
@@ -248,6 +249,9 @@ class MapEdit(Given):
         default=None,
         description="Days after which a frame is deleted, for good, counted from when it was "
         "received. Workers delete what is older within minutes.",
+    )
+    up: Up | None = Field(
+        default=None, description="Up in the parent frames of its poses; see NewMap."
     )
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, WithJsonSchema
 
-from sceneprint_client.api.base import ApiRecord, Given, Note
+from sceneprint_client.api.base import ApiRecord, Direction, Given, Note, Up
 
 #: Names of the models that ship with the service, the default first.
 PRESETS = ("depth", "lidar", "paper")
@@ -65,6 +65,11 @@ class NewMap(Given):
         description="Days after which a frame is deleted, counted from when it was received; "
         "null: never.",
     )
+    up: Up | None = Field(
+        default=None,
+        description="Up in the parent frames of its poses, (0, 0, 1) where z points up: what a "
+        "frame with a pose and no `up` of its own has. Null: learnt from frames that have both.",
+    )
 
 
 class Reencoding(ApiRecord):
@@ -107,6 +112,10 @@ class Map(ApiRecord):
     quota_bytes: int | None = Field(default=None, description="Null: no quota.")
     retention_days: float | None = Field(
         default=None, description="Days after which a frame is deleted; null: never."
+    )
+    up: Direction | None = Field(
+        default=None,
+        description="Up in the parent frames of its poses; null: learnt from its frames.",
     )
     overdue: int | None = Field(
         default=None,

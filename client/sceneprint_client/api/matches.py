@@ -61,6 +61,11 @@ class Validation(ApiRecord):
         default=[],
         description="In which directions the search found it; of an accepted match, both.",
     )
+    tilt_deg: float | None = Field(
+        default=None,
+        description="By how much the transform tilts the query's `up` against the match's; null "
+        "where either is not known.",
+    )
 
 
 class FreeDirection(ApiRecord):

@@ -138,6 +138,7 @@ def _upload(archive: Archive, step: Step, options: ImportOptions) -> Upload:
         with_pose=options.with_poses,
         parent_frame=options.parent_frame or parent_frame_of(step.sequence, options.robot),
         base=options.T_base_sensor,
+        up=None if options.up is None else options.up.unit,
     )
     data = archive.data_of(step.reference)
     return Upload(data, meta, options.priority, options.if_novel)

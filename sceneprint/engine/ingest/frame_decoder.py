@@ -146,6 +146,7 @@ def columns(
         "pose": None if pose is None else pose.tolist(),
         "base_frame": None if base is None else base[0],
         "base": None if base is None else base[1].tolist(),
+        "up": None if meta.up is None else meta.up.unit,
     }
 
 

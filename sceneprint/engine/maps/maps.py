@@ -37,10 +37,12 @@ def create_map(store: Store, new: NewMap) -> tuple[Map, bool]:
 
     Raises
     ------
-    MapExists : there is one of that name with another title, model, quota or retention.
+    MapExists : there is one of that name with another title, model, quota, retention or up.
     """
     model = read_model(new.model)
-    limits = new.model_dump(include=set(LIMITS & new.model_fields_set))
+    limits: dict[str, Any] = new.model_dump(include=set(LIMITS & new.model_fields_set))
+    if new.up is not None:
+        limits["up"] = new.up.unit
     with store.database.write() as connection:
         there = {row.name: row for row in list_maps(connection)}.get(new.name)
         if there is None:
@@ -50,7 +52,7 @@ def create_map(store: Store, new: NewMap) -> tuple[Map, bool]:
         other = any(getattr(there, name) != value for name, value in limits.items())
         if other or (there.title, there.model_id) != (new.title, model.id):
             raise errors.MapExists(
-                f"Map {new.name!r} already exists with a different title, model or limits. Use "
+                f"Map {new.name!r} already exists with a different title, model, limits or up. Use "
                 "it as it is, delete it, or choose another name."
             )
         return serializers.map_record(connection, there), False
@@ -68,6 +70,7 @@ _COLUMNS = {
     "tags": ("tags",),
     "pose": ("pose_parent", "pose"),
     "T_base_sensor": ("base_frame", "base"),
+    "up": ("up",),
 }
 _CONTENT = (
     "intrinsics", "depth_scale", "depth_along_ray", "viewpoint", "units_per_metre", "format",
@@ -111,7 +114,7 @@ def edit_map(
     store: Store, map_name: str, patch: Mapping[str, Any],
     if_match: Collection[str] | None = None, *, dry_run: bool = False,
 ) -> Map:  # fmt: skip
-    """Change title, quotas and retention of a map; parameters and errors as of `edit_frame`.
+    """Change title, limits and up of a map; parameters and errors as of `edit_frame`.
 
     Who may set a quota, the caller has seen to. With `dry_run` nothing is changed, and the map told
     as it would be.
@@ -121,6 +124,8 @@ def edit_map(
     except ValidationError as error:
         raise _invalid(error, "The edit of the map") from error
     values = change.model_dump(include=change.model_fields_set)
+    if change.up is not None:
+        values["up"] = change.up.unit
     with store.database.read() if dry_run else store.database.write() as connection:
         row = find_map(connection, map_name)
         _check_tag(f"Map {row.name!r}", serializers.map_tag(row), if_match)
@@ -156,6 +161,7 @@ def _merged(frame: FrameRow, patch: Mapping[str, Any]) -> FrameMeta:
         "tags": frame.tags,
         "pose": _relative_transform(frame.pose, "parent_frame", frame.pose_parent),
         "T_base_sensor": _relative_transform(frame.base, "base_frame", frame.base_frame),
+        "up": frame.up,
     }
     for field, given in patch.items():
         is_transform = field in ("pose", "T_base_sensor") and isinstance(given, Mapping)

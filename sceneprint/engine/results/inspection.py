@@ -19,6 +19,7 @@ from sceneprint import errors
 from sceneprint.engine.maps.map_frames import FORM, Output, find_indexed, geometry_of, placed
 from sceneprint.engine.models import Signers
 from sceneprint.engine.results.stored_results import StoredResult, StoredResults
+from sceneprint.engine.search.gravity import known_ups
 from sceneprint.engine.search.response import uncertainty_record, validation_record
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import query_sensor, sensor_of, tag_of, transform
@@ -28,6 +29,7 @@ from sceneprint.formats.points.ply_export import points_of, write_ply
 from sceneprint.formats.points.web import LIMIT, encode_points, thinned
 from sceneprint.geometry.pose.rigid import inverse, moved
 from sceneprint.geometry.retrieval.distance import pairwise_distances, similarity
+from sceneprint.geometry.validation.gravity import NO_UPS, Ups
 from sceneprint.geometry.validation.icp import PAIR_METHOD
 from sceneprint.geometry.validation.inspection import (
     AGREES,
@@ -41,7 +43,7 @@ from sceneprint.geometry.validation.inspection import (
 )
 from sceneprint.geometry.validation.overlap import sampled
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
-from sceneprint.pipeline import validate
+from sceneprint.pipeline import validate, validate_without_up
 from sceneprint.store import Store
 from sceneprint.store.frames import find_frame, frames_of, refers_to
 from sceneprint.store.maps import find_map, list_maps
@@ -85,6 +87,7 @@ class StoredPair:
     sensor : what the coordinates of the match are called
     blob : of the match's geometry artifact
     row, number : the match's map and number
+    ups : up in the query's and in the match's sensors, as far as it is known
     """
 
     kept: StoredResult
@@ -93,6 +96,7 @@ class StoredPair:
     blob: str
     row: MapRow
     number: int
+    ups: Ups = NO_UPS
 
 
 class Pairs:
@@ -118,6 +122,7 @@ class Pairs:
             row = find_map(connection, match.map)
             frame = find_frame(connection, row, match.frame_id)
             blobs = geometry_blobs(connection, [frame.number], kept.model_id)
+            ups = {} if kept.up is None else known_ups(connection, kept.ranked)
         if frame.state == FrameState.DELETED or frame.number not in kept.ranked:
             raise _deleted(match)
         if frame.number not in blobs:
@@ -125,7 +130,10 @@ class Pairs:
                 f"Map {match.map!r} has changed its model since the query, and frames of "
                 "different models cannot be compared. Send the query again."
             )
-        return StoredPair(kept, match, sensor_of(frame), blobs[frame.number], row, frame.number)
+        return StoredPair(
+            kept, match, sensor_of(frame), blobs[frame.number], row, frame.number,
+            (kept.up, ups.get(frame.number)),
+        )  # fmt: skip
 
     def opened(self, pair: StoredPair) -> tuple[Geometry, Geometry]:
         """The artifacts of the query and of the match.
@@ -155,7 +163,15 @@ class Pairs:
         p = self.parameters(pair)
         seed, options = pair.kept.query.seed, thresholds(pair.kept.query.validation, p)
         key = pair.kept.answer.query_id, pair.blob
-        return self._remembered.get(key, lambda: validate(query, match, seed, *options))
+
+        def make() -> PairValidation:
+            found = validate(query, match, seed, *options, ups=pair.ups)
+            if found.reason != pair.match.validation.reason and pair.kept.up is not None:
+                # nothing was accepted with `up`, and the surfaces were asked without it
+                return validate_without_up(query, match, seed, options[0], pair.ups) or found
+            return found
+
+        return self._remembered.get(key, make)
 
 
 class _ValidationCache:

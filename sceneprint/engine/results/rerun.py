@@ -153,4 +153,5 @@ def _ready(kept: StoredResult, query: Query) -> PreparedQuery:
         base=kept.base,
         artifact=artifact,
         kind=kept.answer.kind,
+        up=kept.up,
     )

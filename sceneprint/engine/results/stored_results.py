@@ -73,6 +73,7 @@ class StoredResult:
     at : when, seconds since 1970
     taken : who took an uploaded query, in which run and when
     base : what its robot's base is called, and T_base_query (4, 4); None where it is not known
+    up : (3,) unit vector in the query's sensor; None where it is not known
     """
 
     answer: Answer
@@ -84,6 +85,7 @@ class StoredResult:
     at: float = field(default_factory=time.time)
     taken: QueryOrigin = field(default_factory=lambda: QueryOrigin(None, None, None))
     base: tuple[str, Floats] | None = None
+    up: Floats | None = None
 
 
 #: Whether an answer may still be looked at: of its head alone, the rest may be left out.
@@ -167,6 +169,7 @@ def written(kept: StoredResult) -> bytes:
             "at": kept.at,
             "taken": asdict(kept.taken),
             "base": None if kept.base is None else [kept.base[0], kept.base[1].tolist()],
+            "up": None if kept.up is None else kept.up.tolist(),
         }
     ).encode()
     parts = [head, kept.vector.tobytes(), kept.geometry or b""]
@@ -215,6 +218,8 @@ def _of(head: dict[str, Any], vector: Bytes, geometry: bytes | None) -> StoredRe
         at=head["at"],
         taken=QueryOrigin(**head["taken"]),
         base=None if head["base"] is None else (head["base"][0], np.array(head["base"][1])),
+        # answers of before there was gravity are kept for an hour more
+        up=None if head.get("up") is None else np.array(head["up"]),
     )
 
 

@@ -73,7 +73,7 @@ def answer(
     clock.stage("diversify")
     chosen = range(min(wanted, len(ranking))) if selection is None else selection.indices.tolist()
     p = model.parameters.validation
-    tried = validated(store, searched, chosen, asked.geometry, query, deadline, p)
+    tried = validated(store, searched, chosen, asked.geometry, query, deadline, p, asked.up)
     clock.stage("validate")
     shown = range(len(ranking)) if query.explain else chosen
     with store.queried.read() as connection:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.engine.search import retrieval
+from sceneprint.engine.search.gravity import known_ups
 from sceneprint.engine.search.response import Candidates, validation_record
 from sceneprint.engine.search.verification import NOT_ASKED, Validated, thresholds
 from sceneprint.engine.serializers import sensor_of, transform
@@ -280,6 +281,8 @@ def _aligned(
         model_id = part.place.row.model_id
         with asking.store.queried.read() as connection:
             blob = geometry_blobs(connection, [row.number], model_id).get(row.number)
+            ranked = asking.searched.ranking.indices.tolist()
+            up = known_ups(connection, [*ranked, row.number]).get(row.number)
         if blob is None:
             return ToldValidation(status="skipped", reason="it was deleted during the query"), None
         try:
@@ -288,5 +291,6 @@ def _aligned(
             return ToldValidation(status="skipped", reason=str(error)), None
         query = asking.query
         p = asking.model.parameters.validation
-        made = validate(geometry, own, query.seed, *thresholds(query.validation, p))
+        options = thresholds(query.validation, p)
+        made = validate(geometry, own, query.seed, *options, ups=(asking.asked.up, up))
     return validation_record(made), made.T_match_query

@@ -165,7 +165,8 @@ def _compared(a: PreparedQuery, b: PreparedQuery, signer: Signer, how: Compariso
     distance = distances(a.vector, b.vector[None], signer.model.metric)
     made, T, p = None, None, signer.model.parameters.validation
     if a.geometry is not None and b.geometry is not None:
-        found = validate(b.geometry, a.geometry, how.seed, *thresholds(how.validation, p))
+        options = thresholds(how.validation, p)
+        found = validate(b.geometry, a.geometry, how.seed, *options, ups=(b.up, a.up))
         made, T = found, found.T_match_query
     spent = {
         "prepare": round(a.prepare_ms + b.prepare_ms, 2),
@@ -309,7 +310,7 @@ class Queries:
         if query.keep:
             kept = StoredResult(
                 told, query, asked.model_id, asked.vector, asked.artifact, ranked,
-                taken=asked.taken, base=asked.base,
+                taken=asked.taken, base=asked.base, up=asked.up,
             )  # fmt: skip
             self._kept.keep(kept)
         return told

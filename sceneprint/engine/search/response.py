@@ -199,4 +199,5 @@ def validation_record(v: PairValidation) -> ToldValidation:
         ambiguity=v.ambiguity,
         search=v.search if v.directions else None,
         directions=list(v.directions),
+        tilt_deg=None if v.tilt_rad is None else math.degrees(v.tilt_rad),
     )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_upload
+from sceneprint.engine.search.gravity import known_ups
 from sceneprint.engine.search.map_view import MapView, Stored, search_stored
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.formats.artifact import read_geometry, write_geometry
@@ -54,6 +55,7 @@ class PreparedQuery:
     base : what the robot's base is called, and T_base_query (4, 4); None where it is not known
     artifact : `geometry` as bytes
     kind : of the frame
+    up : (3,) unit vector in its sensor; None where it is not known
     """
 
     model_id: str
@@ -66,6 +68,7 @@ class PreparedQuery:
     base: tuple[str, Floats] | None = None
     artifact: bytes | None = None
     kind: Kind = "depth"
+    up: Floats | None = None
 
 
 def prepare_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -> PreparedQuery:
@@ -83,17 +86,18 @@ def prepare_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -
     taken = check_taken(QueryOrigin(meta.robot, meta.session, at), query)
     read = read_upload(data, meta)
     kind, base = read.kind, read.base
+    up = None if meta.up is None else np.array(meta.up.unit)
     if "validate" not in query.stages:
         vector = sign(read.frame, signer).vector
         return PreparedQuery(
-            signer.model.id, vector, None, taken, None, _since(start), base=base, kind=kind
+            signer.model.id, vector, None, taken, None, _since(start), base=base, kind=kind, up=up
         )
     signature, seen = prepare(read.frame, signer)
     # as it would be read back: the same answer as when the frame is in the map
     artifact = write_geometry(seen)
     return PreparedQuery(
         signature.model_id, signature.vector, read_geometry(artifact), taken, None, _since(start),
-        base=base, artifact=artifact, kind=kind,
+        base=base, artifact=artifact, kind=kind, up=up,
     )  # fmt: skip
 
 
@@ -115,6 +119,7 @@ def prepare_stored(store: Store, map_name: str, frame_id: str, query: Query) -> 
             frame = find_frame(connection, row, frame_id)
             vector = stored_vector(connection, frame.number, row.model_id)
             blobs = geometry_blobs(connection, [frame.number], row.model_id)
+            up = known_ups(connection, [frame.number]).get(frame.number)
     except errors.DamagedSignature:
         resign_frames(store, row, [frame.number], row.model_id)
         raise
@@ -143,8 +148,9 @@ def prepare_stored(store: Store, map_name: str, frame_id: str, query: Query) -> 
     own = (frame.number, frame.id)
     asked = np.frombuffer(vector, np.uint8)
     return PreparedQuery(
-        row.model_id, asked, geometry, taken, own, _since(start), row, base, artifact, frame.kind
-    )
+        row.model_id, asked, geometry, taken, own, _since(start), row, base, artifact, frame.kind,
+        up,
+    )  # fmt: skip
 
 
 def check_taken(taken: QueryOrigin, query: Query) -> QueryOrigin:

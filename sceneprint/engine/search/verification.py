@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from sceneprint.engine.search.gravity import known_ups
 from sceneprint.engine.search.retrieval import Deadline, Searched
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
@@ -18,7 +19,7 @@ from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.matches import PairMatch, associate
 from sceneprint.store import Store
 from sceneprint.store.signatures import geometry_blobs
-from sceneprint.types import Geometry
+from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Query, ValidationOptions
 
 #: Candidates that are selected and validated, unless more matches are wanted: more cost time.
@@ -77,7 +78,7 @@ def thresholds(
 
 def validated(
     store: Store, searched: Searched, chosen: Sequence[int], geometry: Geometry | None,
-    query: Query, deadline: Deadline, p: ValidationParameters,
+    query: Query, deadline: Deadline, p: ValidationParameters, up: Floats | None = None,
 ) -> Validated:  # fmt: skip
     """Try candidates in the order of R.
 
@@ -89,12 +90,14 @@ def validated(
     geometry : of the query; None where validation was not asked for
     query, deadline : see there
     p : of the model
+    up : (3,) in the query's sensor, where it is known
     """
     if geometry is None:
         return Validated(chosen, [], {}, NOT_ASKED, deadline.reached)
     ranking, model_id = searched.ranking, searched.parts[0].place.row.model_id
     with store.queried.read() as connection:
         blobs = geometry_blobs(connection, ranking.indices[list(chosen)].tolist(), model_id)
+        ups = {} if up is None else known_ups(connection, ranking.indices.tolist())
     unreadable: dict[int, str] = {}
 
     def open_geometry(number: int) -> Geometry | None:
@@ -108,7 +111,7 @@ def validated(
 
     matches = associate(
         geometry, ranking, chosen, open_geometry, query.k, query.seed,
-        *thresholds(query.validation, p), deadline.allows,
+        *thresholds(query.validation, p), deadline.allows, up=up, up_of=ups.get,
     )  # fmt: skip
     owner = dict(zip(ranking.indices.tolist(), searched.owners.tolist(), strict=True))
     for i, part in enumerate(searched.parts):

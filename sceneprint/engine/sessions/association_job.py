@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
 from sceneprint.engine.models import Signers
+from sceneprint.engine.search.gravity import known_ups
 from sceneprint.engine.search.local_index import Readers
 from sceneprint.engine.search.map_view import MapView
 from sceneprint.engine.search.verification import thresholds
@@ -221,9 +222,12 @@ class Associating:
         ranking = Ranking(hits.keys.astype(np.intp), hits.distances, shares)
         distances = pairwise_distances(view.signatures(hits.keys), view.metric)
         chosen = diversify(ranking.distances, distances, asked.candidates).indices.tolist()
+        with self._store.database.read() as connection:
+            ups = known_ups(connection, [number, *ranking.indices.tolist()])
         matches = associate(
             geometry, ranking, chosen, lambda key: opened.geometry(row, key), asked.k,
             asked.seed, *thresholds(asked.validation, model.parameters.validation),
+            up=ups.get(number), up_of=ups.get,
         )  # fmt: skip
         order = {number: i for i, number in enumerate(ranking.indices.tolist())}
         accepted = sorted(

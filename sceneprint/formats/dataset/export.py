@@ -38,6 +38,8 @@ def write_intrinsics(folder: Path, camera: Camera) -> Path:
         fields["distortion"] = list(lens.distortion)
     if camera.along_ray:
         fields["depth_along_ray"] = True
+    if camera.up is not None:
+        fields["up"] = list(camera.up)
     path = folder / INTRINSICS_FILE
     write_whole(path, (json.dumps(fields, indent=2) + "\n").encode())
     return path

@@ -1,6 +1,7 @@
 """Several validated views, one pose: the votes of the matches averaged robustly.
 
 poses (n, 4, 4)  --average_poses-->  PoseAverage
+directions (n, 3)  --mean_direction-->  (3,)
 """
 
 from __future__ import annotations
@@ -77,6 +78,27 @@ def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAv
     metres, radians = np.sqrt((left**2).mean(axis=0)).tolist()
     which = np.flatnonzero(near[medoid])
     return PoseAverage(T, metres, radians, len(members), len(poses), which)
+
+
+def mean_direction(directions: Floats, within: float) -> Floats | None:
+    """The mean of those unit vectors that most of the others are near: (3,), of length 1.
+
+    Parameters
+    ----------
+    directions : (n, 3)
+    within : radians that two may differ by
+
+    Returns
+    -------
+    direction : or None where there are none, or no more than half of them agree
+    """
+    near = directions @ directions.T >= math.cos(within)
+    agree = near.sum(axis=1)
+    if not len(directions) or 2 * int(agree.max()) <= len(directions):
+        return None
+    mean = directions[near[int(np.argmax(agree))]].sum(axis=0)
+    result: Floats = mean / np.linalg.norm(mean)
+    return result
 
 
 # Which way is up in a frame, from the surfaces it sees.

@@ -20,6 +20,12 @@ import numpy as np
 from sceneprint.geometry.pose.rigid import distinct, inverse, inverses
 from sceneprint.geometry.surface.camera import kind_of
 from sceneprint.geometry.validation.consensus import ConsensusParameters, consensus
+from sceneprint.geometry.validation.gravity import (
+    GravityParameters,
+    Ups,
+    are_level,
+    slopes,
+)
 from sceneprint.geometry.validation.icp import (
     COARSE,
     FINE,
@@ -38,7 +44,11 @@ from sceneprint.geometry.validation.overlap import (
     plane_view,
     sampled,
 )
-from sceneprint.geometry.validation.patch_descriptors import MatchingParameters, correspondences
+from sceneprint.geometry.validation.patch_descriptors import (
+    MatchingParameters,
+    SlopeGate,
+    correspondences,
+)
 from sceneprint.geometry.validation.plan_search import (
     PlanParameters,
     ScanPlan,
@@ -76,6 +86,7 @@ class AlignmentParameters:
     lever: float = 1.0  #: in `stiffness` a radian counts as much as this many metres
     sequence: SequenceParameters = field(default_factory=SequenceParameters)
     plan: PlanParameters = field(default_factory=PlanParameters)
+    gravity: GravityParameters = field(default_factory=GravityParameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +162,7 @@ def align(
 
     Correspondences vote for some forty hypotheses; these are scored by how both frames' points fit
     the other's surface, the best distinct ones refined and ranked by how many planes agree, and
-    the best refined to the end.
+    the best refined to the end. Where up is known in both frames, what tilts is left out.
 
     Parameters
     ----------
@@ -165,10 +176,12 @@ def align(
     alignment : or None where no three correspondences agree, or no hypothesis survives refinement
     """
     a, b = source.geometry, target.geometry
-    hypotheses = consensus(a.patches, b.patches, _pairs(a, b, rng, p, matching), p.consensus)
+    ups = source.up, target.up
+    hypotheses = _voted(a, b, rng, p, matching, ups)
     scores = _scores(source, target, hypotheses, p, overlap_p)
     chosen = distinct(hypotheses, scores, p.same_m, p.same_rad, p.n_refined)
     refined = refined_all(a.surface, b.surface, hypotheses[chosen], p.coarse)
+    refined = refined[are_level(refined, ups, p.gravity.refined_tilt)]
     if not len(refined):
         return None
     refined = refined[_ranked(source, target, refined, p, overlap_p)]
@@ -201,7 +214,8 @@ def align_scans(
     alignments : there and back, or None where no hypothesis survives refinement
     """
     a, b = query.geometry, match.geometry
-    voted = consensus(a.patches, b.patches, _pairs(a, b, rng, p, matching), p.consensus)
+    ups = query.up, match.up
+    voted = _voted(a, b, rng, p, matching, ups)
     plans = [(query.plan(p.plan), match.plan(p.plan))]
     if other_axes:
         plans = other_plans(a.surface, b.surface, p.plan)
@@ -213,6 +227,10 @@ def align_scans(
     if not index:
         return None
     is_planned = np.array(chosen)[index] >= len(voted)
+    level = are_level(transforms, ups, p.gravity.refined_tilt)
+    transforms, is_planned = transforms[level], is_planned[level]
+    if not len(transforms):
+        return None
     order = _ranked(query, match, transforms, p, overlap_p)
     transforms, is_planned = transforms[order], is_planned[order]
     finely = replace(p.fine, stride=p.fine_stride)
@@ -231,13 +249,30 @@ def are_scans(query: Geometry, match: Geometry) -> bool:
     return all(isinstance(one.surface.camera, Sphere) for one in (query, match))
 
 
+def _voted(
+    source: Geometry, target: Geometry, rng: np.random.Generator, p: AlignmentParameters,
+    matching: Matching, ups: Ups,
+) -> Floats:  # fmt: skip
+    """What correspondences vote for, less what tilts."""
+    pairs = _pairs(source, target, rng, p, matching, ups)
+    voted = consensus(source.patches, target.patches, pairs, p.consensus)
+    return voted[are_level(voted, ups, p.gravity.proposed_tilt)]
+
+
 def _pairs(
     source: Geometry, target: Geometry, rng: np.random.Generator, p: AlignmentParameters,
-    matching: Matching,
+    matching: Matching, ups: Ups,
 ) -> Ints32:  # fmt: skip
-    if matching == "sequence":
-        return sequence_correspondences(source.patches, target.patches, rng, p.sequence)
-    return correspondences(source.descriptors, target.descriptors, rng, p.matching)
+    gate = None
+    if ups[0] is not None and ups[1] is not None:
+        angles = slopes(source.patches.normals, ups[0]), slopes(target.patches.normals, ups[1])
+        gate = SlopeGate(*angles, p.gravity.gate)
+    if matching == "histograms":
+        return correspondences(source.descriptors, target.descriptors, rng, p.matching, gate)
+    pairs = sequence_correspondences(source.patches, target.patches, rng, p.sequence)
+    if gate is None:
+        return pairs
+    return pairs[np.abs(gate.source[pairs[:, 0]] - gate.target[pairs[:, 1]]) <= gate.most]
 
 
 def _finished(

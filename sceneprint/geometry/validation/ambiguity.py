@@ -9,18 +9,21 @@ rivals are looked for: the other hypotheses that correspondences voted for, and 
 found, turned by quarter turns about the normals of the main planes or shifted along them, which
 is how rooms and what stands in them repeat.
 
-What a rival agrees on counts by planes (`planes.py`).
+What a rival agrees on counts by planes (`planes.py`). Where up is known in both frames, what tilts
+against it is no rival.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.pose.rigid import distinct
+from sceneprint.geometry.validation.gravity import NO_UPS, Ups, are_level
 from sceneprint.geometry.validation.icp import COARSE, QUICK, RefinementParameters, refined_all
 from sceneprint.geometry.validation.overlap import (
     OverlapParameters,
@@ -156,11 +159,28 @@ def far_from(T: Floats, others: Floats, p: AmbiguityParameters) -> Floats:
     return far
 
 
+class Alternative(NamedTuple):
+    """The best rival of a transform.
+
+    Parameters
+    ----------
+    share : that it explains, every plane counting the same, 0 to 1; 0 where there is none
+    T : (4, 4) of it, or None
+    tilted : share that the best of those explains that tilt against `up`, and that nothing else
+        refutes
+    """
+
+    share: float
+    T: Floats | None
+    tilted: float = 0.0
+
+
 def best_alternative(
     query: PlaneView, match: PlaneView, T: Floats, violations: float, voted: Floats,
     proposed: Floats, p: AmbiguityParameters, agreement_p: OverlapParameters,
-) -> tuple[float, Floats | None]:  # fmt: skip
-    """How far the best rival of T explains the frames, 0 to 1, and that rival: Sec. III-E.
+    ups: Ups = NO_UPS, most_tilt: float = math.inf,
+) -> Alternative:  # fmt: skip
+    """How far the best rival of T explains the frames, and that rival: Sec. III-E.
 
     Parameters
     ----------
@@ -172,6 +192,8 @@ def best_alternative(
     proposed : (m, 4, 4) hypotheses that were not, best first: of those that differ from T and
         from each other as rivals do, the best are refined now
     p, agreement_p : see there
+    ups : of query and match
+    most_tilt : radians against them beyond which a transform is no rival
     """
     moved = np.concatenate([symmetries(match.patches, p) @ T, T @ symmetries(query.patches, p)])
     near = far_from(T, refined_all(query.surface, match.surface, moved, p.first), p)
@@ -185,7 +207,10 @@ def best_alternative(
     rivals = far_from(T, rivals, p)
     seen = explained(query, match, rivals, agreement_p)
     share = np.where(seen.violations < max(p.refuted, violations), seen.share, 0.0)
+    level = are_level(rivals, ups, most_tilt)
+    tilted = float(share[~level].max(initial=0.0))
+    share = np.where(level, share, 0.0)
     if not (share > 0).any():
-        return 0.0, None
+        return Alternative(0.0, None, tilted)
     best = int(np.argmax(share))
-    return float(share[best]), rivals[best]
+    return Alternative(float(share[best]), rivals[best], tilted)

@@ -9,6 +9,7 @@ plane and to the direction it lies in. None of them changes under a rigid motion
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -244,31 +245,62 @@ class MatchingParameters:
 
 
 @kernel
-def _nearest(source: Bytes, target: Bytes, drawn: Ints32, n_nearest: int, pairs: Ints32) -> None:
-    """The targets nearest to each source drawn, by squared distance, ties by index."""
+def _nearest(
+    source: Bytes, target: Bytes, drawn: Ints32, n_nearest: int, slopes: Floats, onto: Floats,
+    gate: float, pairs: Ints32,
+) -> int:  # fmt: skip
+    """The targets nearest to each source drawn, by squared distance, ties by index; how many."""
     count, length = target.shape
+    farthest = np.int32(2147483647)
     squares = np.empty(count, np.int32)
+    found = 0
     for row in range(len(drawn)):
         query = source[drawn[row]]
         for j in range(count):
+            if abs(slopes[drawn[row]] - onto[j]) > gate:
+                squares[j] = farthest
+                continue
             other = target[j]
             total = np.int32(0)
             for k in range(length):
                 gap = np.int32(query[k]) - np.int32(other[k])
                 total += gap * gap
             squares[j] = total
-        for k in range(n_nearest):
+        for _ in range(n_nearest):
             best = 0
             for j in range(1, count):
                 if squares[j] < squares[best]:
                     best = j
-            pairs[row * n_nearest + k, 0] = drawn[row]
-            pairs[row * n_nearest + k, 1] = best
-            squares[best] = np.int32(2147483647)
+            if squares[best] == farthest:  # no other stands at this angle to up
+                break
+            pairs[found, 0] = drawn[row]
+            pairs[found, 1] = best
+            squares[best] = farthest
+            found += 1
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class SlopeGate:
+    """Which patches may correspond where up is known in both frames.
+
+    Parameters
+    ----------
+    source, target : (P,) and (P',) angles of the patches' normals to up, radians
+    most : that two may differ by
+    """
+
+    source: Floats
+    target: Floats
+    most: float
 
 
 def correspondences(
-    source: Bytes, target: Bytes, rng: np.random.Generator, p: MatchingParameters
+    source: Bytes,
+    target: Bytes,
+    rng: np.random.Generator,
+    p: MatchingParameters,
+    gate: SlopeGate | None = None,
 ) -> Ints32:
     """Correspondences of a random few of the source's patches: Sec. III-E.
 
@@ -278,6 +310,7 @@ def correspondences(
     target : (P', d) uint8
     rng : which patches are drawn depends on it alone
     p : see MatchingParameters
+    gate : only patches at about the same angle to up correspond; None: any
 
     Returns
     -------
@@ -292,5 +325,10 @@ def correspondences(
     drawn = np.sort(rng.choice(len(source), min(p.n_sources, len(source)), replace=False))
     n_nearest = min(p.n_nearest, len(target))
     pairs = np.empty((len(drawn) * n_nearest, 2), np.int32)
-    _nearest(source, target, drawn.astype(np.int32), n_nearest, pairs)
-    return pairs
+    if gate is None:
+        gate = SlopeGate(np.zeros(len(source)), np.zeros(len(target)), math.inf)
+    found = _nearest(
+        source, target, drawn.astype(np.int32), n_nearest, gate.source, gate.target, gate.most,
+        pairs,
+    )  # fmt: skip
+    return pairs[:found]

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -43,7 +43,12 @@ from sceneprint.geometry.validation.alignment import (
     are_scans,
     samples_of,
 )
-from sceneprint.geometry.validation.ambiguity import AmbiguityParameters, best_alternative
+from sceneprint.geometry.validation.ambiguity import (
+    Alternative,
+    AmbiguityParameters,
+    best_alternative,
+)
+from sceneprint.geometry.validation.gravity import NO_UPS, Ups, contradiction, tilt_of
 from sceneprint.geometry.validation.icp import (
     FINE,
     CovarianceParameters,
@@ -66,6 +71,10 @@ Direction = Literal["query_to_match", "match_to_query"]
 THERE: Direction = "query_to_match"
 BACK: Direction = "match_to_query"
 _NONE = np.empty((0, 4, 4))
+#: Where `up` itself is wrong, the right transform is among those that it calls impossible.
+_MORE_TILTED = (
+    "a transform that tilts against `up` explains more: check the IMU and the axes of `up`"
+)
 
 
 @dataclass(frozen=True)
@@ -117,6 +126,10 @@ class PairValidation:
     T_other : (4, 4) where the two directions disagree, what the other one found; else None
     hypotheses : (n, 4, 4) T_match_query of the best that either direction refined, and of
         `T_rival`: what the frames may stand to each other, for the map to decide between
+    ups : (3,) up in the query's and in the match's coordinates, as far as it was known
+    tilt_rad : by how much the transform tilts the one up against the other; None where either is
+        not known
+    contradicts_up : the surfaces alone would be believed, but the transform tilts too much
     """
 
     status: Status
@@ -140,6 +153,9 @@ class PairValidation:
     directions: tuple[Direction, ...] = ()
     T_other: Floats | None = None
     hypotheses: Floats = field(default_factory=lambda: _NONE)
+    ups: Ups = NO_UPS
+    tilt_rad: float | None = None
+    contradicts_up: bool = False
 
 
 def middle(a: Floats, b: Floats) -> Floats:
@@ -179,7 +195,7 @@ def validate(
     mode: Mode = "full",
     matching: Matching = "histograms",
     *,
-    ups: tuple[Floats | None, Floats | None] = (None, None),
+    ups: Ups = NO_UPS,
     other_axes: bool = False,
 ) -> PairValidation:
     """Align a query with a candidate both ways, and decide: Sec. III-E.
@@ -193,7 +209,8 @@ def validate(
         other evidence
     matching : what correspondences are found by
     ups : (3,) unit vectors, up in the query's and in the match's coordinates, where they are
-        known; of scans
+        known: where both are, what tilts the one against the other is impossible. Of scans, one
+        alone is of use as well
     other_axes : whether scanners may have stood otherwise than upright; of scans without `ups`
 
     Raises
@@ -211,7 +228,7 @@ def validate(
         return _nothing(
             f"a frame has {fewest} patches, and {p.minimum_patches} are needed to tell places "
             "apart",
-            seed, query, match,
+            seed, query, match, ups,
         )  # fmt: skip
     a, b = (
         samples_of(one, p.agreement.stride, p.rivals.planes, up)
@@ -229,16 +246,57 @@ def validate(
         back = align(b, a, np.random.default_rng((seed, 1)), *numbers)
     if there is None and back is None:
         why = "no correspondences agree on a transform that the surfaces bear out"
-        return _nothing(why, seed, query, match)
+        if tilt_of(np.eye(4), ups) is not None:
+            why += " without tilting against `up`"
+        return _nothing(why, seed, query, match, ups)
     return _decided(a, b, there, back, seed, p, mode)
 
 
-def _nothing(reason: str, seed: int, query: Geometry, match: Geometry) -> PairValidation:
+def validate_without_up(
+    query: Geometry,
+    match: Geometry,
+    seed: int,
+    p: ValidationParameters | None,
+    ups: Ups,
+) -> PairValidation | None:
+    """Ask the surfaces alone, of a query that found nothing with `up`: the check of `up`.
+
+    A transform that they accept and that does not tilt counts as ever. One that is strong and
+    tilts speaks against `up`, or is of a place that looks alike: it is rejected, and the reason
+    says so.
+
+    Parameters
+    ----------
+    query, match, seed, p : see `validate`
+    ups : what was known of up
+
+    Returns
+    -------
+    validation : or None where it adds nothing to what is known
+    """
+    p = p or ValidationParameters()
+    found = validate(query, match, seed, p)
+    if found.status != "accepted":
+        return None
+    found = replace(found, ups=ups, tilt_rad=tilt_of(found.T_match_query, ups))
+    gravity = p.alignment.gravity
+    if found.tilt_rad is None or found.tilt_rad <= gravity.refined_tilt:
+        return found
+    if found.strength != "strong":
+        return None
+    why = contradiction(found.tilt_rad, query, match, ups, gravity)
+    return replace(
+        found, status="rejected", strength=None, reason=why, covariance=None, contradicts_up=True
+    )
+
+
+def _nothing(reason: str, seed: int, query: Geometry, match: Geometry, ups: Ups) -> PairValidation:
     blind = query.surface.camera is None and match.surface.camera is None
     violations = None if blind else 0.0
     return PairValidation(
-        "rejected", None, reason, None, math.inf, math.inf, 0.0, 0.0, violations, 0, 0.0, None, seed
-    )
+        "rejected", None, reason, None, math.inf, math.inf, 0.0, 0.0, violations, 0, 0.0, None,
+        seed, ups=ups,
+    )  # fmt: skip
 
 
 def _decided(
@@ -254,9 +312,10 @@ def _decided(
     (directions, T), *others = sorted(found.items(), key=lambda one: one[1] is not transforms[best])
     e, inliers = _evidence(query, match, both, T, residual, seen, best, p)
     T_other = others[0][1] if others else None
-    ambiguity, T_rival = 0.0, None
+    rival, ups = Alternative(0.0, None), (query.up, match.up)
+    tilt = tilt_of(T, ups)
     strength: Strength | None = None
-    against = objection(e, p.acceptance, mode)
+    against = objection(e, p.acceptance, mode) or _tilted(tilt, p)
     if against is not None:
         status, reason = against
     elif mode == "paper":
@@ -266,25 +325,23 @@ def _decided(
         voted = np.concatenate(
             [there.others if there else _NONE, inverses(back.others) if back else _NONE]
         )
-        ambiguity, T_rival = best_alternative(
-            *views,
-            T,
-            e.plane_violations,
-            voted,
-            there.proposed if there else _NONE,
-            p.rivals,
-            p.agreement,
-        )
-        status, strength, reason = belief(e, ambiguity, p.acceptance)
+        proposed = there.proposed if there else _NONE
+        rival = best_alternative(
+            *views, T, e.plane_violations, voted, proposed, p.rivals, p.agreement,
+            ups, p.alignment.gravity.rival_tilt,
+        )  # fmt: skip
+        status, strength, reason = belief(e, rival.share, p.acceptance)
+        if status == "accepted" and rival.tilted > e.plane_overlap:
+            status, strength, reason = "ambiguous", None, _MORE_TILTED
     covariance = None
     if status == "accepted" and there is not None and back is not None:
         covariance = pair_covariance(there.refined, back.refined, T, p.covariance)
     return PairValidation(
         status, strength, reason, T, e.residual_m, e.residual_rad, e.overlap, e.plane_overlap,
-        e.violations, inliers, ambiguity, T_rival, seed, covariance,
+        e.violations, inliers, rival.share, rival.T, seed, covariance,
         _sees_around(query.geometry) and _sees_around(match.geometry),
         e.planes, e.plane_violations, both[0].search, directions, T_other,
-        _hypotheses(there, back, transforms, T_rival, p.n_hypotheses),
+        _hypotheses(there, back, transforms, rival.T, p.n_hypotheses), ups, tilt,
     )  # fmt: skip
 
 
@@ -299,6 +356,13 @@ def _hypotheses(
     if back is not None:
         told += [*inverses(back.others[:each])]
     return np.array(told)
+
+
+def _tilted(tilt: float | None, p: ValidationParameters) -> tuple[Status, str] | None:
+    """The last refinement may have left what the search let pass."""
+    if tilt is None or tilt <= p.alignment.gravity.refined_tilt:
+        return None
+    return "rejected", f"it tilts by {math.degrees(tilt):.0f} deg against `up`"
 
 
 def _estimates(

@@ -29,7 +29,8 @@ export function about(frame, job, { edit }) {
     card("Source", edit && h("button", { class: "button", type: "button", id: "edit", onClick: edit }, "Edit"), list(who)),
     card("Sensor", null, list(frame.kind === "cloud" ? ofCloud(frame) : ofDepth(frame))),
     card("Pose", null, frame.pose ? transform(frame.pose) : h("p", { class: "muted" }, "No pose was sent, so answers cannot place this frame in the map."),
-      frame.T_base_sensor && [h("h3", {}, "Mounting"), transform(frame.T_base_sensor)]),
+      frame.T_base_sensor && [h("h3", {}, "Mounting"), transform(frame.T_base_sensor)],
+      frame.up && list([["Up", [frame.up.x, frame.up.y, frame.up.z].map((x) => x.toFixed(4)).join(", ")]])),
     card("Identity", null, list([
       ["Frame", mono(frame.frame_id)], ["Content", frame.content_id && mono(frame.content_id)],
       ["Upload", bytes(frame.bytes)], ["Note", frame.note],

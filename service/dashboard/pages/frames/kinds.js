@@ -89,7 +89,7 @@ export async function fieldsOf(file) {
     throw new Error(`${file.name} is not a JSON object.`);
   }
   const known = ["fx", "fy", "cx", "cy", "width", "height", "distortion", "depth_scale",
-    "depth_along_ray", "viewpoint", "units_per_metre", "format"];
+    "depth_along_ray", "viewpoint", "units_per_metre", "format", "up"];
   return Object.fromEntries(known.filter((one) => one in said).map((one) => [one, said[one]]));
 }
 

@@ -47,6 +47,7 @@ export function metaOf(given, source, pose = null) {
   for (const name of ["robot", "session"]) if (said(given[name])) meta[name] = given[name].trim();
   const tags = listOf(given.tags);
   if (tags.length) meta.tags = tags;
+  if (given.up) meta.up = given.up;
   if (pose) {
     meta.pose = { matrix: pose };
     if (said(given.parent_frame)) meta.pose.parent_frame = given.parent_frame.trim();

@@ -1,0 +1,75 @@
+"""Which way is up in the frames of a search: of their own, or of the map that they are placed in.
+
+frame numbers  --known_ups-->  unit vectors in the frames' sensors
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from sqlalchemy import Connection
+
+from sceneprint.geometry.pose.average import mean_direction
+from sceneprint.store.frame_queries import FrameUp, frame_ups
+from sceneprint.types import Floats
+
+#: Ups that differ by more are not those of one gravity, even with noise.
+AGREE = math.radians(10.0)
+#: Frames with pose and up that a map's up is learnt from, at least: one alone may be wrong.
+_FEWEST = 3
+
+
+def known_ups(connection: Connection, numbers: Iterable[int]) -> dict[int, Floats]:
+    """Up in the sensors of frames, as far as it is known.
+
+    A frame has its own, as it was sent; else that of its map's parent frames, where its pose is
+    known: the one that the map was given, or the one that most of these frames agree on.
+
+    Parameters
+    ----------
+    connection : of the database
+    numbers : of frames; the more there are, the better a map's up is learnt
+
+    Returns
+    -------
+    ups : (3,) unit vectors by number; without frames that contradict themselves, and whose map
+        does not decide it
+    """
+    found: dict[tuple[int, str | None], list[FrameUp]] = {}
+    for one in frame_ups(connection, numbers):
+        found.setdefault((one.map_number, one.parent), []).append(one)
+    return {number: up for group in found.values() for number, up in _of_parent(group).items()}
+
+
+def _of_parent(group: Sequence[FrameUp]) -> dict[int, Floats]:
+    """Ups of frames of one parent frame."""
+    shared, sure = _shared_up(group)
+    ups = {}
+    for one in group:
+        own = None if one.up is None else np.array(one.up)
+        implied = None
+        if shared is not None and one.pose is not None:
+            implied = np.array(one.pose)[:3, :3].T @ shared
+        if own is None or implied is None:
+            known = implied if own is None else own
+        else:
+            known = own if own @ implied >= math.cos(AGREE) else implied if sure else None
+        if known is not None:
+            ups[one.number] = known
+    return ups
+
+
+def _shared_up(group: Sequence[FrameUp]) -> tuple[Floats | None, bool]:
+    """Up in the parent frame, and whether it outweighs that of a single frame."""
+    if group[0].map_up is not None:
+        return np.array(group[0].map_up), True
+    told = [
+        np.array(one.pose)[:3, :3] @ np.array(one.up)
+        for one in group
+        if one.pose is not None and one.up is not None
+    ]
+    if len(told) < _FEWEST:
+        return None, False
+    return mean_direction(np.stack(told), AGREE), True
