@@ -5,7 +5,8 @@
     ranking = sceneprint.retrieve(signature, signatures, signer.model)  # R
     selection = sceneprint.diversify(ranking, signatures)  # C
     matches = sceneprint.associate(geometry, ranking, selection.indices, open_geometry)  # C_vld
-    location = sceneprint.locate(matches, poses)
+    views_of = sceneprint.views_of_rows(matches, poses, open_geometry)
+    place = sceneprint.localize([sceneprint.QueryFrame(geometry, matches)], poses, None, views_of)
 
     answer = sceneprint.Client("http://robot-server:8008").query("warehouse", path)  # all at once
 
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
     from sceneprint.formats.dataset import find_sequences, make_frame, read_frame
     from sceneprint.formats.points import decode_cloud
     from sceneprint.geometry.validation.validation import PairValidation
-    from sceneprint.matches import PairMatch, PoseEstimate, associate, locate
+    from sceneprint.localization import PoseEstimate, QueryFrame, localize, views_of_rows
+    from sceneprint.matches import PairMatch, associate
     from sceneprint.models import Model, read_model
     from sceneprint.pipeline import (
         Signature,
@@ -49,6 +51,7 @@ __all__ = [
     "PairMatch",
     "PairValidation",
     "PoseEstimate",
+    "QueryFrame",
     "Signature",
     "Signer",
     "associate",
@@ -56,7 +59,7 @@ __all__ = [
     "distance",
     "diversify",
     "find_sequences",
-    "locate",
+    "localize",
     "make_frame",
     "open_signer",
     "prepare",
@@ -66,6 +69,7 @@ __all__ = [
     "retrieve",
     "sign",
     "validate",
+    "views_of_rows",
     "write_geometry",
 ]
 
@@ -76,7 +80,8 @@ _HOME = {
     "DepthFrame": "types",
     "Geometry": "types",
     "Intrinsics": "types",
-    "PoseEstimate": "matches",
+    "PoseEstimate": "localization",
+    "QueryFrame": "localization",
     "PairMatch": "matches",
     "Model": "models",
     "Signature": "pipeline",
@@ -87,7 +92,7 @@ _HOME = {
     "distance": "pipeline",
     "diversify": "pipeline",
     "find_sequences": "formats.dataset",
-    "locate": "matches",
+    "localize": "localization",
     "make_frame": "formats.dataset",
     "open_signer": "pipeline",
     "prepare": "pipeline",
@@ -97,6 +102,7 @@ _HOME = {
     "retrieve": "pipeline",
     "sign": "pipeline",
     "validate": "pipeline",
+    "views_of_rows": "localization",
     "write_geometry": "formats.artifact",
 }
 

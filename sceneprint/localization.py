@@ -127,6 +127,7 @@ class PoseEstimate:
     alternatives : the poses that the evidence supports, the answer among them, best first; more
         than one only where the answer is ambiguous
     rival_ratio : the next best place's score by that of the best; None where no map was asked
+    votes : accepted matches that have a pose in the parent frame
     members : rows of the matches that vote for the answer
     """
 
@@ -139,6 +140,7 @@ class PoseEstimate:
     verified_by: Verifier | None
     alternatives: tuple[Alternative, ...]
     rival_ratio: float | None
+    votes: int = 0
     members: tuple[int, ...] = ()
 
 
@@ -237,6 +239,39 @@ def localize(
     return _estimate(parent, places, prior, bool(scored), blind, p)
 
 
+def views_of_rows(
+    matches: Sequence[PairMatch],
+    poses: Sequence[Floats],
+    open_geometry: Callable[[int], Geometry | None],
+    parents: Sequence[str] | None = None,
+    p: MapParameters | None = None,
+    overlap_p: OverlapParameters | None = None,
+) -> ViewsOf:
+    """What `localize` asks the map with, where all poses of a database are at hand.
+
+    Parameters
+    ----------
+    matches : of the query: poses are first compared on their rows
+    poses : T_parent_sensor (4, 4) of every row
+    open_geometry : artifact of a row, or None
+    parents : parent frame of every row; default: one for all
+    p, overlap_p : see there
+    """
+
+    def views_of(parent: str, at: Floats) -> MapViews:  # noqa: ARG001
+        own = [i for i in range(len(poses)) if parents is None or parents[i] == parent]
+        tried = {match.index for match in matches}
+        return MapViews(
+            np.array([poses[i] for i in own]).reshape(-1, 4, 4),
+            lambda k: open_geometry(own[k]),
+            p or MapParameters(),
+            overlap_p or OverlapParameters(),
+            [k for k, i in enumerate(own) if i in tried],
+        )
+
+    return views_of
+
+
 _NONE = np.empty((0, 4, 4))
 
 
@@ -263,7 +298,8 @@ def _suggested(
         poses[match.index] @ match.validation.hypotheses @ inverse(frame.T)
         for frame in frames
         for match in frame.matches
-        if len(match.validation.hypotheses)
+        # of a sensor that cannot have stood so
+        if len(match.validation.hypotheses) and not match.validation.contradicts_up
     ]
     most = max(map(len, of_each), default=0)
     told = [one[rank] for rank in range(most) for one in of_each if rank < len(one)]
@@ -356,7 +392,8 @@ def _estimate(
         for one in told[: p.views]
     )
     status: LocalizationStatus = "ambiguous" if told else "not_found"
-    return PoseEstimate(status, against, parent, None, None, None, None, alternatives, ratio)
+    votes = sum(vote.accepted for place in places for vote in place.votes)
+    return PoseEstimate(status, against, parent, None, None, None, None, alternatives, ratio, votes)
 
 
 def _against_votes(
@@ -459,7 +496,7 @@ def _found(
     strength: Strength = "strong" if place.strong else "weak"
     return PoseEstimate(
         "found", reason, parent, average, covariance, strength, verified_by, (), ratio,
-        tuple(vote.match.index for vote in accepted),
+        total, tuple(vote.match.index for vote in accepted),
     )  # fmt: skip
 
 

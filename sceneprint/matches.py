@@ -1,22 +1,18 @@
-"""What is made of a ranking's candidates: matches in the order to believe them, and a place.
+"""What is made of a ranking's candidates: matches in the order to believe them.
 
-candidates of R  --associate-->  matches, C_vld first  --locate-->  pose of the query
+candidates of R  --associate-->  matches, C_vld first
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from sceneprint.geometry.pose.average import PoseAverage, average_poses
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.alignment import are_scans
-from sceneprint.geometry.validation.association import preferred, voters
+from sceneprint.geometry.validation.association import preferred
 from sceneprint.geometry.validation.gravity import Ups
-from sceneprint.geometry.validation.icp import place_covariance, transported
 from sceneprint.geometry.validation.sequence_alignment import Matching
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.pipeline import validate, validate_without_up
@@ -38,22 +34,6 @@ class PairMatch:
     distance: int
     similarity: float
     validation: PairValidation
-
-
-@dataclass(frozen=True, eq=False)
-class PoseEstimate:
-    """Where a query was taken.
-
-    Parameters
-    ----------
-    parent : frame in which the pose is given
-    average : T_parent_query with the spread of the votes and how many agree
-    covariance : (6, 6) of it, as `geometry.covariance` orders it; None where a vote has none
-    """
-
-    parent: str
-    average: PoseAverage
-    covariance: Floats | None
 
 
 def associate(
@@ -173,47 +153,3 @@ def _retry_without_up(
         validation = validate_without_up(query, geometry, seed, p, ups)
         if validation is not None:
             tried[place] = replace(before, validation=validation)
-
-
-def locate(
-    matches: Sequence[PairMatch],
-    poses: Sequence[Floats] | Mapping[int, Floats],
-    parents: Sequence[str] | Mapping[int, str] | None = None,
-    views: int = 5,
-) -> PoseEstimate | None:
-    """Pose of the query: robust average over up to five validated views.
-
-    Parameters
-    ----------
-    matches : of `associate`
-    poses : T_parent_sensor (4, 4) of every row of the database, or by the rows of the matches
-    parents : parent frame of every row; default: one for all. Poses are combined within one
-        parent frame only, that of most of the matches
-    views : most that are averaged, at least 1
-
-    Returns
-    -------
-    location : or None where nothing was accepted
-
-    Raises
-    ------
-    ValueError : views below 1.
-    """
-    if views < 1:
-        raise ValueError(f"views = {views}: average 1 view or more")
-    accepted = [m for m in matches if m.validation.status == "accepted"]
-    names = [parents[m.index] if parents is not None else "" for m in accepted]
-    chosen = voters(names, [m.validation.strength == "strong" for m in accepted], views)
-    votes, told = [], []
-    for match in [accepted[i] for i in chosen]:
-        T, covariance = match.validation.T_match_query, match.validation.covariance
-        if T is not None:
-            votes.append(poses[match.index] @ T)
-            if covariance is not None:
-                told.append(transported(covariance, poses[match.index][:3, :3], np.zeros(3)))
-    if not votes:
-        return None
-    average, sure = average_poses(np.stack(votes)), None
-    if len(told) == len(votes):
-        sure = place_covariance(average, np.stack(votes), np.stack(told))
-    return PoseEstimate(names[chosen[0]], average, sure)

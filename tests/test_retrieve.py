@@ -13,12 +13,13 @@ from sceneprint.geometry.pose.average import average_poses
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.retrieval.dpp import diversify as select
 from sceneprint.geometry.signature.segmentation import patches_of, segment
-from sceneprint.geometry.validation.association import expected_error, preferred, voters
+from sceneprint.geometry.validation.association import expected_error, preferred
 from sceneprint.geometry.validation.patch_descriptors import compress, patch_descriptors
 from sceneprint.geometry.validation.validation import PairValidation
+from sceneprint.lab.evaluation.judgement import voters
 from sceneprint.lab.synth import KINECT, take, trajectory
 from sceneprint.lab.synth.dataset import room_and_rng
-from sceneprint.matches import PairMatch, associate, locate
+from sceneprint.matches import PairMatch, associate
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import (
     Signature,

@@ -17,6 +17,7 @@ from sceneprint_client.api import (
     Filter,
     FrameMeta,
     NamedFrame,
+    Prior,
     Query,
     Stage,
     ValidationOptions,
@@ -127,6 +128,7 @@ class QueryOptions(TypedDict, total=False):
     candidates: int | None
     diversity: Diversity | dict[str, float] | None
     validation: ValidationOptions | dict[str, Any] | None
+    prior: Prior | dict[str, Any] | None
     deadline_ms: int | None
     explain: bool
     explain_frame: str | None

@@ -429,6 +429,55 @@ def frame_ups(connection: Connection, numbers: Iterable[int]) -> list[FrameUp]:
     return [FrameUp(*row) for row in rows_among(connection, asked, c.number, numbers)]
 
 
+# Frames by where they were taken: for whoever compares poses in a map.
+
+
+@dataclass(frozen=True)
+class PlacedFrame:
+    """A posed frame: its number, T_parent_sensor (4 rows of 4), the blob of its geometry."""
+
+    number: int
+    pose: list[list[float]]
+    geometry: str
+
+
+def placed_frames(
+    connection: Connection, map_number: int, parent: str, model_id: str,
+    centre: Sequence[float], within: float, most: int,
+) -> list[PlacedFrame]:  # fmt: skip
+    """Indexed frames of a parent frame taken near a point, the nearest first.
+
+    Parameters
+    ----------
+    connection : of the database
+    map_number, parent : whose frames
+    model_id : of their signatures
+    centre : x, y, z of the point, metres
+    within : half the width of the cube that they are in, metres
+    most : of them
+    """
+    c = frames.c
+    axes = (c.pose_x, c.pose_y, c.pose_z)
+    apart = [(axis - middle) * (axis - middle) for axis, middle in zip(axes, centre, strict=True)]
+    asked = (
+        select(c.number, c.pose, signatures.c.geometry)
+        .join(signatures, signatures.c.frame_number == c.number)
+        .where(
+            c.map_number == map_number,
+            c.pose_parent == parent,
+            *(
+                axis.between(middle - within, middle + within)
+                for axis, middle in zip(axes, centre, strict=True)
+            ),
+            c.state == FrameState.INDEXED,
+            signatures.c.model_id == model_id,
+        )
+        .order_by(apart[0] + apart[1] + apart[2], c.number)
+        .limit(most)
+    )
+    return [PlacedFrame(*row) for row in connection.execute(asked)]
+
+
 # What frames of a map weigh, and which a session brought: for whoever thins it out.
 
 

@@ -139,6 +139,7 @@ frames = Table(
         "pose_z",
     ),
     Index(None, "blob"),
+    Index("ix_frames_placed", "map_number", "pose_parent", "pose_x", "pose_y", "pose_z"),
     sqlite_autoincrement=True,
 )
 #: The oldest frames of a map that are still there: rows of deleted ones stay for ever.

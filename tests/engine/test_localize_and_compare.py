@@ -65,7 +65,7 @@ def test_what_is_not_found_says_why(full: Engine, empty: Engine, uploads: Any, i
         [],
         None,
     )
-    assert tight.reason.startswith("none of 10 candidates was accepted; the nearest: the two ")
+    assert tight.reason.startswith("none of 10 candidates is accepted (the nearest: the two ")
     none = ask(filter={"robot": "nobody"})
     assert none.reason == "the map has no frame to compare: no frame passes the filter"
     late = ask(deadline_ms=1)

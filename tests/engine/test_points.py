@@ -117,7 +117,7 @@ def test_one_match_is_validated_once(
     from sceneprint.engine.results import inspection
 
     whole = inspection.validate
-    monkeypatch.setattr(inspection, "validate", lambda *a: made.append(1) or whole(*a))
+    monkeypatch.setattr(inspection, "validate", lambda *a, **b: made.append(1) or whole(*a, **b))
     told = full.inspection.match(asked.query_id, best)
     for side in ("query", "match"):
         full.points.match(asked.query_id, best, side=side).make()  # type: ignore[arg-type]

@@ -17,6 +17,7 @@ from sceneprint_client.api.frames import Added, CameraIntrinsics, Frame, FrameMe
 from sceneprint_client.api.listing import Filter, Region
 from sceneprint_client.api.maps import Map, NewMap, Reencoding
 from sceneprint_client.api.matches import (
+    Alternative,
     ExplainedFrame,
     Explanation,
     Location,
@@ -31,6 +32,7 @@ from sceneprint_client.api.query import (
     Counts,
     Localization,
     OfMap,
+    Prior,
     Query,
     SeveralQuery,
 )
@@ -38,6 +40,7 @@ from sceneprint_client.api.results import Comparison, Similarity
 
 __all__ = [
     "Added",
+    "Alternative",
     "Answer",
     "AnswerStatus",
     "CameraIntrinsics",
@@ -62,6 +65,7 @@ __all__ = [
     "NewMap",
     "OfMap",
     "Page",
+    "Prior",
     "Problem",
     "Progress",
     "Quaternion",

@@ -120,7 +120,8 @@ class Match(ApiRecord):
     validation: Validation
     transform: Transform | None = Field(description="Query to match; believe it where accepted.")
     pose_in_map: Transform | None = Field(
-        description="The query in the parent frame of the match's pose, where that is known."
+        description="The query in the parent frame of the match's pose, where that is known and "
+        "the match is not rejected."
     )
     uncertainty: Uncertainty | None = Field(
         default=None, description="Of `transform`, where the match is accepted."
@@ -131,13 +132,51 @@ class Match(ApiRecord):
     )
 
 
+#: What decided on a pose.
+Verifier = Literal["matches", "map", "prior"]
+
+
+class Alternative(ApiRecord):
+    """A pose of the query that the evidence supports; of several, one is right at most."""
+
+    pose: Transform
+    weight: float = Field(
+        description="Of its votes, one for each viewpoint: 1 of a strong match, 0.4 of a weak or "
+        "an ambiguous one; 0 where the map alone suggests it."
+    )
+    support: int = Field(description="Matches from different viewpoints that vote for it.")
+    score: float | None = Field(
+        description="How far the map's frames bear it out: the share of the query's surface that "
+        "they show there, every plane counting alike, less for what they saw through; 1 at most. "
+        "Null where they were not asked."
+    )
+
+
 class Location(ApiRecord):
-    """The query's pose averaged over its accepted matches."""
+    """The query's pose averaged over the accepted matches that agree on it."""
 
     pose: Transform
     map: str | None = Field(default=None, description="Whose frames it is averaged over.")
-    support: int = Field(description="Matches that agree on it.")
-    votes: int = Field(description="Matches that were asked.")
+    support: int = Field(
+        description="Matches that agree on it; 0 where the map alone confirms it, and 1 is one "
+        "view, unconfirmed."
+    )
+    votes: int = Field(description="Accepted matches, whatever pose they vote for.")
+    strength: Literal["strong", "weak"] = Field(
+        default="strong", description="`strong` where a match that votes for it is."
+    )
+    verified_by: Verifier = Field(
+        default="matches",
+        description="`matches`: accepted matches agree, and no other pose comes near. `map`: the "
+        "map's frames confirm it, where matches did not suffice. `prior`: they bear several poses "
+        "out, and this is the one that the prior expects.",
+    )
+    rival_ratio: float | None = Field(
+        default=None,
+        description="How far the map bears out the best pose of another place, as a share of the "
+        "best of all: 0 where nothing comes near, 1 where it is as good. Null where the map's "
+        "frames were not asked.",
+    )
     spread_m: float
     spread_deg: float
     uncertainty: Uncertainty | None = Field(default=None, description="Of `pose`.")

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from sceneprint_client.api.base import ApiRecord, Given, Transform
-from sceneprint_client.api.frames import Kind
+from sceneprint_client.api.frames import GivenPose, Kind
 from sceneprint_client.api.listing import Filter, parsed
-from sceneprint_client.api.matches import ExplainedFrame, Explanation, Location, Match, Uncertainty
+from sceneprint_client.api.matches import (
+    Alternative,
+    ExplainedFrame,
+    Explanation,
+    Location,
+    Match,
+    Uncertainty,
+    Verifier,
+)
 from sceneprint_client.api.options import (
     MOST_MAPS,
     STAGES,
@@ -23,6 +31,36 @@ from sceneprint_client.api.options import (
 )
 
 AnswerStatus = Literal["found", "ambiguous", "not_found", "unvalidated"]
+#: The likeliest cause of an answer `not_found`.
+Cause = Literal[
+    "no_frames", "deadline", "too_little_in_view", "one_plane", "gravity", "other_sensor", "scale",
+    "nothing_alike",
+]  # fmt: skip
+
+
+class Prior(Given):
+    """What a robot believes of its pose before it asks: T_parent_query and how sure that is."""
+
+    pose: GivenPose = Field(
+        description="Of the query's sensor in a parent frame of the map; `parent_frame` is needed."
+    )
+    covariance: Annotated[list[float], Field(min_length=36, max_length=36)] | None = Field(
+        default=None,
+        description="6 x 6, row by row, of errors (x, y, z, rx, ry, rz) in the parent's axes, as "
+        "ROS orders PoseWithCovariance: metres and radians.",
+    )
+    deviation_m: float = Field(
+        default=0.3, gt=0, le=20, description="In place of `covariance`: along each axis."
+    )
+    deviation_deg: float = Field(
+        default=10.0, gt=0, le=180, description="In place of `covariance`: about each axis."
+    )
+
+    @model_validator(mode="after")
+    def _in_a_parent_frame(self) -> Prior:
+        if self.pose.parent_frame is None:
+            raise ValueError("a prior needs pose.parent_frame: the one of the map's poses")
+        return self
 
 
 class Query(Given):
@@ -59,6 +97,12 @@ class Query(Given):
     )
     validation: Annotated[ValidationOptions | None, JsonText] = Field(
         default=None, description="What a match must stand to be accepted."
+    )
+    prior: Annotated[Prior | None, JsonText] = Field(
+        default=None,
+        description="What the robot believes of its pose. Candidates near it are tried first, and "
+        "it is refined on the map beside the search over all; it decides only between poses that "
+        "the map bears out alike.",
     )
     deadline_ms: int | None = Field(
         default=None,
@@ -151,15 +195,27 @@ class Answer(ApiRecord):
 
     query_id: str
     status: AnswerStatus = Field(
-        description="`found`: at least one match is accepted. `ambiguous`: none is, and one fits "
-        "in several ways. `unvalidated`: validation was not asked for, or the deadline came "
-        "before a match was accepted."
+        description="`found`: one pose is supported, and no other comes near; where no accepted "
+        "match has a pose, a match is accepted. `ambiguous`: the evidence supports several poses, "
+        "or one that it does not confirm: never drive on it. `not_found`: nothing is supported, "
+        "see `cause`. `unvalidated`: validation was not asked for, or the deadline came before a "
+        "match was accepted."
     )
+    reason: str = Field(
+        default="", description="Why, in a sentence; of `not_found` with what to do next."
+    )
+    cause: Cause | None = Field(default=None, description="The likeliest of `not_found`.")
     matches: list[Match] = Field(
         description="Accepted ones first, strong before weak, then the most precise, or, of scans "
         "all around, the nearest first; then the others that were tried."
     )
-    location: Location | None = Field(description="Where accepted matches have poses.")
+    location: Location | None = Field(
+        description="Where the query was taken: where it is `found`, and the matches have poses."
+    )
+    alternatives: list[Alternative] = Field(
+        default=[],
+        description="Of `ambiguous`: the poses that the evidence supports, the best first.",
+    )
     seed: int
     model: str
     index_generation: int = Field(
@@ -170,7 +226,7 @@ class Answer(ApiRecord):
     counts: Counts
     milliseconds: dict[str, float] = Field(
         description="`prepare` (signature and geometry of the query), `retrieve`, `diversify`, "
-        "`validate`, `explain` where it was asked for, `total`."
+        "`validate`, `locate`, `explain` where it was asked for, `total`."
     )
     maps: list[str] = Field(default=[], description="The maps that were asked.")
     frame: FrameName | None = Field(
@@ -214,17 +270,21 @@ class Localization(ApiRecord):
     """Where the query was taken, if that is known."""
 
     status: LocalizationStatus = Field(
-        description="`found`: a match is accepted. `ambiguous`: none is, and one fits in several "
-        "ways: move on and ask again. `not_found`: none is, or the deadline came before."
+        description="`found`: one pose is supported, and no other comes near. `ambiguous`: several "
+        "are, see `alternatives`, or one that is not confirmed: move on and ask again. "
+        "`not_found`: none is, see `cause`, or the deadline came before."
     )
     reason: str
+    cause: Cause | None = Field(default=None, description="The likeliest of `not_found`.")
     map: str
     pose: Transform | None = Field(
         description="T_parent_query: the query's camera in the parent frame of its matches' "
         "poses. Null unless `found`, and where no accepted match has a pose: see `best`."
     )
-    support: int = Field(description="Matches that agree on the pose.")
-    votes: int = Field(description="Matches that were asked for it.")
+    support: int = Field(
+        description="Matches that agree on the pose; 1 is one view, which nothing confirms."
+    )
+    votes: int = Field(description="Accepted matches, whatever pose they vote for.")
     spread_m: float | None = Field(description="Of the votes; null without a pose.")
     spread_deg: float | None
     uncertainty: Uncertainty | None = Field(default=None, description="Of `pose`.")
@@ -233,7 +293,19 @@ class Localization(ApiRecord):
         description="As `pose`, of the robot's base: where the query has T_base_sensor.",
     )
     strength: Literal["strong", "weak"] | None = Field(
-        description="`strong` where any accepted match is; null where none is accepted."
+        description="`strong` where a match that votes for the pose is; null unless `found`."
+    )
+    verified_by: Verifier | None = Field(
+        default=None,
+        description="What decided, as in `location` of an answer; null unless `found`.",
+    )
+    rival_ratio: float | None = Field(
+        default=None,
+        description="How near another place comes, 0 to 1; null where the map was not asked.",
+    )
+    alternatives: list[Alternative] = Field(
+        default=[],
+        description="Of `ambiguous`: the poses that the evidence supports, the best first.",
     )
     best: Match | None = Field(
         description="The accepted match to believe first, with the transform to it."

@@ -11,7 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from sceneprint.engine.search.explanation import ExplainedQuery, explain, why
-from sceneprint.engine.search.response import Candidates, location_record, match_records
+from sceneprint.engine.search.outcome import outcome_of
+from sceneprint.engine.search.response import (
+    Candidates,
+    alternative_records,
+    location_record,
+    match_records,
+)
 from sceneprint.engine.search.retrieval import (
     Deadline,
     PreparedQuery,
@@ -19,17 +25,25 @@ from sceneprint.engine.search.retrieval import (
     SearchedMap,
     search_maps,
 )
-from sceneprint.engine.search.verification import Validated, validated, wanted_of
+from sceneprint.engine.search.verification import (
+    Validated,
+    nearest_first,
+    placed,
+    prior_of,
+    validated,
+    wanted_of,
+)
 from sceneprint.engine.serializers import query_sensor
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.geometry.retrieval.distance import Ints64, pairwise_distances
 from sceneprint.geometry.retrieval.dpp import DiversityParameters, Selection, diversify
+from sceneprint.localization import QueryFrame
 from sceneprint.matches import PairMatch
 from sceneprint.models import Model
 from sceneprint.store import Store
 from sceneprint.store.frames import frames_of
 from sceneprint.store.postgres.replica import behind_s
-from sceneprint_client.api import Answer, AnswerStatus, Counts, FrameName, OfMap, Query
+from sceneprint_client.api import Answer, Counts, FrameName, OfMap, Query
 
 
 @dataclass
@@ -72,8 +86,9 @@ def answer(
     among, selection, scales = _selection(searched, query, model, wanted)
     clock.stage("diversify")
     chosen = range(min(wanted, len(ranking))) if selection is None else selection.indices.tolist()
-    p = model.parameters.validation
-    tried = validated(store, searched, chosen, asked.geometry, query, deadline, p, asked.up)
+    p, prior = model.parameters.validation, prior_of(query, places)
+    first = chosen if prior is None else nearest_first(store, ranking, chosen, prior)
+    tried = validated(store, searched, first, asked.geometry, query, deadline, p, asked.up)
     clock.stage("validate")
     shown = range(len(ranking)) if query.explain else chosen
     with store.queried.read() as connection:
@@ -81,6 +96,11 @@ def answer(
     matches = [one for one in tried.matches if one.index in rows]  # the rest was deleted meanwhile
     names = {place.row.number: place.row.name for place in places}
     own = query_sensor(_name(asked), asked.kind, list(names.values()))
+    estimate = None
+    if asked.geometry is not None:
+        frames = [QueryFrame(asked.geometry, matches)]
+        estimate = placed(store, searched, tried, rows, frames, prior, p, query.validation)
+        clock.stage("locate")
     found = Candidates(
         names, ranking, selection, rows, tried.unreadable, tried.untried, own, p.covariance,
         asked.base,
@@ -95,16 +115,21 @@ def answer(
         clock.stage("explain")
     clock.spent["total"] = round(sum(clock.spent.values()), 2)
     counts = [_counts(searched, i, found, tried, matches) for i in range(len(places))]
+    total = _sum(counts)
+    outcome = outcome_of(query, estimate, tried, matches, total, asked.geometry, p)
     told = Answer(
         query_id=uuid.uuid4().hex,
-        status=_status(matches, query, tried),
+        status=outcome.status,
+        reason=outcome.reason,
+        cause=outcome.cause,
         matches=match_records(found, chosen, matches),
-        location=location_record(found, matches),
+        location=location_record(found, estimate) if outcome.status == "found" else None,
+        alternatives=alternative_records(found, estimate) if outcome.status == "ambiguous" else [],
         seed=query.seed,
         model=model.label,
         index_generation=min(map(_generation, places)),
         exact=searched.exact,
-        counts=_sum(counts),
+        counts=total,
         milliseconds=clock.spent,
         maps=[place.row.name for place in places],
         frame=_name(asked),
@@ -172,14 +197,3 @@ def _name(asked: PreparedQuery) -> FrameName | None:
     if asked.frame is None or asked.home is None:
         return None
     return FrameName(map=asked.home.name, frame_id=asked.frame[1])
-
-
-def _status(matches: Sequence[PairMatch], query: Query, tried: Validated) -> AnswerStatus:
-    statuses = [match.validation.status for match in matches]
-    if "accepted" in statuses:
-        return "found"
-    if "validate" not in query.stages:
-        return "unvalidated"
-    if "ambiguous" in statuses:
-        return "ambiguous"
-    return "unvalidated" if tried.late else "not_found"

@@ -38,7 +38,6 @@ from sceneprint_client.api import (
     FrameMeta,
     FrameName,
     Localization,
-    Match,
     NamedFrame,
     Query,
     SeveralQuery,
@@ -393,11 +392,14 @@ def localization_of(answer: Answer) -> Localization:
     status: LocalizationStatus = "not_found"
     if answer.status in ("found", "ambiguous"):
         status = answer.status
-    strong = any(one.validation.strength == "strong" for one in accepted)
     there = answer.location
+    strength = there.strength if there is not None else None
+    if there is None and status == "found":  # of matches without a pose
+        strength = accepted[0].validation.strength
     return Localization(
         status=status,
-        reason=_reason(answer, accepted),
+        reason=answer.reason,
+        cause=answer.cause,
         map=answer.maps[0],
         pose=None if there is None else there.pose,
         support=0 if there is None else there.support,
@@ -406,8 +408,11 @@ def localization_of(answer: Answer) -> Localization:
         spread_deg=None if there is None else there.spread_deg,
         uncertainty=None if there is None else there.uncertainty,
         base=None if there is None else there.base,
-        strength=None if not accepted else "strong" if strong else "weak",
-        best=accepted[0] if accepted else None,
+        strength=strength,
+        verified_by=None if there is None else there.verified_by,
+        rival_ratio=None if there is None else there.rival_ratio,
+        alternatives=answer.alternatives,
+        best=accepted[0] if accepted and status == "found" else None,
         matches=[one.frame_id for one in accepted],
         query_id=answer.query_id,
         seed=answer.seed,
@@ -415,35 +420,3 @@ def localization_of(answer: Answer) -> Localization:
         deadline_reached=answer.deadline_reached,
         milliseconds=answer.milliseconds,
     )
-
-
-def _reason(answer: Answer, accepted: list[Match]) -> str:
-    there, counts = answer.location, answer.counts
-    if there is not None:
-        return (
-            f"{there.support} of {there.votes} matches agree on the pose, within "
-            f"{there.spread_m:.2g} m and {there.spread_deg:.2g} deg"
-        )
-    if accepted:
-        return (
-            f"{len(accepted)} matches are accepted, but none has a pose in the map; `best` has "
-            "the transform to the first"
-        )
-    unsure = [one for one in answer.matches if one.validation.status == "ambiguous"]
-    if unsure:
-        return (
-            f"the best fit is not unique: {unsure[0].validation.reason} (frame "
-            f"{unsure[0].frame_id})"
-        )
-    if not counts.passed:
-        return "the map has no frame to compare" + (
-            ": no frame passes the filter" if counts.map else ""
-        )
-    if answer.deadline_reached:
-        return (
-            f"the deadline passed before a match was accepted: {counts.validated} of "
-            f"{len(answer.matches)} candidates were validated"
-        )
-    first = next((one for one in answer.matches if one.validation.status == "rejected"), None)
-    why = "" if first is None else f"; the nearest: {first.validation.reason}"
-    return f"none of {counts.validated} candidates was accepted{why}"

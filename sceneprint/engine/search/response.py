@@ -20,9 +20,11 @@ from sceneprint.geometry.validation.icp import (
     free_directions,
 )
 from sceneprint.geometry.validation.validation import PairValidation
-from sceneprint.matches import PairMatch, locate
+from sceneprint.localization import PoseEstimate
+from sceneprint.matches import PairMatch
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats
+from sceneprint_client.api import Alternative as ToldAlternative
 from sceneprint_client.api import Location as ToldLocation
 from sceneprint_client.api import Match as ToldMatch
 from sceneprint_client.api import Residual, Transform
@@ -94,30 +96,40 @@ def match_records(
     return told
 
 
-def location_record(found: Candidates, matches: Sequence[PairMatch]) -> ToldLocation | None:
-    """The query's pose, from the accepted matches whose poses are known."""
-    posed = {
-        number: np.array(row.pose) for number, row in found.rows.items() if row.pose is not None
-    }
-    # a parent frame is one map's: another map may call its own the same
-    parents = {
-        number: f"{found.rows[number].map_number} {found.rows[number].pose_parent}"
-        for number in posed
-    }
-    location = locate([match for match in matches if match.index in posed], posed, parents)
-    if location is None:
+def location_record(found: Candidates, estimate: PoseEstimate | None) -> ToldLocation | None:
+    """The query's pose, where it was found."""
+    if estimate is None or estimate.average is None:
         return None
-    average, (number, _, parent) = location.average, location.parent.partition(" ")
+    average, (number, _, parent) = estimate.average, estimate.parent.partition(" ")
     return ToldLocation(
         pose=transform(average.T, parent, found.query_frame),
         map=found.maps[int(number)],
-        support=average.support,
-        votes=average.votes,
+        support=len(estimate.members),
+        votes=estimate.votes,
+        strength=estimate.strength or "weak",
+        verified_by=estimate.verified_by or "matches",
+        rival_ratio=estimate.rival_ratio,
         spread_m=average.spread_m,
         spread_deg=math.degrees(average.spread_rad),
-        uncertainty=uncertainty_record(location.covariance, PLACE_METHOD, found.covariance),
+        uncertainty=uncertainty_record(estimate.covariance, PLACE_METHOD, found.covariance),
         base=found.base_of(average.T, parent),
     )
+
+
+def alternative_records(found: Candidates, estimate: PoseEstimate | None) -> list[ToldAlternative]:
+    """The poses that the evidence supports, where it does not decide."""
+    if estimate is None:
+        return []
+    parent = estimate.parent.partition(" ")[2]
+    return [
+        ToldAlternative(
+            pose=transform(one.T, parent, found.query_frame),
+            weight=one.weight,
+            support=one.support,
+            score=one.score,
+        )
+        for one in estimate.alternatives
+    ]
 
 
 def _match(
@@ -133,7 +145,9 @@ def _match(
         place = found.selection.indices.tolist().index(position)
         gain = float(found.selection.gains[place])
     T = None if tried is None else tried.T_match_query
-    in_map: Floats | None = None if T is None or row.pose is None else np.array(row.pose) @ T
+    in_map: Floats | None = None
+    if T is not None and row.pose is not None and validation.status != "rejected":
+        in_map = np.array(row.pose) @ T
     return ToldMatch(
         frame_id=row.id,
         map=found.maps[row.map_number],

@@ -1,24 +1,42 @@
-"""Candidates of R to matches, C_vld first, until enough are accepted or time is up: Sec. III-E.
+"""Candidates of R to matches, and matches with the map's frames to where the query was taken.
 
-query Geometry, candidates  --validated-->  Validated
+query Geometry, candidates  --validated-->  Validated  --placed-->  PoseEstimate
+
+Candidates are validated, C_vld first, until enough are accepted or time is up: Sec. III-E. The
+poses that they suggest are compared on the frames of the map that were taken near them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from sceneprint.engine.search.gravity import known_ups
-from sceneprint.engine.search.retrieval import Deadline, Searched
+from sceneprint.engine.search.retrieval import Deadline, Searched, SearchedMap
+from sceneprint.engine.serializers import pose_matrix
 from sceneprint.engine.upkeep.repair import resign_frames
-from sceneprint.errors import DamagedBlob, UnreadableGeometry
+from sceneprint.errors import DamagedBlob, InvalidRequest, UnreadableGeometry
 from sceneprint.formats.artifact import read_geometry
+from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
+from sceneprint.geometry.validation.map_verification import MapViews
 from sceneprint.geometry.validation.validation import ValidationParameters
+from sceneprint.localization import (
+    LocalizationParameters,
+    PoseEstimate,
+    Prior,
+    QueryFrame,
+    localize,
+)
 from sceneprint.matches import PairMatch, associate
 from sceneprint.store import Store
+from sceneprint.store.frame_queries import PlacedFrame, placed_frames
+from sceneprint.store.frames import frames_of
 from sceneprint.store.signatures import geometry_blobs
+from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Query, ValidationOptions
 
@@ -45,6 +63,7 @@ class Validated:
     unreadable : numbers of frames whose artifact cannot be read, and why
     untried : why the others were not tried
     late : whether the deadline came before the last of them; None without a deadline
+    geometries : of the first candidates that were tried, by frame number
     """
 
     chosen: Sequence[int]
@@ -52,6 +71,7 @@ class Validated:
     unreadable: dict[int, str]
     untried: str
     late: bool | None
+    geometries: dict[int, Geometry] = field(default_factory=dict)
 
 
 def wanted_of(query: Query) -> int:
@@ -99,15 +119,19 @@ def validated(
         blobs = geometry_blobs(connection, ranking.indices[list(chosen)].tolist(), model_id)
         ups = {} if up is None else known_ups(connection, ranking.indices.tolist())
     unreadable: dict[int, str] = {}
+    opened: dict[int, Geometry] = {}
 
     def open_geometry(number: int) -> Geometry | None:
         if number not in blobs:  # deleted in the meantime
             return None
         try:  # when its turn comes: 200 at once would be 125 MB
-            return read_geometry(store.blobs.get(blobs[number]))
+            geometry_of = read_geometry(store.blobs.get(blobs[number]))
         except (DamagedBlob, UnreadableGeometry) as error:  # one frame must not cost the answer
             unreadable[number] = str(error)
             return None
+        if len(opened) < CANDIDATES:
+            opened[number] = geometry_of
+        return geometry_of
 
     matches = associate(
         geometry, ranking, chosen, open_geometry, query.k, query.seed,
@@ -123,4 +147,141 @@ def validated(
         if late
         else "enough matches were accepted before it"
     )
-    return Validated(chosen, matches, unreadable, untried, late)
+    return Validated(chosen, matches, unreadable, untried, late, opened)
+
+
+#: Frames that are looked for about each pose that a candidate suggests, and how far off, metres:
+#: first close by, as a map may hold thousands, and farther off where that gives too few.
+_NEAR_FRAMES = 48
+_NEAR_M = (2.0, 8.0)
+#: Poses this near are looked about once, metres.
+_CELL_M = 1.0
+#: Places that are looked about, at most.
+_MOST_PLACES = 24
+
+
+def placed(
+    store: Store, searched: Searched, tried: Validated, rows: Mapping[int, FrameRow],
+    asked: Sequence[QueryFrame], prior: Prior | None, p: ValidationParameters,
+    options: ValidationOptions | None,
+) -> PoseEstimate | None:  # fmt: skip
+    """Where the query was taken, by its matches and the frames of the map about the poses.
+
+    Parameters
+    ----------
+    store, searched : see there
+    tried : of `validated`
+    rows : of the candidates, by number; those without a pose suggest none
+    asked : the query's frames with their matches
+    prior : what the robot believed before; its parent as `parent_key` writes it
+    p : of the model
+    options : what the query asks of a match: where it asks for anything, the map's frames tell
+        poses apart, but confirm none by themselves; in mode `paper` they are not asked
+
+    Returns
+    -------
+    estimate : None where no match has a pose, and there is no prior
+    """
+    poses = {number: np.array(row.pose) for number, row in rows.items() if row.pose is not None}
+    parents = {number: parent_key(rows[number]) for number in poses}
+    frames = [replace(one, matches=[m for m in one.matches if m.index in poses]) for one in asked]
+    own_p = LocalizationParameters()
+    if options is not None:
+        own_p = replace(own_p, map_score=math.inf)
+    own = {int(number) for frame in searched.parts for number in frame.dead}
+    filtered = [part.among.tolist() for part in searched.parts if part.among is not None]
+    passing = {number for keys in filtered for number in keys} if filtered else None
+    model_id = searched.parts[0].place.row.model_id
+
+    def views_of(parent: str, at: Floats) -> MapViews:
+        known = [number for number in tried.geometries if parents.get(number) == parent]
+        near = {
+            number: found
+            for number, found in _near_frames(store, parent, model_id, at).items()
+            if number not in own and (passing is None or number in passing)
+        }
+        numbers = [*known, *(number for number in near if number not in known)]
+        at_poses = [poses[n] if n in known else np.array(near[n].pose) for n in numbers]
+
+        def open_view(i: int) -> Geometry | None:
+            number = numbers[i]
+            if number in known:
+                return tried.geometries[number]
+            try:
+                return read_geometry(store.blobs.get(near[number].geometry))
+            except (DamagedBlob, UnreadableGeometry):
+                return None  # one frame of many: the others tell the poses apart
+
+        stack = np.array(at_poses).reshape(-1, 4, 4)
+        return MapViews(stack, open_view, own_p.map, p.agreement, range(len(known)))
+
+    paper = options is not None and options.mode == "paper"
+    return localize(frames, poses, parents, None if paper else views_of, prior, own_p, p.agreement)
+
+
+def prior_of(query: Query, places: Sequence[SearchedMap]) -> Prior | None:
+    """What the robot believed before; InvalidRequest or InvalidPose where it cannot be used."""
+    given = query.prior
+    if given is None:
+        return None
+    if "validate" not in query.stages:
+        raise InvalidRequest(
+            "A prior needs validated matches. Leave `stages` out, or include `validate`.",
+            (("prior", "without validate"),),
+        )
+    if len(places) > 1:
+        raise InvalidRequest(
+            "A prior is a pose in one map. Ask that map alone, or leave `prior` out.",
+            (("prior", "of several maps"),),
+        )
+    deviations = [given.deviation_m] * 3 + [math.radians(given.deviation_deg)] * 3
+    covariance = np.diag(np.square(deviations))
+    if given.covariance is not None:
+        covariance = np.array(given.covariance).reshape(6, 6)
+        whole = np.isfinite(covariance).all() and np.allclose(covariance, covariance.T)
+        if not whole or np.linalg.eigvalsh(covariance)[0] <= 0:
+            raise InvalidRequest(
+                "The covariance of the prior is not one: it must be symmetric with eigenvalues "
+                "above 0. Send the 36 numbers row by row, or `deviation_m` and `deviation_deg`.",
+                (("prior.covariance", "not positive definite"),),
+            )
+    parent = f"{places[0].row.number} {given.pose.parent_frame}"
+    return Prior(parent, pose_matrix(given.pose, "The prior: "), covariance)
+
+
+def nearest_first(store: Store, ranking: Ranking, chosen: Sequence[int], prior: Prior) -> list[int]:
+    """Candidates, positions in R, those that were taken near a prior first, else as they were."""
+    with store.queried.read() as connection:
+        rows = frames_of(connection, ranking.indices[list(chosen)].tolist())
+    deviation = math.sqrt(float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]))
+    reach = _NEAR_M[-1] + 3 * deviation
+
+    def far(position: int) -> bool:
+        row = rows.get(int(ranking.indices[position]))
+        if row is None or row.pose is None or parent_key(row) != prior.parent:
+            return True
+        return bool(np.linalg.norm(np.array(row.pose)[:3, 3] - prior.T[:3, 3]) > reach)
+
+    return sorted(chosen, key=far)
+
+
+def parent_key(row: FrameRow) -> str:
+    """A parent frame by its map: another map may call its own the same."""
+    return f"{row.map_number} {row.pose_parent}"
+
+
+def _near_frames(store: Store, parent: str, model_id: str, at: Floats) -> dict[int, PlacedFrame]:
+    """Frames of a parent frame taken about poses (n, 4, 4), by number."""
+    number, _, name = parent.partition(" ")
+    cells = np.unique(np.round(at[:, :3, 3] / _CELL_M), axis=0, return_index=True)[1]
+    found: dict[int, PlacedFrame] = {}
+    with store.queried.read() as connection:
+        for centre in at[np.sort(cells)[:_MOST_PLACES], :3, 3].tolist():
+            for within in _NEAR_M:
+                near = placed_frames(
+                    connection, int(number), name, model_id, centre, within, _NEAR_FRAMES
+                )
+                if len(near) == _NEAR_FRAMES:
+                    break
+            found |= {one.number: one for one in near}
+    return found

@@ -24,7 +24,6 @@ from sceneprint.geometry.retrieval.distance import (
 )
 from sceneprint.geometry.retrieval.dpp import diversify
 from sceneprint.geometry.validation.acceptance import Mode
-from sceneprint.geometry.validation.association import voters
 from sceneprint.geometry.validation.sequence_alignment import Matching
 from sceneprint.geometry.validation.validation import ValidationParameters, refined_at
 from sceneprint.lab.evaluation.protocol import (
@@ -123,6 +122,31 @@ def open_judge(
     """Make ready to validate frames of a store."""
     # neighbouring queries have many candidates in common
     return Judge(lru_cache(128)(store.geometry), mode, seed, p, matching)
+
+
+def voters(parents: Sequence[str], strong: Sequence[bool], most: int = 5) -> list[int]:
+    """Positions of the matches whose poses may be averaged: those of one parent frame.
+
+    The parent frame with most strong matches votes, and of equals the one with most matches; of
+    these, the one whose match comes first.
+
+    Parameters
+    ----------
+    parents : parent frames of accepted matches, in the order of `preferred`
+    strong : which of them are strong
+    most : votes that are taken, the first ones
+
+    Raises
+    ------
+    ValueError : not one for one.
+    """
+    votes: dict[str, tuple[int, int]] = {}
+    for parent, sure in zip(parents, strong, strict=True):
+        known = votes.get(parent, (0, 0))
+        votes[parent] = (known[0] + sure, known[1] + 1)
+    # the first of equals: dicts keep the order in which parents came
+    winner = max(votes, key=votes.__getitem__, default=None)
+    return [i for i, parent in enumerate(parents) if parent == winner][:most]
 
 
 def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
