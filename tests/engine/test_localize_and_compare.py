@@ -67,9 +67,10 @@ def test_what_is_not_found_says_why(full: Engine, empty: Engine, uploads: Any, i
     )
     assert tight.reason.startswith("none of 10 candidates is accepted (the nearest: the two ")
     none = ask(filter={"robot": "nobody"})
-    assert none.reason == "the map has no frame to compare: no frame passes the filter"
+    assert none.reason == "no frame of the map passes the filter. Widen the filter"
+    assert (none.cause, tight.cause) == ("no_frames", "nothing_alike")
     late = ask(deadline_ms=1)
-    assert (late.status, late.deadline_reached) == ("not_found", True)
+    assert (late.status, late.deadline_reached, late.cause) == ("not_found", True, "deadline")
     assert late.reason.startswith("the deadline passed before a match was accepted: 0 of 10")
     unsure = ask(validation={"ambiguous": 0.0})
     assert (unsure.status, unsure.pose) == ("ambiguous", None)

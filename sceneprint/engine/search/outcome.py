@@ -59,9 +59,10 @@ def outcome_of(
             f"{len(accepted)} matches are accepted, but none has a pose in the map; `best` has the "
             "transform to the first",
         )
-    if estimate is not None and estimate.status != "not_found":
-        return Outcome(estimate.status, estimate.reason)
     unsure = next((one for one in matches if one.validation.status == "ambiguous"), None)
+    decided = estimate is not None and estimate.status == "found"
+    if estimate is not None and (decided or accepted or (estimate.alternatives and not unsure)):
+        return Outcome(estimate.status, estimate.reason)
     if unsure is not None:
         return Outcome("ambiguous", f"the best fit is not unique: {unsure.validation.reason}")
     if tried.late:
