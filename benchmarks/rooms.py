@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +20,8 @@ from sqlalchemy import insert, select
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.formats.points.ply_export import write_ply
-from sceneprint.lab.synth import synthesise_room, synthesise_survey
+from sceneprint.lab.synth import KINECT, symmetric_box, synthesise_room, synthesise_survey, take
+from sceneprint.lab.synth.trajectories import pose
 from sceneprint.settings import Settings
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames as frame_table
@@ -95,6 +97,27 @@ def box(ahead: float) -> Shot:
     Image.fromarray((depth * 1000).round().astype(np.uint16)).save(file, "PNG")
     lens = {"width": 320, "height": 240, "fx": 292.5, "fy": 292.5, "cx": 159.5, "cy": 119.5}
     return Shot(file.getvalue(), {"intrinsics": lens})
+
+
+def circled(azimuths: Sequence[float]) -> list[Shot]:
+    """A cube in an empty hall from all around, 1.8 m away: its four sides look the same.
+
+    `azimuths`: of the camera as seen from the cube, degrees.
+    """
+    room, rng, found = symmetric_box(), np.random.default_rng(SEED), []
+    for view, azimuth in enumerate(azimuths):
+        a = math.radians(azimuth)
+        eye = (1.8 * math.cos(a), 1.8 * math.sin(a), 1.2)
+        T = pose(np.array([*eye, a + math.pi, math.atan2(-0.9, 1.8), 0.0]))
+        file = io.BytesIO()
+        np.save(file, take(room, T, KINECT, rng))
+        lens = {n: getattr(KINECT, n) for n in ("width", "height", "fx", "fy", "cx", "cy")}
+        meta = {
+            "intrinsics": lens, "session": "round", "captured_at": f"2026-11-20T11:00:{view:02d}Z",
+            "pose": {"parent_frame": "hall", "matrix": T.tolist()},
+        }  # fmt: skip
+        found.append(Shot(file.getvalue(), meta, "frame.npy"))
+    return found
 
 
 def send(client: httpx.Client, name: str, of: list[Shot]) -> list[str]:

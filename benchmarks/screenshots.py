@@ -20,13 +20,13 @@ import httpx
 from tqdm import tqdm
 
 from benchmarks.chromium import PATIENCE_S, chromium, installed, settled, watched
-from benchmarks.rooms import Shot, box, scans, send, shots, wait
+from benchmarks.rooms import Shot, box, circled, scans, send, shots, wait
 from sceneprint.cli.demo import serving
 
 if TYPE_CHECKING:
     from playwright.sync_api import FilePayload
 
-MAP, HALL, BOXES = "building", "hall-3", "boxes"
+MAP, HALL, BOXES, SIDES = "building", "hall-3", "boxes", "four-sides"
 THEMES = ("light", "dark")
 #: Which rooms, views of each, and every how many-th of its path one is.
 ROOMS, VIEWS, STEP = (3, 0), 12, 4
@@ -34,6 +34,8 @@ ROOMS, VIEWS, STEP = (3, 0), 12, 4
 WIDTH, LOW, HIGH = 1280, 800, 2400
 #: Width and height of a tablet held upright.
 TABLET = (768, 1024)
+#: Of a phone.
+PHONE = (390, 844)
 #: Seconds that a page may go on drawing after it is there.
 LINGER_S = 2.0
 #: Bytes a second at which uploads are sent, to be seen at it.
@@ -99,12 +101,14 @@ def fill(client: httpx.Client, data: Path, made: list[Shot]) -> None:
     """Upload all frames while nobody signs them, and damage one of them on the disk."""
     for name, title, model in (
         (MAP, "Two rooms, two robots", "depth"), (HALL, "Hall 3", "lidar"),
-        (BOXES, "Rooms without furniture", "depth"), ("empty", None, "depth"),
+        (BOXES, "Rooms without furniture", "depth"), (SIDES, "A cube in a hall", "depth"),
+        ("empty", None, "depth"),
     ):  # fmt: skip
         new = {"name": name, "title": title, "model": model}
         client.post("/v1/maps", json=new).raise_for_status()
     send(client, MAP, made)
     send(client, BOXES, [box(0.0)])
+    send(client, SIDES, circled(range(30, 390, 30)))
     walk = scans(4)
     send(client, HALL, walk[:-1])
     known = set((data / "blobs").rglob("*"))
@@ -118,6 +122,7 @@ def views(client: httpx.Client, made: list[Shot]) -> list[View]:
     """Have all frames signed, ask, associate, make keys and a snapshot; the pages of all that."""
     wait(client, f"/v1/maps/{MAP}", {"indexed"})
     wait(client, f"/v1/maps/{BOXES}", {"indexed"})
+    wait(client, f"/v1/maps/{SIDES}", {"indexed"})
     wait(client, f"/v1/maps/{HALL}", {"indexed", "failed"})
     whole = {"grants": {"*": "admin"}}
     client.post("/v1/keys", json={"name": "operator", **whole}).raise_for_status()
@@ -134,9 +139,13 @@ def views(client: httpx.Client, made: list[Shot]) -> list[View]:
     for one in (made[5], made[8], made[-2]):
         _ask(client, MAP, one)
     boxed = _ask(client, BOXES, box(0.3))
+    sides = str(_ask(client, SIDES, circled([40])[0])["query_id"])
+    absent = str(_ask(client, SIDES, made[0])["query_id"])
     (dead,) = client.get("/v1/jobs", params={"state": "dead"}).json()["items"]
     hall = str(_listed(client, HALL, "indexed")[0]["frame_id"])
-    return list(_views(answer, boxed, ids[3], hall, dead["job_id"], key, made))
+    return [
+        *_views(answer, boxed, ids[3], hall, dead["job_id"], key, made), *_unsure(sides, absent)
+    ]
 
 
 def _listed(client: httpx.Client, name: str, state: str | None = None) -> list[dict[str, Any]]:
@@ -213,6 +222,16 @@ def _views(
     lens = json.dumps({**made[0].meta["intrinsics"], "depth_scale": 1000}).encode()
     files = (("torn.ply", b"ply\nformat ascii 1.0\n"), *sent, ("intrinsics.json", lens))
     yield View("uploading", "#/maps/empty/upload", files=files, press=("Upload 7 files",))
+
+
+def _unsure(sides: str, absent: str) -> Iterator[View]:
+    """Answers that are not found: one of several poses, and one of none."""
+    several = View("answer-ambiguous", f"#/queries/{sides}")
+    plan = View("map-view-ambiguous", f"#/maps/{SIDES}/paths?query={sides}", tall=True)
+    none = View("answer-not-found", f"#/queries/{absent}")
+    for one in (several, plan, none):
+        yield one
+        yield replace(one, name=f"{one.name}-phone", size=PHONE)
 
 
 def picture(browser: Any, url: str, view: View, theme: str, path: Path) -> Path:

@@ -1,6 +1,6 @@
 // Beside the view: the verdict, what it was reached from, and how far it can be trusted.
-import { count, degrees, metres, percent, shortId } from "../lib/format.js";
-import { h } from "../lib/dom.js";
+import { coded, h } from "../lib/dom.js";
+import { count, degrees, metres, percent, sentence, shortId } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { statusOf } from "../query/words.js";
 import { apart, axisName, deviations, freedom, isOptical, shiftOf, turnOf } from "./words.js";
@@ -23,11 +23,9 @@ export function verdictCard(details) {
   const note = details.transform ? MEANT[validation.status] : "No transform was found.";
   return card("Verdict",
     h("p", {}, h("span", { class: "badge overlay-verdict", dataset: { kind } }, text)),
-    h("p", { class: "overlay-reason" }, sentence(validation.reason)),
+    h("p", { class: "overlay-reason" }, coded(sentence(validation.reason))),
     note && h("p", { class: "muted" }, note));
 }
-
-export const sentence = (text) => `${text.charAt(0).toUpperCase()}${text.slice(1)}.`;
 
 /** What the verdict was reached from. @param {Object<string, any>} details */
 export function evidenceCard(details) {

@@ -1,14 +1,14 @@
 // A query and one of its matches laid on each other, with all that speaks for and against it.
 import { at, save } from "../lib/api.js";
-import { h, put } from "../lib/dom.js";
-import { shortId } from "../lib/format.js";
+import { coded, h, put } from "../lib/dom.js";
+import { sentence, shortId } from "../lib/format.js";
 import { picture } from "../lib/picture.js";
 import { link } from "../lib/router.js";
 import { toast } from "../lib/states.js";
 import { residualCounts } from "../viewer/points.js";
 import { createViewer } from "../viewer/viewer.js";
 import { legend } from "./legend.js";
-import { evidenceCard, framesCard, rivalCard, sentence, transformCard, uncertaintyCard, verdictCard } from "./numbers.js";
+import { evidenceCard, framesCard, rivalCard, transformCard, uncertaintyCard, verdictCard } from "./numbers.js";
 import { TRANSFORM } from "./overlay.js";
 import { Scene, tally } from "./scene.js";
 import { isOptical } from "./words.js";
@@ -141,7 +141,7 @@ export function show(root, { params, search, signal, go, actions }, { answer, de
     if (focused?.startsWith("overlay-")) document.getElementById(focused)?.focus();
     const points = shown.colour === "residual" && sets[shown.pose] ? sets[shown.pose] : aligned;
     put(legends, !details.transform && h("p", { class: "overlay-none" }, h("strong", {}, "No transform. "),
-      `${sentence(details.validation.reason)} Both are shown in their own sensor frames, with a common origin.`),
+      coded(sentence(details.validation.reason)), " Both are shown in their own sensor frames, with a common origin."),
     legend(shown, details, points, tallies[shown.pose]),
     h("p", { class: "muted overlay-keys" }, "Drag to turn, with Shift to move, wheel or pinch to zoom. In the view: arrows, + and −, 0 shows all; B toggles before and after",
       details.rival && ", R rival", ", C colours, P patches, V violations, S sensors."), said);

@@ -16,7 +16,7 @@ import { createScene } from "./scene.js";
 import { placeOf } from "./shapes.js";
 import { edgesTable, runsTable } from "./tables.js";
 
-export const styles = ["paths/paths.css"];
+export const styles = ["paths/paths.css", "query/alternatives.css"];
 
 export async function render(root, { params: { map }, search, signal, go }) {
   const query = search.get("query");
@@ -204,7 +204,7 @@ class Page {
       return;
     }
     if (!this.asked) return;
-    const { asked } = this, join = asked.pose && this.#reached.get(asked.parent)?.matrix;
+    const { asked } = this, join = this.#reached.get(asked.parent)?.matrix;
     const drawn = Boolean(join);
     put(this.asks, askedPanel(asked, {
       drawn, onshow: () => { this.parent = asked.parent; this.#draw(); },
@@ -212,9 +212,14 @@ class Page {
     }));
     const camera = this.#drawn.find((one) => one.camera)?.camera ?? null;
     this.scene.ask(drawn ? {
-      pose: multiply(join, asked.pose), axes: asked.axes, turn: join, camera: asked.kind === "cloud" ? null : camera,
+      pose: asked.pose && multiply(join, asked.pose), axes: asked.axes,
+      alternatives: asked.alternatives.map((one) => multiply(join, ofRows(one.pose.matrix))),
+      turn: join, camera: asked.kind === "cloud" ? null : camera,
       matches: asked.matches.filter((one) => this.#reached.has(one.parent))
-        .map((one) => ({ pose: multiply(this.#reached.get(one.parent).matrix, one.pose), camera: this.#cameraOf(one) })),
+        .map((one) => {
+          const { matrix } = this.#reached.get(one.parent);
+          return { pose: multiply(matrix, one.pose), voted: multiply(matrix, one.voted), camera: this.#cameraOf(one) };
+        }),
     } : null);
   }
 

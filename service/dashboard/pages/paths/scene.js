@@ -2,12 +2,13 @@
 
 import { h, put } from "../lib/dom.js";
 import { metres } from "../lib/format.js";
+import { letterOf } from "../query/alternatives.js";
 import { Orbit, VIEW } from "../viewer/camera.js";
 import { links } from "../viewer/shapes.js";
 import { createViewer, frustum } from "../viewer/viewer.js";
 import { nearest, projector } from "./pick.js";
 import {
-  AXES, boxAbout, copies, dashes, ellipsoid, grid, nice, placeOf, polyline, spaced, upright,
+  AXES, boxAbout, copies, dashes, ellipsoid, grid, hollow, nice, placeOf, polyline, spaced, upright,
 } from "./shapes.js";
 
 const FRUSTUMS = 160, CLOSEST = 16; // at first, and how many times as many when one is near
@@ -18,6 +19,8 @@ export const EDGES = [
   { kind: "unchecked", tint: "muted", dash: [0.35, 0.35] },
   { kind: "inconsistent", tint: "violation", dash: [1, 0.7] },
 ];
+/** Layers of a query. */
+const ASKED = ["query", "ellipsoid", "alternatives", "matches", "matched"];
 const STEEP = Math.PI / 2;
 
 /** Colour of a run: a token of paths.css. @param {number} number */
@@ -106,7 +109,7 @@ class Scene {
     this.#drawn = paths;
     this.#hidden = new Set();
     this.#selected = this.#asked = null;
-    for (const id of ["selected", "query", "ellipsoid", "matches", "matched"]) this.#viewer.remove(id);
+    for (const id of ["selected", ...ASKED]) this.#viewer.remove(id);
     this.#box = boxAbout(all.map((p) => this.#near(p)));
     const size = this.#box ? Math.hypot(...this.#box.high.map((x, k) => x - this.#box.low[k])) : 1;
     this.#size = Math.max(size, 0.5) * 0.035;
@@ -143,22 +146,27 @@ class Scene {
 
   /**
    * The query among the paths; null: none.
-   * @param {{pose: number[], axes: any, turn: number[], camera: any, matches: {pose: number[], camera: any}[]} | null} asked
-   *   camera: null of a cloud's sensor; all in the picture's frame, but the axes, which `turn` brings there
+   * @param {{pose: number[] | null, alternatives: number[][], axes: any, turn: number[], camera: any,
+   *   matches: {pose: number[], voted: number[], camera: any}[]} | null} asked pose: null unless found;
+   *   voted: the pose of the query that a match speaks for; camera: null of a cloud's sensor; all in
+   *   the picture's frame, but the axes, which `turn` brings there
    */
   ask(asked) {
     this.#asked = asked;
-    for (const id of ["query", "ellipsoid", "matches", "matched"]) this.#viewer.remove(id);
-    if (asked === null) { this.#moved(); return; }
-    const eye = this.#near(placeOf(asked.pose)), size = 2.4 * this.#size;
-    this.#viewer.lines("query", { positions: copies(sensor(asked.camera, size), [this.#moveOrigin(asked.pose)]), tint: "query", width: 3.5 });
-    if (asked.axes) {
-      const turn = [...asked.turn.slice(0, 12), ...eye, 1];
+    for (const id of ASKED) this.#viewer.remove(id);
+    if (asked === null) { this.#label(); return; }
+    const size = 2.4 * this.#size, shape = sensor(asked.camera, size);
+    if (asked.pose) this.#viewer.lines("query", { positions: copies(shape, [this.#moveOrigin(asked.pose)]), tint: "query", width: 3.5 });
+    // of one rank: none is drawn as the answer
+    const broken = hollow(shape, size / 8);
+    if (asked.alternatives.length) this.#viewer.lines("alternatives", { positions: copies(broken, asked.alternatives.map((m) => this.#moveOrigin(m))), tint: "query", width: 2.5 });
+    if (asked.pose && asked.axes) {
+      const turn = [...asked.turn.slice(0, 12), ...this.#near(placeOf(asked.pose)), 1];
       this.#viewer.lines("ellipsoid", { positions: copies(ellipsoid(asked.axes), [turn]), tint: "query", width: 1.5 });
     }
     const there = asked.matches.map(({ pose }) => this.#moveOrigin(pose));
     const seen = asked.matches.map(({ camera }, i) => copies(sensor(camera, 1.3 * this.#size), [there[i]]));
-    this.#viewer.lines("matches", { positions: links(there.map(() => eye), there.map(placeOf)), tint: "query", width: 1.5 });
+    this.#viewer.lines("matches", { positions: links(asked.matches.map(({ voted }) => this.#near(placeOf(voted))), there.map(placeOf)), tint: "query", width: 1.5 });
     this.#viewer.lines("matched", { positions: Float32Array.from(seen.flatMap((one) => [...one])), tint: "match", width: 2.5 });
     this.#label();
   }
@@ -179,7 +187,7 @@ class Scene {
     if (from === "top") this.#viewer.look({ azimuth: 0, elevation: STEEP });
     if (from === "side") this.#viewer.look({ azimuth: 0.6, elevation: 0.55 });
     const seen = this.#drawn.flatMap((_, i) => (this.#hidden.has(i) ? [] : [`path ${i}`, `frustums ${i}`]));
-    this.#viewer.fit([...seen, "query", "matched"].filter((id) => this.#viewer.has(id)));
+    this.#viewer.fit([...seen, "query", "alternatives", "matched"].filter((id) => this.#viewer.has(id)));
     this.#wide = this.#viewer.camera.distance;
     this.#moved();
   }
@@ -246,7 +254,10 @@ class Scene {
     this.#drawn.forEach((one, i) => {
       if (one.world.length) made.push({ path: i, at: this.#near(placeOf(one.world[0])), node: h("span", { class: "paths-label", style: { borderColor: `var(${tokenOf(one.number)})` } }, String(i + 1)) });
     });
-    if (this.#asked) made.push({ at: this.#near(placeOf(this.#asked.pose)), node: h("span", { class: "paths-label", dataset: { kind: "query" } }, "Query") });
+    this.#asked?.alternatives.forEach((pose, i) => {
+      made.push({ at: this.#near(placeOf(pose)), node: h("span", { class: "paths-label", dataset: { kind: "alternative" } }, letterOf(i)) });
+    });
+    if (this.#asked?.pose) made.push({ at: this.#near(placeOf(this.#asked.pose)), node: h("span", { class: "paths-label", dataset: { kind: "query" } }, "Query") });
     if (this.#selected) {
       const { path, place } = this.#selected;
       made.push({ at: this.#near(placeOf(this.#drawn[path].world[place])), node: h("span", { class: "paths-label", dataset: { kind: "selected" } }, "Chosen") });

@@ -49,6 +49,20 @@ export function dashes(pairs, dash, gap, most = 40) {
   return new Float32Array(out);
 }
 
+/**
+ * A shape whose every line is broken: it marks what may be, beside what is.
+ * @param {Float32Array} shape segments @param {number} dash metres
+ */
+export function hollow(shape, dash) {
+  const out = [];
+  for (let k = 0; k < shape.length; k += 6) {
+    const [a, b] = [[...shape.slice(k, k + 3)], [...shape.slice(k + 3, k + 6)]];
+    const on = Math.min(dash, Math.hypot(b[0] - a[0], b[1] - a[1], b[2] - a[2]) / 2); // a ring's are short
+    if (on > 0) out.push(...dashes([[a, b]], on, on));
+  }
+  return new Float32Array(out);
+}
+
 /** Every so-manieth, with the first and the last. @param {number} count @param {number} most */
 export function evenly(count, most) {
   if (count <= most) return Array.from({ length: count }, (_, i) => i);

@@ -10,7 +10,7 @@ import { recall } from "./recent.js";
 import { again, showAnswer } from "./result.js";
 import { thumbs } from "./thumbs.js";
 
-export const styles = ["query/query.css"];
+export const styles = ["query/query.css", "query/alternatives.css"];
 
 /** @param {HTMLElement} root @param {Object<string, any>} context see main.js */
 export async function render(root, { params, signal, title, actions }) {

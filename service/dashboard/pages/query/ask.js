@@ -14,7 +14,7 @@ import { chooser } from "./source.js";
 import { thumbs } from "./thumbs.js";
 import { verdict } from "./words.js";
 
-export const styles = ["query/query.css", "frames/source.css"];
+export const styles = ["query/query.css", "query/alternatives.css", "frames/source.css"];
 
 /** Milliseconds after the last change until it is asked: a slider that is dragged asks once. */
 const PAUSE_MS = 250;

@@ -1,15 +1,16 @@
 // An answer as it is shown: the verdict, the rows, the funnel, the heat map, "why not?".
 import { at, get } from "../lib/api.js";
-import { h, put } from "../lib/dom.js";
+import { coded, h, put } from "../lib/dom.js";
 import { degrees, metres, percent, shortId } from "../lib/format.js";
 import { heatmap } from "../lib/heatmap.js";
 import { link } from "../lib/router.js";
 import { failed, loading } from "../lib/states.js";
+import { alternativesList } from "./alternatives.js";
 import { choice } from "./choice.js";
 import { funnel } from "./funnel.js";
 import { rows } from "./rows.js";
 import { whyNot } from "./whynot.js";
-import { deviation, differences, keyOf, number, verdict } from "./words.js";
+import { deviation, differences, keyOf, mapOf, number, verdict } from "./words.js";
 
 /** Frames of the ranking that are compared with each other at first, and at most. */
 const FIRST = 50;
@@ -52,18 +53,20 @@ export function again(answer, text = "Query again") {
 
 function lead(answer, before, isOwnPage) {
   const changed = before && differences(before, answer);
-  const { kind, title, text, details } = verdict(answer);
-  const pose = answer.location;
+  const { kind, title, cause, text, next, details } = verdict(answer);
+  const pose = answer.location, several = answer.alternatives;
   return h("section", { class: "card query-verdict", dataset: { kind, status: answer.status }, "aria-label": "Verdict" },
     h("span", { class: "query-verdict-shape", "aria-hidden": "true" }, SHAPES[answer.status]),
     h("div", { class: "query-verdict-text" },
-      h("p", {}, h("strong", {}, `${title}. `), text),
-      details.length > 0 && h("ul", { class: "query-verdict-details" }, details.map((one) => h("li", {}, one))),
+      h("p", {}, h("strong", {}, `${title}. `), cause && h("span", { class: "badge", dataset: { kind } }, cause), cause && " ", coded(text)),
+      next && h("p", { class: "query-next" }, coded(next)),
+      details.length > 0 && h("ul", { class: "query-verdict-details" }, details.map((one) => h("li", {}, coded(one)))),
+      several.length > 0 && alternativesList(several),
       changed !== null && h("p", { class: "query-changed" }, h("span", { class: "muted" }, "Compared with the previous answer: "),
         changed.length ? changed.join("; ") : "nothing changed"),
       pose && poseOf(pose, answer.kind)),
     h("div", { class: "query-verdict-links" },
-      pose && h("a", { class: "button", href: link("maps", pose.map ?? answer.maps[0], "paths", { query: answer.query_id }) }, "On the map"),
+      (pose || several.length > 0) && h("a", { class: "button", href: link("maps", mapOf(answer), "paths", { query: answer.query_id }) }, "On the map"),
       !isOwnPage && h("a", { class: "button", href: link("queries", answer.query_id), title: "Can be shared for one hour" }, `Answer ${shortId(answer.query_id)}`)));
 }
 

@@ -1,5 +1,5 @@
 // The rows R, DR and VDR one under the other, the query at their left, as in the paper's figure.
-import { h, put } from "../lib/dom.js";
+import { coded, h, put } from "../lib/dom.js";
 import { count, percent, shortId } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { figures, keyOf, number, statusOf } from "./words.js";
@@ -113,7 +113,7 @@ function evidence(answer, one, was) {
   return [
     h("span", { class: "badge", dataset: { kind } }, text),
     was && was.get(keyOf(one)) !== text && h("span", { class: "query-was" }, was.has(keyOf(one)) ? `was ${was.get(keyOf(one))}` : "was not a candidate"),
-    h("span", { class: "query-reason" }, one.validation.reason),
+    h("span", { class: "query-reason" }, coded(one.validation.reason)),
     measured.length > 0 && h("dl", { class: "query-figures" }, measured.map(([term, value]) => [h("dt", {}, term), h("dd", { class: "number" }, value)])),
     one.transform && h("a", { class: "query-overlay", href: link("queries", answer.query_id, "matches", one.frame_id, { map: one.map }) }, "Overlay in 3-D"),
   ];

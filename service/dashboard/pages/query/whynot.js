@@ -1,6 +1,6 @@
 // "Why not this frame?": asks again with `explain_frame`, and says where the frame was lost.
 import { h, put } from "../lib/dom.js";
-import { count, percent, shortId } from "../lib/format.js";
+import { count, percent, sentence, shortId } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { failed, loading } from "../lib/states.js";
 import { figures } from "./words.js";
@@ -101,8 +101,4 @@ function explained(told, answer, change) {
     change && offer && h("button", { type: "button", class: "button", onclick: () => change(said) }, offer),
     h("dl", { class: "query-facts" }, facts.map(([term, value]) => h("div", {}, h("dt", {}, term), h("dd", { class: "number" }, value)))),
   ];
-}
-
-function sentence(text) {
-  return `${text.charAt(0).toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
 }

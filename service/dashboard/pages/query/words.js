@@ -1,5 +1,5 @@
 // What an answer says, in one line a lost person understands, and in figures.
-import { count, degrees, metres, percent, shortId } from "../lib/format.js";
+import { count, degrees, metres, percent, sentence, shortId } from "../lib/format.js";
 
 const STATUS = {
   accepted: { kind: "good", text: "accepted" },
@@ -21,54 +21,112 @@ export function keyOf(one) {
   return `${one.map}/${one.frame_id}`;
 }
 
+/** The likeliest causes of `not_found`. */
+const CAUSES = {
+  no_frames: "nothing to compare",
+  too_little_in_view: "too little in view",
+  one_plane: "too few planes in view",
+  gravity: "tilted against gravity",
+  other_sensor: "another kind of sensor",
+  scale: "scale does not fit",
+  nothing_alike: "nothing like it in the map",
+};
+
+/**
+ * Which of the maps of an answer its poses lie in.
+ * @param {Object<string, any>} answer
+ * @returns {string}
+ */
+export function mapOf({ location, alternatives, matches, maps }) {
+  const parent = alternatives[0]?.pose.parent_frame;
+  return location?.map ?? (maps.length === 1 ? maps[0] : matches.find((one) => one.pose_in_map?.parent_frame === parent)?.map ?? maps[0]);
+}
+
 /**
  * The verdict of an answer.
  * @param {Object<string, any>} answer
- * @returns {{kind: string, shape: string, title: string, text: string, details: any[]}}
+ * @returns {{kind: string, title: string, cause: string | null, text: string, next: string | null, details: string[]}}
+ *   cause: of not found, in a few words; next: what to do
  */
 export function verdict(answer) {
-  const { counts, matches, location } = answer;
-  const where = answer.maps.length > 1 ? `${answer.maps.length} maps` : `map ${answer.maps[0]}`;
-  if (answer.status === "found") {
-    const best = matches[0];
-    const sure = best.validation.strength === "weak" ? "weak" : "strong";
-    const kind = sure === "weak" ? "warn" : "good";
-    if (location === null) {
-      return { kind, shape: "✓", title: "Found",
-        text: `The query shows the same place as frame ${shortId(best.frame_id)} in map ${best.map}. Its position is unknown, as no match has a pose.`,
-        details: [`${sure} match`, `${counts.accepted} of ${counts.validated} validated frames accepted`] };
-    }
-    const p = location.pose.translation;
-    const spread = deviation(location.uncertainty?.covariance);
-    return { kind, shape: "✓", title: "Found",
-      text: `In map ${location.map ?? best.map}, at x ${number(p.x)}, y ${number(p.y)}, z ${number(p.z)} m in ${location.pose.parent_frame}.`,
-      details: [`${location.support} of ${location.votes} matches agree`, `best match ${sure}`,
-        spread && `± ${metres(spread.m)}, ± ${degrees(spread.deg)} (one standard deviation, worst axis)`,
-        location.votes > 1 && `they lie ${metres(location.spread_m)}, ${degrees(location.spread_deg)} apart`].filter(Boolean) };
-  }
+  const { why, next } = parts(answer.reason);
+  const told = { cause: null, next, details: [] };
+  if (answer.status === "found") return { ...told, ...found(answer), title: "Found", next: null };
   if (answer.status === "ambiguous") {
-    const fits = matches.filter((one) => one.validation.status === "ambiguous");
-    return { kind: "warn", shape: "≈", title: "Ambiguous, so not found",
-      text: `${fits.length === 1 ? `Frame ${shortId(fits[0].frame_id)} fits` : `${fits.length} frames fit`} the query, but in more than one way: the shared view does not determine the place.`,
-      details: [fits[0]?.validation.reason].filter(Boolean) };
+    const { length } = answer.alternatives;
+    const these = length === 0 ? "" : length === 1 ? "Do not act on this pose. " : "Do not act on any of these poses. ";
+    return { ...told, kind: "warn", title: "Ambiguous", text: why,
+      next: `${these}Move on and query again, or query with a prior.`,
+      details: [`${count(answer.counts.accepted)} of ${count(answer.counts.validated)} validated frames accepted`] };
   }
-  if (answer.status === "unvalidated") {
-    const why = answer.deadline_reached ? "The deadline passed before a match was accepted." : "Validation was not requested.";
-    const [near] = matches.filter((one) => one.validation.status === "skipped").sort((a, b) => a.rank - b.rank);
-    const nearest = counts.validated ? "The nearest frame that was not tried" : "The nearest frame";
-    return { kind: "neutral", shape: "?", title: "Not validated",
-      text: near ? `${why} ${nearest} is ${shortId(near.frame_id)} of map ${near.map}, ${percent(near.similarity)} similar; it may or may not show the same place.` : why,
-      details: [] };
-  }
-  return { kind: "bad", shape: "✕", title: "Not found", text: notFound(answer, where), details: reasons(matches) };
+  if (answer.status === "unvalidated") return { ...told, ...unvalidated(answer), kind: "neutral", title: "Not validated" };
+  return { ...told, kind: "bad", title: "Not found", cause: CAUSES[answer.cause] ?? null, text: why, details: reasons(answer.matches) };
 }
 
-/** @param {Object<string, any>} answer @param {string} where */
-function notFound({ counts }, where) {
-  if (counts.map === 0) return `No frame of ${where} is searchable yet: none is indexed, or the query itself is the only one.`;
-  if (counts.passed === 0) return `None of the ${count(counts.map)} frames of ${where} passes the filter.`;
-  const tried = counts.validated === 1 ? "One frame was" : `${count(counts.validated)} frames were`;
-  return `${tried} aligned with the query, and ${counts.validated === 1 ? "it does not fit" : "none fits"}: the place is not in ${where}, or too little of it is in view.`;
+/** @param {Object<string, any>} answer */
+function found({ matches, counts, location, maps }) {
+  if (location === null) {
+    const [best] = matches, { strength } = best.validation;
+    return { kind: strength === "weak" ? "warn" : "good",
+      text: `The query shows the same place as frame ${shortId(best.frame_id)} in map ${best.map}. Its position is unknown, as no match has a pose.`,
+      details: [`${strength ?? "strong"} match`, `${counts.accepted} of ${counts.validated} validated frames accepted`] };
+  }
+  const p = location.pose.translation, spread = deviation(location.uncertainty?.covariance);
+  return { kind: sureness(location),
+    text: `In map ${location.map ?? maps[0]}, at x ${number(p.x)}, y ${number(p.y)}, z ${number(p.z)} m in ${location.pose.parent_frame}.`,
+    details: [...grounds(location), rivalOf(location),
+      ...(spread ? [`± ${metres(spread.m)}, ± ${degrees(spread.deg)} (one standard deviation, worst axis)`] : [])] };
+}
+
+/** @param {Object<string, any>} answer */
+function unvalidated({ matches, counts, deadline_reached: late }) {
+  const why = late ? "The deadline passed before a match was accepted." : "Validation was not requested.";
+  const [near] = matches.filter((one) => one.validation.status === "skipped").sort((a, b) => a.rank - b.rank);
+  const nearest = counts.validated ? "The nearest frame that was not tried" : "The nearest frame";
+  return {
+    text: near ? `${why} ${nearest} is ${shortId(near.frame_id)} of map ${near.map}, ${percent(near.similarity)} similar; it may or may not show the same place.` : why,
+    next: late ? "Allow more time." : null,
+  };
+}
+
+/** Kind of badge of a pose that is found: an unconfirmed one is to be looked at twice. @param {Object<string, any>} location */
+function sureness({ support, strength, verified_by: by }) {
+  return by === "map" || (by === "matches" && support > 1 && strength === "strong") ? "good" : "warn";
+}
+
+/**
+ * What a pose that is found rests on.
+ * @param {Object<string, any>} location of an answer
+ * @returns {string[]}
+ */
+export function grounds({ support, votes, strength, verified_by: by, spread_m: shift, spread_deg: turn }) {
+  const told = [];
+  if (by === "map") told.push("confirmed by the map’s frames");
+  if (by === "prior") told.push("several poses fit, and the prior decided");
+  if (support === 0) told.push("no accepted match");
+  else if (support === 1 && by === "matches") told.push("one view, unconfirmed");
+  else told.push(support === 1 ? "one view" : `${count(support)} of ${count(votes)} accepted matches vote for this pose, within ${metres(shift)}, ${degrees(turn)}`);
+  if (support > 0) told.push(`${strength} match${support === 1 ? "" : "es"}`);
+  const apart = votes - support;
+  if (apart > 0) told.push(`${count(apart)} accepted ${apart === 1 ? "match votes" : "matches vote"} for another pose`);
+  return told;
+}
+
+/** How near another place comes. @param {Object<string, any>} location of an answer */
+export function rivalOf({ rival_ratio: ratio }) {
+  if (ratio === null) return "not compared with other places";
+  return ratio < 0.05 ? "no other place fits" : `the next best place fits ${percent(ratio)} as well`;
+}
+
+/**
+ * The sentences of a reason.
+ * @param {string} reason
+ * @returns {{why: string, next: string | null}} next: what to do, where it is told
+ */
+export function parts(reason) {
+  const end = reason.search(/\. (?=[A-Z])/);
+  return end < 0 ? { why: sentence(reason), next: null }
+    : { why: sentence(reason.slice(0, end)), next: sentence(reason.slice(end + 2)) };
 }
 
 // the same reason of ten candidates is one reason
@@ -93,7 +151,7 @@ export function deviation(covariance) {
 
 /** What a validation measured: names and texts. @returns {[string, string][]} */
 export function figures(validation) {
-  const { residual, overlap, plane_overlap: planes, inliers, free_space_violations: through, ambiguity } = validation;
+  const { residual, overlap, plane_overlap: planes, inliers, free_space_violations: through, ambiguity, tilt_deg: tilt } = validation;
   if (overlap === null || overlap === undefined) return [];
   return [
     ["Residual", residual ? `${metres(residual.translation_m)}, ${degrees(residual.rotation_deg)}` : "none"],
@@ -103,6 +161,7 @@ export function figures(validation) {
     ["Violations", through === null ? "unknown" : percent(through)],
     // rivals are looked for only where nothing else speaks against it
     ["Ambiguity", ambiguity === 0 && validation.status !== "accepted" ? "–" : percent(ambiguity)],
+    ...(tilt === null || tilt === undefined ? [] : [/** @type {[string, string]} */ (["Tilt", degrees(tilt)])]),
   ];
 }
 
