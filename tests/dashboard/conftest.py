@@ -25,6 +25,7 @@ from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
 from playwright.sync_api import Browser, Page, Request, sync_playwright
 
+from benchmarks.rooms import circled, send
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.lab.synth import synthesise_room
 
@@ -194,6 +195,24 @@ def station(chromium: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
         until(signed, 4 * PATIENCE_S)  # a machine of many engineers signs slowly
         yield found
+
+
+@pytest.fixture(scope="session")
+def four_sides(station: Station) -> dict[str, Any]:
+    """The answer, which is kept, to a view of a cube whose four sides look the same.
+
+    Its map `four-sides` has twelve views from all around, of the run `round` in `hall`.
+    """
+    path = station.make_map("four-sides")
+    ids = send(station.client, "four-sides", circled(range(30, 390, 30)))
+    until(lambda: station.client.get(path).json()["frames"].get("indexed") == len(ids))
+    (one,) = circled([40])
+    form = {"files": {"frame": (one.name, one.data)}}
+    about = {"meta": json.dumps({"intrinsics": one.meta["intrinsics"]})}
+    answer = station.client.post(f"{path}/queries", data=about, **form)
+    assert answer.status_code == 200, answer.text
+    told: dict[str, Any] = answer.json()
+    return told
 
 
 def _shots(folder: Path) -> Iterator[tuple[dict[str, Any], bytes]]:

@@ -130,7 +130,7 @@ def test_a_query_is_among_them(
     expect(page.locator("#paths-parent")).to_have_value("room-0")
     expect(page.locator(".paths-run")).to_have_count(2)
     card = page.locator("section", has=page.locator("#paths-asked"))
-    expect(card).to_contain_text(f"{location['support']} of {location['votes']} matches")
+    expect(card).to_contain_text(f"{location['support']} of {location['votes']} accepted matches")
     covariance = np.array(location["uncertainty"]["covariance"]).reshape(6, 6)[:3, :3]
     axes = np.sqrt(np.linalg.eigvalsh(covariance)[::-1] * 7.8147)  # 95 % in three dimensions
     told = [
@@ -170,6 +170,48 @@ def test_a_query_is_among_them(
     drawn = page.evaluate("css => document.querySelector(css).viewer.frames", CANVAS)
     page.wait_for_timeout(300)
     assert page.evaluate("css => document.querySelector(css).viewer.frames", CANVAS) == drawn
+
+
+def test_alternatives_are_drawn_alike_and_none_as_the_answer(
+    page: Page, station: Any, four_sides: dict[str, Any], settle: Any, axe: Any, until: Any
+) -> None:
+    several = four_sides["alternatives"]
+    page.goto(f"{station.home}#/maps/four-sides/paths?query={four_sides['query_id']}")
+    settle(page)
+    card = page.locator("section", has=page.locator("#paths-asked"))
+    expect(card.locator(".badge")).to_have_text("ambiguous")
+    expect(card.locator(".alternatives li")).to_have_count(len(several))
+    expect(card).to_contain_text("Do not act on any of these poses")
+    voting = [m for m in four_sides["matches"] if m["validation"]["status"] != "rejected"]
+    expect(card).to_contain_text(f"{len(voting)} of {len(voting)} matches have a position here")
+    layers = "css => ['query', 'ellipsoid', 'alternatives'].map("
+    layers += "(id) => document.querySelector(css).viewer.has(id))"
+    assert page.evaluate(layers, CANVAS) == [False, False, True]
+    labels = page.locator(".paths-labels .paths-label[data-kind=alternative]")
+    assert labels.all_inner_texts() == list("ABCDE"[: len(several)])
+    expect(page.locator(".paths-label[data-kind=query]")).to_have_count(0)
+    page.get_by_role("button", name="From above").click()
+    first = station.client.get(
+        "/v1/maps/four-sides/trajectory", params={"session": "round"},
+        headers={"Accept": "application/json"},
+    ).json()["poses"][0][1:4]  # fmt: skip
+    where = """([css, places]) => {
+      const { viewer } = document.querySelector(css);
+      const labels = [...document.querySelectorAll('.paths-label[data-kind=alternative]')];
+      return Math.max(...places.map((p, i) => {
+        const [x, y] = viewer.project(p);
+        const [left, top] = labels[i].style.transform.match(/[-0-9.]+(?=px)/g).map(Number);
+        return Math.hypot(left - x, top - y);
+      }));
+    }"""
+    places = [
+        [one["pose"]["translation"][axis] - first[i] for i, axis in enumerate("xyz")]
+        for one in several
+    ]
+    until(lambda: page.evaluate(where, [CANVAS, places]) < 1)
+    assert axe(page) == []
+    page.get_by_role("button", name="Hide it").click()
+    expect(labels).to_have_count(0)
 
 
 def test_what_is_not_there_is_told(
@@ -228,6 +270,10 @@ def test_numbers_behind_the_picture(page: Page, station: Any, settle: Any) -> No
     dashed = run("shapes", "Array.from(m.dashes([[[0,0,0],[3,0,0]]], 1, 0.5))")
     assert dashed == [0, 0, 0, 1, 0, 0, 1.5, 0, 0, 2.5, 0, 0]
     assert run("shapes", "m.dashes([[[0,0,0],[900,0,0]]], 1, 0.5, 10).length") == 60
+    # each line broken, however short: dashes of 1, or of half a short line
+    broken = run("shapes", "Array.from(m.hollow(new Float32Array(given[0]), 1))",
+                 [0, 0, 0, 3, 0, 0, 0, 0, 0, 0, 1, 0])  # fmt: skip
+    assert broken == [0, 0, 0, 1, 0, 0, 2, 0, 0, 3, 0, 0, 0, 0, 0, 0, 0.5, 0]
     # cameras look level along x: their down is the map's -z; a camera's own axes: down is y
     level = [0, -1, 0, 0, 0, 0, -1, 0, 1, 0, 0, 0, 5, 5, 5, 1]
     itself = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]

@@ -109,7 +109,7 @@ def test_the_rows_are_the_answer(station, page, ask, axe):
     ("search", "status", "title"),
     [
         ("", "found", "Found."),
-        ("&ambiguous=0", "ambiguous", "Ambiguous, so not found."),
+        ("&ambiguous=0", "ambiguous", "Ambiguous."),
         ("&residual_m=0.00001&candidates=3", "not_found", "Not found."),
         ("&stages=retrieve", "unvalidated", "Not validated."),
         ("&session=nobody", "not_found", "Not found."),
@@ -127,9 +127,103 @@ def test_the_verdict_is_the_status(page, ask, search, status, title):
         assert f"x {round(p['x'], 2):g}, y {round(p['y'], 2):g}, z {round(p['z'], 2):g} m" in said
         assert answer["location"]["pose"]["parent_frame"] in said
     if "session" in search:
-        assert f"None of the {answer['counts']['map']} frames" in said
+        assert said == "Not found. Nothing to compare No frame of the map passes the filter."
+        assert verdict.locator(".query-next").inner_text() == "Widen the filter."
     if search == "&stages=retrieve":
         assert tiles(page, "VDR") == tiles(page, "DR") == []
+
+
+def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, settle, axe):
+    assert (four_sides["status"], four_sides["location"]) == ("ambiguous", None)
+    several = four_sides["alternatives"]
+    # the cube turned by 90, 180 and 270 degrees; the sensor is 1.8 m from its axis
+    assert len(several) >= 4
+    page.goto(f"{station.home}#/queries/{four_sides['query_id']}")
+    settle(page)
+    verdict = page.locator(".query-verdict")
+    said = verdict.inner_text()
+    reason = four_sides["reason"]
+    assert f"Ambiguous. {reason[0].upper()}{reason[1:]}." in said
+    assert "Do not act on any of these poses. Move on and query again" in said
+    assert "found" not in said.lower()
+    assert "agree" not in said.lower()
+    items = verdict.locator(".alternatives li").evaluate_all(
+        """all => all.map(one => ({
+            letter: one.querySelector(".alternatives-letter").textContent,
+            place: one.querySelector(".alternatives-place").textContent,
+            figures: [...one.querySelectorAll("dd")].map((each) => each.textContent),
+            bars: [...one.querySelectorAll(".alternatives-bar > span")].map((each) => each.style.width),
+        }))"""
+    )
+    heaviest = max(one["weight"] for one in several)
+    for i, (item, told) in enumerate(zip(items, several, strict=True)):
+        assert item["letter"] == "ABCDE"[i]
+        p = told["pose"]["translation"]
+        place = ", ".join(f"{axis} {round(p[axis], 2):g}" for axis in "xyz")
+        assert item["place"].startswith(place)
+        assert item["place"].endswith(" from A") == (i > 0)
+        support = told["support"]
+        supported = f"{support} match{'es' if support > 1 else ''}" if support else "the map alone"
+        figures = [f"{round(told['weight'], 2):g}", supported, f"{round(told['score'], 2):g}"]
+        assert item["figures"] == figures
+        widths = [float(one.removesuffix("%")) for one in item["bars"]]
+        assert widths == pytest.approx([100 * told["weight"] / heaviest, 100 * told["score"]], abs=0.1)
+    on_map = verdict.get_by_role("link", name="On the map").get_attribute("href")
+    assert on_map == f"#/maps/four-sides/paths?query={four_sides['query_id']}"
+    assert axe(page) == []
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
+    page.goto(f"{station.home}#/")
+    settle(page)
+
+    def run(expression: str, *given: object) -> Any:
+        url = f"{station.url}/dashboard/query/words.js"
+        script = f"async ([url, given]) => {{ const m = await import(url); return {expression}; }}"
+        return page.evaluate(script, [url, list(given)])
+
+    def told(**change: object) -> tuple[list[str], str, str]:
+        pose = {"parent_frame": "hall", "translation": {"x": 1, "y": 2, "z": 0.5}}
+        location = {
+            "map": "house", "pose": pose, "support": 3, "votes": 3, "strength": "strong",
+            "verified_by": "matches", "rival_ratio": 0.42, "spread_m": 0.02, "spread_deg": 0.5,
+            "uncertainty": None, **change,
+        }  # fmt: skip
+        answer = {
+            "status": "found", "reason": "3 of 3", "cause": None, "matches": [], "counts": {},
+            "alternatives": [], "maps": ["house"], "location": location,
+        }  # fmt: skip
+        one = run("m.verdict(given[0])", answer)
+        assert one["text"] == "In map house, at x 1, y 2, z 0.5 m in hall."
+        return one["details"], one["kind"], one["title"]
+
+    near = "the next best place fits 42 % as well"
+    firm = "3 of 3 accepted matches vote for this pose, within 20 mm, 0.5°"
+    assert told() == ([firm, "strong matches", near], "good", "Found")
+    apart = firm.replace("of 3", "of 5")
+    assert told(votes=5) == (
+        [apart, "strong matches", "2 accepted matches vote for another pose", near], "good", "Found"
+    )  # fmt: skip
+    lone = ["one view, unconfirmed", "strong match", "1 accepted match votes for another pose"]
+    assert told(support=1, votes=2, rival_ratio=0.0) == (
+        [*lone, "no other place fits"], "warn", "Found"
+    )  # fmt: skip
+    assert told(support=0, votes=0, verified_by="map", strength="weak")[:2] == (
+        ["confirmed by the map’s frames", "no accepted match", near], "good"
+    )  # fmt: skip
+    assert told(support=1, votes=1, verified_by="prior", strength="weak", rival_ratio=None)[:2] == (
+        ["several poses fit, and the prior decided", "one view", "weak match",
+         "not compared with other places"], "warn"
+    )  # fmt: skip
+    assert told(strength="weak")[1] == "warn"
+
+    gravity = "tilted by 3.5 deg against `up`. Check `up`"
+    assert run("m.parts(given[0])", gravity) == {
+        "why": "Tilted by 3.5 deg against `up`.", "next": "Check `up`."
+    }  # fmt: skip
+    assert run("m.parts(given[0])", "no match") == {"why": "No match.", "next": None}
 
 
 def test_a_control_asks_again(station, page, ask, settle):

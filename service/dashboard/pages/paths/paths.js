@@ -203,7 +203,7 @@ class Page {
         h("p", { class: "muted" }, "Its answer has expired: answers are stored for an hour. Query again to see it here.")));
       return;
     }
-    if (!this.asked) return;
+    if (!this.asked) { this.scene.ask(null); return; }
     const { asked } = this, join = this.#reached.get(asked.parent)?.matrix;
     const drawn = Boolean(join);
     put(this.asks, askedPanel(asked, {

@@ -23,13 +23,13 @@ export function keyOf(one) {
 
 /** The likeliest causes of `not_found`. */
 const CAUSES = {
-  no_frames: "nothing to compare",
-  too_little_in_view: "too little in view",
-  one_plane: "too few planes in view",
-  gravity: "tilted against gravity",
-  other_sensor: "another kind of sensor",
-  scale: "scale does not fit",
-  nothing_alike: "nothing like it in the map",
+  no_frames: "Nothing to compare",
+  too_little_in_view: "Too little in view",
+  one_plane: "Too few planes in view",
+  gravity: "Tilted against gravity",
+  other_sensor: "Another kind of sensor",
+  scale: "Scale does not fit",
+  nothing_alike: "Nothing like it in the map",
 };
 
 /**
