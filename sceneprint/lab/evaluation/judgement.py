@@ -18,6 +18,7 @@ from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.retrieval.distance import (
     Ints64,
     Metric,
+    Ranking,
     cross_distances,
     pairwise_distances,
     ranking_size,
@@ -31,12 +32,15 @@ from sceneprint.lab.evaluation.protocol import (
     VIEWS,
     Error,
     FrameStore,
+    JudgedAnswer,
+    SignedFrame,
     ValidatedPair,
     Watch,
     in_preferred_order,
     pose_error,
     unwatched,
 )
+from sceneprint.matches import associate, locate
 from sceneprint.pipeline import validate
 from sceneprint.types import Bytes, Floats, Geometry
 
@@ -72,6 +76,7 @@ class QueryTask:
     ranking : database indices of the first of R, in order
     selection : those of C, in order
     candidates : all of both, each once
+    allowed : rising indices of all database frames that it may find
     """
 
     number: int
@@ -80,6 +85,7 @@ class QueryTask:
     ranking: list[int]
     selection: list[int]
     candidates: tuple[Candidate, ...]
+    allowed: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +97,7 @@ class Judged:
     average_of_ranking: Error
     average_bound: Error
     milliseconds: float
+    answer: JudgedAnswer
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +111,7 @@ class Judge:
     seed : of every pair, as a service has one for all that it validates
     p : of the model
     matching : see `validate`
+    database : the frames of the map; empty where only pairs are validated
     """
 
     geometry: Callable[[int], Geometry]
@@ -111,6 +119,7 @@ class Judge:
     seed: int
     p: ValidationParameters = field(default_factory=ValidationParameters)
     matching: Matching = "histograms"
+    database: Sequence[SignedFrame] = ()
 
 
 def open_judge(
@@ -119,10 +128,11 @@ def open_judge(
     seed: int,
     p: ValidationParameters,
     matching: Matching = "histograms",
+    database: Sequence[SignedFrame] = (),
 ) -> Judge:
     """Make ready to validate frames of a store."""
     # neighbouring queries have many candidates in common
-    return Judge(lru_cache(128)(store.geometry), mode, seed, p, matching)
+    return Judge(lru_cache(128)(store.geometry), mode, seed, p, matching, database)
 
 
 def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
@@ -167,7 +177,46 @@ def judge(judging: Judge, task: QueryTask) -> Judged:
         _average(task, of, {p.match: p.validation.T_match_query for p in ranked}),
         _average(task, of, {p.match: refined.get(p.match) for p in views}),
         spent,
+        answer_of(judging, task),
     )
+
+
+def answer_of(judging: Judge, task: QueryTask) -> JudgedAnswer:
+    """The answer that a robot gets from the candidates of C, by the true pose.
+
+    What a service does with a query after the selection, in one place: validation until enough
+    are accepted, the pose of those, and how sure that is.
+    """
+    allowed = set(task.allowed.tolist())
+
+    def open_geometry(row: int) -> Geometry | None:
+        return judging.geometry(judging.database[row].number) if row in allowed else None
+
+    start = time.perf_counter()
+    n = len(task.selection)
+    selected = Ranking(
+        np.array(task.selection, np.intp), np.zeros(n, np.int64), np.zeros(n)
+    )  # neither distance decides here
+    matches = associate(
+        judging.geometry(task.number), selected, range(n), open_geometry,
+        seed=judging.seed, p=judging.p, mode=judging.mode, matching=judging.matching,
+    )  # fmt: skip
+    near = {match.index: judging.database[match.index] for match in matches}
+    there = locate(
+        matches,
+        {row: frame.pose for row, frame in near.items()},
+        {row: frame.scene for row, frame in near.items()},
+    )
+    spent = 1e3 * (time.perf_counter() - start)
+    accepted = [m.validation for m in matches if m.validation.status == "accepted"]
+    if not accepted:
+        unsure = any(m.validation.status == "ambiguous" for m in matches)
+        return JudgedAnswer("ambiguous" if unsure else "not_found", milliseconds=spent)
+    strong = any(v.strength == "strong" for v in accepted)
+    error = Error()
+    if there is not None and there.parent == task.scene:
+        error = pose_error(there.average.T, task.pose)
+    return JudgedAnswer("found", "strong" if strong else "weak", error, spent)
 
 
 def true_transform(task: QueryTask, candidate: Candidate) -> Floats:

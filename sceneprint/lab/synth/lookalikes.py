@@ -126,7 +126,7 @@ def synthesise_lookalike(
     shoot = _SHOOTS[kind](rng, index, queries)
     sensor = own_sensor(noise, intrinsics, rng) if noise else None
     if sensor is not None and kind == "object":
-        sensor = replace(sensor, farthest=float(rng.uniform(3.5, 6.0)))
+        sensor = worn(sensor, rng)
     name = f"{kind}-{index:03d}"
 
     def shots(part: str, views: Sequence[tuple[Room, Floats]]) -> tuple[DepthFrame, ...]:
@@ -146,6 +146,18 @@ def synthesise_lookalike(
         name, kind, seed, index, shots("map", shoot.map), shots("queries", shoot.queries),
         kind not in ELSEWHERE,
     )  # fmt: skip
+
+
+def worn(sensor: KinectNoise, rng: np.random.Generator) -> KinectNoise:
+    """A worse one that sees less far, as depth cameras of other makes do."""
+    s = float(rng.uniform(1.0, 2.0))
+    return replace(
+        sensor,
+        disparity_sigma=sensor.disparity_sigma * s,
+        warp=sensor.warp * s * 1.5,
+        grazing_start=sensor.grazing_start - math.radians(rng.uniform(0.0, 8.0)),
+        farthest=float(rng.uniform(3.0, 5.5)),
+    )
 
 
 # Objects that are the same from several sides, but for details.
@@ -175,17 +187,30 @@ class SymmetricObject:
 
 
 def cabinet(rng: np.random.Generator) -> SymmetricObject:
-    """A cabinet with the same doors on both long sides; one has a handle, a gap, a cable."""
-    w, d, h = rng.uniform((0.6, 0.35, 0.6), (1.4, 0.65, 1.4))
-    foot, over = rng.uniform(0.03, 0.1), rng.uniform(0.0, 0.02)
-    n, t = int(rng.integers(1, 4)), float(rng.uniform(0.008, 0.02))
+    """A cabinet with the same doors on both long sides; one has a handle, a gap, a cable.
+
+    On a plinth or on legs; most carry a narrower upper part.
+    """
+    w, d, h = rng.uniform((0.6, 0.35, 0.5), (1.3, 0.65, 1.1))
+    foot, over = rng.uniform(0.03, 0.16), rng.uniform(0.0, 0.03)
+    n, t = int(rng.integers(1, 4)), float(rng.uniform(0.008, 0.025))
     doors = [
         box(w / n - 0.012, t, h - foot - 0.05, ((k + 0.5) * w / n - w / 2, -d / 2 - t / 2, foot))
         for k in range(n)
     ]
     half = join([box(w, d / 2, h - foot, (0, -d / 4, foot)), *doors])
-    parts = [half, half.moved(yaw=math.pi), box(w * 0.96, d * 0.9, foot)]
+    parts = [half, half.moved(yaw=math.pi)]
     parts.append(box(w + 2 * over, d + 2 * over + 2 * t, 0.025, (0, 0, h)))
+    if foot > 0.09:
+        x, y = w / 2 - 0.04, d / 2 - 0.04
+        parts += [box(0.05, 0.05, foot, (a * x, b * y, 0)) for a in (-1, 1) for b in (-1, 1)]
+    else:
+        parts.append(box(w * 0.96, d * 0.9, foot))
+    if rng.random() < 0.7:
+        a, b, c = rng.uniform((0.4, 0.4, 0.15), (0.8, 0.85, 0.5)) * (w, d, 1.0)
+        parts.append(box(a, b, c, (0, 0, h + 0.02)))
+        if rng.random() < 0.5:  # and a board on it
+            parts.append(box(a + 0.12, b + 0.08, 0.03, (0, 0, h + c + 0.02)))
     return SymmetricObject(join(parts), _details(rng, w, d + 2 * t, h), 2)
 
 
@@ -219,16 +244,18 @@ def column(rng: np.random.Generator) -> SymmetricObject:
 
 
 def double_sofa(rng: np.random.Generator) -> SymmetricObject:
-    """Seats on both sides of one back, arms at both ends; a cushion lies on one of them."""
+    """Seats on both sides of one back, arms at both ends; a blanket or cushion lies on one."""
     w, d, h = rng.uniform((0.9, 0.9, 0.36), (1.8, 1.3, 0.46))
     arm, rise, soft = rng.uniform(0.1, 0.2), rng.uniform(0.25, 0.45), rng.uniform(0.15, 0.4)
     seat = ellipsoid(((w - 2 * arm) / 2, d / 4, 0.09), soft, 20).moved((0, -d / 4, h - 0.14))
     parts = [seat, seat.moved(yaw=math.pi), box(w, d, h - 0.08, (0, 0, 0.04))]
     parts.append(ellipsoid((w / 2, 0.1, (h + rise) / 2), soft, 20))
     parts += [box(arm, d, h + 0.15, (a * (w - arm) / 2, 0, 0)) for a in (-1, 1)]
-    cushion = blob(rng, rng.uniform((0.15, 0.05, 0.1), (0.22, 0.09, 0.18)), 0.05)
-    at = (rng.uniform(-0.3, 0.3) * w, -0.16, h)
-    return SymmetricObject(join(parts), cushion.moved(at, rng.normal(0, 0.2)), 2)
+    at = (rng.uniform(-0.3, 0.3) * w, -0.55 * d / 2, h + 0.03)
+    left = box(rng.uniform(0.2, 0.5), rng.uniform(0.2, 0.35), rng.uniform(0.01, 0.03))
+    if rng.random() < 0.25:
+        left = blob(rng, rng.uniform((0.14, 0.1, 0.04), (0.2, 0.16, 0.08)), 0.05)
+    return SymmetricObject(join(parts), left.moved(at, rng.normal(0, 0.2)), 2)
 
 
 def small_flat(rng: np.random.Generator) -> SyntheticMesh:
@@ -245,7 +272,7 @@ def _details(rng: np.random.Generator, w: float, d: float, h: float) -> Syntheti
         lambda: _bump(rng, w, d, h),
         lambda: small_flat(rng).moved((rng.uniform(-0.25, 0.25) * w, 0, h + 0.025), 0.3),
     ]
-    chosen = rng.choice(len(makers), int(rng.integers(1, 5)), replace=False)
+    chosen = rng.choice(len(makers), int(rng.integers(1, 4)), replace=False)
     return join(makers[int(k)]() for k in chosen)
 
 
@@ -263,7 +290,7 @@ def _bump(rng: np.random.Generator, w: float, d: float, h: float) -> SyntheticMe
 
 
 OBJECTS = (cabinet, four_legs, column, double_sofa)
-_FREQUENCIES = (0.5, 0.2, 0.1, 0.2)
+_FREQUENCIES = (0.5, 0.15, 0.1, 0.25)
 
 
 def symmetric_object(rng: np.random.Generator) -> SymmetricObject:
@@ -548,12 +575,14 @@ def _absent_places(rng: np.random.Generator, index: int, queries: int) -> Shoot:
             room = make_room(rng)
             found += [(room, T) for T in scattered_poses(room, each, rng)]
         if around:
-            circled = _circled_object(rng, 0, 0)
-            found += list(circled.map)[:around]
+            circled = _circled_object(rng, 0, around)
+            found += list(circled.map if around > len(circled.queries) else circled.queries)
         return found
 
     alone = max(1, queries // 4)
-    return Shoot(views(4, 10, 20), views(3, -(-(queries - alone) // 3), alone)[:queries])
+    rooms = max(3, queries // 12)
+    each = -(-(queries - alone) // rooms)
+    return Shoot(views(4, 10, 20), views(rooms, each, alone)[-queries:])
 
 
 _SHOOTS: dict[str, Callable[[np.random.Generator, int, int], Shoot]] = {

@@ -175,7 +175,7 @@ def orbit(
 ) -> list[Floats]:
     """Hand-held views from a circle, slightly downward, each looking at its middle.
 
-    Distance, height and aim wander slowly, by about a tenth of a metre.
+    Distance, height and aim wander slowly, by a tenth of a metre or two.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def orbit(
     """
     start = float(rng.uniform(-math.pi, math.pi)) if first is None else first
     azimuth = start + sweep * np.arange(n) / n
-    scale = (0.1, 0.1, 0.04, 0.04, 0.04, math.radians(3.0))
+    scale = (0.15, 0.15, 0.08, 0.08, 0.08, math.radians(4.0))
     waves = rng.normal(0, 1, (6, 3)) * np.array(scale)[:, None] / math.sqrt(3)
     phase = np.outer(np.arange(1, 4), 2 * math.pi * np.arange(n) / n)  # closed: 1 to 3 a turn
     away, up, *aim, roll = waves @ np.cos(phase + rng.uniform(0, 2 * math.pi, (3, 1)))
