@@ -84,7 +84,7 @@ def ask_site(
     site = synthesise_lookalike(kind, seed, index, queries=queries)
     database, of_map = signed(site.map, site.name, signer, 0)
     # of another place: a pose in its own frame is a pose in no map
-    scene = site.name if site.present or kind == "unmapped" else f"{site.name}, elsewhere"
+    scene = site.name if site.same_frame else f"{site.name}, elsewhere"
     asked, of_queries = signed(site.queries, scene, signer, len(database))
     geometries = [*of_map, *of_queries]
     p = signer.model.parameters.validation
@@ -110,7 +110,7 @@ def _answerable(site: LookalikeSite) -> list[bool]:
     if not site.present:
         return [False] * len(site.queries)
     seen = overlaps([view_of(q) for q in site.queries], [view_of(d) for d in site.map])
-    return (seen.least.max(axis=1) >= ANSWERABLE).tolist()
+    return [bool(most >= ANSWERABLE) for most in seen.least.max(axis=1)]
 
 
 def table(told: Sequence[Told]) -> list[str]:

@@ -59,6 +59,8 @@ from sceneprint.types import DepthFrame, Floats, Intrinsics
 KINDS = ("object", "offices", "unmapped", "kitchens", "opposite", "absent")
 #: kinds of which nothing in the map is the query's place
 ELSEWHERE = ("unmapped", "kitchens", "absent")
+#: of those, kinds whose queries have a parent frame of their own
+APART = ("kitchens", "absent")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +72,7 @@ class LookalikeSite:
     name : "object-000" and so on
     kind : one of KINDS
     seed, index : what it was made from
-    map, queries : depth in whole millimetres; pose is T_world_camera, of both in one world
+    map, queries : depth in whole millimetres where noisy; pose is T_world_camera
     present : whether the queries were taken at a place of the map
     """
 
@@ -81,6 +83,11 @@ class LookalikeSite:
     map: tuple[DepthFrame, ...]
     queries: tuple[DepthFrame, ...]
     present: bool
+
+    @property
+    def same_frame(self) -> bool:
+        """Whether map and queries have one parent frame, so that poses can be compared."""
+        return self.kind not in APART
 
 
 @dataclass(frozen=True, eq=False)
@@ -553,12 +560,12 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Shoot
         half = join([piece.mesh, *loads]).moved((0.0, -d / 2 - 0.01, 0.0))
         seats = [swivel_chair(rng).mesh.moved((rng.normal(0, 0.1), -d - 0.35, 0), math.pi)]
         halves.append(join([half, *(seats if piece.seats == 1 else [])]).moved(yaw=turn))
-    half_room = rng.uniform((3.2, 3.2), (5.5, 5.5))
-    outline = rectangle(*(2 * half_room)) - half_room
+    size = rng.uniform((6.6, 6.6), (9.5, 9.5))
+    outline = rectangle(*size) - size / 2 + rng.normal(0, 0.4, 2).clip(-0.6, 0.6)
     height = float(rng.uniform(2.5, 3.5))
     mesh = join([*_closed(outline, rng, height), *halves])
     room = Room(mesh, outline, Ceiling(height, np.zeros(2)))
-    radius = float(rng.uniform(max(1.5, math.hypot(w / 2, d) + 0.6), 3.0))
+    radius = float(rng.uniform(1.5, 2.0)) if w < 1.6 else float(rng.uniform(1.8, 2.2))
     middle = (0.0, 0.0, 0.5 * min(float(piece.mesh.vertices[:, 2].max()), 1.2))
     sweep = math.radians(140)
     seen = orbit(middle, radius, 20, rng, first=-math.pi / 2 - sweep / 2, sweep=sweep)
