@@ -375,6 +375,8 @@ def _estimate(
         ratio = min(max(next_best / best.score, 0.0), 1.0) if best.score > 0 else 1.0
     voted = max(places, key=lambda place: (place.accepted, place.weight, place.score))
     against = _against_votes(voted, places, mapped, blind, p)
+    if against is None and prior is not None:
+        against = _against_by_prior(voted, by_score, prior, p)
     if against is None:
         return _found(parent, voted, places, "matches", ratio, p)
     if mapped and _map_confirms(best, places, p):
@@ -455,6 +457,18 @@ def _confirmed_by_prior(
         and _excess(best, p) <= p.violations
     )
     return best if sure else None
+
+
+def _against_by_prior(
+    voted: _Place, by_score: Sequence[_Place], prior: Prior, p: LocalizationParameters
+) -> str | None:
+    """Why a place that the prior does not expect is not the answer; None where it is."""
+    if is_expected(voted.pose, prior):
+        return None
+    near = max((one.score for one in by_score if is_expected(one.pose, prior)), default=0.0)
+    if near <= p.prior_rival * voted.score:
+        return None
+    return "the matches agree on a pose that the prior rules out, and one near the prior fits too"
 
 
 def is_expected(T: Floats, prior: Prior) -> bool:

@@ -486,13 +486,22 @@ class FormFrames:
     ----------
     files : their bytes, not yet read
     metas : what is known of each, or why that cannot be
-    priority, if_novel : of all
+    texts : the other fields
     """
 
     files: Sequence[BinaryIO]
     metas: Sequence[FrameMeta | InvalidRequest]
-    priority: int
-    if_novel: float | None
+    texts: Mapping[str, str]
+
+    @property
+    def priority(self) -> int:
+        """Of all, in the queue."""
+        return priority_of(self.texts)
+
+    @property
+    def if_novel(self) -> float | None:
+        """Of all: kept only if new by so much."""
+        return novelty_of(self.texts.get("if_novel"))
 
     def read(self) -> list[Upload]:
         """Those whose metadata are sound."""
@@ -508,27 +517,37 @@ class FormFrames:
 
 
 @asynccontextmanager
-async def frames_of(request: Request) -> AsyncIterator[FormFrames]:
+async def frames_of(
+    request: Request, *fields: str, most: int = MOST_OF_BATCH
+) -> AsyncIterator[FormFrames]:
     """Read a form with parts `frame` and a field `metas`.
+
+    Parameters
+    ----------
+    request : with the form
+    fields : names of the other fields that it may have
+    most : frames that it may have
 
     Raises
     ------
     UnsupportedType, MalformedBody, StoreFull, UnusableStore : see `form_of`.
     InvalidRequest : there is no frame, or there are not as many metadata as frames.
     """
-    async with form_of(request, most_files=MOST_OF_BATCH) as form:
-        check_parts(form, ("frame", "metas", "priority", "if_novel"))
+    async with form_of(request, most_files=most) as form:
+        check_parts(form, ("frame", "metas", *fields))
         files = [one.file for one in form.getlist("frame") if isinstance(one, UploadFile)]
         if not files or len(files) != len(form.getlist("frame")):
             raise InvalidRequest(
                 "The form has no file part `frame`, or one that is not a file. Send 1 to "
-                f"{MOST_OF_BATCH} depth images or point clouds in parts of that name, each with "
+                f"{most} depth images or point clouds in parts of that name, each with "
                 "a file name.",
                 (("frame", "not all files"),),
             )
-        texts = texts_of(form)
-        metas = _metas(texts.get("metas"), len(files))
-        yield FormFrames(files, metas, priority_of(texts), novelty_of(texts.get("if_novel")))
+        texts = dict(texts_of(form))
+        metas = _metas(texts.pop("metas", None), len(files))
+        batch = FormFrames(files, metas, texts)
+        _ = batch.priority, batch.if_novel  # what is wrong with them is said before anything else
+        yield batch
 
 
 def upload_responses(batch: FormFrames, outcomes: Sequence[UploadResult]) -> Batch:

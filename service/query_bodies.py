@@ -118,6 +118,28 @@ def described(kind: type[BaseModel], named: Mapping[str, Any], required: list[st
     }
 
 
+def sequence_body(kind: type[BaseModel], most: int) -> dict[str, Any]:
+    """A form with the frames of a sequence and how to ask, for the OpenAPI document."""
+    own = kind.model_json_schema(ref_template=TEMPLATE)["properties"]
+    meta = {"type": "array", "items": {"$ref": "#/components/schemas/FrameMeta"}}
+    file = {"type": "string", "format": "binary"}
+    properties = {
+        "frame": {
+            "type": "array", "minItems": 2, "maxItems": most, "items": file,
+            "description": "A part `frame` for each, in the order they were taken.",
+        },
+        "metas": {**meta, "description": "One for each, with `pose`: the odometry."},
+        **{name: as_text(one) for name, one in own.items()},
+    }  # fmt: skip
+    schema = {"type": "object", "required": ["frame", "metas"], "properties": properties}
+    encoding = {"metas": {"contentType": JSON}}
+    return {
+        "requestBody": {
+            "required": True, "content": {FORM: {"schema": schema, "encoding": encoding}}
+        }
+    }  # fmt: skip
+
+
 def _parameter(name: str, option: Mapping[str, Any]) -> dict[str, Any]:
     """An option as the query string has it, where the frame is the body."""
     schema = {key: one for key, one in option.items() if key not in ("description", "title")}

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import ModelMismatch, UselessFrame
-from sceneprint.geometry.pose.average import average_poses
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.retrieval.dpp import diversify as select
 from sceneprint.geometry.signature.segmentation import patches_of, segment
@@ -295,7 +294,7 @@ def test_of_scans_all_around_the_nearest_goes_first() -> None:
     assert preferred([replace(far, around=True)]) == [0]
 
 
-# locate
+# What an evaluation averages
 
 
 def test_voters_by_hand() -> None:
@@ -314,66 +313,6 @@ def test_voters_by_hand() -> None:
     assert voters(["b", "a", "a"], [True, True, False]) == [1, 2]
     with pytest.raises(ValueError, match="zip"):
         voters(["a"], [])
-
-
-def test_locate_by_hand() -> None:
-    # the pose of the match in the map, then of the query in the match
-    turn = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]], float)
-    found = locate([match(1, outcome(T=shifted(2.0)))], [np.eye(4), turn], ["here", "there"])
-    assert found is not None
-    np.testing.assert_allclose(found.average.T, turn @ shifted(2.0), atol=1e-12)
-    assert found.average.T[:3, 3].tolist() == pytest.approx([5, 8, 7])
-    assert (found.average.support, found.average.votes, found.parent) == (1, 1, "there")
-
-
-def test_locate_averages_accepted_views_only() -> None:
-    poses = [np.eye(4)] * 10
-    lost = replace(outcome("rejected"), T_match_query=None)
-    matches = [
-        match(0, outcome(T=shifted(0.0))),
-        match(1, outcome(T=shifted(0.04), strength="weak")),
-        match(2, outcome("ambiguous", T=shifted(9.0))),
-        match(3, outcome("rejected", T=shifted(9.0))),
-        match(4, lost),
-    ]
-    found = locate(matches, poses)
-    assert found is not None
-    assert (found.average.support, found.average.votes, found.parent) == (2, 2, "")
-    assert found.average.T[0, 3] == pytest.approx(0.02)
-    assert locate(matches[2:], poses) is None
-    assert locate([], poses) is None
-
-
-def test_locate_combines_poses_of_one_parent_frame() -> None:
-    # three matches of a hall, two of a flat whose coordinates mean something else
-    parents = ["flat", "hall", "flat", "hall", "hall", "attic"]
-    matches = [match(i, outcome(T=shifted(0.01 * i))) for i in (0, 1, 2, 3, 4)]
-    found = locate(matches, [np.eye(4)] * 6, parents)
-    assert found is not None
-    assert (found.parent, found.average.votes) == ("hall", 3)
-    assert found.average.T[0, 3] == pytest.approx((0.01 + 0.03 + 0.04) / 3)
-    found = locate(matches[:4], [np.eye(4)] * 6, parents)
-    assert found is not None
-    assert (found.parent, found.average.T[0, 3]) == ("flat", pytest.approx(0.01))
-
-
-def test_locate_averages_one_view_at_least() -> None:
-    for views in (0, -1):
-        with pytest.raises(ValueError, match="1 view or more"):
-            locate([match(0, outcome())], [np.eye(4)], views=views)
-
-
-def test_locate_takes_the_first_few() -> None:
-    matches = [match(i, outcome(T=shifted(0.01 * i))) for i in range(8)]
-    for views in (1, 2, 5, 20):
-        found = locate(matches, [np.eye(4)] * 8, views=views)
-        assert found is not None
-        assert found.average.votes == min(views, 8)
-        votes = np.array([shifted(0.01 * i) for i in range(min(views, 8))])
-        np.testing.assert_array_equal(found.average.T, average_poses(votes).T)
-    default = locate(matches, [np.eye(4)] * 8)
-    assert default is not None
-    assert default.average.votes == 5
 
 
 def test_frames_are_judged_by_the_numbers_of_their_model(

@@ -35,6 +35,7 @@ from sceneprint_client.requests import (
     QueryOptions,
     compared_frame,
     form_text,
+    frames_form,
     given,
     map_path,
     match_path,
@@ -112,6 +113,34 @@ class QueryMethods(ServiceConnection):
         name, wanted = named_or_sent(map_name, frame, meta, frame_id, up)
         request = _query_request(wanted, query_of(Query, how))
         return self._ask(Localization, "POST", f"{map_path(name)}/localize", **request)
+
+    def localize_sequence(
+        self, map_name: str, frames: Sequence[bytes | Path | FrameFile],
+        metas: Sequence[FrameMeta] | None = None, **how: Unpack[QueryOptions],
+    ) -> Localization:  # fmt: skip
+        """Where in a map was the last of these frames taken? The earlier ones vote for it too.
+
+        Parameters
+        ----------
+        map_name : of the map
+        frames : 2 to 10 in the order they were taken, as for `upload`
+        metas : of each; their poses, in one parent frame of any name, are the odometry. Default:
+            what lies beside the files
+        how : see `query`
+
+        Raises
+        ------
+        InvalidRequest : too few or too many frames, not as many metadata, or no odometry.
+        """
+        if metas is not None and len(metas) != len(frames):
+            raise InvalidRequest(
+                f"There are {len(frames)} frames and {len(metas)} `metas`. Give one for each.",
+                (("metas", "not one for each"),),
+            )
+        request = frames_form(frames, [None] * len(frames) if metas is None else metas)
+        query = query_json(query_of(Query, how))
+        request["data"] |= {name: form_text(value) for name, value in query.items()}
+        return self._ask(Localization, "POST", f"{map_path(map_name)}/localize/sequence", **request)
 
     def similarity(
         self, a: bytes | Path | FrameFile | NamedFrame | tuple[str, str],

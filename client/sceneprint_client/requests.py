@@ -62,6 +62,17 @@ def frame_form(data: bytes, meta: FrameMeta) -> dict[str, Any]:
     }
 
 
+def frames_form(
+    frames: Sequence[bytes | Path | FrameFile], metas: Sequence[FrameMeta | None]
+) -> dict[str, Any]:
+    """Arguments of a request that sends several frames with their poses; see `frame_bytes`."""
+    sent = [frame_bytes(*one, with_pose=True) for one in zip(frames, metas, strict=True)]
+    return {
+        "files": [("frame", ("frame", data, "application/octet-stream")) for data, _ in sent],
+        "data": {"metas": json.dumps([meta_json(meta) for _, meta in sent])},
+    }
+
+
 def meta_json(meta: FrameMeta) -> dict[str, Any]:
     """What is known of a frame as it is sent: a viewpoint of null says that there is none."""
     return meta.model_dump(mode="json", exclude_defaults=True)

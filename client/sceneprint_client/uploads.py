@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from sceneprint_client.api.frames import (
 from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.http import ServiceConnection, read_record
 from sceneprint_client.jobs import growing_pauses
-from sceneprint_client.requests import frame_bytes, frame_form, frame_path, map_path, meta_json
+from sceneprint_client.requests import frame_bytes, frame_form, frame_path, frames_form, map_path
 
 if TYPE_CHECKING:
     from sceneprint_client.frame_files import FrameFile
@@ -142,13 +141,9 @@ class UploadMethods(ServiceConnection):
                 (("frames", "too many or too few"),),
             )
         known = [None] * len(frames) if metas is None else metas
-        sent = [frame_bytes(*one, with_pose=True) for one in zip(frames, known, strict=True)]
-        metadata = json.dumps([meta_json(meta) for _, meta in sent])
-        files = [("frame", ("frame", data, "application/octet-stream")) for data, _ in sent]
-        return self._ask(
-            Batch, "POST", f"{map_path(map_name)}/frames/batch", files=files,
-            data={"metas": metadata, **_upload_fields(priority, if_novel)},
-        ).items  # fmt: skip
+        request = frames_form(frames, known)
+        request["data"] |= _upload_fields(priority, if_novel)
+        return self._ask(Batch, "POST", f"{map_path(map_name)}/frames/batch", **request).items
 
     def _upload(
         self, method: str, path: str, frame: bytes | Path | FrameFile, meta: FrameMeta | None,

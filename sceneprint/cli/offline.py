@@ -9,7 +9,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -34,6 +34,7 @@ from sceneprint.formats.points.ply_export import write_ply
 from sceneprint.models import PRESETS, ModelParameters, read_model, save_model
 from sceneprint.pipeline import Signature, Signer, sign
 from sceneprint.settings import Settings
+from sceneprint.types import DepthFrame
 
 
 def add_sign(commands: Any) -> None:
@@ -417,6 +418,8 @@ def run_picture(options: argparse.Namespace) -> int:
 
 #: Stored units per metre.
 DEPTH_SCALE = 1000.0
+#: Kinds of look-alike sites, as `sceneprint.lab.synth.lookalikes` has them.
+LOOKALIKES = ("object", "offices", "unmapped", "kitchens", "opposite", "absent")
 
 
 def add_synth(commands: Any) -> None:
@@ -427,11 +430,23 @@ def add_synth(commands: Any) -> None:
         description="Render furnished rooms as a Kinect would see them, in 7-Scenes layout: "
         "OUT/room-000/seq-01/frame-000000.depth.png and .pose.txt. With --sensor lidar: halls, "
         "storeys and blocks as a spinning laser would see them, OUT/site-000/scan-000000.ply "
-        "and .pose.txt.",
+        "and .pose.txt. With --lookalikes: sites that look like themselves or like another, as "
+        "7-Scenes scenes whose TrainSplit.txt and TestSplit.txt say what is the map and what the "
+        "queries, so that `sceneprint evaluate OUT` measures wrong answers.",
     )
     command.add_argument("out", type=Path, metavar="OUT", help="output folder, new or empty")
     command.add_argument(
         "--sensor", choices=("kinect", "lidar"), default="kinect", help="default: kinect"
+    )
+    command.add_argument(
+        "--lookalikes",
+        choices=LOOKALIKES,
+        metavar="KIND",
+        help="object: a symmetric object circled on a bare floor; offices: a row of equal rooms, "
+        "or a hall of equal bays; unmapped: such a row, the queries from a room that the map "
+        "lacks; kitchens: the queries from another kitchen with the same furniture; opposite: "
+        "furniture in a room, the queries from its other side; absent: the queries from other "
+        "rooms",
     )
     command.add_argument(
         "--rooms",
@@ -445,7 +460,7 @@ def add_synth(commands: Any) -> None:
         type=positive,
         default=25,
         metavar="M",
-        help="number of views per room (default: 25)",
+        help="number of views per room; with --lookalikes, of queries per site (default: 25)",
     )
     command.add_argument("--seed", type=whole_number, default=0, metavar="S", help="default: 0")
     command.add_argument(
@@ -463,6 +478,12 @@ def add_synth(commands: Any) -> None:
 
 def run_synth(options: argparse.Namespace) -> int:
     """Make the rooms."""
+    if options.lookalikes and (options.path or options.sensor == "lidar"):
+        given = "--path" if options.path else "--sensor lidar"
+        raise DatasetError(
+            f"--lookalikes and {given}: look-alike sites have camera paths of their own. "
+            f"Leave {given} out."
+        )
     if options.out.exists() and any(options.out.iterdir()):
         raise DatasetError(
             f"{options.out}: is not empty, and frames of two runs must not be mixed. Use a new "
@@ -472,20 +493,20 @@ def run_synth(options: argparse.Namespace) -> int:
     with tqdm(total=options.rooms, desc="synth", unit="room", disable=None) as bar:
         for _ in _rooms(options):
             bar.update()
-    made = "sites" if options.sensor == "lidar" else "rooms"
-    print(f"{options.rooms} {made} of {options.views} views in {options.out}")
+    made = "sites" if options.lookalikes or options.sensor == "lidar" else "rooms"
+    views = "queries" if options.lookalikes else "views"
+    print(f"{options.rooms} {made} of {options.views} {views} in {options.out}")
     return 0
 
 
 def _rooms(options: argparse.Namespace) -> Iterator[None]:
-    make = partial(
-        _write_site if options.sensor == "lidar" else _write_room,
-        options.out,
-        options.seed,
-        options.views,
-        along_path=options.path,
-        perfect=options.perfect,
-    )
+    where = options.out, options.seed, options.views
+    make: Callable[[int], None]
+    if options.lookalikes:
+        make = partial(_write_lookalike, *where, kind=options.lookalikes, perfect=options.perfect)
+    else:
+        write = _write_site if options.sensor == "lidar" else _write_room
+        make = partial(write, *where, along_path=options.path, perfect=options.perfect)
     jobs = min(options.jobs, options.rooms)
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         yield from pool.map(make, range(options.rooms))
@@ -499,13 +520,35 @@ def _write_room(
     noise = None if perfect else KinectNoise()
     room = synthesise_room(seed, index, views, along_path=along_path, noise=noise)
     folder = out / room.name
-    sequence = folder / "seq-01"
-    sequence.mkdir(parents=True)
+    _write_sequence(folder / "seq-01", room.frames)
     write_intrinsics(folder, Camera(room.frames[0].intrinsics, DEPTH_SCALE, along_ray=False))
-    for number, frame in enumerate(room.frames):
+
+
+def _write_sequence(sequence: Path, frames: Sequence[DepthFrame]) -> None:
+    sequence.mkdir(parents=True)
+    for number, frame in enumerate(frames):
         write_depth_png(sequence / f"frame-{number:06d}.depth.png", frame.depth, DEPTH_SCALE)
         if frame.pose is not None:
             write_pose(sequence / f"frame-{number:06d}.pose.txt", frame.pose)
+
+
+def _write_lookalike(
+    out: Path, seed: int, queries: int, index: int, *, kind: str, perfect: bool
+) -> None:
+    """A scene of two sequences, or two scenes where the queries' place is not in the map."""
+    from sceneprint.lab.synth import KinectNoise, synthesise_lookalike
+
+    noise = None if perfect else KinectNoise()
+    site = synthesise_lookalike(kind, seed, index, queries=queries, noise=noise)
+    of_map = of_queries = out / site.name
+    if not site.same_frame:
+        of_queries = out / f"{site.name}-elsewhere"
+    _write_sequence(of_map / "seq-01", site.map)
+    _write_sequence(of_queries / "seq-02", site.queries)
+    (of_map / "TrainSplit.txt").write_text("sequence1\n")
+    (of_queries / "TestSplit.txt").write_text("sequence2\n")
+    for folder in {of_map, of_queries}:
+        write_intrinsics(folder, Camera(site.map[0].intrinsics, DEPTH_SCALE, along_ray=False))
 
 
 def _write_site(

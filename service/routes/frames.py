@@ -206,7 +206,7 @@ async def add_batch(
 
     All that are taken are taken in one commit: where the whole is refused, none was.
     """
-    async with here.uploads.place(), frames_of(request) as batch:
+    async with here.uploads.place(), frames_of(request, "priority", "if_novel") as batch:
 
         def take() -> tuple[Batch, bool]:
             uploads = batch.read()

@@ -13,17 +13,30 @@ from sceneprint.engine.search.query import check_localizes, localization_of
 from sceneprint_client.api import (
     Answer,
     Comparison,
+    FrameMeta,
     Localization,
     NamedFrame,
     Query,
     SeveralQuery,
     Similarity,
 )
+from sceneprint_client.api.query import MOST_OF_SEQUENCE
 from service.auth import Asking, may_read, v1_router
-from service.bodies import FORM
+from service.bodies import FORM, frames_of
 from service.context import Context, Here
 from service.problems import declared
-from service.query_bodies import JSON, TEMPLATE, Sent, as_text, described, pair, question, unnamed
+from service.query_bodies import (
+    JSON,
+    TEMPLATE,
+    Sent,
+    as_text,
+    checked,
+    described,
+    pair,
+    question,
+    sequence_body,
+    unnamed,
+)
 
 router = v1_router(tag="queries")
 
@@ -57,6 +70,38 @@ async def localize(map_name: str, request: Request, here: Here) -> Localization:
     The whole answer, with all candidates, is kept under `query_id` unless `keep` is false.
     """
     return localization_of(await _asked(map_name, request, here, localizes=True))
+
+
+_SEQUENCE: dict[str, Any] = sequence_body(Query, MOST_OF_SEQUENCE)
+
+
+@router.post(
+    "/maps/{map_name}/localize/sequence", responses=_STATUSES, openapi_extra=_SEQUENCE,
+    dependencies=[Depends(may_read)],
+)  # fmt: skip
+async def localize_sequence(map_name: str, request: Request, here: Here) -> Localization:
+    """Where am I in this map, by my last few frames? One status and the pose of the last.
+
+    Send 2 to 10 frames in the order they were taken, each with a `pose` in one parent frame of any
+    name: the odometry. Each is looked up; all of them vote for the pose of the last.
+    """
+    since, engine = time.perf_counter(), here.engine
+    options = tuple(Query.model_fields)
+    async with (
+        here.gate.place(),
+        frames_of(request, *options, most=MOST_OF_SEQUENCE) as sent,
+    ):
+        query = checked(Query, sent.texts)
+        wrong = next((one for one in sent.metas if not isinstance(one, FrameMeta)), None)
+        if wrong is not None:
+            raise wrong
+        answer = await here.gate.run(
+            lambda: engine.queries.sequence(
+                map_name, [(one.data, one.meta) for one in sent.read()], query, since
+            )
+        )
+    here.metrics.answer(answer)
+    return localization_of(answer)
 
 
 @router.post("/queries", responses=_STATUSES, openapi_extra=_SEVERAL)

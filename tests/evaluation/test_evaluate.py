@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from PIL import Image
 
 import sceneprint as sp
 from sceneprint.cli import main
+from sceneprint.geometry.pose.rigid import difference
 from sceneprint.models import Model, save_model
 
 ROW = {"within_5cm_5deg", "within_10cm_10deg", "median_translation_m", "median_rotation_deg"}
@@ -70,6 +72,11 @@ def test_the_json_has_every_key(figures: Any) -> None:
     assert set(found["diversity"]["translation"]) == {"R", "DR", "VR", "VDR"}
     assert found["counts"] == {"queries": 3, "database": 4 + 12, "left_out": 0}
     assert sum(found["lost"].values()) == 3
+    told = found["answers"]
+    assert told["queries"] == 3
+    shares = ("found_right", "found_wrong", "ambiguous", "not_found")
+    assert sum(told[key] for key in shares) == pytest.approx(1.0)
+    assert found["milliseconds"]["answer"] > 0
     assert found["milliseconds"]["prepare"] > 0
     assert found["settings"]["seed"] == 0
     assert found["R"]["within_10cm_10deg"] == found["DR"]["within_10cm_10deg"]
@@ -136,6 +143,7 @@ def test_the_answers_are_those_of_the_library(
         assert one["ranking"] == [names[database[j]] for j in ranking.indices[:10]]
         assert one["selection"] == [names[database[ranking.indices[j]]] for j in chosen.indices]
         assert {match.validation.seed for match in matches} == {seed}
+        assert one["answer"] == answer_by_library(room, i, stored, ranking, chosen, seed)
         assert one["matches"] == [
             {
                 "match": names[database[match.index]],
@@ -147,6 +155,29 @@ def test_the_answers_are_those_of_the_library(
             }
             for match in matches
         ]  # fmt: skip
+
+
+def answer_by_library(
+    room: Path, i: int, stored: list[bytes], ranking: Any, chosen: Any, seed: int
+) -> dict[str, Any]:
+    """The whole answer to frame `i`, of every second frame: stopped at five accepted matches."""
+    (sequence,) = sp.find_sequences(room)
+    poses = [reference.read().pose for reference in sequence.frames]
+    query, *_ = geometries = [sp.read_geometry(one) for one in (stored[i], *stored[0:12:2])]
+    matches = sp.associate(
+        query, ranking, chosen.indices.tolist(), lambda row: geometries[row + 1], seed=seed
+    )
+    views_of = sp.views_of_rows(matches, poses[0:12:2], lambda row: geometries[row + 1])
+    there = sp.localize([sp.QueryFrame(query, matches)], poses[0:12:2], None, views_of)
+    assert there is not None  # so that the test says something
+    assert there.average is not None
+    metres, radians = difference(there.average.T, poses[i])
+    return {
+        "status": "found",
+        "strength": there.strength,
+        "translation_m": metres,
+        "rotation_deg": math.degrees(radians),
+    }
 
 
 def test_a_scene_that_is_absent(

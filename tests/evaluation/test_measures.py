@@ -17,14 +17,22 @@ from sceneprint.lab.evaluation.measures import (
     PLACES,
     absent,
     accuracy,
+    answers,
     bound,
     lost,
     oracle_and_random,
     place_of,
     rows,
+    upper_bound,
     validation,
 )
-from sceneprint.lab.evaluation.protocol import Error, QueryOutcome, ValidatedPair, pose_error
+from sceneprint.lab.evaluation.protocol import (
+    Error,
+    JudgedAnswer,
+    QueryOutcome,
+    ValidatedPair,
+    pose_error,
+)
 from sceneprint.lab.evaluation.report import (
     average,
     measured,
@@ -100,6 +108,34 @@ def test_random_five(make_outcome: MakeOutcome, make_pair: MakePair) -> None:
     one = make_outcome([0], [0], [make_pair(0)], least=[0.6, 0.6] + [0.0] * 8)
     found = oracle_and_random([one])["random"]["top5_overlap_50"]
     assert found == pytest.approx(1 - 56 / 252)
+
+
+def test_whole_answers_by_hand() -> None:
+    """Two are right, one is off a little, one faces elsewhere, one is in another room."""
+    told = [
+        JudgedAnswer("found", "strong", Error(0.02, 0.01)),
+        JudgedAnswer("found", "weak", Error(0.10, math.radians(10))),
+        JudgedAnswer("found", "weak", Error(0.30, 0.05)),
+        JudgedAnswer("found", "strong", Error(0.05, math.radians(180))),
+        JudgedAnswer("found", "weak"),
+        JudgedAnswer("ambiguous"),
+        JudgedAnswer("not_found"),
+        JudgedAnswer("not_found"),
+    ]
+    found = answers(told)
+    assert found == {
+        "queries": 8,
+        "found_right": 2 / 8,
+        "found_wrong": 3 / 8,
+        "ambiguous": 1 / 8,
+        "not_found": 2 / 8,
+        "grossly_wrong": 2 / 8,
+        "grossly_wrong_at_most": upper_bound(2, 8),
+        "found_strong_wrong": 1 / 8,
+    }
+    nothing = answers([])
+    assert nothing.pop("queries") == 0
+    assert set(nothing.values()) == {None}
 
 
 def test_where_three_queries_are_lost(three: list[QueryOutcome]) -> None:

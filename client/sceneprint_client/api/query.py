@@ -31,6 +31,8 @@ from sceneprint_client.api.options import (
 )
 
 AnswerStatus = Literal["found", "ambiguous", "not_found", "unvalidated"]
+#: Frames of a sequence that is asked at once, at most.
+MOST_OF_SEQUENCE = 10
 #: The likeliest cause of an answer `not_found`.
 Cause = Literal[
     "no_frames", "deadline", "too_little_in_view", "one_plane", "gravity", "other_sensor", "scale",
@@ -226,7 +228,8 @@ class Answer(ApiRecord):
     counts: Counts
     milliseconds: dict[str, float] = Field(
         description="`prepare` (signature and geometry of the query), `retrieve`, `diversify`, "
-        "`validate`, `locate`, `explain` where it was asked for, `total`."
+        "`validate`, `locate`, `explain` where it was asked for, `earlier` for the earlier frames "
+        "of a sequence, `total`."
     )
     maps: list[str] = Field(default=[], description="The maps that were asked.")
     frame: FrameName | None = Field(
@@ -239,6 +242,9 @@ class Answer(ApiRecord):
         description="Of the frame that was asked for. Transforms call the sensor of a depth image "
         "`ID.optical` (x right, y down, z forward), and that of a cloud, which keeps its axes, "
         "`ID.sensor`.",
+    )
+    frames: int = Field(
+        default=1, description="Of the query: with a sequence, `matches` are those of the last."
     )
     per_map: dict[str, OfMap] | None = Field(
         default=None, description="What each of several maps had; null where one was asked."

@@ -10,6 +10,8 @@ import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from sceneprint.engine.search.explanation import ExplainedQuery, explain, why
 from sceneprint.engine.search.outcome import outcome_of
 from sceneprint.engine.search.response import (
@@ -37,12 +39,14 @@ from sceneprint.engine.serializers import query_sensor
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.geometry.retrieval.distance import Ints64, pairwise_distances
 from sceneprint.geometry.retrieval.dpp import DiversityParameters, Selection, diversify
-from sceneprint.localization import QueryFrame
+from sceneprint.localization import PoseEstimate, Prior, QueryFrame
 from sceneprint.matches import PairMatch
 from sceneprint.models import Model
 from sceneprint.store import Store
 from sceneprint.store.frames import frames_of
 from sceneprint.store.postgres.replica import behind_s
+from sceneprint.store.tables import FrameRow
+from sceneprint.types import Floats
 from sceneprint_client.api import Answer, Counts, FrameName, OfMap, Query
 
 
@@ -59,9 +63,44 @@ class _Clock:
         self._since = now
 
 
+@dataclass(frozen=True, eq=False)
+class SequenceFrame:
+    """An earlier frame of a query, and where its sensor was: T_query_sensor (4, 4), by odometry."""
+
+    asked: PreparedQuery
+    T: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """A frame of a query, and what came of its candidates.
+
+    Parameters
+    ----------
+    asked : the frame
+    searched : its R
+    selection : C, or None where it was not asked for
+    among, scales : distances within R, and what C was selected by
+    chosen : positions in R of the candidates
+    tried : what validation made of them
+    rows : of the frames that are shown, by number
+    matches : those that were tried and are still there
+    """
+
+    asked: PreparedQuery
+    searched: Searched
+    selection: Selection | None
+    among: Ints64 | None
+    scales: DiversityParameters | None
+    chosen: Sequence[int]
+    tried: Validated
+    rows: dict[int, FrameRow]
+    matches: list[PairMatch]
+
+
 def answer(
     store: Store, places: Sequence[SearchedMap], model: Model, asked: PreparedQuery, query: Query,
-    deadline: Deadline,
+    deadline: Deadline, earlier: Sequence[SequenceFrame] = (),
 ) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
     """Ask maps; the answer, and the numbers of the frames of R.
 
@@ -72,12 +111,43 @@ def answer(
     model : of all of them
     asked, query : what is sought, and how
     deadline : see Deadline
+    earlier : frames of the same query: they vote for the pose of `asked`, which is answered for
 
     Raises
     ------
     UnknownFrame : there is none of the id that is to be explained.
+    InvalidRequest, InvalidPose : the prior cannot be used.
     """
     clock = _Clock({"prepare": round(asked.prepare_ms, 2)})
+    prior = prior_of(query, places)
+    before = [_attempt(store, places, model, one.asked, query, deadline, prior) for one in earlier]
+    if before:
+        clock.stage("earlier")
+    last = _attempt(store, places, model, asked, query, deadline, prior, clock)
+    estimate, p = None, model.parameters.validation
+    if asked.geometry is not None:
+        poses = [*(one.T for one in earlier), np.eye(4)]
+        attempts = [*before, last]
+        frames = [
+            QueryFrame(one.asked.geometry, one.matches, T)
+            for one, T in zip(attempts, poses, strict=True)
+            if one.asked.geometry is not None
+        ]
+        rows = {number: row for one in attempts for number, row in one.rows.items()}
+        geometries = {n: g for one in attempts for n, g in one.tried.geometries.items()}
+        estimate = placed(
+            store, last.searched, geometries, rows, frames, prior, p, query.validation
+        )
+        clock.stage("locate")
+    return _answer(store, places, model, last, estimate, query, deadline, clock, len(before))
+
+
+def _attempt(
+    store: Store, places: Sequence[SearchedMap], model: Model, asked: PreparedQuery, query: Query,
+    deadline: Deadline, prior: Prior | None, clock: _Clock | None = None,
+) -> _Attempt:  # fmt: skip
+    """Look for one frame of a query, and validate its candidates."""
+    clock = clock or _Clock({})
     searched = search_maps(store, places, asked, query, model)
     for place in places:
         resign_frames(store, place.row, sorted(place.view.damaged), place.row.model_id)
@@ -86,28 +156,33 @@ def answer(
     among, selection, scales = _selection(searched, query, model, wanted)
     clock.stage("diversify")
     chosen = range(min(wanted, len(ranking))) if selection is None else selection.indices.tolist()
-    p, prior = model.parameters.validation, prior_of(query, places)
     first = chosen if prior is None else nearest_first(store, ranking, chosen, prior)
+    p = model.parameters.validation
     tried = validated(store, searched, first, asked.geometry, query, deadline, p, asked.up)
     clock.stage("validate")
     shown = range(len(ranking)) if query.explain else chosen
     with store.queried.read() as connection:
         rows = frames_of(connection, ranking.indices[list(shown)].tolist())
     matches = [one for one in tried.matches if one.index in rows]  # the rest was deleted meanwhile
+    return _Attempt(asked, searched, selection, among, scales, chosen, tried, rows, matches)
+
+
+def _answer(
+    store: Store, places: Sequence[SearchedMap], model: Model, last: _Attempt,
+    estimate: PoseEstimate | None, query: Query, deadline: Deadline, clock: _Clock, earlier: int,
+) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
+    """What is told of the frame that was asked for."""
+    asked, searched, tried, p = last.asked, last.searched, last.tried, model.parameters.validation
+    ranking, matches = searched.ranking, last.matches
     names = {place.row.number: place.row.name for place in places}
     own = query_sensor(_name(asked), asked.kind, list(names.values()))
-    estimate = None
-    if asked.geometry is not None:
-        frames = [QueryFrame(asked.geometry, matches)]
-        estimate = placed(store, searched, tried, rows, frames, prior, p, query.validation)
-        clock.stage("locate")
     found = Candidates(
-        names, ranking, selection, rows, tried.unreadable, tried.untried, own, p.covariance,
-        asked.base,
+        names, ranking, last.selection, last.rows, tried.unreadable, tried.untried, own,
+        p.covariance, asked.base,
     )  # fmt: skip
     explanations = explained = None
     if query.explain:
-        explanations = explain(found, tried, among, scales)
+        explanations = explain(found, tried, last.among, last.scales)
     if query.explain_frame is not None:
         asking = ExplainedQuery(store, searched, asked, query, found, tried, model, deadline)
         explained = why(asking, query.explain_frame)
@@ -122,7 +197,7 @@ def answer(
         status=outcome.status,
         reason=outcome.reason,
         cause=outcome.cause,
-        matches=match_records(found, chosen, matches),
+        matches=match_records(found, last.chosen, matches),
         location=location_record(found, estimate) if outcome.status == "found" else None,
         alternatives=alternative_records(found, estimate) if outcome.status == "ambiguous" else [],
         seed=query.seed,
@@ -134,6 +209,7 @@ def answer(
         maps=[place.row.name for place in places],
         frame=_name(asked),
         kind=asked.kind,
+        frames=1 + earlier,
         per_map=_per_map(places, counts) if len(places) > 1 else None,
         deadline_reached=tried.late,
         replica_behind_s=behind_s(),

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from sceneprint.engine.models import Signers
 from sceneprint.engine.results.stored_results import StoredResult, StoredResults
-from sceneprint.engine.search.answer import answer
+from sceneprint.engine.search.answer import SequenceFrame, answer
 from sceneprint.engine.search.local_index import Readers
 from sceneprint.engine.search.response import uncertainty_record, validation_record
 from sceneprint.engine.search.retrieval import (
@@ -24,6 +24,7 @@ from sceneprint.engine.search.retrieval import (
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import model_label, sensor_frame, transform
 from sceneprint.errors import Busy, InvalidRequest, ModelMismatch, SceneprintError, UnknownMap
+from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.retrieval.distance import distances, similarity
 from sceneprint.geometry.validation.icp import PAIR_METHOD
 from sceneprint.models import PRESETS, read_model
@@ -32,6 +33,7 @@ from sceneprint.store import Store
 from sceneprint.store.maps import find_maps, list_maps, model_names, unknown_map
 from sceneprint.store.postgres.replica import read_through
 from sceneprint.store.tables import MapRow
+from sceneprint.types import Floats
 from sceneprint_client.api import (
     Answer,
     Comparison,
@@ -44,7 +46,7 @@ from sceneprint_client.api import (
     Similarity,
 )
 from sceneprint_client.api.options import MOST_MAPS
-from sceneprint_client.api.query import LocalizationStatus
+from sceneprint_client.api.query import MOST_OF_SEQUENCE, LocalizationStatus
 
 # Queries that meet a map's switch to another model: answered wholly with one, or asked again.
 
@@ -270,6 +272,38 @@ class Queries:
 
         return read_through(self._store.replica, lambda: steadily(self._store, maps, ask))
 
+    def sequence(
+        self, map_name: str, frames: Sequence[tuple[bytes, FrameMeta]], query: Query,
+        since: float | None = None,
+    ) -> Answer:  # fmt: skip
+        """Look up the last of some frames of one run; the earlier ones vote for its pose too.
+
+        Parameters
+        ----------
+        map_name : of the map
+        frames : samples and meta of each in the order they were taken: their poses, in one parent
+            frame of any name, are the odometry
+        query : how to ask, for each of them
+        since : see `upload`
+
+        Raises
+        ------
+        UnknownMap : there is none.
+        InvalidRequest : fewer than 2 frames, too many, or without odometry; or see `upload`.
+        """
+        check_sequence([meta for _, meta in frames], query)
+        deadline = Deadline(query.deadline_ms, since)
+
+        def ask(rows: list[MapRow]) -> Answer:
+            signer = self._signers(rows[0].model_id)
+            *before, last = [prepare_upload(*one, signer, query) for one in frames]
+            earlier = [
+                SequenceFrame(one, inverse(_odometry(last)) @ _odometry(one)) for one in before
+            ]
+            return self.answer(rows, last, query, deadline, earlier)
+
+        return read_through(self._store.replica, lambda: steadily(self._store, [map_name], ask))
+
     def stored(
         self, maps: Sequence[str], frame: NamedFrame, query: Query, since: float | None = None
     ) -> Answer:
@@ -287,8 +321,9 @@ class Queries:
         return read_through(self._store.replica, lambda: steadily(self._store, names, ask))
 
     def answer(
-        self, asked_of: Sequence[MapRow], asked: PreparedQuery, query: Query, deadline: Deadline
-    ) -> Answer:
+        self, asked_of: Sequence[MapRow], asked: PreparedQuery, query: Query, deadline: Deadline,
+        earlier: Sequence[SequenceFrame] = (),
+    ) -> Answer:  # fmt: skip
         """Answer from the maps as they are now; ModelMismatch where one has switched meanwhile."""
         database = self._store.queried
         with database.read() as connection:
@@ -305,7 +340,7 @@ class Queries:
         for place in places:
             check_model(place.view.model_id, asked.model_id)
         model = self._signers(asked.model_id).model
-        told, ranked = answer(self._store, places, model, asked, query, deadline)
+        told, ranked = answer(self._store, places, model, asked, query, deadline, earlier)
         if query.keep:
             kept = StoredResult(
                 told, query, asked.model_id, asked.vector, asked.artifact, ranked,
@@ -365,6 +400,33 @@ class Queries:
             "model, or switch the others with `sceneprint reencode`.",
             tuple((f"maps.{name}", f"has {model}") for name, model in told.items()),
         )
+
+
+def check_sequence(metas: Sequence[FrameMeta], query: Query) -> None:
+    """See that frames can be asked as a sequence; InvalidRequest where they cannot."""
+    check_localizes(query)
+    if not 2 <= len(metas) <= MOST_OF_SEQUENCE:
+        raise InvalidRequest(
+            f"A sequence of {len(metas)} frames. Send 2 to {MOST_OF_SEQUENCE}, the last one being "
+            "the frame to be placed.",
+            (("frame", f"{len(metas)} of them"),),
+        )
+    without = [i for i, meta in enumerate(metas) if meta.pose is None]
+    parents = {meta.pose.parent_frame for meta in metas if meta.pose is not None}
+    if without or len(parents) > 1:
+        what = f"frame {without[0]} has no pose" if without else "they have several parent frames"
+        raise InvalidRequest(
+            f"The frames of a sequence need odometry, but {what}. Send each with `pose` in one "
+            "parent frame, such as odom.",
+            (("metas", what),),
+        )
+
+
+def _odometry(frame: PreparedQuery) -> Floats:
+    """T_odom_sensor of a frame of a sequence."""
+    if frame.pose is None:
+        raise ValueError("a frame of a sequence without a pose")
+    return frame.pose
 
 
 # An answer to the one thing a robot wants: where it is.

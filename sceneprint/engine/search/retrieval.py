@@ -56,6 +56,7 @@ class PreparedQuery:
     artifact : `geometry` as bytes
     kind : of the frame
     up : (3,) unit vector in its sensor; None where it is not known
+    pose : (4, 4) T_parent_sensor that came with an upload, of a sequence's odometry
     """
 
     model_id: str
@@ -69,6 +70,7 @@ class PreparedQuery:
     artifact: bytes | None = None
     kind: Kind = "depth"
     up: Floats | None = None
+    pose: Floats | None = None
 
 
 def prepare_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -> PreparedQuery:
@@ -97,7 +99,7 @@ def prepare_upload(data: bytes, meta: FrameMeta, signer: Signer, query: Query) -
     artifact = write_geometry(seen)
     return PreparedQuery(
         signature.model_id, signature.vector, read_geometry(artifact), taken, None, _since(start),
-        base=base, artifact=artifact, kind=kind, up=up,
+        base=base, artifact=artifact, kind=kind, up=up, pose=read.frame.pose,
     )  # fmt: skip
 
 

@@ -161,7 +161,8 @@ _MOST_PLACES = 24
 
 
 def placed(
-    store: Store, searched: Searched, tried: Validated, rows: Mapping[int, FrameRow],
+    store: Store, searched: Searched, geometries: Mapping[int, Geometry],
+    rows: Mapping[int, FrameRow],
     asked: Sequence[QueryFrame], prior: Prior | None, p: ValidationParameters,
     options: ValidationOptions | None,
 ) -> PoseEstimate | None:  # fmt: skip
@@ -170,7 +171,7 @@ def placed(
     Parameters
     ----------
     store, searched : see there
-    tried : of `validated`
+    geometries : of candidates, by number, as far as they are open
     rows : of the candidates, by number; those without a pose suggest none
     asked : the query's frames with their matches
     prior : what the robot believed before; its parent as `parent_key` writes it
@@ -194,7 +195,7 @@ def placed(
     model_id = searched.parts[0].place.row.model_id
 
     def views_of(parent: str, at: Floats) -> MapViews:
-        known = [number for number in tried.geometries if parents.get(number) == parent]
+        known = [number for number in geometries if parents.get(number) == parent]
         near = {
             number: found
             for number, found in _near_frames(store, parent, model_id, at).items()
@@ -206,7 +207,7 @@ def placed(
         def open_view(i: int) -> Geometry | None:
             number = numbers[i]
             if number in known:
-                return tried.geometries[number]
+                return geometries[number]
             try:
                 return read_geometry(store.blobs.get(near[number].geometry))
             except (DamagedBlob, UnreadableGeometry):

@@ -18,6 +18,7 @@ from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.retrieval.distance import (
     Ints64,
     Metric,
+    Ranking,
     cross_distances,
     pairwise_distances,
     ranking_size,
@@ -30,12 +31,16 @@ from sceneprint.lab.evaluation.protocol import (
     VIEWS,
     Error,
     FrameStore,
+    JudgedAnswer,
+    SignedFrame,
     ValidatedPair,
     Watch,
     in_preferred_order,
     pose_error,
     unwatched,
 )
+from sceneprint.localization import QueryFrame, localize, views_of_rows
+from sceneprint.matches import associate
 from sceneprint.pipeline import validate
 from sceneprint.types import Bytes, Floats, Geometry
 
@@ -71,6 +76,7 @@ class QueryTask:
     ranking : database indices of the first of R, in order
     selection : those of C, in order
     candidates : all of both, each once
+    allowed : rising indices of all database frames that it may find
     """
 
     number: int
@@ -79,6 +85,7 @@ class QueryTask:
     ranking: list[int]
     selection: list[int]
     candidates: tuple[Candidate, ...]
+    allowed: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +97,7 @@ class Judged:
     average_of_ranking: Error
     average_bound: Error
     milliseconds: float
+    answer: JudgedAnswer
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +111,7 @@ class Judge:
     seed : of every pair, as a service has one for all that it validates
     p : of the model
     matching : see `validate`
+    database : the frames of the map; empty where only pairs are validated
     """
 
     geometry: Callable[[int], Geometry]
@@ -110,6 +119,7 @@ class Judge:
     seed: int
     p: ValidationParameters = field(default_factory=ValidationParameters)
     matching: Matching = "histograms"
+    database: Sequence[SignedFrame] = ()
 
 
 def open_judge(
@@ -118,10 +128,11 @@ def open_judge(
     seed: int,
     p: ValidationParameters,
     matching: Matching = "histograms",
+    database: Sequence[SignedFrame] = (),
 ) -> Judge:
     """Make ready to validate frames of a store."""
     # neighbouring queries have many candidates in common
-    return Judge(lru_cache(128)(store.geometry), mode, seed, p, matching)
+    return Judge(lru_cache(128)(store.geometry), mode, seed, p, matching, database)
 
 
 def voters(parents: Sequence[str], strong: Sequence[bool], most: int = 5) -> list[int]:
@@ -191,7 +202,44 @@ def judge(judging: Judge, task: QueryTask) -> Judged:
         _average(task, of, {p.match: p.validation.T_match_query for p in ranked}),
         _average(task, of, {p.match: refined.get(p.match) for p in views}),
         spent,
+        answer_of(judging, task),
     )
+
+
+def answer_of(judging: Judge, task: QueryTask) -> JudgedAnswer:
+    """The answer that a robot gets from the candidates of C, by the true pose.
+
+    What a service does with a query after the selection, in one place: validation until enough
+    are accepted, the pose of those, and how sure that is.
+    """
+    allowed = set(task.allowed.tolist())
+
+    def open_geometry(row: int) -> Geometry | None:
+        return judging.geometry(judging.database[row].number) if row in allowed else None
+
+    start = time.perf_counter()
+    n = len(task.selection)
+    selected = Ranking(
+        np.array(task.selection, np.intp), np.zeros(n, np.int64), np.zeros(n)
+    )  # neither distance decides here
+    matches = associate(
+        judging.geometry(task.number), selected, range(n), open_geometry,
+        seed=judging.seed, p=judging.p, mode=judging.mode, matching=judging.matching,
+    )  # fmt: skip
+    poses = [frame.pose for frame in judging.database]
+    # what a query may not find must not tell poses apart either: a scene of its own
+    scenes = [frame.scene if row in allowed else "" for row, frame in enumerate(judging.database)]
+    views_of = views_of_rows(matches, poses, open_geometry, scenes, overlap_p=judging.p.agreement)
+    query = QueryFrame(judging.geometry(task.number), matches)
+    told = localize(
+        [query], poses, scenes, views_of if judging.mode == "full" else None,
+        overlap_p=judging.p.agreement,
+    )  # fmt: skip
+    spent = 1e3 * (time.perf_counter() - start)
+    if told is None or told.average is None:
+        return JudgedAnswer("not_found" if told is None else told.status, milliseconds=spent)
+    error = pose_error(told.average.T, task.pose) if told.parent == task.scene else Error()
+    return JudgedAnswer(told.status, told.strength, error, spent)
 
 
 def true_transform(task: QueryTask, candidate: Candidate) -> Floats:

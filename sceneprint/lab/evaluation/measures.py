@@ -13,7 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.lab.evaluation.protocol import Error, QueryOutcome, SignedFrame, ValidatedPair
+from sceneprint.lab.evaluation.protocol import (
+    Error,
+    JudgedAnswer,
+    QueryOutcome,
+    SignedFrame,
+    ValidatedPair,
+)
 from sceneprint.types import Floats
 
 #: The k of recall@k.
@@ -324,6 +330,30 @@ def absent(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
         "accepted_weak": _share([a == "weak" for a in answers]),
         "pairs": sum(len(o.pairs) for o in away),
         "pairs_accepted": sum(p.accepted for o in away for p in o.pairs.values()),
+    }
+
+
+def answers(told: Sequence[JudgedAnswer]) -> Figures:
+    """What robots are told, as shares of all queries; the first four add up to 1.
+
+    `found_right`: within 10 cm and 10 degrees. `found_wrong`: found and not right, of absent
+    scenes always; `grossly_wrong` of them are beyond 50 cm or 15 degrees, and the rate of
+    those is below `grossly_wrong_at_most` (95 %, one-sided). `found_strong_wrong`: wrong ones
+    that were called strong. Null where nothing was asked.
+    """
+    wrong = [one.status == "found" and not one.right for one in told]
+    gross = [one.grossly_wrong for one in told]
+    return {
+        "queries": len(told),
+        "found_right": _share([one.right for one in told]),
+        "found_wrong": _share(wrong),
+        "ambiguous": _share([one.status == "ambiguous" for one in told]),
+        "not_found": _share([one.status == "not_found" for one in told]),
+        "grossly_wrong": _share(gross),
+        "grossly_wrong_at_most": upper_bound(sum(gross), len(told)),
+        "found_strong_wrong": _share(
+            [one.strength == "strong" and w for one, w in zip(told, wrong, strict=True)]
+        ),
     }
 
 

@@ -27,6 +27,7 @@ from sceneprint.formats.dataset.sequences import natural
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.pose.rigid import difference, moved
 from sceneprint.geometry.retrieval.distance import Metric
+from sceneprint.geometry.validation.acceptance import Strength
 from sceneprint.geometry.validation.association import preferred
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.models import Model
@@ -51,6 +52,10 @@ if TYPE_CHECKING:
 VIEWS = 5
 #: A transform between rooms' frames is right within these metres and degrees.
 RIGHT = (0.10, 10.0)
+#: An answer beyond these is another place, not an inaccurate one.
+GROSS = (0.50, 15.0)
+
+AnswerStatus = Literal["found", "ambiguous", "not_found"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +130,34 @@ class ValidatedPair:
 
 
 @dataclass(frozen=True, eq=False)
+class JudgedAnswer:
+    """What a robot is told of a query, and how far off that is.
+
+    Parameters
+    ----------
+    status : "found", "ambiguous" or "not_found"
+    strength : "strong" or "weak"; None unless found
+    error : of the pose in the map; infinite without one, and in another parent frame
+    milliseconds : that the answer took, from R on
+    """
+
+    status: AnswerStatus = "not_found"
+    strength: Strength | None = None
+    error: Error = Error()
+    milliseconds: float = 0.0
+
+    @property
+    def right(self) -> bool:
+        """Whether it is found within 10 cm and 10 degrees."""
+        return self.status == "found" and self.error.within(*RIGHT)
+
+    @property
+    def grossly_wrong(self) -> bool:
+        """Whether it is found, but beyond 50 cm or 15 degrees."""
+        return self.status == "found" and not self.error.within(*GROSS)
+
+
+@dataclass(frozen=True, eq=False)
 class QueryOutcome:
     """All that is known of a query when the evaluation is done.
 
@@ -142,6 +175,7 @@ class QueryOutcome:
     average, average_of_ranking : errors of the pose averaged over accepted views of C and of R
     average_bound : error of the average of the same views of C, each refined from the true pose
     milliseconds : of ranking, of the selection, of averaging
+    answer : the whole answer; see `answer_of`
     """
 
     name: str
@@ -160,6 +194,7 @@ class QueryOutcome:
     average_of_ranking: Error = Error()
     average_bound: Error = Error()
     milliseconds: dict[str, float] = field(default_factory=dict)
+    answer: JudgedAnswer = JudgedAnswer()
 
     def overlap_of(self, match: int) -> float:
         """Overlap with a database frame, by the definition of retrieval."""

@@ -21,6 +21,7 @@ from sceneprint.lab.evaluation.measures import (
     Figures,
     absent,
     accuracy,
+    answers,
     bound,
     lost,
     oracle_and_random,
@@ -217,6 +218,7 @@ def measured(
         "diversity": diversity(outcomes, poses, database),
         "lost": lost(outcomes),
         "absent": absent(outcomes),
+        "answers": answers([outcome.answer for outcome in outcomes]),
     }
 
 
@@ -236,7 +238,7 @@ def milliseconds(outcomes: Sequence[QueryOutcome]) -> dict[str, float | None]:
     """Median time of each stage: of a query, or under `validate` of one pair."""
     stages: dict[str, list[float]] = {
         stage: [o.milliseconds[stage] for o in outcomes if stage in o.milliseconds]
-        for stage in ("rank", "compare_ranking", "diversify", "average")
+        for stage in ("rank", "compare_ranking", "diversify", "average", "answer")
     }
     stages["validate"] = [pair.milliseconds for o in outcomes for pair in o.pairs.values()]
     return {stage: float(np.median(ms)) if ms else None for stage, ms in stages.items()}
@@ -258,6 +260,11 @@ def per_query(outcome: QueryOutcome, names: Sequence[str]) -> dict[str, Any]:
         "VDR": _answer(outcome, [pair.match for pair in answers[:1]], names),
         "accepted": len(answers),
         "pose_average": _error(outcome.average),
+        "answer": {
+            "status": outcome.answer.status,
+            "strength": outcome.answer.strength,
+            **_error(outcome.answer.error),
+        },
         "ranking": [names[match] for match in outcome.ranking[: outcome.candidates]],
         "selection": [names[match] for match in outcome.selection],
         "matches": _matches(outcome, names),
@@ -353,9 +360,15 @@ def table(found: dict[str, Any]) -> list[str]:
     lines += [_chance(found[name], name) for name in ("oracle", "random")]
     baselines = found.get("baselines", {})
     lines += [_accuracy(n, row) + _overlap(row) for n, row in baselines.items() if "recall" in row]
-    lines += ["", *_recalls(found), "", *_sentences(found), ""]
+    lines += ["", *_recalls(found), "", *_answers(found), "", *_sentences(found), ""]
     for scene, figures in found.get("by_scene", {}).items():
-        lines += [f"queries of {scene}, among all", *_rows(figures), _lost(figures), ""]
+        lines += [
+            f"queries of {scene}, among all",
+            *_rows(figures),
+            *_answers(figures),
+            _lost(figures),
+            "",
+        ]
     if found["left_out"]:
         lines.append(_left_out(found))
     return [*lines, _times(found)]
@@ -415,6 +428,29 @@ def _recall(name: str, row: dict[str, Any]) -> str:
 
 def _chance(row: dict[str, Any], name: str) -> str:
     return f"{name:58}" + _overlap(row)
+
+
+_ANSWERS = {
+    "found_right": "found and right",
+    "found_wrong": "found and wrong",
+    "ambiguous": "ambiguous",
+    "not_found": "not found",
+}
+
+
+def _answers(found: dict[str, Any]) -> list[str]:
+    """A row for each thing that a robot may be told."""
+    if "answers" not in found:  # of figures that were kept before there were any
+        return []
+    told = found["answers"]
+    lines = [f"{'answers':18}{'share':>10}"]
+    lines += [f"{name:18}{_share(told[key]):>10}" for key, name in _ANSWERS.items()]
+    lines[2] += (
+        f"   beyond 50 cm or 15 deg {_share(told['grossly_wrong'])}, at most "
+        f"{_share(told['grossly_wrong_at_most'])}; called strong "
+        f"{_share(told['found_strong_wrong'])}"
+    )
+    return lines
 
 
 def _sentences(found: dict[str, Any]) -> list[str]:

@@ -314,12 +314,13 @@ def _evaluate_slice(
     )
     local = Overlaps(truth.mean[of_queries], truth.least[of_queries])
     tasks = [
-        _task(query, database, one, local, i, settings.candidates)
+        _task(query, database, one, local, i, settings.candidates, allowed[i])
         for i, (query, one) in enumerate(zip(queries, ranked, strict=True))
     ]
     opening = partial(
-        open_judge, store, settings.mode, settings.seed, prepared.validation, settings.matching
-    )
+        open_judge, store, settings.mode, settings.seed, prepared.validation, settings.matching,
+        database,
+    )  # fmt: skip
     judged = watch(map_over(tasks, judge, opening, settings.jobs), "validate", len(tasks))
     return [
         _outcome(queries[i], ranked[i], one, allowed[i], same[i], local, i, settings.candidates)
@@ -334,6 +335,7 @@ def _task(
     truth: Overlaps,
     row: int,
     first: int,
+    allowed: NDArray[np.bool_],
 ) -> QueryTask:
     ranking = ranked.ranking[:first]
     candidates = tuple(
@@ -347,7 +349,10 @@ def _task(
         )
         for j in sorted({*ranking, *ranked.selection})
     )
-    return QueryTask(query.number, query.scene, query.pose, ranking, ranked.selection, candidates)
+    return QueryTask(
+        query.number, query.scene, query.pose, ranking, ranked.selection, candidates,
+        np.flatnonzero(allowed),
+    )  # fmt: skip
 
 
 def _outcome(
@@ -377,5 +382,7 @@ def _outcome(
         average=judged.average,
         average_of_ranking=judged.average_of_ranking,
         average_bound=judged.average_bound,
-        milliseconds=ranked.milliseconds | {"average": judged.milliseconds},
+        milliseconds=ranked.milliseconds
+        | {"average": judged.milliseconds, "answer": judged.answer.milliseconds},
+        answer=judged.answer,
     )

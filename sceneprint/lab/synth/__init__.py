@@ -1,6 +1,7 @@
 """Synthetic depth frames of furnished rooms and laser scans of large sites, with exact poses.
 
     seed, index  --synthesise_room-->  frames        seed, index  --synthesise_survey-->  clouds
+    kind, seed, index  --synthesise_lookalike-->  frames of a map, and queries
 
 Nothing here reads or writes files.
 """
@@ -15,6 +16,7 @@ from sceneprint.lab.synth.dataset import (
     take,
 )
 from sceneprint.lab.synth.large_scenes import corridor, symmetric_box
+from sceneprint.lab.synth.lookalikes import LookalikeSite, synthesise_lookalike
 from sceneprint.lab.synth.rooms import Room, make_room
 from sceneprint.lab.synth.sensors import (
     KINECT_V1,
@@ -32,6 +34,7 @@ __all__ = [
     "KINECT_V1",
     "Caster",
     "KinectNoise",
+    "LookalikeSite",
     "Room",
     "Spinning",
     "Survey",
@@ -44,6 +47,7 @@ __all__ = [
     "scan",
     "scattered_poses",
     "symmetric_box",
+    "synthesise_lookalike",
     "synthesise_room",
     "synthesise_survey",
     "take",

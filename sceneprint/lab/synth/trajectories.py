@@ -159,6 +159,50 @@ def _directions(n: int) -> Floats:
     return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
 
 
+# A circle around something: a camera that keeps looking at it.
+#
+# middle, radius, n, rng  --orbit-->  n x T_world_camera (4, 4), in order
+
+
+def orbit(
+    middle: tuple[float, float, float],
+    radius: float,
+    n: int,
+    rng: np.random.Generator,
+    *,
+    first: float | None = None,
+    sweep: float = 2 * math.pi,
+) -> list[Floats]:
+    """Hand-held views from a circle, slightly downward, each looking at its middle.
+
+    Distance, height and aim wander slowly, by a tenth of a metre or two.
+
+    Parameters
+    ----------
+    middle : what is looked at, metres
+    radius : of the circle, metres
+    n : how many views, evenly spread
+    first : azimuth of the first, rad; default: any
+    sweep : how far round they go, rad
+
+    Returns
+    -------
+    poses : n T_world_camera, (4, 4), in the order of the circle
+    """
+    start = float(rng.uniform(-math.pi, math.pi)) if first is None else first
+    azimuth = start + sweep * np.arange(n) / n
+    scale = (0.15, 0.15, 0.08, 0.08, 0.08, math.radians(4.0))
+    waves = rng.normal(0, 1, (6, 3)) * np.array(scale)[:, None] / math.sqrt(3)
+    phase = np.outer(np.arange(1, 4), 2 * math.pi * np.arange(n) / n)  # closed: 1 to 3 a turn
+    away, up, *aim, roll = waves @ np.cos(phase + rng.uniform(0, 2 * math.pi, (3, 1)))
+    r, z = radius + away, rng.uniform(1.05, 1.65) + up
+    eye = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), z])
+    eye[:, :2] += middle[:2]
+    to = np.array(middle) + np.column_stack(aim) + rng.normal(0, 0.015, (n, 3)) - eye
+    yaw, pitch = np.arctan2(to[:, 1], to[:, 0]), np.arctan2(to[:, 2], np.hypot(to[:, 0], to[:, 1]))
+    return [pose(view) for view in np.column_stack([eye, yaw, pitch, roll])]
+
+
 # A hand-held path: a camera that looks around and comes back.
 #
 #     Room, n, rng  --trajectory-->  n x T_world_camera (4, 4), in order

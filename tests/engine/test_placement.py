@@ -1,0 +1,153 @@
+"""Where a query was taken, by all frames of a map: priors, sequences, causes, and what is read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.engine.search.query import localization_of
+from sceneprint.errors import InvalidPose, InvalidRequest
+from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.store.frame_queries import placed_frames
+from sceneprint_client.api import Localization, Prior, Query
+
+Ids = Callable[[Engine], list[str]]
+
+
+def localized(engine: Engine, upload: Any, **how: Any) -> Localization:
+    query = Query.model_validate({"keep": False, **how})
+    meta = upload.meta.model_copy(update={"pose": None})
+    return localization_of(engine.query_upload("hall", upload.data, meta, query))
+
+
+def prior_at(upload: Any, shift: float = 0.0, **more: Any) -> dict[str, Any]:
+    T = np.array(upload.pose)
+    T[0, 3] += shift
+    return {"pose": {"matrix": T.tolist(), "parent_frame": upload.room}, **more}
+
+
+def test_frames_are_found_by_where_they_were_taken(full: Engine, uploads: Any, ids: Ids) -> None:
+    poses = [np.array(one.pose)[:3, 3] for one in uploads]
+    with full.store.database.read() as connection:
+        row, _, _ = full.view("hall")
+
+        def near(centre: Any, within: float, most: int = 99, room: str = uploads[0].room) -> Any:
+            return placed_frames(
+                connection, row.number, room, row.model_id, centre.tolist(), within, most
+            )
+
+        for within in (0.01, 0.05, 5.0):
+            by_hand = sorted(
+                (float(((at - poses[2]) ** 2).sum()), i)
+                for i, at in enumerate(poses[:6])
+                if np.abs(at - poses[2]).max() <= within
+            )
+            found = near(poses[2], within)
+            assert [one.number for one in found] == [i + 1 for _, i in by_hand]
+            for one in found:
+                np.testing.assert_allclose(one.pose, uploads[one.number - 1].pose, atol=1e-12)
+        assert [one.number for one in near(poses[2], 5.0, most=2)] == [3, by_hand[1][1] + 1]
+        assert near(poses[2] + 50.0, 5.0) == []
+        assert near(poses[2], 5.0, room="nowhere") == []
+    full.delete_frame("hall", ids(full)[2])
+    with full.store.database.read() as connection:
+        left = placed_frames(
+            connection, row.number, uploads[0].room, row.model_id, poses[2].tolist(), 5.0, 99
+        )
+    assert 3 not in {one.number for one in left}
+
+
+def test_a_prior_is_read_and_changes_no_answer_that_is_sure(full: Engine, uploads: Any) -> None:
+    alone = localized(full, uploads[8])
+    for prior in (prior_at(uploads[8], 0.2), prior_at(uploads[8], 3.0)):
+        there = localized(full, uploads[8], prior=prior)
+        assert (there.status, there.verified_by, there.pose) == ("found", "matches", alone.pose)
+    covariance = (np.eye(6) * 0.04).ravel().tolist()
+    given = Prior.model_validate(prior_at(uploads[8], covariance=covariance))
+    assert localized(full, uploads[8], prior=given).pose == alone.pose
+
+
+def test_a_prior_that_cannot_be_used_says_why(full: Engine, uploads: Any) -> None:
+    flat = np.eye(6)
+    flat[0, 0] = 0.0
+    with pytest.raises(InvalidRequest, match="covariance of the prior is not one"):
+        localized(full, uploads[8], prior=prior_at(uploads[8], covariance=flat.ravel().tolist()))
+    skew = prior_at(uploads[8])
+    skew["pose"]["matrix"][0][0] += 0.5
+    with pytest.raises(InvalidPose, match="The prior"):
+        localized(full, uploads[8], prior=skew)
+    with pytest.raises(InvalidRequest, match="A prior needs validated matches"):
+        full.query_upload(
+            "hall", uploads[8].data, uploads[8].meta,
+            Query.model_validate({"stages": "retrieve", "prior": prior_at(uploads[8])}),
+        )  # fmt: skip
+    with pytest.raises(ValueError, match=r"needs pose\.parent_frame"):
+        Prior.model_validate({"pose": {"matrix": np.eye(4).tolist()}})
+
+
+def test_a_sequence_places_its_last_frame(full: Engine, uploads: Any) -> None:
+    """The odometry starts anywhere: only what lies between the frames counts."""
+    start = np.eye(4)
+    start[:3, 3] = 40.0, -7.0, 1.0
+    sent = []
+    for one in uploads[6:9]:
+        T = start @ inverse(np.array(uploads[6].pose)) @ np.array(one.pose)
+        pose = {"matrix": T.tolist(), "parent_frame": "odom"}
+        meta = one.meta.model_validate(one.meta.model_dump() | {"pose": pose})
+        sent.append((one.data, meta))
+    answer = full.queries.sequence("hall", sent, Query(keep=False))
+    assert (answer.status, answer.frames) == ("found", 3)
+    assert answer.location is not None
+    assert answer.location.votes == 15  # five of each frame
+    there = np.array(answer.location.pose.matrix)
+    assert np.linalg.norm(there[:3, 3] - np.array(uploads[8].pose)[:3, 3]) < 0.02
+    turn = there[:3, :3].T @ np.array(uploads[8].pose)[:3, :3]
+    assert math.degrees(math.acos(min(1.0, (np.trace(turn) - 1) / 2))) < 1.0
+    assert "earlier" in answer.milliseconds
+
+
+def test_a_sequence_needs_frames_and_odometry(full: Engine, uploads: Any) -> None:
+    bare = uploads[0].meta.model_copy(update={"pose": None})
+    one, other = (uploads[0].data, uploads[0].meta), (uploads[0].data, bare)
+    for frames, why in (
+        ([one], "A sequence of 1 frames"), ([one] * 11, "A sequence of 11 frames"),
+        ([one, other], "frame 1 has no pose"),
+        ([one, (uploads[6].data, uploads[6].meta)], "several parent frames"),
+    ):  # fmt: skip
+        with pytest.raises(InvalidRequest, match=why):
+            full.queries.sequence("hall", frames, Query())
+
+
+@pytest.mark.parametrize(
+    ("change", "cause", "told"),
+    [
+        ("scale", "scale", "times as far away as those of the map. Check `depth_scale`"),
+        ("wall", "one_plane", "Turn towards furniture"),
+    ],
+)
+def test_what_is_not_found_names_its_likeliest_cause(
+    full: Engine, uploads: Any, make_upload: Any, change: str, cause: str, told: str
+) -> None:
+    frame = uploads[0].frame
+    if change == "scale":
+        upload = uploads[0]
+        meta = upload.meta.model_copy(update={"depth_scale": 5000.0, "pose": None})
+        answer = full.query_upload("hall", upload.data, meta, Query(keep=False))
+    else:
+        from dataclasses import replace
+
+        # a slanted wall, which fills the view
+        slant = 1.5 + np.linspace(0.0, 1.0, frame.depth.shape[1])[None, :]
+        depth = np.broadcast_to(slant, frame.depth.shape).astype(np.float32)
+        wall = make_upload(replace(frame, depth=depth, pose=np.eye(4)), "wall")
+        answer = full.query_upload("hall", wall.data, wall.meta, Query(keep=False))
+    assert (answer.status, answer.cause, answer.location) == ("not_found", cause, None)
+    assert told in answer.reason
+    assert [m.pose_in_map for m in answer.matches if m.validation.status == "rejected"] == [
+        None for m in answer.matches if m.validation.status == "rejected"
+    ]

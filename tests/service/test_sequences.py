@@ -1,0 +1,89 @@
+"""Several frames asked at once, over HTTP."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="module")
+def path(served, make_map, shots) -> str:
+    """A map with the first two views of a room, by its path."""
+    home = make_map(served, "sequences")
+    for shot in shots[:2]:
+        meta = {"session": "morning", "robot": "r1", "pose": {"matrix": shot.pose}}
+        sent = served.client.post(
+            f"{home}/frames", **shot.form(**meta), headers={"Prefer": "wait=60"}
+        )
+        assert sent.json()["state"] == "indexed"
+    return str(home)
+
+
+def ask(served: Any, path: str, shots: Any, poses: Any, **more: str) -> Any:
+    files, metas = [], []
+    for shot, pose in zip(shots, poses, strict=True):
+        form = shot.form() if pose is None else shot.form(pose=pose)
+        files.append(("frame", form["files"]["frame"]))
+        metas.append(json.loads(form["data"]["meta"]))
+    data = {"metas": json.dumps(metas), **more}
+    return served.client.post(f"{path}/localize/sequence", files=files, data=data)
+
+
+def odometry(T: Any) -> dict[str, Any]:
+    return {"matrix": np.array(T).tolist(), "parent_frame": "odom"}
+
+
+def test_the_last_of_several_frames_is_placed(served, path, shots):
+    start = np.eye(4)
+    start[:3, 3] = 5.0, 6.0, 7.0  # of odometry nothing but what lies between frames counts
+    asked = [shots[1], shots[0]]
+    poses = [odometry(start @ np.array(shot.pose)) for shot in asked]
+    answer = ask(served, path, asked, poses, keep="false", k="3")
+    assert answer.status_code == 200, answer.text
+    there = answer.json()
+    assert (there["status"], there["verified_by"]) == ("found", "matches")
+    np.testing.assert_allclose(there["pose"]["matrix"], shots[0].pose, atol=0.03)
+    alone = served.client.post(f"{path}/localize", **shots[0].form())
+    assert there["votes"] == 2 * alone.json()["votes"]
+
+
+@pytest.mark.parametrize(
+    ("count", "poses", "more", "told"),
+    [
+        (1, True, {}, "A sequence of 1 frames"),
+        (2, False, {}, "frame 0 has no pose"),
+        (2, True, {"k": "0"}, "greater than or equal to 1"),
+        (2, True, {"colour": "red"}, "colour"),
+        (2, True, {"stages": "retrieve"}, "A pose needs validated matches"),
+    ],
+)
+def test_what_is_no_sequence_is_refused(served, path, shots, count, poses, more, told):
+    asked = shots[:count]
+    given = [odometry(shot.pose) if poses else None for shot in asked]
+    answer = ask(served, path, asked, given, **more)
+    assert answer.status_code == 422, answer.text
+    assert told in answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_the_client_sends_a_sequence(served, path, shots):
+    from sceneprint_client import Client
+    from sceneprint_client.api import FrameMeta
+    from sceneprint_client.errors import InvalidRequest
+
+    frames, metas = [], []
+    for shot in (shots[1], shots[0]):
+        form = shot.form(pose=odometry(shot.pose))
+        frames.append(form["files"]["frame"][1])
+        metas.append(FrameMeta.model_validate_json(form["data"]["meta"]))
+    name = path.rpartition("/")[2]
+    with Client(served.url) as client:
+        there = client.localize_sequence(name, frames, metas, keep=False)
+        assert there.status == "found"
+        assert there.pose is not None
+        np.testing.assert_allclose(there.pose.matrix, shots[0].pose, atol=0.03)
+        with pytest.raises(InvalidRequest, match="Give one for each"):
+            client.localize_sequence(name, frames, metas[:1])

@@ -1,0 +1,203 @@
+"""Sites that look like themselves or like another: the same each time, and as alike as they say."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sceneprint import cli
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.lab.evaluation.protocol import overlaps, view_of
+from sceneprint.lab.synth import KINECT, Room, render, synthesise_lookalike
+from sceneprint.lab.synth.lookalikes import (
+    APART,
+    ELSEWHERE,
+    KINDS,
+    OBJECTS,
+    Likeness,
+    SymmetricObject,
+    bare_floor,
+    cabinet,
+    difference_share,
+    equal_bays,
+    equal_offices,
+)
+from sceneprint.lab.synth.mesh import rotation_z
+from sceneprint.lab.synth.trajectories import orbit, scattered_poses
+from sceneprint.types import Floats, Intrinsics
+
+SEED = 5
+#: a Kinect's field of view in few samples
+SMALL = Intrinsics(160, 120, 146.25, 146.25, 79.5, 59.5)
+
+
+def run(*arguments: object, expect: int = 0) -> tuple[str, str]:
+    """What the command prints: its output and its errors."""
+    out, told = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(told):
+        code = cli.main([str(one) for one in arguments])
+    assert code == expect, told.getvalue()
+    return out.getvalue(), told.getvalue()
+
+
+def turned(T: Floats, yaw: float) -> Floats:
+    """A pose carried about the world's z axis."""
+    turn = np.eye(4)
+    turn[:3, :3] = rotation_z(yaw)
+    return turn @ T
+
+
+def share_that_differs(room: Room, T: Floats, yaw: float, metres: float) -> float:
+    """Of what is seen within 5 m, where the floor does not end, after a turn of the camera."""
+    a, b = render(room, T), render(room, turned(T, yaw))
+    near = (a > 0) & (a < 5.0)
+    return float(np.mean(np.abs(a - b)[near] > metres))
+
+
+def orbit_of(thing: SymmetricObject, rng: np.random.Generator) -> list[Floats]:
+    return orbit((0.0, 0.0, 0.5), 1.8, 9, rng)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_site_depends_on_its_seed_and_number_alone(kind: str) -> None:
+    site, again, other = (
+        synthesise_lookalike(kind, seed, 1, queries=2, intrinsics=SMALL)
+        for seed in (SEED, SEED, SEED + 1)
+    )
+    assert site.name == f"{kind}-001"
+    assert (site.present, site.same_frame) == (kind not in ELSEWHERE, kind not in APART)
+    assert len(site.queries) == 2
+    assert len(site.map) >= 15
+    for one, same in zip(
+        (*site.map[:3], *site.queries), (*again.map[:3], *again.queries), strict=True
+    ):
+        np.testing.assert_array_equal(one.depth, same.depth)
+        np.testing.assert_array_equal(one.pose, same.pose)
+    assert not np.array_equal(site.queries[0].depth, other.queries[0].depth)
+    names = [frame.name for frame in (*site.map, *site.queries)]
+    assert len(set(names)) == len(names)
+    shown = [float(np.mean(frame.depth > 0)) for frame in site.queries]
+    assert min(shown) > 0.3
+
+
+def test_there_is_no_other_kind() -> None:
+    with pytest.raises(ValueError, match=r"no kind 'stairs' of look-alikes\. Choose from object, "):
+        synthesise_lookalike("stairs", 0, 0)
+
+
+@pytest.mark.parametrize("make", OBJECTS)
+def test_the_body_of_an_object_is_the_same_turned_by_its_symmetry(
+    make: Callable[[np.random.Generator], SymmetricObject],
+) -> None:
+    """Every ray meets the turned body as it meets the body; details are a small part of a view."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        thing = make(rng)
+        angle = 2 * math.pi / thing.order
+        body, whole = (
+            bare_floor(mesh, np.random.default_rng(0)) for mesh in (thing.body, thing.mesh)
+        )
+        for T in orbit_of(thing, rng)[::3]:
+            assert share_that_differs(body, T, angle, 0.001) < 0.001  # but for edges
+            assert share_that_differs(whole, T, angle, 0.02) < 0.05
+
+
+def test_details_break_the_symmetry_of_a_cabinet() -> None:
+    """Over eight cabinets, from all around, turned by 180 degrees: something differs, not much."""
+    shares = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        thing = cabinet(rng)
+        assert thing.order == 2
+        room = bare_floor(thing.mesh, rng)
+        views = orbit_of(thing, rng)[::2]
+        shares.append(max(share_that_differs(room, T, math.pi, 0.003) for T in views))
+    assert min(shares) > 2e-4
+    assert max(shares) < 0.2
+
+
+def test_an_orbit_goes_round_and_looks_at_the_middle() -> None:
+    middle = np.array([1.0, -2.0, 0.5])
+    poses = orbit((1.0, -2.0, 0.5), 1.7, 72, np.random.default_rng(3))
+    eyes = np.array([T[:3, 3] for T in poses])
+    away = np.linalg.norm(eyes[:, :2] - middle[:2], axis=1)
+    assert away.min() > 1.1
+    assert away.max() < 2.3
+    azimuth = np.unwrap(np.arctan2(eyes[:, 1] + 2.0, eyes[:, 0] - 1.0))
+    np.testing.assert_allclose(np.diff(azimuth), 2 * math.pi / 72)
+    for T in poses:
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+        to = (middle - T[:3, 3]) / np.linalg.norm(middle - T[:3, 3])
+        assert math.degrees(math.acos(float(T[:3, 2] @ to))) < 15  # half of the view is 28
+        assert T[2, 2] < 0  # downward
+
+
+def test_every_query_around_an_object_has_a_frame_beside_it_and_one_across() -> None:
+    site = synthesise_lookalike("object", SEED, 0, queries=6, noise=None)
+    seen = overlaps([view_of(q) for q in site.queries], [view_of(d) for d in site.map])
+    assert seen.least.max(axis=1).min() > 0.5
+    where = np.array([d.pose[:2, 3] for d in site.map if d.pose is not None])
+    for query in site.queries:
+        assert query.pose is not None
+        across = np.linalg.norm(where + query.pose[:2, 3], axis=1)
+        assert across.min() < 0.8
+
+
+def test_equal_offices_differ_by_what_people_move_and_not_at_all_without_it() -> None:
+    same = equal_offices(2, Likeness(0.0, 0.0, 0.0, 1.0), np.random.default_rng(1))
+    moved = equal_offices(2, Likeness(0.0, 0.0, 0.3, 0.5), np.random.default_rng(1))
+    np.testing.assert_array_equal(same[0].vertices, same[1].vertices)
+    poses = scattered_poses(moved[0], 6, np.random.default_rng(2))
+    assert max(difference_share(same[0], same[1], T) for T in poses) == 0.0
+    shares = [difference_share(moved[0], moved[1], T) for T in poses]
+    assert 0.01 < np.median(shares) < 0.4
+
+
+def test_bays_repeat() -> None:
+    hall, pitch = equal_bays(4, Likeness(0.0, 0.0, 0.0, 1.0), np.random.default_rng(4))
+    width = hall.size[1]
+    for x, y in ((0.5, 0.5), (0.3, 0.6)):
+        T = orbit((x * pitch, y * width, 0.8), 0.2, 1, np.random.default_rng(0))[0]
+        shifted = T.copy()
+        shifted[0, 3] += pitch
+        # the ends of the hall are seen from elsewhere, the bays are not
+        alike = np.abs(render(hall, T, KINECT) - render(hall, shifted, KINECT)) < 1e-3
+        assert alike.mean() > 0.8
+
+
+@pytest.mark.parametrize(("kind", "scenes"), [("object", 1), ("kitchens", 2)])
+def test_the_layout_is_read_back(kind: str, scenes: int, tmp_path: Path) -> None:
+    out = tmp_path / "sites"
+    said, _ = run("synth", out, "--lookalikes", kind, "--rooms", 1, "--views", 3, "--seed", SEED)
+    assert f"1 sites of 3 queries in {out}" in said
+    site = synthesise_lookalike(kind, SEED, 0, queries=3)
+    found = find_sequences(out)
+    assert len({sequence.parent_frame for sequence in found}) == scenes
+    parts = {sequence.split: sequence for sequence in found}
+    assert set(parts) == {"train", "test"}
+    for part, frames in (("train", site.map), ("test", site.queries)):
+        read = parts[part].frames
+        assert len(read) == len(frames)
+        for reference, frame in zip(read[:3], frames, strict=False):
+            back = reference.read()
+            np.testing.assert_allclose(back.depth, frame.depth, atol=1e-6)
+            np.testing.assert_allclose(back.pose, frame.pose, atol=1e-6)
+
+
+@pytest.mark.parametrize("more", [("--path",), ("--sensor", "lidar")])
+def test_lookalikes_have_paths_of_their_own(more: tuple[str, ...], tmp_path: Path) -> None:
+    _, told = run("synth", tmp_path / "x", "--lookalikes", "object", *more, expect=2)
+    assert f"--lookalikes and {' '.join(more)}: look-alike sites have camera paths" in told
+    assert not (tmp_path / "x").exists()
+
+
+def test_the_command_has_every_kind() -> None:
+    from sceneprint.cli.offline import LOOKALIKES
+
+    assert LOOKALIKES == KINDS

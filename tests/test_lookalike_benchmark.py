@@ -1,0 +1,54 @@
+"""`python -m benchmarks.lookalikes`: the table by hand, and one small site asked for real."""
+
+from __future__ import annotations
+
+from benchmarks.lookalikes import Told, ask_site, table
+from sceneprint.lab.evaluation.measures import upper_bound
+from sceneprint.lab.evaluation.protocol import Error, JudgedAnswer
+from sceneprint.pipeline import Signer
+
+
+def told(kind: str, number: int, answer: JudgedAnswer) -> Told:
+    return Told(f"{kind}-000", kind, number, kind == "object", answer)
+
+
+def test_the_table_by_hand() -> None:
+    right = JudgedAnswer("found", "strong", Error(0.03, 0.02), 100.0)
+    flipped = JudgedAnswer("found", "strong", Error(2.5, 3.1), 300.0)
+    lines = table(
+        [
+            told("object", 0, right),
+            told("object", 1, flipped),
+            told("absent", 0, JudgedAnswer("not_found", milliseconds=40.0)),
+            told("absent", 1, JudgedAnswer("ambiguous", milliseconds=60.0)),
+        ]
+    )
+    rows = {line.split("|")[1].strip(): line for line in lines[2:]}
+    assert list(rows) == ["object", "absent", "all"]
+    bounds = [upper_bound(1, 2), upper_bound(0, 2), upper_bound(1, 4)]
+    a, b, c = (f"{bound:.3f}" for bound in bounds)
+    assert rows["object"] == (
+        f"| object | 2 | 2 | 0.500 | 0.500 | 0.500 | {a} | 0.500 | 0.000 | 0.000 | 200 |"
+    )
+    assert rows["absent"] == (
+        f"| absent | 2 | 0 | 0.000 | 0.000 | 0.000 | {b} | 0.000 | 0.500 | 0.500 | 50 |"
+    )
+    assert rows["all"] == (
+        f"| all | 4 | 2 | 0.250 | 0.250 | 0.250 | {c} | 0.250 | 0.250 | 0.250 | 80 |"
+    )
+
+
+def test_a_site_is_asked_and_every_answer_is_one_of_three(small_signer: Signer) -> None:
+    answers = ask_site(small_signer, ("object", 0, 2), seed=5)
+    assert [(one.site, one.query, one.answerable) for one in answers] == [
+        ("object-000", 0, True),
+        ("object-000", 1, True),
+    ]
+    for one in answers:
+        assert one.answer.status in ("found", "ambiguous", "not_found")
+        assert (one.answer.strength is None) == (one.answer.status != "found")
+        assert one.answer.milliseconds > 0
+    again = ask_site(small_signer, ("object", 0, 2), seed=5)
+    assert [(a.answer.status, a.answer.error) for a in again] == [
+        (a.answer.status, a.answer.error) for a in answers
+    ]
