@@ -144,7 +144,8 @@ def views(client: httpx.Client, made: list[Shot]) -> list[View]:
     (dead,) = client.get("/v1/jobs", params={"state": "dead"}).json()["items"]
     hall = str(_listed(client, HALL, "indexed")[0]["frame_id"])
     return [
-        *_views(answer, boxed, ids[3], hall, dead["job_id"], key, made), *_unsure(sides, absent)
+        *_views(answer, boxed, ids[3], hall, dead["job_id"], key, made),
+        *_unsure(sides, absent),
     ]
 
 

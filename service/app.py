@@ -23,6 +23,7 @@ from sceneprint_client.api import (
     FrameMeta,
     NamedFrame,
     NewMap,
+    Prior,
     Problem,
     ValidationOptions,
 )
@@ -68,6 +69,7 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
                 (NamedFrame, "validation"),
                 (Diversity, "validation"),
                 (ValidationOptions, "validation"),
+                (Prior, "validation"),
                 (NewMap, "validation"),
                 (NewKey, "validation"),
                 (NewAssociation, "validation"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import signal
@@ -24,7 +25,9 @@ from sceneprint.pipeline import Signer, open_signer, sign
 from sceneprint.settings import Settings
 from sceneprint.types import DepthFrame, Intrinsics
 from sceneprint_client.addresses import DEFAULT_URL
+from sceneprint_client.api.base import checked
 from sceneprint_client.api.frames import MOST_PRIORITY, GivenBase, novelty_of
+from sceneprint_client.api.query import Prior
 
 if TYPE_CHECKING:
     from sceneprint_client import Client
@@ -203,6 +206,52 @@ def add_up_option(command: argparse.ArgumentParser) -> None:
         metavar="X,Y,Z",
         help="up in the sensor's axes, a unit vector, as 0,-1,0 for a camera held level (write "
         "--up=-1,0,0 if it starts with a minus)",
+    )
+
+
+_A_PRIOR = (
+    '{"pose": {"parent_frame": "room", "translation": {"x": 1, "y": 2, "z": 0}, "rotation": '
+    '{"x": 0, "y": 0, "z": 0, "w": 1}}, "deviation_m": 0.3, "deviation_deg": 10}'
+)
+
+
+def prior_of(text: str) -> dict[str, Any]:
+    """A prior as JSON has it: the text itself, or the file that it names."""
+    given = text
+    if not text.lstrip().startswith("{"):
+        try:
+            given = Path(text).read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            why = error.strerror if isinstance(error, OSError) else "it is not text"
+            raise argparse.ArgumentTypeError(
+                f"{text}: cannot be read ({why}). Give JSON, or a file of it, such as {_A_PRIOR}"
+            ) from error
+    try:
+        prior = json.loads(given)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"the prior is not JSON ({error}). Give an object such as {_A_PRIOR}"
+        ) from error
+    if not isinstance(prior, dict):
+        raise argparse.ArgumentTypeError(
+            f"the prior is not a JSON object. Give one such as {_A_PRIOR}"
+        )
+    try:
+        checked(Prior, "The prior", **prior)
+    except InvalidRequest as error:
+        raise argparse.ArgumentTypeError(f"{error} An example: {_A_PRIOR}") from error
+    return prior
+
+
+def add_prior_option(command: argparse.ArgumentParser) -> None:
+    """`--prior`."""
+    command.add_argument(
+        "--prior",
+        type=prior_of,
+        metavar="FILE|JSON",
+        help="what you believe of the pose: JSON, or a file of it, with `pose` (its "
+        "`parent_frame` is needed) and `covariance` (36 numbers) or `deviation_m` and "
+        "`deviation_deg` (default: 0.3 m, 10 deg)",
     )
 
 

@@ -7,12 +7,14 @@ import json
 import math
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli.options import (
     add_asking_options,
+    add_prior_option,
     add_service_options,
     add_up_option,
     explained_lines,
@@ -29,7 +31,15 @@ from sceneprint_client.api.results import COLOURS, TRANSFORMS
 
 if TYPE_CHECKING:
     from sceneprint_client import Client
-    from sceneprint_client.api import Answer, Localization, Match, Similarity, Transform
+    from sceneprint_client.api import (
+        Alternative,
+        Answer,
+        Localization,
+        Location,
+        Match,
+        Similarity,
+        Transform,
+    )
 
 # The query's points laid on those of its best match, as a file for any viewer of clouds.
 
@@ -128,6 +138,7 @@ def add_query(commands: Any) -> None:
     command.add_argument("--json", action="store_true", help="print one JSON answer per line")
     add_up_option(command)
     add_asking_options(command)
+    add_prior_option(command)
     add_overlay_options(command)
     add_service_options(command)
     command.set_defaults(run=run_query)
@@ -136,7 +147,7 @@ def add_query(commands: Any) -> None:
 def run_query(options: argparse.Namespace) -> int:
     """Ask; returns 2 where a frame could not be looked up."""
     references = query_frames(options.path, options.frame)
-    how: dict[str, Any] = {**options_of(options), "stages": options.stages}
+    how = {**options_of(options), "stages": options.stages, "prior": options.prior}
     several = options.map == "*" or options.also
     if several:
         how["maps"] = "*" if options.map == "*" else [options.map, *options.also]
@@ -224,11 +235,58 @@ def answer_lines(name: str, answer: Answer) -> list[str]:
             f"{one_line(v.reason)}".rstrip()
         )
     if answer.location is not None:
-        there, r = answer.location, answer.location.pose.rotation
+        lines += [_pose_line(answer.location.pose), f"  {_grounds(answer.location)}"]
+    elif answer.reason:
+        cause = f"{answer.cause}: " if answer.cause else ""
+        lines.append(f"  {cause}{one_line(answer.reason)}")
+    return lines + _alternative_lines(answer.alternatives)
+
+
+def _pose_line(pose: Transform) -> str:
+    r = pose.rotation
+    return (
+        f"  at {metres(pose)} m in {one_line(pose.parent_frame)}, rotation "
+        f"{r.x:.4f} {r.y:.4f} {r.z:.4f} {r.w:.4f} (x y z w)"
+    )
+
+
+_DECIDED = {
+    "matches": "decided by the matches",
+    "map": "confirmed by the map's frames",
+    "prior": "several poses fit, and the prior decided",
+}
+
+
+def _grounds(there: Location | Localization) -> str:
+    """What a pose that is found rests on, and how near another place comes."""
+    if there.support == 0:
+        voted = "no match votes for it"
+    elif there.support == 1:
+        voted = f"one view ({there.strength})"
+        voted += ", unconfirmed" if there.verified_by == "matches" else ""
+    else:
+        voted = f"{there.support} of {there.votes} accepted matches vote for it ({there.strength})"
+        if there.spread_m is not None and there.spread_deg is not None:
+            voted += f", spread {100 * there.spread_m:.1f} cm, {there.spread_deg:.1f} deg"
+    rival = "not compared with other places"
+    if there.rival_ratio is not None:
+        rival = f"the next best place fits {there.rival_ratio:.0%} as well"
+    return f"{voted}; {_DECIDED[there.verified_by or 'matches']}; {rival}"
+
+
+def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
+    """The poses of an ambiguous answer, a line each; none of them is the answer."""
+    if not alternatives:
+        return []
+    head = f"  {len(alternatives)} poses are supported; at most one is right:"
+    if len(alternatives) == 1:
+        head = "  one pose is supported, and not confirmed:"
+    lines = [head]
+    for one in alternatives:
+        score = "not compared with the map" if one.score is None else f"score {one.score:.2f}"
         lines.append(
-            f"  at {metres(there.pose)} m in {one_line(there.pose.parent_frame)}, rotation "
-            f"{r.x:.4f} {r.y:.4f} {r.z:.4f} {r.w:.4f} (x y z w); {there.support} of {there.votes} "
-            f"matches agree, spread {100 * there.spread_m:.1f} cm, {there.spread_deg:.1f} deg"
+            f"    {metres(one.pose)} m in {one_line(one.pose.parent_frame)}, weight "
+            f"{one.weight:.1f}, support {one.support}, {score}"
         )
     return lines
 
@@ -276,6 +334,7 @@ def add_localize(commands: Any) -> None:
     command.add_argument("--json", action="store_true", help="print JSON")
     add_up_option(command)
     add_asking_options(command)
+    add_prior_option(command)
     add_service_options(command)
     command.set_defaults(run=run_localize)
 
@@ -283,7 +342,7 @@ def add_localize(commands: Any) -> None:
 def run_localize(options: argparse.Namespace) -> int:
     """Ask; returns 1 where the frame is not found."""
     reference = query_frames(options.path, options.frame)[0]
-    how: dict[str, Any] = options_of(options)
+    how = {**options_of(options), "prior": options.prior}
     with open_client(options) as client:
         there = client.localize(options.map, reference, up=options.up, **how)
     if options.json:
@@ -300,15 +359,13 @@ def localization_lines(name: str, there: Localization) -> list[str]:
         f"{one_line(name)}: {there.status.replace('_', ' ')}{sure}; {one_line(there.reason)} "
         f"({there.milliseconds.get('total', 0.0):.0f} ms)"
     ]
+    if there.cause is not None:
+        lines.append(f"  cause: {there.cause}")
     if there.pose is not None:
-        r = there.pose.rotation
-        lines.append(
-            f"  at {metres(there.pose)} m in {one_line(there.pose.parent_frame)}, rotation "
-            f"{r.x:.4f} {r.y:.4f} {r.z:.4f} {r.w:.4f} (x y z w)"
-        )
+        lines += [_pose_line(there.pose), f"  {_grounds(there)}"]
     elif there.best is not None:
         lines.append(f"  at {metres(there.best.transform)} m from frame {there.best.frame_id}")
-    return lines
+    return lines + _alternative_lines(there.alternatives)
 
 
 # `sceneprint similarity`: how alike are two frames, and do they see one place?

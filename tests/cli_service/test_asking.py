@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from benchmarks.rooms import circled
 from sceneprint.cli.query import frame_argument
 from sceneprint_client import Client
+from sceneprint_client.api import FrameMeta
 
 Run = Callable[..., Any]
 
@@ -87,7 +91,87 @@ def test_a_frame_is_localized(sceneprint: Run, maps: dict[str, list[str]], rooms
     there = json.loads(sceneprint("localize", "near", rooms / "room-0", "--json").stdout)
     assert (there["status"], there["matches"][0]) == ("found", maps["near"][0])
     lost = sceneprint("localize", "near", rooms / "room-1", "--frame", 0, expect=1).stdout
-    assert ": not found; none of 2 candidates was accepted" in lost
+    assert ": not found; none of 2 candidates is accepted" in lost
+    assert lost.splitlines()[1] == "  cause: nothing_alike"
+
+
+@pytest.fixture(scope="module")
+def sides(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Any]]:
+    """A file of a view of a cube, and its map `sides`: the same from each of the four sides."""
+    folder = tmp_path_factory.mktemp("sides")
+    with Client(service_url) as client:
+        client.create_map("sides", model="depth")
+        for one in circled((30, 120, 210, 300)):
+            client.upload("sides", one.data, FrameMeta.model_validate(one.meta), wait_s=60)
+    (asked,) = circled([40])
+    (folder / "view.npy").write_bytes(asked.data)
+    (folder / "intrinsics.json").write_text(json.dumps(asked.meta["intrinsics"]))
+    return folder / "view.npy", asked.meta["pose"]["matrix"]
+
+
+def test_an_ambiguous_place_is_told_with_its_alternatives(
+    sceneprint: Run, sides: tuple[Path, list[Any]]
+) -> None:
+    file, truth = sides
+    told = json.loads(sceneprint("localize", "sides", file, "--json", expect=1).stdout)
+    assert (told["status"], told["pose"], len(told["alternatives"])) == ("ambiguous", None, 4)
+    located = sceneprint("localize", "sides", file, expect=1).stdout.splitlines()
+    assert f"/view: ambiguous; {told['reason']} (" in located[0]
+    queried = sceneprint("query", "sides", file).stdout.splitlines()
+    assert queried[-6] == f"  {told['reason']}"
+    assert located[1:] == queried[-5:]
+    assert located[1] == "  4 poses are supported; at most one is right:"
+    places = []
+    for line, one in zip(located[2:], told["alternatives"], strict=True):
+        place = re.fullmatch(
+            r"    (\S+) (\S+) (\S+) m in hall, weight 0\.4, support 1, score (\S+)", line
+        )
+        assert place is not None, line
+        *xyz, score = map(float, place.groups())
+        places.append(complex(*xyz[:2]))
+        t = one["pose"]["translation"]
+        assert [*xyz, score] == pytest.approx([t["x"], t["y"], t["z"], one["score"]], abs=6e-3)
+    # the true place turned about the cube by 0, 90, 180 and 270 degrees
+    true = complex(truth[0][3], truth[1][3])
+    turned = sorted((true * 1j**i for i in range(4)), key=lambda z: (z.real, z.imag))
+    found = sorted(places, key=lambda z: (z.real, z.imag))
+    assert [abs(a - b) for a, b in zip(turned, found, strict=True)] == pytest.approx(
+        [0] * 4, abs=0.1
+    )
+
+
+def test_a_prior_is_a_file_or_json(
+    sceneprint: Run, sides: tuple[Path, list[Any]], tmp_path: Path, capsys: Any
+) -> None:
+    file, truth = sides
+    prior = {"pose": {"parent_frame": "hall", "matrix": truth}, "deviation_m": 0.2}
+    (tmp_path / "prior.json").write_text(json.dumps(prior))
+    asked = ("localize", "sides", file, "--json", "--prior")
+    there = json.loads(sceneprint(*asked, json.dumps(prior)).stdout)
+    assert (there["status"], there["verified_by"]) == ("found", "prior")
+    off = np.array(there["pose"]["matrix"])[:3, 3] - np.array(truth)[:3, 3]
+    assert np.linalg.norm(off) < 0.1
+    by_file = json.loads(sceneprint(*asked, tmp_path / "prior.json").stdout)
+    assert by_file["pose"] == there["pose"]
+    lines = sceneprint("query", "sides", file, "--prior", json.dumps(prior)).stdout.splitlines()
+    assert lines[-2].startswith("  at ")
+    assert "; several poses fit, and the prior decided; the next best place fits " in lines[-1]
+    (tmp_path / "torn.json").write_text('{"pose": ')
+    pose = {"translation": {"x": 0, "y": 0, "z": 0}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+    for wrong, text in (
+        (tmp_path / "none.json", "cannot be read (No such file or directory). Give JSON, or"),
+        (tmp_path / "torn.json", "the prior is not JSON ("),
+        (json.dumps({"pose": pose}), "a prior needs pose.parent_frame"),
+        (json.dumps({**prior, "covariance": [1]}), "covariance: List should have at least 36"),
+        (json.dumps({**prior, "deviation": 1}), "deviation: Extra inputs are not permitted"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            sceneprint("localize", "sides", file, "--prior", wrong)
+        assert ended.value.code == 2
+        assert text in capsys.readouterr().err
+    flat = json.dumps({**prior, "covariance": [0.0] * 36})
+    refused = sceneprint("localize", "sides", file, "--prior", flat, expect=2).stderr
+    assert "it must be symmetric with eigenvalues above 0" in refused
 
 
 def test_two_frames_are_compared(sceneprint: Run, maps: dict[str, list[str]], rooms: Path) -> None:

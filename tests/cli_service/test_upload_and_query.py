@@ -162,7 +162,7 @@ def test_ctrl_c_keeps_what_was_received(service_url: str, rooms: Path) -> None:
 
 def test_a_query_is_told_in_a_table(sceneprint: Run, house: str, rooms: Path) -> None:
     done = sceneprint("query", house, rooms / "room-0", "--frame", 1, "--k", 2)
-    head, titles, *matches, place = done.stdout.splitlines()
+    head, titles, *matches, place, grounds = done.stdout.splitlines()
     assert re.fullmatch(
         r"seq-01/frame-000001: found \(\d of \d validated, 6 ranked of 6 frames, \d+ ms\)", head
     )
@@ -176,11 +176,11 @@ def test_a_query_is_told_in_a_table(sceneprint: Run, house: str, rooms: Path) ->
     there = read_pose(rooms / "room-0/seq-01/frame-000001.pose.txt")
     assert [float(value) for value in first.groups()[:3]] == pytest.approx([0, 0, 0], abs=2e-3)
     assert [float(value) for value in first.groups()[3:]] == pytest.approx(there[:3, 3], abs=2e-3)
-    found = re.match(
-        r"  at (\S+) (\S+) (\S+) m in r1/room-0, rotation .* matches agree, spread", place
-    )
+    found = re.match(r"  at (\S+) (\S+) (\S+) m in r1/room-0, rotation .* \(x y z w\)$", place)
     assert found is not None, place
     assert [float(value) for value in found.groups()] == pytest.approx(there[:3, 3], abs=0.05)
+    rests = r"  one view \(strong\), unconfirmed; decided by the matches; "
+    assert re.match(rests + r"the next best place fits \d+% as well$", grounds), grounds
 
 
 def test_queries_as_json(sceneprint: Run, house: str, rooms: Path) -> None:

@@ -152,7 +152,8 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
             letter: one.querySelector(".alternatives-letter").textContent,
             place: one.querySelector(".alternatives-place").textContent,
             figures: [...one.querySelectorAll("dd")].map((each) => each.textContent),
-            bars: [...one.querySelectorAll(".alternatives-bar > span")].map((each) => each.style.width),
+            bars: [...one.querySelectorAll(".alternatives-bar > span")].map(
+                (each) => each.style.width),
         }))"""
     )
     heaviest = max(one["weight"] for one in several)
@@ -167,7 +168,8 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
         figures = [f"{round(told['weight'], 2):g}", supported, f"{round(told['score'], 2):g}"]
         assert item["figures"] == figures
         widths = [float(one.removesuffix("%")) for one in item["bars"]]
-        assert widths == pytest.approx([100 * told["weight"] / heaviest, 100 * told["score"]], abs=0.1)
+        share = told["weight"] / heaviest
+        assert widths == pytest.approx([100 * share, 100 * told["score"]], abs=0.1)
     on_map = verdict.get_by_role("link", name="On the map").get_attribute("href")
     assert on_map == f"#/maps/four-sides/paths?query={four_sides['query_id']}"
     assert axe(page) == []

@@ -44,7 +44,7 @@ def test_the_document_is_whole(document):
             place = place[step]
         assert isinstance(place, dict)
     names = [operation["operationId"] for operation in operations(document).values()]
-    assert len(names) == len(set(names)) == 70
+    assert len(names) == len(set(names)) == 71
     used = {reference.rpartition("/")[2] for reference in found}
     assert set(document["components"]["schemas"]) == used  # nothing that nothing refers to
 
@@ -96,7 +96,7 @@ def test_bodies_that_are_read_by_hand_are_described(document):
     assert sorted(form["properties"]) == ["frame", "if_novel", "meta", "priority"]
     query = operations(document)["post", "/v1/maps/{map_name}/queries"]["requestBody"]
     options = {"k", "stages", "exact", "filter", "seed", "candidates", "diversity", "validation",
-               "deadline_ms", "explain", "explain_frame", "keep"}  # fmt: skip
+               "prior", "deadline_ms", "explain", "explain_frame", "keep"}  # fmt: skip
     assert {"application/json", "multipart/form-data", "image/png"} <= set(query["content"])
     beside = operations(document)["post", "/v1/maps/{map_name}/queries"]["parameters"]
     assert {one["name"] for one in beside if one["in"] == "query"} >= options | {"fx", "meta"}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-STAGES = ("prepare", "retrieve", "diversify", "validate", "total")
+STAGES = ("prepare", "retrieve", "diversify", "validate", "locate", "total")
 
 
 @pytest.fixture(scope="module")

@@ -193,7 +193,9 @@ def test_what_happens_in_other_maps_moves_nothing_that_is_told(both):
 def test_it_is_all_there(both):
     """Else the test above would prove nothing."""
     text = "".join(both[0])
-    for part in ("frame.indexed", "association.found", "cursor=", '"status":"found"', "end_header",
+    # the frames' poses contradict what they show, so that their matches disagree
+    for part in ("frame.indexed", "association.found", "cursor=", '"status":"ambiguous"',
+                 "end_header",
                  '"frame_id":"frame-3"', "POST /v1/similarity\n200", "VERTEX_SE3"):  # fmt: skip
         assert part in text, part
     assert "bravo" not in text.replace('{"name": "bravo"}', "").replace("a map named 'bravo'", "")

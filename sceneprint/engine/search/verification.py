@@ -247,7 +247,7 @@ def prior_of(query: Query, places: Sequence[SearchedMap]) -> Prior | None:
                 (("prior.covariance", "not positive definite"),),
             )
     parent = f"{places[0].row.number} {given.pose.parent_frame}"
-    return Prior(parent, pose_matrix(given.pose, "The prior: "), covariance)
+    return Prior(parent, pose_matrix(given.pose, "The prior"), covariance)
 
 
 def nearest_first(store: Store, ranking: Ranking, chosen: Sequence[int], prior: Prior) -> list[int]:

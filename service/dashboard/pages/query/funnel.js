@@ -19,7 +19,7 @@ export const LOST_AT = {
   query: "map", state: "map", filter: "passed", shortlist: "compared", ranking: "ranked", selection: "selected",
   turn: "validated", deadline: "validated", validation: "accepted",
 };
-const STAGES = [["prepare", "Prepare"], ["retrieve", "Retrieve"], ["diversify", "Diversify"], ["validate", "Validate"], ["explain", "Explain"]];
+const STAGES = [["prepare", "Prepare"], ["retrieve", "Retrieve"], ["diversify", "Diversify"], ["validate", "Validate"], ["locate", "Compare poses"], ["earlier", "Earlier frames"], ["explain", "Explain"]];
 
 /**
  * The counts of an answer as steps.
