@@ -19,11 +19,22 @@ def test_the_robot_maps_a_room_and_finds_itself(tmp_path: Path) -> None:
     assert ran.returncode == 0, ran.stderr
     told = ran.stdout
     assert "driving: 12 frames are uploaded" in told
-    assert "it could be several places: drive a metre" in told
-    assert "found, " in told
-    [error] = re.findall(r"([\d.]+) cm from where it truly is", told)
-    assert float(error) < 5
-    assert told.count("not a place of the map: explore") == 1
+    room, _, cabinet = told.partition("beside a cabinet that looks the same from behind:")
+    assert "  do not drive: " in room
+    assert re.search(r"found, [2-9] of \d views vote for one pose, decided by matches", room)
+    assert room.count("not a place of the map (nothing_alike): explore") == 1
+    # both sides are told of each view, half a turn about the cabinet apart, and none is driven on
+    alone, _, believed = cabinet.partition("asked again, and odometry says where it is")
+    assert alone.count("do not drive: ") == 2
+    assert "found" not in alone
+    sides = [complex(*map(float, one)) for one in re.findall(r"x (\S+), y (\S+) m: weight", alone)]
+    assert len(sides) == 4
+    assert max(abs(sides[i] + sides[i + 1]) for i in (0, 2)) < 0.2
+    assert "decided by prior" in believed
+    errors = [float(one) for one in re.findall(r"([\d.]+) cm from where it truly is", told)]
+    assert len(errors) == 2
+    assert errors[0] < 5
+    assert errors[1] < 10
     assert "the map has {'indexed': 13} frames of the sessions ['afternoon', 'morning']" in told
     assert (tmp_path / "robot" / "sceneprint.db").is_file()
 
