@@ -49,10 +49,11 @@ class LocalizationParameters:
     views: int = 5  #: votes that are averaged, at most
     weak: float = 0.4  #: weight of a weak or ambiguous match; a strong one counts 1
     outweigh: float = 2.0  #: times as much weight as any other place
-    rival: float = 0.9  #: of the winner's score, above which another pose makes it ambiguous
-    violations: float = 0.04  #: most, beyond the map's own, for each unit of weight of a pose
+    sure_weight: float = 2.0  #: of a place, that two strong matches give it
+    rival: float = 0.9  #: of its score, above which another pose makes it ambiguous
+    rival_unsure: float = 0.3  #: the same of a place with less weight, and without any
+    violations: float = 0.045  #: most, beyond the map's own, for each unit of weight of a pose
     map_score: float = 0.3  #: least score of a pose that the map confirms without a strong match
-    map_rival: float = 0.3  #: and most of it that another pose may reach
     map_planes: float = 12.0  #: and least number of distinct planes that agree
     map_views: int = 8  #: and least number of frames of the map that agree
     prior_planes: float = 6.0  #: that agree at a pose that the prior decides for, at least
@@ -78,7 +79,7 @@ class QueryFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class PosePrior:
     """What a robot believes of its pose before it asks.
 
     Parameters
@@ -94,7 +95,7 @@ class Prior:
 
 
 @dataclass(frozen=True, eq=False)
-class Alternative:
+class AlternativePose:
     """A pose that the evidence supports.
 
     Parameters
@@ -138,7 +139,7 @@ class PoseEstimate:
     covariance: Floats | None
     strength: Strength | None
     verified_by: Verifier | None
-    alternatives: tuple[Alternative, ...]
+    alternatives: tuple[AlternativePose, ...]
     rival_ratio: float | None
     votes: int = 0
     members: tuple[int, ...] = ()
@@ -196,7 +197,7 @@ def localize(
     poses: Sequence[Floats] | Mapping[int, Floats],
     parents: Sequence[str] | Mapping[int, str] | None = None,
     views_of: ViewsOf | None = None,
-    prior: Prior | None = None,
+    prior: PosePrior | None = None,
     p: LocalizationParameters | None = None,
     overlap_p: OverlapParameters | None = None,
 ) -> PoseEstimate | None:
@@ -364,7 +365,7 @@ def _from_different_views(votes: Sequence[_Vote], p: MapParameters) -> list[_Vot
 
 
 def _estimate(
-    parent: str, places: Sequence[_Place], prior: Prior | None, mapped: bool, blind: bool,
+    parent: str, places: Sequence[_Place], prior: PosePrior | None, mapped: bool, blind: bool,
     p: LocalizationParameters,
 ) -> PoseEstimate:  # fmt: skip
     """The verdict on places, one or more."""
@@ -390,7 +391,7 @@ def _estimate(
         if place.votes or (place.score >= p.map_score and _planes(place) >= p.map_planes)
     ]  # fmt: skip
     alternatives = tuple(
-        Alternative(one.pose, one.weight, one.support, one.score if mapped else None)
+        AlternativePose(one.pose, one.weight, one.support, one.score if mapped else None)
         for one in told[: p.views]
     )
     status: LocalizationStatus = "ambiguous" if told else "not_found"
@@ -411,8 +412,13 @@ def _against_votes(
         return "the matches disagree: none of their poses has twice the weight of the next"
     if mapped:
         score = max((place.score for place in others), default=0.0)
-        if score > p.rival * voted.score:
-            return "another pose explains the frame as well: the place repeats, or has a symmetry"
+        sure = voted.weight >= p.sure_weight
+        if score > (p.rival if sure else p.rival_unsure) * voted.score:
+            return (
+                "another pose explains the frame as well: the place repeats, or has a symmetry"
+                if score > p.rival * voted.score
+                else "too little speaks for the pose while another explains much of the frame"
+            )
         excess = _excess(voted, p)
         if excess > p.violations * max(voted.weight, 1.0):
             return (
@@ -432,7 +438,7 @@ def _map_confirms(best: _Place, places: Sequence[_Place], p: LocalizationParamet
     frames = {i for _, i in best.scored.views}
     return (
         best.score >= p.map_score
-        and max((place.score for place in others), default=0.0) <= p.map_rival * best.score
+        and max((place.score for place in others), default=0.0) <= p.rival_unsure * best.score
         and best.scored.planes >= p.map_planes
         and len(frames) >= p.map_views
         and max((place.weight for place in others), default=0.0) < 1.0
@@ -441,7 +447,7 @@ def _map_confirms(best: _Place, places: Sequence[_Place], p: LocalizationParamet
 
 
 def _confirmed_by_prior(
-    by_score: Sequence[_Place], prior: Prior, p: LocalizationParameters
+    by_score: Sequence[_Place], prior: PosePrior, p: LocalizationParameters
 ) -> _Place | None:
     """The one place near the prior that the map bears out as well as any other."""
     inside = [place for place in by_score if is_expected(place.pose, prior)]
@@ -460,7 +466,7 @@ def _confirmed_by_prior(
 
 
 def _against_by_prior(
-    voted: _Place, by_score: Sequence[_Place], prior: Prior, p: LocalizationParameters
+    voted: _Place, by_score: Sequence[_Place], prior: PosePrior, p: LocalizationParameters
 ) -> str | None:
     """Why a place that the prior does not expect is not the answer; None where it is."""
     if is_expected(voted.pose, prior):
@@ -471,7 +477,7 @@ def _against_by_prior(
     return "the matches agree on a pose that the prior rules out, and one near the prior fits too"
 
 
-def is_expected(T: Floats, prior: Prior) -> bool:
+def is_expected(T: Floats, prior: PosePrior) -> bool:
     """Whether a pose lies where the prior has 99.9 % of its mass."""
     off = error_of(prior.T, T)
     return float(off @ np.linalg.solve(prior.covariance, off)) <= _CHI_SQUARE_6

@@ -25,7 +25,7 @@ from sceneprint.lab.synth import KINECT, render, symmetric_box, synthesise_room
 from sceneprint.localization import (
     LocalizationParameters,
     PoseEstimate,
-    Prior,
+    PosePrior,
     QueryFrame,
     is_expected,
     localize,
@@ -270,7 +270,7 @@ def test_a_room_bears_out_the_true_pose_alone(signer: Signer) -> None:
 
 
 def box_query(
-    box_views: tuple[list[Floats], list[Geometry]], signer: Signer, prior: Prior | None = None
+    box_views: tuple[list[Floats], list[Geometry]], signer: Signer, prior: PosePrior | None = None
 ) -> tuple[PoseEstimate, Floats]:
     """A view between two of the map, asked of all."""
     poses, views = box_views
@@ -307,18 +307,18 @@ def test_a_cube_is_ambiguous_by_quarter_turns_until_a_prior_decides(
     for turn in turns[:2]:  # the map cannot tell which, and the robot can
         start = turn.copy()
         start[:3, 3] += 0.12, -0.1, 0.05
-        sure, _ = box_query(box_views, signer, Prior("", start, covariance))
+        sure, _ = box_query(box_views, signer, PosePrior("", start, covariance))
         assert sure.average is not None
         assert (sure.status, sure.verified_by) == ("found", "prior")
         np.testing.assert_allclose(sure.average.T, turn, atol=0.05)
     far = T.copy()
     far[:3, 3] += 2.0, 2.0, 0.0
-    wrong, _ = box_query(box_views, signer, Prior("", far, covariance))
+    wrong, _ = box_query(box_views, signer, PosePrior("", far, covariance))
     assert wrong.status == "ambiguous"  # of a prior that is wrong by metres nothing becomes found
 
 
 def test_a_pose_is_expected_within_the_mass_of_its_prior() -> None:
-    prior = Prior("", shifted(1.0), np.diag([0.01] * 3 + [0.0004] * 3))
+    prior = PosePrior("", shifted(1.0), np.diag([0.01] * 3 + [0.0004] * 3))
     # chi-square of six degrees of freedom: 22.458 holds 99.9 %
     assert is_expected(shifted(1.0 + 0.1 * math.sqrt(22.4)), prior)
     assert not is_expected(shifted(1.0 + 0.1 * math.sqrt(22.5)), prior)
@@ -348,5 +348,5 @@ def test_frames_of_a_sequence_vote_for_the_pose_of_the_last(blank: Geometry) -> 
 
 def test_the_numbers_are_those_of_the_docs() -> None:
     p = LocalizationParameters()
-    told = (p.weak, p.outweigh, p.rival, p.violations, p.map_score, p.map_rival, p.map_planes)
-    assert told == (0.4, 2.0, 0.9, 0.04, 0.3, 0.3, 12.0)
+    told = (p.weak, p.outweigh, p.rival, p.violations, p.map_score, p.rival_unsure, p.map_planes)
+    assert told == (0.4, 2.0, 0.9, 0.045, 0.3, 0.3, 12.0)

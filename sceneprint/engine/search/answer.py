@@ -39,7 +39,7 @@ from sceneprint.engine.serializers import query_sensor
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.geometry.retrieval.distance import Ints64, pairwise_distances
 from sceneprint.geometry.retrieval.dpp import DiversityParameters, Selection, diversify
-from sceneprint.localization import PoseEstimate, Prior, QueryFrame
+from sceneprint.localization import PoseEstimate, PosePrior, QueryFrame
 from sceneprint.matches import PairMatch
 from sceneprint.models import Model
 from sceneprint.store import Store
@@ -144,7 +144,7 @@ def answer(
 
 def _attempt(
     store: Store, places: Sequence[SearchedMap], model: Model, asked: PreparedQuery, query: Query,
-    deadline: Deadline, prior: Prior | None, clock: _Clock | None = None,
+    deadline: Deadline, prior: PosePrior | None, clock: _Clock | None = None,
 ) -> _Attempt:  # fmt: skip
     """Look for one frame of a query, and validate its candidates."""
     clock = clock or _Clock({})

@@ -27,7 +27,7 @@ from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.localization import (
     LocalizationParameters,
     PoseEstimate,
-    Prior,
+    PosePrior,
     QueryFrame,
     localize,
 )
@@ -163,7 +163,7 @@ _MOST_PLACES = 24
 def placed(
     store: Store, searched: Searched, geometries: Mapping[int, Geometry],
     rows: Mapping[int, FrameRow],
-    asked: Sequence[QueryFrame], prior: Prior | None, p: ValidationParameters,
+    asked: Sequence[QueryFrame], prior: PosePrior | None, p: ValidationParameters,
     options: ValidationOptions | None,
 ) -> PoseEstimate | None:  # fmt: skip
     """Where the query was taken, by its matches and the frames of the map about the poses.
@@ -220,7 +220,7 @@ def placed(
     return localize(frames, poses, parents, None if paper else views_of, prior, own_p, p.agreement)
 
 
-def prior_of(query: Query, places: Sequence[SearchedMap]) -> Prior | None:
+def prior_of(query: Query, places: Sequence[SearchedMap]) -> PosePrior | None:
     """What the robot believed before; InvalidRequest or InvalidPose where it cannot be used."""
     given = query.prior
     if given is None:
@@ -247,10 +247,12 @@ def prior_of(query: Query, places: Sequence[SearchedMap]) -> Prior | None:
                 (("prior.covariance", "not positive definite"),),
             )
     parent = f"{places[0].row.number} {given.pose.parent_frame}"
-    return Prior(parent, pose_matrix(given.pose, "The prior"), covariance)
+    return PosePrior(parent, pose_matrix(given.pose, "The prior"), covariance)
 
 
-def nearest_first(store: Store, ranking: Ranking, chosen: Sequence[int], prior: Prior) -> list[int]:
+def nearest_first(
+    store: Store, ranking: Ranking, chosen: Sequence[int], prior: PosePrior
+) -> list[int]:
     """Candidates, positions in R, those that were taken near a prior first, else as they were."""
     with store.queried.read() as connection:
         rows = frames_of(connection, ranking.indices[list(chosen)].tolist())

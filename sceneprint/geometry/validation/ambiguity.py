@@ -159,7 +159,7 @@ def far_from(T: Floats, others: Floats, p: AmbiguityParameters) -> Floats:
     return far
 
 
-class Alternative(NamedTuple):
+class Rival(NamedTuple):
     """The best rival of a transform.
 
     Parameters
@@ -179,7 +179,7 @@ def best_alternative(
     query: PlaneView, match: PlaneView, T: Floats, violations: float, voted: Floats,
     proposed: Floats, p: AmbiguityParameters, agreement_p: OverlapParameters,
     ups: Ups = NO_UPS, most_tilt: float = math.inf,
-) -> Alternative:  # fmt: skip
+) -> Rival:  # fmt: skip
     """How far the best rival of T explains the frames, and that rival: Sec. III-E.
 
     Parameters
@@ -211,6 +211,6 @@ def best_alternative(
     tilted = float(share[~level].max(initial=0.0))
     share = np.where(level, share, 0.0)
     if not (share > 0).any():
-        return Alternative(0.0, None, tilted)
+        return Rival(0.0, None, tilted)
     best = int(np.argmax(share))
-    return Alternative(float(share[best]), rivals[best], tilted)
+    return Rival(float(share[best]), rivals[best], tilted)

@@ -90,6 +90,7 @@ class ScoredPose:
     hidden : the same of the map's surfaces, which the query saw through
     noise : violations that the map's frames about the pose show among themselves; 0 where it
         was not asked for
+    asked : frames of the map that were taken near enough to see the same
     views : frames of the query with positions of map frames that agree, most shared first
     """
 
@@ -99,6 +100,7 @@ class ScoredPose:
     planes: float
     violations: float
     hidden: float
+    asked: int
     views: tuple[tuple[int, int], ...]
     noise: float = 0.0
 
@@ -195,6 +197,7 @@ def score_pose(
     """
     limits = tolerances(overlap_p)
     total = agreeing = violating = seen = through = 0.0
+    asked = 0
     shared: list[tuple[int, int, int]] = []
     for number, frame in enumerate(frames):
         points, weights = frame.planes.points, frame.planes.weights
@@ -204,6 +207,7 @@ def score_pose(
             view = views[i]
             if view is None or i == without:
                 continue
+            asked += 1
             T_view_sensor = inverse(view.T) @ T_parent_sensor
             said = look_up(points, view.target, T_view_sensor, limits)
             count = int((said == AGREES).sum())
@@ -223,7 +227,7 @@ def score_pose(
     hidden = through / max(seen + through, 1e-9)
     score = share * (1.0 - p.violation_weight * (violations + hidden))
     pairs = tuple((number, i) for _, number, i in sorted(shared))
-    return ScoredPose(T, score, share, agreeing / len(frames), violations, hidden, pairs)
+    return ScoredPose(T, score, share, agreeing / len(frames), violations, hidden, asked, pairs)
 
 
 def map_noise(

@@ -44,8 +44,8 @@ from sceneprint.geometry.validation.alignment import (
     samples_of,
 )
 from sceneprint.geometry.validation.ambiguity import (
-    Alternative,
     AmbiguityParameters,
+    Rival,
     best_alternative,
 )
 from sceneprint.geometry.validation.gravity import NO_UPS, Ups, contradiction, tilt_of
@@ -312,7 +312,7 @@ def _decided(
     (directions, T), *others = sorted(found.items(), key=lambda one: one[1] is not transforms[best])
     e, inliers = _evidence(query, match, both, T, residual, seen, best, p)
     T_other = others[0][1] if others else None
-    rival, ups = Alternative(0.0, None), (query.up, match.up)
+    rival, ups = Rival(0.0, None), (query.up, match.up)
     tilt = tilt_of(T, ups)
     strength: Strength | None = None
     against = objection(e, p.acceptance, mode) or _tilted(tilt, p)
