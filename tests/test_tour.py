@@ -152,9 +152,18 @@ def test_queries_answer_as_the_page_says(outputs: dict[str, list[str]]) -> None:
     assert kept[0] == answer
     where = one(outputs, "Where am I?")[0]
     assert (where["status"], where["pose"]["parent_frame"]) == ("found", "room-001")
+    alike, moved, believed = outputs["When several places look alike"]
+    (unsure,) = [each for each in documents(alike) if "alternatives" in each]
+    assert (unsure["status"], unsure["pose"]) == ("ambiguous", None)
+    assert len(unsure["alternatives"]) >= 2
+    assert "do not drive: move on, and ask again" in moved
+    assert "at most one is right:" in moved
+    there = documents(believed)[0]
+    assert (there["status"], there["verified_by"]) == ("found", "prior")
+    assert "several poses fit, and the prior decided" in believed
     named, every = one(outputs, "In which of several maps?")[2:]
     assert named["maps"] == ["building", "annex"]
-    assert set(every["per_map"]) == {"annex", "building"}
+    assert set(every["per_map"]) == {"annex", "building", "cabinet"}
     stored, sent = one(outputs, "Are these two of one place?")
     assert [each["validation"]["status"] for each in (stored, sent)] == ["accepted"] * 2
 
