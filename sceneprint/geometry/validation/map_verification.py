@@ -13,8 +13,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneprint.geometry.pose.average import average_poses
 from sceneprint.geometry.pose.rigid import difference, distinct, inverse
@@ -47,9 +49,11 @@ class MapParameters:
     violation_weight: float = 2.0  #: of the violations of either side, in the score
     n_poses: int = 40  #: that are scored on the candidates
     n_places: int = 6  #: places, the best of these, that are scored on all frames
+    hopeful: float = 0.2  #: of the best score, below which a place is not looked into further
     n_refined: int = 3  #: places whose pose is refined
     n_refining: int = 3  #: views that a pose is refined on
     n_noise: int = 4  #: frames of the map whose own violations are taken for noise
+    least_noise: float = 0.02  #: violations of a pose below which that is not asked
     same_m: float = 0.1  #: poses this near are one
     same_rad: float = math.radians(6.0)
     place_m: float = 0.25  #: poses farther apart are of two places
@@ -65,15 +69,20 @@ class MapFrame:
     Parameters
     ----------
     geometry : of the frame
-    planes : see PlaneView
     target : its surface, to be looked up
     T : (4, 4) T_parent_sensor; of a frame of the query T_query_sensor
+    weighing : which of its patches lie in one plane
     """
 
     geometry: Geometry
-    planes: PlaneView
     target: LookupTarget
     T: Floats
+    weighing: PlaneParameters
+
+    @cached_property
+    def planes(self) -> PlaneView:
+        """Its patches with their weights, when they are first needed."""
+        return plane_view(self.geometry, self.weighing)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,19 +144,18 @@ class MapViews:
             )  # fmt: skip
         return self._frames[i]
 
-    def near(self, T: Floats, around: bool, *, first: bool = False) -> list[int]:
+    def near(self, T: Floats, around: bool, among: NDArray[np.intp] | None = None) -> list[int]:
         """The frames that most likely see what a sensor at T sees, nearest first.
 
         Parameters
         ----------
         T : (4, 4) T_parent_sensor
         around : whether it sees all around; else directions count beside distance
-        first : look among the candidates alone
+        among : positions of the frames to choose from; default: all
         """
         p = self._p
         ahead = 0.0 if around else p.look_ahead
-        some = first and len(self.candidates) > 0
-        poses = self.poses[self.candidates] if some else self.poses
+        poses = self.poses if among is None else self.poses[among]
         axes = poses[:, :3, 2]
         middles = poses[:, :3, 3] + ahead * axes
         apart = np.linalg.norm(middles - (T[:3, 3] + ahead * T[:3, 2]), axis=1)
@@ -155,7 +163,7 @@ class MapViews:
             apart += p.look_ahead * (1.0 - axes @ T[:3, 2])
         order = np.argsort(apart, kind="stable")[: p.n_views]
         order = order[apart[order] < (p.around_reach if around else p.reach)]
-        near: list[int] = (self.candidates[order] if some else order).tolist()
+        near: list[int] = (order if among is None else among[order]).tolist()
         return near
 
 
@@ -171,7 +179,7 @@ def map_frame(
     p, overlap_p : see there
     """
     target = looked_up(geometry.surface, overlap_p)
-    return MapFrame(geometry, plane_view(geometry, p.planes), target, T)
+    return MapFrame(geometry, target, T, p.planes)
 
 
 def sees_around(geometry: Geometry) -> bool:
@@ -182,7 +190,7 @@ def sees_around(geometry: Geometry) -> bool:
 
 def score_pose(
     frames: Sequence[MapFrame], T: Floats, views: MapViews, p: MapParameters,
-    overlap_p: OverlapParameters, *, without: int | None = None, first: bool = False,
+    overlap_p: OverlapParameters, among: NDArray[np.intp] | None = None,
 ) -> ScoredPose:  # fmt: skip
     """How the map's frames bear a pose of the query out.
 
@@ -192,8 +200,7 @@ def score_pose(
     T : (4, 4) T_parent_query
     views : of the same parent frame
     p, overlap_p : see there
-    without : position of a frame that has no say
-    first : score on the candidates alone
+    among : positions of the frames that it is scored on; default: all
     """
     limits = tolerances(overlap_p)
     total = agreeing = violating = seen = through = 0.0
@@ -203,9 +210,9 @@ def score_pose(
         points, weights = frame.planes.points, frame.planes.weights
         agree, violate = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
         T_parent_sensor = T @ frame.T
-        for i in views.near(T_parent_sensor, sees_around(frame.geometry), first=first):
+        for i in views.near(T_parent_sensor, sees_around(frame.geometry), among):
             view = views[i]
-            if view is None or i == without:
+            if view is None:
                 continue
             asked += 1
             T_view_sensor = inverse(view.T) @ T_parent_sensor
@@ -233,7 +240,7 @@ def score_pose(
 def map_noise(
     pose: ScoredPose, views: MapViews, p: MapParameters, overlap_p: OverlapParameters
 ) -> float:
-    """Violations that the map's frames about a pose show among themselves: their median.
+    """Violations that the frames that bear a pose out show among themselves: their median.
 
     Poses that drift and things that were moved let free space speak against right poses too.
 
@@ -243,11 +250,12 @@ def map_noise(
     views, p, overlap_p : see there
     """
     found = []
+    agreeing = np.unique([i for _, i in pose.views])
     for _, i in pose.views[: p.n_noise]:
         view = views[i]
         if view is not None:
             alone = replace(view, T=np.eye(4))
-            own = score_pose([alone], view.T, views, p, overlap_p, without=i)
+            own = score_pose([alone], view.T, views, p, overlap_p, agreeing[agreeing != i])
             found.append(own.violations + own.hidden)
     return float(np.median(found)) if found else 0.0
 
@@ -318,19 +326,25 @@ def compare_poses(
     """
     first = -np.arange(len(poses), dtype=float)
     chosen = distinct(poses, first, p.same_m, p.same_rad, p.n_poses)
-    scored = [score_pose(frames, poses[i], views, p, overlap_p, first=True) for i in chosen]
-    places = best_of_places(scored, p)[: p.n_places]
+    among = views.candidates if len(views.candidates) else None
+    scored = [score_pose(frames, poses[i], views, p, overlap_p, among) for i in chosen]
+    places = _hopeful(best_of_places(scored, p), p)[: p.n_places]
     scored = [score_pose(frames, place.T, views, p, overlap_p) for place in places]
     places = best_of_places(scored, p)
-    for pose in places[: p.n_refined]:
+    for pose in _hopeful(places, p)[: p.n_refined]:
         T = refined_pose(frames, pose, views, p)
         if T is not None:
             scored.append(score_pose(frames, T, views, p, overlap_p))
     places = best_of_places(scored, p)
     for k, pose in enumerate(places[: p.n_refined]):
-        if pose.violations + pose.hidden > 0:
+        if pose.violations + pose.hidden > p.least_noise:
             places[k] = replace(pose, noise=map_noise(pose, views, p, overlap_p))
     return places
+
+
+def _hopeful(places: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
+    """Those that may yet come near the best of them, which is the first."""
+    return [one for one in places if one is places[0] or one.score >= p.hopeful * places[0].score]
 
 
 def best_of_places(scored: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
