@@ -170,6 +170,20 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
         widths = [float(one.removesuffix("%")) for one in item["bars"]]
         share = told["weight"] / heaviest
         assert widths == pytest.approx([100 * share, 100 * told["score"]], abs=0.1)
+    # each match stands with the pose that it votes for
+    votes = page.locator("[data-row=VDR] .query-vote").all_inner_texts()
+    support = {f"for pose {'ABCDE'[i]}": one["support"] for i, one in enumerate(several)}
+    voting = sum(one["validation"]["status"] == "ambiguous" for one in four_sides["matches"])
+    assert len(votes) == voting
+    for letter, number in support.items():
+        assert votes.count(letter) == number
+    page.locator("[data-row=VDR] .query-overlay").first.click()
+    settle(page)
+    letter = votes[0]
+    said = page.locator(".overlay-card").first.inner_text()
+    assert f"The match speaks {letter}: the answer is ambiguous." in said
+    page.go_back()
+    settle(page)
     on_map = verdict.get_by_role("link", name="On the map").get_attribute("href")
     assert on_map == f"#/maps/four-sides/paths?query={four_sides['query_id']}"
     assert axe(page) == []

@@ -40,15 +40,6 @@ export function put(parent, ...children) {
 }
 
 /**
- * A text of the API: what stands in backticks is code.
- * @param {string} text
- * @returns {(string | HTMLElement)[]}
- */
-export function coded(text) {
-  return text.split("`").map((part, i) => (i % 2 ? h("code", {}, part) : part));
-}
-
-/**
  * What a button does, once at a time: a second click while it is under way does nothing.
  * @param {() => Promise<any>} act
  * @returns {() => Promise<any>}

@@ -20,11 +20,6 @@ export function bytes(n) {
   return `${step === 0 || rest >= 99.95 ? WHOLE.format(rest) : rest.toFixed(1)} ${STEPS[step]}`;
 }
 
-/** A reason of the API as a sentence. @param {string} text */
-export function sentence(text) {
-  return `${text.charAt(0).toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
-}
-
 /** A length: "1.24 m", "34 mm". @param {number | null | undefined} x metres */
 export function metres(x) {
   if (!isNumber(x)) return NONE;

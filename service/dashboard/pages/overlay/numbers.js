@@ -1,7 +1,9 @@
 // Beside the view: the verdict, what it was reached from, and how far it can be trusted.
-import { coded, h } from "../lib/dom.js";
-import { count, degrees, metres, percent, sentence, shortId } from "../lib/format.js";
+import { h } from "../lib/dom.js";
+import { count, degrees, metres, percent, shortId } from "../lib/format.js";
+import { coded, sentence } from "../lib/prose.js";
 import { link } from "../lib/router.js";
+import { voteOf } from "../query/alternatives.js";
 import { statusOf } from "../query/words.js";
 import { apart, axisName, deviations, freedom, isOptical, shiftOf, turnOf } from "./words.js";
 
@@ -17,14 +19,20 @@ const fine = (x) => (x < 1 ? `${x.toFixed(2)}°` : degrees(x));
 /** @param {string} title @param {...any} children */
 const card = (title, ...children) => h("section", { class: "card overlay-card" }, h("h2", {}, title), children);
 
-/** What came of it, in a word and a sentence. @param {Object<string, any>} details */
-export function verdictCard(details) {
+/**
+ * What came of it, in a word and a sentence, and which pose it speaks for.
+ * @param {Object<string, any>} answer @param {Object<string, any>} details
+ */
+export function verdictCard(answer, details) {
   const { validation } = details, { kind, text } = statusOf(validation);
+  const match = answer.matches.find((one) => one.frame_id === details.frame_id && one.map === details.map);
+  const vote = match ? voteOf(answer, match) : null;
   const note = details.transform ? MEANT[validation.status] : "No transform was found.";
   return card("Verdict",
     h("p", {}, h("span", { class: "badge overlay-verdict", dataset: { kind } }, text)),
     h("p", { class: "overlay-reason" }, coded(sentence(validation.reason))),
-    note && h("p", { class: "muted" }, note));
+    note && h("p", { class: "muted" }, note),
+    vote && h("p", { class: "overlay-note" }, `The match speaks ${vote}${answer.status === "ambiguous" ? ": the answer is ambiguous" : " than the answer’s"}.`));
 }
 
 /** What the verdict was reached from. @param {Object<string, any>} details */

@@ -1,8 +1,9 @@
 // A query and one of its matches laid on each other, with all that speaks for and against it.
 import { at, save } from "../lib/api.js";
-import { coded, h, put } from "../lib/dom.js";
-import { sentence, shortId } from "../lib/format.js";
+import { h, put } from "../lib/dom.js";
+import { shortId } from "../lib/format.js";
 import { picture } from "../lib/picture.js";
+import { coded, sentence } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { toast } from "../lib/states.js";
 import { residualCounts } from "../viewer/points.js";
@@ -46,7 +47,7 @@ export function show(root, { params, search, signal, go, actions }, { answer, de
   const rival = h("div");
   const stage = h("div", { class: "overlay-stage" }, canvas, lost);
   const view = h("section", { class: "card overlay-view", "aria-label": "The view" }, bar, stage, legends);
-  const side = h("div", { class: "overlay-side" }, verdictCard(details), rival, evidenceCard(details),
+  const side = h("div", { class: "overlay-side" }, verdictCard(answer, details), rival, evidenceCard(details),
     transformCard(details), uncertaintyCard(details), framesCard(answer, details, matched, asked));
   put(root, h("div", { class: "overlay-page" }, view, side));
   actions(steps(answer, params, map), h("button", {

@@ -1,8 +1,9 @@
 // The query of an answer that is kept: where it is among the paths, how surely, and what it matched.
 
 import { at, get } from "../lib/api.js";
-import { coded, h } from "../lib/dom.js";
+import { h } from "../lib/dom.js";
 import { count, metres, shortId } from "../lib/format.js";
+import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { alternativesList } from "../query/alternatives.js";
 import { grounds, mapOf, rivalOf, verdict } from "../query/words.js";

@@ -7,6 +7,25 @@ import { number } from "./words.js";
 /** What an alternative is called, in lists and on the map: A, B, C. @param {number} i from 0 */
 export const letterOf = (i) => String.fromCharCode(65 + i);
 
+const SAME = { metres: 0.25, degrees: 15 }; // votes so near each other are for one place
+
+/**
+ * Which pose a match speaks for, where that is not the answer's.
+ * @param {Object<string, any>} answer
+ * @param {Object<string, any>} match one of it
+ * @returns {string | null}
+ */
+export function voteOf({ location, alternatives }, { pose_in_map: own, validation }) {
+  if (!own || !["accepted", "ambiguous"].includes(validation.status)) return null;
+  const isFor = (pose) => {
+    const away = apart(pose, own);
+    return pose.parent_frame === own.parent_frame && away.metres <= SAME.metres && away.degrees <= SAME.degrees;
+  };
+  const i = alternatives.findIndex((one) => isFor(one.pose));
+  if (i >= 0) return `for pose ${letterOf(i)}`;
+  return (location === null && alternatives.length === 0) || (location && isFor(location.pose)) ? null : "for another pose";
+}
+
 /**
  * The list, for a wide card and a narrow one.
  * @param {Object<string, any>[]} alternatives of an answer

@@ -1,8 +1,9 @@
 // An answer as it is shown: the verdict, the rows, the funnel, the heat map, "why not?".
 import { at, get } from "../lib/api.js";
-import { coded, h, put } from "../lib/dom.js";
+import { h, put } from "../lib/dom.js";
 import { degrees, metres, percent, shortId } from "../lib/format.js";
 import { heatmap } from "../lib/heatmap.js";
+import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { failed, loading } from "../lib/states.js";
 import { alternativesList } from "./alternatives.js";

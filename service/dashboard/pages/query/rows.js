@@ -1,7 +1,9 @@
 // The rows R, DR and VDR one under the other, the query at their left, as in the paper's figure.
-import { coded, h, put } from "../lib/dom.js";
+import { h, put } from "../lib/dom.js";
 import { count, percent, shortId } from "../lib/format.js";
+import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
+import { voteOf } from "./alternatives.js";
 import { figures, keyOf, number, statusOf } from "./words.js";
 
 const VIEWS = [["depth", "Depth"], ["normals", "Normals"], ["patches", "Patches"]];
@@ -109,9 +111,10 @@ function asked(answer, pictures) {
 
 function evidence(answer, one, was) {
   const { kind, text } = statusOf(one.validation);
-  const measured = figures(one.validation);
+  const measured = figures(one.validation), vote = voteOf(answer, one);
   return [
     h("span", { class: "badge", dataset: { kind } }, text),
+    vote && h("span", { class: "query-vote" }, vote),
     was && was.get(keyOf(one)) !== text && h("span", { class: "query-was" }, was.has(keyOf(one)) ? `was ${was.get(keyOf(one))}` : "was not a candidate"),
     h("span", { class: "query-reason" }, coded(one.validation.reason)),
     measured.length > 0 && h("dl", { class: "query-figures" }, measured.map(([term, value]) => [h("dt", {}, term), h("dd", { class: "number" }, value)])),

@@ -1,6 +1,7 @@
 // "Why not this frame?": asks again with `explain_frame`, and says where the frame was lost.
 import { h, put } from "../lib/dom.js";
-import { count, percent, sentence, shortId } from "../lib/format.js";
+import { count, percent, shortId } from "../lib/format.js";
+import { sentence } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { failed, loading } from "../lib/states.js";
 import { figures } from "./words.js";

@@ -1,5 +1,6 @@
 // What an answer says, in one line a lost person understands, and in figures.
-import { count, degrees, metres, percent, sentence, shortId } from "../lib/format.js";
+import { count, degrees, metres, percent, shortId } from "../lib/format.js";
+import { sentence } from "../lib/prose.js";
 
 const STATUS = {
   accepted: { kind: "good", text: "accepted" },

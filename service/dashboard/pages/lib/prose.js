@@ -1,0 +1,16 @@
+// Reasons of the API as text of a page.
+import { h } from "./dom.js";
+
+/** A reason of the API as a sentence. @param {string} text */
+export function sentence(text) {
+  return `${text.charAt(0).toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
+}
+
+/**
+ * A text of the API: what stands in backticks is code.
+ * @param {string} text
+ * @returns {(string | HTMLElement)[]}
+ */
+export function coded(text) {
+  return text.split("`").map((part, i) => (i % 2 ? h("code", {}, part) : part));
+}
