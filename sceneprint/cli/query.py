@@ -27,6 +27,7 @@ from sceneprint.cli.options import (
 )
 from sceneprint.errors import DatasetError, FrameError, MissingDependency, TooLarge, UnknownFrame
 from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint_client.api.query import MOST_OF_SEQUENCE
 from sceneprint_client.api.results import COLOURS, TRANSFORMS
 
 if TYPE_CHECKING:
@@ -331,6 +332,11 @@ def add_localize(commands: Any) -> None:
     command.add_argument(
         "--frame", metavar="N|FILE", help="frame of a folder: index from 0, or name (default: 0)"
     )
+    command.add_argument(
+        "--last", type=whole_number, default=1, metavar="K",
+        help="ask with the K last frames up to this one, 2 to 10, whose poses in the folder are "
+        "the odometry (default: 1, this one alone)",
+    )  # fmt: skip
     command.add_argument("--json", action="store_true", help="print JSON")
     add_up_option(command)
     add_asking_options(command)
@@ -342,14 +348,41 @@ def add_localize(commands: Any) -> None:
 def run_localize(options: argparse.Namespace) -> int:
     """Ask; returns 1 where the frame is not found."""
     reference = query_frames(options.path, options.frame)[0]
+    before = _frames_before(options, reference)
     how = {**options_of(options), "prior": options.prior}
     with open_client(options) as client:
-        there = client.localize(options.map, reference, up=options.up, **how)
+        if before:
+            there = client.localize_sequence(options.map, [*before, reference], **how)
+        else:
+            there = client.localize(options.map, reference, up=options.up, **how)
     if options.json:
         print(there.model_dump_json())
     else:
         print("\n".join(localization_lines(reference.name, there)))
     return 0 if there.status == "found" else 1
+
+
+def _frames_before(options: argparse.Namespace, reference: FrameReference) -> list[FrameReference]:
+    """The frames of a sequence before its last one; DatasetError where it cannot be asked so."""
+    if options.last == 1:
+        return []
+    if not 2 <= options.last <= MOST_OF_SEQUENCE:
+        raise DatasetError(f"--last {options.last}: choose from 1 to {MOST_OF_SEQUENCE}.")
+    if options.up is not None:
+        raise DatasetError(
+            "--up is of one frame. Leave --last out, or have `up` in the intrinsics.json beside "
+            "the frames."
+        )
+    run = reference.name.rpartition("/")[0]
+    frames = [f for f in query_frames(options.path, None) if f.name.rpartition("/")[0] == run]
+    place = [f.path for f in frames].index(reference.path)
+    before = frames[max(place - options.last + 1, 0) : place]
+    if len(before) < options.last - 1:
+        raise DatasetError(
+            f"{reference.name}: {len(before)} frames come before it, and --last {options.last} "
+            f"needs {options.last - 1}. Choose a later --frame, or a smaller --last."
+        )
+    return before
 
 
 def localization_lines(name: str, there: Localization) -> list[str]:

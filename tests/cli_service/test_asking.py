@@ -140,6 +140,24 @@ def test_an_ambiguous_place_is_told_with_its_alternatives(
     )
 
 
+def test_the_last_frames_of_a_folder_are_asked_together(
+    sceneprint: Run, maps: dict[str, list[str]], rooms: Path, capsys: Any
+) -> None:
+    asked = ("localize", "near", rooms / "room-0", "--frame", 1, "--json")
+    alone = json.loads(sceneprint(*asked).stdout)
+    both = json.loads(sceneprint(*asked, "--last", 2).stdout)
+    assert (alone["status"], both["status"]) == ("found", "found")
+    assert both["votes"] > alone["votes"]  # the frame before votes too
+    here, there = (np.array(one["pose"]["matrix"]) for one in (alone, both))
+    assert np.linalg.norm(here[:3, 3] - there[:3, 3]) < 0.05
+    for wrong, text in (
+        (("--last", 3), "1 frames come before it, and --last 3 needs 2"),
+        (("--last", 11), "--last 11: choose from 1 to 10"),
+        (("--last", 2, "--up", "0,-1,0"), "--up is of one frame"),
+    ):
+        assert text in sceneprint(*asked, *wrong, expect=2).stderr
+
+
 def test_a_prior_is_a_file_or_json(
     sceneprint: Run, sides: tuple[Path, list[Any]], tmp_path: Path, capsys: Any
 ) -> None:
