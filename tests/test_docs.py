@@ -218,11 +218,12 @@ def test_readme_commands_and_examples_run(tmp_path: Path) -> None:
     pairs = json.loads((tmp_path / "pairs.json").read_text())
     assert set(pairs["validation"]) >= {"precision", "recall", "accepted"}
     assert (tmp_path / "plots/contact.png").stat().st_size > 10_000
-    client, library = blocks(README, "python")
+    client, library, place = blocks(README, "python")
     assert re.match(r"found x=\S+ y=\S+ z=\S+$", run_example(client, tmp_path).strip())
     assert len([line for line in library.splitlines() if line]) <= 10
     # the first frame of room 0 is found in other frames of room 0, and in none of room 1
-    lines = run_example(library, tmp_path).splitlines()
+    *lines, located = run_example(library + place, tmp_path).splitlines()
+    assert re.match(r"\('(found|ambiguous)', '", located)
     accepted = [line.split()[0] for line in lines if line.split()[2] == "accepted"]
     assert accepted
     assert all(name.startswith("room-000/") for name in accepted)
