@@ -218,7 +218,12 @@ def localize(
     estimate : or None where nothing suggests a pose
     """
     p, overlap_p = p or LocalizationParameters(), overlap_p or OverlapParameters()
-    parent = _parent(frames, parents) if prior is None else prior.parent
+    parent = _parent(frames, parents)
+    if prior is not None and prior.parent != parent:
+        if _accepts(frames, parents, parent) and not _accepts(frames, parents, prior.parent):
+            prior = None  # what it says of one parent frame tells nothing of another
+        else:
+            parent = prior.parent
     own = [
         replace(frame, matches=[
             m for m in frame.matches if parents is None or parents[m.index] == parent
@@ -289,6 +294,18 @@ def _parent(frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, 
             )  # fmt: skip
     # the first of equals: dicts keep the order in which parents came
     return max(counts, key=counts.__getitem__, default="")
+
+
+def _accepts(
+    frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None, parent: str
+) -> bool:
+    """Whether a match of a parent frame is accepted."""
+    return any(
+        match.validation.status == "accepted"
+        and ("" if parents is None else parents[match.index]) == parent
+        for frame in frames
+        for match in frame.matches
+    )
 
 
 def _suggested(
@@ -386,10 +403,13 @@ def _estimate(
         inside = _confirmed_by_prior(by_score, prior, p)
         if inside is not None:
             return _found(parent, inside, places, "prior", ratio, p)
+    least = max(p.map_score, 0.5 * best.score)
     told = [
         place for place in sorted(places, key=lambda one: (-one.weight, -one.score))
-        if place.votes or (place.score >= p.map_score and _planes(place) >= p.map_planes)
+        if place.votes or place.score >= least
     ]  # fmt: skip
+    if not any(one.votes or _planes(one) >= p.map_planes for one in told):
+        told = []  # a few planes fit in many places
     alternatives = tuple(
         AlternativePose(one.pose, one.weight, one.support, one.score if mapped else None)
         for one in told[: p.views]
@@ -422,7 +442,7 @@ def _against_votes(
         excess = _excess(voted, p)
         if excess > p.violations * max(voted.weight, 1.0):
             return (
-                f"the matches agree, but {excess:.0%} of what should be in sight is not there: "
+                f"a pose fits, but {excess:.0%} of what should be in sight there is missing: "
                 "another place may look like this one, or this one has changed"
             )
     if not voted.strong and not blind:
@@ -527,10 +547,13 @@ def _found_reason(
         return "the map's frames confirm this pose, and no other comes near"
     if verified_by == "prior":
         return "several poses fit, and only this one lies where the prior expects the robot"
+    if agreeing == 1:
+        told = "one match gives the pose; one view, unconfirmed"
+        return told if accepted == 1 else f"{told}, and {accepted - 1} weaker ones disagree"
     spread = (
         f", within {average.spread_m:.2g} m and {math.degrees(average.spread_rad):.2g} deg"
         if average.support > 1
         else ""
     )
     told = f"{agreeing} of {accepted} matches agree on the pose{spread}"
-    return f"{told}; one view, unconfirmed" if support == 1 else told
+    return f"{told}, all from one viewpoint" if support == 1 else told

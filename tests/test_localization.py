@@ -102,7 +102,7 @@ def test_the_pose_of_a_match_leads_to_that_of_the_query(blank: Geometry) -> None
     assert found.average is not None
     np.testing.assert_allclose(found.average.T, turn @ shifted(2.0), atol=1e-12)
     assert (found.status, found.parent, found.votes, found.members) == ("found", "there", 1, (1,))
-    assert found.reason == "1 of 1 matches agree on the pose; one view, unconfirmed"
+    assert found.reason == "one match gives the pose; one view, unconfirmed"
     assert (found.rival_ratio, found.verified_by, found.alternatives) == (None, "matches", ())
 
 

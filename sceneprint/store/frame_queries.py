@@ -478,6 +478,15 @@ def placed_frames(
     return [PlacedFrame(*row) for row in connection.execute(asked)]
 
 
+def has_parent_frame(connection: Connection, map_number: int, parent: str) -> bool:
+    """Whether a frame of a map that is not deleted has a pose in that parent frame."""
+    c = frames.c
+    asked = select(c.number).where(
+        c.map_number == map_number, c.pose_parent == parent, c.state != FrameState.DELETED
+    )
+    return connection.execute(asked.limit(1)).first() is not None
+
+
 # What frames of a map weigh, and which a session brought: for whoever thins it out.
 
 

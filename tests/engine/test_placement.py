@@ -86,6 +86,10 @@ def test_a_prior_that_cannot_be_used_says_why(full: Engine, uploads: Any) -> Non
             "hall", uploads[8].data, uploads[8].meta,
             Query.model_validate({"stages": "retrieve", "prior": prior_at(uploads[8])}),
         )  # fmt: skip
+    elsewhere = prior_at(uploads[8])
+    elsewhere["pose"]["parent_frame"] = "elsewhere"
+    with pytest.raises(InvalidRequest, match="No frame of map 'hall' has a pose in the parent"):
+        localized(full, uploads[8], prior=elsewhere)
     with pytest.raises(ValueError, match=r"needs pose\.parent_frame"):
         Prior.model_validate({"pose": {"matrix": np.eye(4).tolist()}})
 

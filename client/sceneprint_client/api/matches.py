@@ -140,6 +140,7 @@ class Alternative(ApiRecord):
     """A pose of the query that the evidence supports; of several, one is right at most."""
 
     pose: Transform
+    map: str | None = Field(default=None, description="Whose parent frame it is given in.")
     weight: float = Field(
         description="Of its votes, one for each viewpoint: 1 of a strong match, 0.4 of a weak or "
         "an ambiguous one; 0 where the map alone suggests it."

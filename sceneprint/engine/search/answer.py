@@ -119,7 +119,7 @@ def answer(
     InvalidRequest, InvalidPose : the prior cannot be used.
     """
     clock = _Clock({"prepare": round(asked.prepare_ms, 2)})
-    prior = prior_of(query, places)
+    prior = prior_of(store, query, places)
     before = [_attempt(store, places, model, one.asked, query, deadline, prior) for one in earlier]
     if before:
         clock.stage("earlier")
@@ -191,7 +191,12 @@ def _answer(
     clock.spent["total"] = round(sum(clock.spent.values()), 2)
     counts = [_counts(searched, i, found, tried, matches) for i in range(len(places))]
     total = _sum(counts)
-    outcome = outcome_of(query, estimate, tried, matches, total, asked.geometry, p)
+    posed = any(
+        last.rows[one.index].pose is not None
+        for one in matches
+        if one.validation.status == "accepted"
+    )
+    outcome = outcome_of(query, estimate, tried, matches, total, asked.geometry, p, posed=posed)
     told = Answer(
         query_id=uuid.uuid4().hex,
         status=outcome.status,

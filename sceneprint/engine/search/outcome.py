@@ -36,7 +36,7 @@ class Outcome:
 
 def outcome_of(
     query: Query, estimate: PoseEstimate | None, tried: Validated, matches: Sequence[PairMatch],
-    counts: Counts, geometry: Geometry | None, p: ValidationParameters,
+    counts: Counts, geometry: Geometry | None, p: ValidationParameters, *, posed: bool,
 ) -> Outcome:  # fmt: skip
     """What came of a query.
 
@@ -49,11 +49,12 @@ def outcome_of(
     counts : of all maps
     geometry : of the query; None where it was not validated
     p : of the model
+    posed : whether an accepted match has a pose in the map
     """
     if "validate" not in query.stages:
         return Outcome("unvalidated", "validation was not asked for")
     accepted = [one for one in matches if one.validation.status == "accepted"]
-    if accepted and (estimate is None or not estimate.votes):
+    if accepted and not posed:
         return Outcome(
             "found",
             f"{len(accepted)} matches are accepted, but none has a pose in the map; `best` has the "

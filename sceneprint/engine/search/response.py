@@ -120,10 +120,11 @@ def alternative_records(found: Candidates, estimate: PoseEstimate | None) -> lis
     """The poses that the evidence supports, where it does not decide."""
     if estimate is None:
         return []
-    parent = estimate.parent.partition(" ")[2]
+    number, _, parent = estimate.parent.partition(" ")
     return [
         ToldAlternative(
             pose=transform(one.T, parent, found.query_frame),
+            map=found.maps[int(number)],
             weight=one.weight,
             support=one.support,
             score=one.score,

@@ -33,7 +33,7 @@ from sceneprint.localization import (
 )
 from sceneprint.matches import PairMatch, associate
 from sceneprint.store import Store
-from sceneprint.store.frame_queries import PlacedFrame, placed_frames
+from sceneprint.store.frame_queries import PlacedFrame, has_parent_frame, placed_frames
 from sceneprint.store.frames import frames_of
 from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import FrameRow
@@ -220,7 +220,7 @@ def placed(
     return localize(frames, poses, parents, None if paper else views_of, prior, own_p, p.agreement)
 
 
-def prior_of(query: Query, places: Sequence[SearchedMap]) -> PosePrior | None:
+def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PosePrior | None:
     """What the robot believed before; InvalidRequest or InvalidPose where it cannot be used."""
     given = query.prior
     if given is None:
@@ -246,7 +246,15 @@ def prior_of(query: Query, places: Sequence[SearchedMap]) -> PosePrior | None:
                 "above 0. Send the 36 numbers row by row, or `deviation_m` and `deviation_deg`.",
                 (("prior.covariance", "not positive definite"),),
             )
-    parent = f"{places[0].row.number} {given.pose.parent_frame}"
+    row, name = places[0].row, str(given.pose.parent_frame)
+    with store.queried.read() as connection:
+        if not has_parent_frame(connection, row.number, name):
+            raise InvalidRequest(
+                f"No frame of map {row.name!r} has a pose in the parent frame {name!r} of the "
+                "prior. Give the pose in one that the map has; `sceneprint frames` shows them.",
+                (("prior.pose.parent_frame", "not of this map"),),
+            )
+    parent = f"{row.number} {name}"
     return PosePrior(parent, pose_matrix(given.pose, "The prior"), covariance)
 
 
