@@ -52,7 +52,7 @@ class LocalizationParameters:
     sure_weight: float = 2.0  #: of a place, that two strong matches give it
     rival: float = 0.9  #: of its score, above which another pose makes it ambiguous
     rival_unsure: float = 0.3  #: the same of a place with less weight, and without any
-    violations: float = 0.045  #: most, beyond the map's own, for each unit of weight of a pose
+    violations: float = 0.05  #: most, beyond the map's own, for each unit of weight of a pose
     map_score: float = 0.3  #: least score of a pose that the map confirms without a strong match
     map_planes: float = 12.0  #: and least number of distinct planes that agree
     map_views: int = 8  #: and least number of frames of the map that agree

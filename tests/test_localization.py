@@ -349,4 +349,4 @@ def test_frames_of_a_sequence_vote_for_the_pose_of_the_last(blank: Geometry) -> 
 def test_the_numbers_are_those_of_the_docs() -> None:
     p = LocalizationParameters()
     told = (p.weak, p.outweigh, p.rival, p.violations, p.map_score, p.rival_unsure, p.map_planes)
-    assert told == (0.4, 2.0, 0.9, 0.045, 0.3, 0.3, 12.0)
+    assert told == (0.4, 2.0, 0.9, 0.05, 0.3, 0.3, 12.0)
