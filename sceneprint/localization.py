@@ -50,13 +50,13 @@ class LocalizationParameters:
     weak: float = 0.4  #: weight of a weak or ambiguous match; a strong one counts 1
     outweigh: float = 2.0  #: times as much weight as any other place
     sure_weight: float = 2.0  #: of a place, that two strong matches give it
+    planes: float = 6.0  #: distinct ones that must agree at any pose, where the map is asked
     rival: float = 0.9  #: of its score, above which another pose makes it ambiguous
     rival_unsure: float = 0.3  #: the same of a place with less weight, and without any
     violations: float = 0.05  #: most, beyond the map's own, for each unit of weight of a pose
     map_score: float = 0.3  #: least score of a pose that the map confirms without a strong match
     map_planes: float = 12.0  #: and least number of distinct planes that agree
     map_views: int = 8  #: and least number of frames of the map that agree
-    prior_planes: float = 6.0  #: that agree at a pose that the prior decides for, at least
     prior_rival: float = 0.65  #: of its score that another pose near the prior may reach
     most_noise: float = 0.2  #: violations of the map's own that are believed
     map: MapParameters = field(default_factory=MapParameters)
@@ -439,6 +439,11 @@ def _against_votes(
                 if score > p.rival * voted.score
                 else "too little speaks for the pose while another explains much of the frame"
             )
+        if _planes(voted) < p.planes:
+            return (
+                f"only {_planes(voted):.0f} distinct planes agree, and a few planes fit in many "
+                "places"
+            )
         excess = _excess(voted, p)
         if excess > p.violations * max(voted.weight, 1.0):
             return (
@@ -477,7 +482,7 @@ def _confirmed_by_prior(
     next_best = inside[1].score if len(inside) > 1 else 0.0
     sure = (
         best.score >= p.map_score
-        and _planes(best) >= p.prior_planes
+        and _planes(best) >= p.planes
         and next_best <= p.prior_rival * best.score
         and best.score >= p.rival * by_score[0].score
         and _excess(best, p) <= p.violations
