@@ -2,7 +2,7 @@
 
 seed  --synthesise_lookalike-->  sites  --answer_of-->  Told, ...  --table-->  shares by kind
 
-Seeds 1 to 99 are for choosing numbers; judge by seeds that nothing was chosen on, 1000 and later.
+Seeds 1 to 99 are for choosing numbers; judge by seeds from 1000 on that nobody has looked at.
 """
 
 from __future__ import annotations
