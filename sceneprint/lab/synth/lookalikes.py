@@ -571,7 +571,7 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Shoot
         seats = [swivel_chair(rng).mesh.moved((rng.normal(0, 0.1), -d - 0.35, 0), math.pi)]
         things = [  # what stands on the floor of one side, and not of the other
             floor_thing(rng).mesh.moved(
-                (rng.uniform(-w / 2, w / 2), -d - rng.uniform(0.3, 1.1), 0.0)
+                (rng.uniform(-w / 2, w / 2), -d - rng.uniform(0.2, 0.45), 0.0)
             )
             for _ in range(int(rng.integers(1, 4)))
         ]
