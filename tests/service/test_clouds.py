@@ -80,7 +80,7 @@ def hall(served, make_map, shots, clouds) -> tuple[str, list[str]]:
 def found(answer: Any, status: str = "found") -> dict[str, Any]:
     assert answer.status_code == 200, answer.text
     told: dict[str, Any] = answer.json()
-    assert told["status"] == status
+    assert told["status"] == status, told["reason"]
     return told
 
 

@@ -34,7 +34,7 @@ from sceneprint.geometry.validation.overlap import (
     tolerances,
 )
 from sceneprint.geometry.validation.validation import refined_at
-from sceneprint.types import Floats, Geometry, Sphere
+from sceneprint.types import Floats, Geometry, Intrinsics
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class MapParameters:
     n_views: int = 10  #: that a pose is scored on, at most
     look_ahead: float = 1.5  #: of a camera, to the middle of what it sees, metres
     reach: float = 3.5  #: between the middles of two views that may share surfaces, metres
-    around_reach: float = 15.0  #: the same of sensors that see all around
+    around_reach: float = 15.0  #: between two sensors that may look anywhere
     least_agreeing: float = 0.03  #: share of the query's points, below which a view has no say
     violation_weight: float = 2.0  #: of the violations of either side, in the score
     n_poses: int = 40  #: that are scored on the candidates
@@ -144,25 +144,25 @@ class MapViews:
             )  # fmt: skip
         return self._frames[i]
 
-    def near(self, T: Floats, around: bool, among: NDArray[np.intp] | None = None) -> list[int]:
+    def near(self, T: Floats, ahead: bool, among: NDArray[np.intp] | None = None) -> list[int]:
         """The frames that most likely see what a sensor at T sees, nearest first.
 
         Parameters
         ----------
         T : (4, 4) T_parent_sensor
-        around : whether it sees all around; else directions count beside distance
+        ahead : whether it looks along z, so that directions count beside distance
         among : positions of the frames to choose from; default: all
         """
         p = self._p
-        ahead = 0.0 if around else p.look_ahead
+        forward = p.look_ahead if ahead else 0.0
         poses = self.poses if among is None else self.poses[among]
         axes = poses[:, :3, 2]
-        middles = poses[:, :3, 3] + ahead * axes
-        apart = np.linalg.norm(middles - (T[:3, 3] + ahead * T[:3, 2]), axis=1)
-        if not around:
+        middles = poses[:, :3, 3] + forward * axes
+        apart = np.linalg.norm(middles - (T[:3, 3] + forward * T[:3, 2]), axis=1)
+        if ahead:
             apart += p.look_ahead * (1.0 - axes @ T[:3, 2])
         order = np.argsort(apart, kind="stable")[: p.n_views]
-        order = order[apart[order] < (p.around_reach if around else p.reach)]
+        order = order[apart[order] < (p.reach if ahead else p.around_reach)]
         near: list[int] = (order if among is None else among[order]).tolist()
         return near
 
@@ -182,10 +182,11 @@ def map_frame(
     return MapFrame(geometry, target, T, p.planes)
 
 
-def sees_around(geometry: Geometry) -> bool:
-    """Whether the sensor sees all around, or its viewpoint is not known."""
-    camera = geometry.surface.camera
-    return camera is None or (isinstance(camera, Sphere) and camera.sees_around)
+def looks_ahead(geometry: Geometry) -> bool:
+    """Whether it is known where the sensor looks: along z, as depth cameras do. Clouds keep axes
+    of any kind, and many see all around.
+    """
+    return isinstance(geometry.surface.camera, Intrinsics)
 
 
 def score_pose(
@@ -210,7 +211,7 @@ def score_pose(
         points, weights = frame.planes.points, frame.planes.weights
         agree, violate = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
         T_parent_sensor = T @ frame.T
-        for i in views.near(T_parent_sensor, sees_around(frame.geometry), among):
+        for i in views.near(T_parent_sensor, looks_ahead(frame.geometry), among):
             view = views[i]
             if view is None:
                 continue
