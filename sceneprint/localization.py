@@ -426,7 +426,7 @@ def _against_votes(
     """Why the place with most votes is not the answer; None where it is."""
     others = [place for place in places if place is not voted]
     if not voted.accepted:
-        return "no candidate is accepted"
+        return "no match is accepted, and the map's frames confirm none of the poses that fit"
     heaviest = max((place.weight for place in others), default=0.0)
     if heaviest * p.outweigh > voted.weight:
         return "the matches disagree: none of their poses has twice the weight of the next"

@@ -434,11 +434,14 @@ def frame_ups(connection: Connection, numbers: Iterable[int]) -> list[FrameUp]:
 
 @dataclass(frozen=True)
 class PlacedFrame:
-    """A posed frame: its number, T_parent_sensor (4 rows of 4), the blob of its geometry."""
+    """A posed frame: its number, T_parent_sensor (4 rows of 4), the blob of its geometry, and
+    what is known of its points where it is a cloud.
+    """
 
     number: int
     pose: list[list[float]]
     geometry: str
+    cloud: dict[str, Any] | None
 
 
 def placed_frames(
@@ -460,7 +463,7 @@ def placed_frames(
     axes = (c.pose_x, c.pose_y, c.pose_z)
     apart = [(axis - middle) * (axis - middle) for axis, middle in zip(axes, centre, strict=True)]
     asked = (
-        select(c.number, c.pose, signatures.c.geometry)
+        select(c.number, c.pose, signatures.c.geometry, c.cloud)
         .join(signatures, signatures.c.frame_number == c.number)
         .where(
             c.map_number == map_number,

@@ -22,7 +22,7 @@ from sceneprint.errors import DamagedBlob, InvalidRequest, UnreadableGeometry
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
-from sceneprint.geometry.validation.map_verification import MapViews
+from sceneprint.geometry.validation.map_verification import MapViews, looks_ahead
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.localization import (
     LocalizationParameters,
@@ -151,9 +151,11 @@ def validated(
 
 
 #: Frames that are looked for about each pose that a candidate suggests, and how far off, metres:
-#: first close by, as a map may hold thousands, and farther off where that gives too few.
+#: first close by, as a map may hold thousands, and farther off where that gives too few. Scans
+#: see farther than cameras.
 _NEAR_FRAMES = 48
 _NEAR_M = (2.0, 8.0)
+_NEAR_SCANS_M = (2.0, 8.0, 15.0)
 #: Poses this near are looked about once, metres.
 _CELL_M = 1.0
 #: Places that are looked about, at most.
@@ -189,20 +191,14 @@ def placed(
     own_p = LocalizationParameters()
     if options is not None:
         own_p = replace(own_p, map_score=math.inf)
-    own = {int(number) for frame in searched.parts for number in frame.dead}
-    filtered = [part.among.tolist() for part in searched.parts if part.among is not None]
-    passing = {number for keys in filtered for number in keys} if filtered else None
-    model_id = searched.parts[0].place.row.model_id
+    reaches = _NEAR_M if all(looks_ahead(one.geometry) for one in asked) else _NEAR_SCANS_M
 
     def views_of(parent: str, at: Floats) -> MapViews:
         known = [number for number in geometries if parents.get(number) == parent]
-        near = {
-            number: found
-            for number, found in _near_frames(store, parent, model_id, at).items()
-            if number not in own and (passing is None or number in passing)
-        }
+        near = _near_frames(store, searched, parent, at, reaches)
         numbers = [*known, *(number for number in near if number not in known)]
         at_poses = [poses[n] if n in known else np.array(near[n].pose) for n in numbers]
+        ahead = [(rows[n] if n in known else near[n]).cloud is None for n in numbers]
 
         def open_view(i: int) -> Geometry | None:
             number = numbers[i]
@@ -214,7 +210,7 @@ def placed(
                 return None  # one frame of many: the others tell the poses apart
 
         stack = np.array(at_poses).reshape(-1, 4, 4)
-        return MapViews(stack, open_view, own_p.map, p.agreement, range(len(known)))
+        return MapViews(stack, open_view, own_p.map, p.agreement, range(len(known)), ahead)
 
     paper = options is not None and options.mode == "paper"
     return localize(frames, poses, parents, None if paper else views_of, prior, own_p, p.agreement)
@@ -281,18 +277,25 @@ def parent_key(row: FrameRow) -> str:
     return f"{row.map_number} {row.pose_parent}"
 
 
-def _near_frames(store: Store, parent: str, model_id: str, at: Floats) -> dict[int, PlacedFrame]:
-    """Frames of a parent frame taken about poses (n, 4, 4), by number."""
+def _near_frames(
+    store: Store, searched: Searched, parent: str, at: Floats, reaches: Sequence[float]
+) -> dict[int, PlacedFrame]:
+    """Frames of a parent frame taken about poses (n, 4, 4) that the query may find, by number."""
     number, _, name = parent.partition(" ")
+    part = next(one for one in searched.parts if one.place.row.number == int(number))
     cells = np.unique(np.round(at[:, :3, 3] / _CELL_M), axis=0, return_index=True)[1]
     found: dict[int, PlacedFrame] = {}
     with store.queried.read() as connection:
         for centre in at[np.sort(cells)[:_MOST_PLACES], :3, 3].tolist():
-            for within in _NEAR_M:
+            for within in reaches:
                 near = placed_frames(
-                    connection, int(number), name, model_id, centre, within, _NEAR_FRAMES
-                )
+                    connection, int(number), name, part.place.row.model_id, centre, within,
+                    _NEAR_FRAMES,
+                )  # fmt: skip
                 if len(near) == _NEAR_FRAMES:
                     break
             found |= {one.number: one for one in near}
-    return found
+    passing = set(found)
+    if part.among is not None:
+        passing = set(np.intersect1d(list(found), part.among).tolist())
+    return {n: one for n, one in found.items() if n in passing and n not in part.dead}

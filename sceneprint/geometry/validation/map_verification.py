@@ -44,7 +44,7 @@ class MapParameters:
     n_views: int = 10  #: that a pose is scored on, at most
     look_ahead: float = 1.5  #: of a camera, to the middle of what it sees, metres
     reach: float = 3.5  #: between the middles of two views that may share surfaces, metres
-    around_reach: float = 15.0  #: between two sensors that may look anywhere
+    around_reach: float = 15.0  #: the same where one of the sensors may look anywhere
     least_agreeing: float = 0.03  #: share of the query's points, below which a view has no say
     violation_weight: float = 2.0  #: of the violations of either side, in the score
     n_poses: int = 40  #: that are scored on the candidates
@@ -99,7 +99,6 @@ class ScoredPose:
     hidden : the same of the map's surfaces, which the query saw through
     noise : violations that the map's frames about the pose show among themselves; 0 where it
         was not asked for
-    asked : frames of the map that were taken near enough to see the same
     views : frames of the query with positions of map frames that agree, most shared first
     """
 
@@ -109,7 +108,6 @@ class ScoredPose:
     planes: float
     violations: float
     hidden: float
-    asked: int
     views: tuple[tuple[int, int], ...]
     noise: float = 0.0
 
@@ -120,6 +118,7 @@ class MapViews:
     def __init__(
         self, poses: Floats, open_geometry: Callable[[int], Geometry | None],
         p: MapParameters, overlap_p: OverlapParameters, candidates: Sequence[int] = (),
+        ahead: Sequence[bool] | None = None,
     ) -> None:  # fmt: skip
         """Hold frames by their poses.
 
@@ -130,9 +129,11 @@ class MapViews:
         p, overlap_p : see there
         candidates : positions of those that poses are first compared on, being open already;
             none: all
+        ahead : of each, whether its sensor looks along z, as depth cameras do; default: all do
         """
         self.poses, self._open, self._p, self._overlap = poses, open_geometry, p, overlap_p
         self.candidates = np.array(candidates, np.intp)
+        self._ahead = np.ones(len(poses), bool) if ahead is None else np.array(ahead, bool)
         self._frames: dict[int, MapFrame | None] = {}
 
     def __getitem__(self, i: int) -> MapFrame | None:
@@ -150,19 +151,21 @@ class MapViews:
         Parameters
         ----------
         T : (4, 4) T_parent_sensor
-        ahead : whether it looks along z, so that directions count beside distance
+        ahead : whether it looks along z; where both sensors do, directions count beside distance
         among : positions of the frames to choose from; default: all
         """
         p = self._p
-        forward = p.look_ahead if ahead else 0.0
         poses = self.poses if among is None else self.poses[among]
+        look_ahead = self._ahead if among is None else self._ahead[among]
         axes = poses[:, :3, 2]
-        middles = poses[:, :3, 3] + forward * axes
-        apart = np.linalg.norm(middles - (T[:3, 3] + forward * T[:3, 2]), axis=1)
-        if ahead:
-            apart += p.look_ahead * (1.0 - axes @ T[:3, 2])
+        middles = poses[:, :3, 3] + np.where(look_ahead, p.look_ahead, 0.0)[:, None] * axes
+        own = T[:3, 3] + (p.look_ahead if ahead else 0.0) * T[:3, 2]
+        apart = np.linalg.norm(middles - own, axis=1)
+        both = look_ahead & ahead
+        apart += np.where(both, p.look_ahead * (1.0 - axes @ T[:3, 2]), 0.0)
+        apart /= np.where(both, p.reach, p.around_reach)
         order = np.argsort(apart, kind="stable")[: p.n_views]
-        order = order[apart[order] < (p.reach if ahead else p.around_reach)]
+        order = order[apart[order] < 1.0]
         near: list[int] = (order if among is None else among[order]).tolist()
         return near
 
@@ -205,7 +208,6 @@ def score_pose(
     """
     limits = tolerances(overlap_p)
     total = agreeing = violating = seen = through = 0.0
-    asked = 0
     shared: list[tuple[int, int, int]] = []
     for number, frame in enumerate(frames):
         points, weights = frame.planes.points, frame.planes.weights
@@ -215,7 +217,6 @@ def score_pose(
             view = views[i]
             if view is None:
                 continue
-            asked += 1
             T_view_sensor = inverse(view.T) @ T_parent_sensor
             said = look_up(points, view.target, T_view_sensor, limits)
             count = int((said == AGREES).sum())
@@ -235,7 +236,7 @@ def score_pose(
     hidden = through / max(seen + through, 1e-9)
     score = share * (1.0 - p.violation_weight * (violations + hidden))
     pairs = tuple((number, i) for _, number, i in sorted(shared))
-    return ScoredPose(T, score, share, agreeing / len(frames), violations, hidden, asked, pairs)
+    return ScoredPose(T, score, share, agreeing / len(frames), violations, hidden, pairs)
 
 
 def map_noise(

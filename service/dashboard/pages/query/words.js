@@ -38,9 +38,8 @@ const CAUSES = {
  * @param {Object<string, any>} answer
  * @returns {string}
  */
-export function mapOf({ location, alternatives, matches, maps }) {
-  const parent = alternatives[0]?.pose.parent_frame;
-  return location?.map ?? (maps.length === 1 ? maps[0] : matches.find((one) => one.pose_in_map?.parent_frame === parent)?.map ?? maps[0]);
+export function mapOf({ location, alternatives, maps }) {
+  return location?.map ?? alternatives[0]?.map ?? maps[0];
 }
 
 /**
@@ -92,7 +91,7 @@ function unvalidated({ matches, counts, deadline_reached: late }) {
 
 /** Kind of badge of a pose that is found: an unconfirmed one is to be looked at twice. @param {Object<string, any>} location */
 function sureness({ support, strength, verified_by: by }) {
-  return by === "map" || (by === "matches" && support > 1 && strength === "strong") ? "good" : "warn";
+  return strength === "strong" && (by === "map" || (by === "matches" && support > 1)) ? "good" : "warn";
 }
 
 /**
