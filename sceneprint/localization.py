@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.geometry.pose.average import PoseAverage, average_poses
-from sceneprint.geometry.pose.rigid import difference, inverse
+from sceneprint.geometry.pose.rigid import distinct, inverse
 from sceneprint.geometry.validation.acceptance import Strength
 from sceneprint.geometry.validation.association import preferred
 from sceneprint.geometry.validation.icp import error_of, place_covariance, transported
@@ -26,6 +26,7 @@ from sceneprint.geometry.validation.map_verification import (
     MapParameters,
     MapViews,
     ScoredPose,
+    at_place,
     compare_poses,
     map_frame,
     refined_starts,
@@ -57,6 +58,7 @@ class LocalizationParameters:
     map_score: float = 0.3  #: least score of a pose that the map confirms without a strong match
     map_planes: float = 12.0  #: and least number of distinct planes that agree
     map_views: int = 8  #: and least number of frames of the map that agree
+    map_viewpoints: int = 2  #: from which candidates suggest it, where no match votes for it
     prior_rival: float = 0.65  #: of its score that another pose near the prior may reach
     most_noise: float = 0.2  #: violations of the map's own that are believed
     map: MapParameters = field(default_factory=MapParameters)
@@ -162,11 +164,18 @@ class _Vote:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """The votes for one place, those to believe most first, and how the map bears it out."""
+    """The votes for one place, those to believe most first, and how the map bears it out.
+
+    Parameters
+    ----------
+    weight, support : of the votes from different viewpoints
+    viewpoints : from which a candidate suggests it, voting or not
+    """
 
     votes: list[_Vote]
     weight: float
     support: int
+    viewpoints: int
     scored: ScoredPose | None = None
 
     @property
@@ -230,7 +239,7 @@ def localize(
         ])
         for frame in frames
     ]  # fmt: skip
-    suggested = _suggested(own, poses)
+    suggested, viewpoints = _suggested(own, poses)
     scored: list[ScoredPose] = []
     if views_of is not None and (len(suggested) or prior is not None):
         ready = [map_frame(one.geometry, one.T, p.map, overlap_p) for one in frames]
@@ -238,7 +247,7 @@ def localize(
         views = views_of(parent, np.concatenate([starts[:1], suggested]))
         near = refined_starts(ready, starts, views, p.map, overlap_p)
         scored = compare_poses(ready, np.concatenate([near, suggested]), views, p.map, overlap_p)
-    places = _places(_votes(own, poses, p), scored, p)
+    places = _places(_votes(own, poses, p), scored, suggested, viewpoints, p)
     if not places:
         return None
     blind = all(frame.geometry.surface.camera is None for frame in frames)
@@ -310,18 +319,27 @@ def _accepts(
 
 def _suggested(
     frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats]
-) -> Floats:
-    """Every pose (n, 4, 4) that a candidate suggests: the best of each, then the next best."""
+) -> tuple[Floats, Floats]:
+    """Every pose (n, 4, 4) that a candidate suggests, and the pose of each one's candidate.
+
+    The best of each candidate come first, then the next best.
+    """
     of_each = [
-        poses[match.index] @ match.validation.hypotheses @ inverse(frame.T)
+        (poses[match.index], poses[match.index] @ match.validation.hypotheses @ inverse(frame.T))
         for frame in frames
         for match in frame.matches
         # of a sensor that cannot have stood so
         if len(match.validation.hypotheses) and not match.validation.contradicts_up
     ]
-    most = max(map(len, of_each), default=0)
-    told = [one[rank] for rank in range(most) for one in of_each if rank < len(one)]
-    return np.array(told).reshape(-1, 4, 4)
+    most = max((len(told) for _, told in of_each), default=0)
+    pairs = [
+        (told[rank], viewpoint)
+        for rank in range(most)
+        for viewpoint, told in of_each
+        if rank < len(told)
+    ]
+    both = np.array(pairs).reshape(-1, 2, 4, 4)
+    return both[:, 0], both[:, 1]
 
 
 def _votes(
@@ -350,8 +368,9 @@ def _votes(
 
 
 def _places(
-    votes: Sequence[_Vote], scored: Sequence[ScoredPose], p: LocalizationParameters
-) -> list[_Place]:
+    votes: Sequence[_Vote], scored: Sequence[ScoredPose], suggested: Floats, viewpoints: Floats,
+    p: LocalizationParameters,
+) -> list[_Place]:  # fmt: skip
     """Votes and scored poses by place: those with votes first, then by score."""
     groups: list[list[_Vote]] = []
     for vote in votes:
@@ -361,24 +380,26 @@ def _places(
                 break
         else:
             groups.append([vote])
+
+    def views_of(T: Floats) -> int:
+        return len(_different_views(viewpoints[at_place(suggested, T, p.map)], p.map))
+
     left = list(scored)
     places = []
     for group in groups:
         own = next((one for one in left if same_place(group[0].T, one.T, p.map)), None)
         left = [one for one in left if one is not own]
-        distinct = _from_different_views(group, p.map)
-        places.append(_Place(group, sum(vote.weight for vote in distinct), len(distinct), own))
-    return places + [_Place([], 0.0, 0, one) for one in left]
+        # a copy of a view is no second vote
+        different = _different_views(np.stack([vote.viewpoint for vote in group]), p.map)
+        weight = sum(group[i].weight for i in different)
+        places.append(_Place(group, weight, len(different), views_of(group[0].T), own))
+    return places + [_Place([], 0.0, 0, views_of(one.T), one) for one in left]
 
 
-def _from_different_views(votes: Sequence[_Vote], p: MapParameters) -> list[_Vote]:
-    """The first vote from each viewpoint: a copy of a view is no second vote."""
-    kept: list[_Vote] = []
-    for vote in votes:
-        apart = [difference(vote.viewpoint, other.viewpoint) for other in kept]
-        if all(metres > p.same_m or radians > p.same_rad for metres, radians in apart):
-            kept.append(vote)
-    return kept
+def _different_views(viewpoints: Floats, p: MapParameters) -> list[int]:
+    """Indices of the first view from each viewpoint (n, 4, 4)."""
+    order = -np.arange(len(viewpoints), dtype=float)
+    return distinct(viewpoints, order, p.same_m, p.same_rad, len(viewpoints))
 
 
 def _estimate(
@@ -462,7 +483,8 @@ def _map_confirms(best: _Place, places: Sequence[_Place], p: LocalizationParamet
     others = [place for place in places if place is not best]
     frames = {i for _, i in best.scored.views}
     return (
-        best.score >= p.map_score
+        (bool(best.votes) or best.viewpoints >= p.map_viewpoints)
+        and best.score >= p.map_score
         and max((place.score for place in others), default=0.0) <= p.rival_unsure * best.score
         and best.scored.planes >= p.map_planes
         and len(frames) >= p.map_views

@@ -13,10 +13,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from typing import Literal
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sceneprint.geometry.frame_cache import cached_per_frame
 from sceneprint.geometry.pose.rigid import distinct, inverse, inverses
 from sceneprint.geometry.surface.camera import kind_of
 from sceneprint.geometry.validation.consensus import ConsensusParameters, consensus
@@ -61,7 +61,7 @@ from sceneprint.geometry.validation.sequence_alignment import (
     SequenceParameters,
     sequence_correspondences,
 )
-from sceneprint.types import Floats, Floats32, Geometry, Ints32, Sphere
+from sceneprint.types import Floats, Floats32, Geometry, Ints32, Sphere, Surface
 
 #: What proposed a transform: patches alike, or plans laid on each other.
 Search = Literal["correspondences", "plans"]
@@ -107,18 +107,15 @@ class FrameSamples:
     up: Floats | None = None
 
     def plan(self, p: PlanParameters) -> ScanPlan:
-        """Of a scan: drawn once, as a frame is compared with many."""
+        """Of a scan."""
         if self.up is not None:
             return plan_of(self.geometry.surface, p, up=self.up)
-        plan = _plans.get(self.geometry)
-        if plan is None or plan.parameters != p:
-            plan = plan_of(self.geometry.surface, p)
-            _plans[self.geometry] = plan
-        return plan
+        return _upright_plan(self.geometry.surface, p)
 
 
-#: While a geometry lives, its plan is kept.
-_plans: WeakKeyDictionary[Geometry, ScanPlan] = WeakKeyDictionary()
+@cached_per_frame
+def _upright_plan(surface: Surface, p: PlanParameters) -> ScanPlan:
+    return plan_of(surface, p)
 
 
 def samples_of(

@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sceneprint.geometry.frame_cache import cached_per_frame
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.pose.rigid import distinct
 from sceneprint.geometry.validation.gravity import NO_UPS, Ups, are_level
@@ -55,6 +56,7 @@ class AmbiguityParameters:
     rival_rad: float = math.radians(15.0)  #: or by this
 
 
+@cached_per_frame
 def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
     """Motions that leave main planes of the patches in themselves.
 

@@ -362,3 +362,11 @@ def same_place(a: Floats, b: Floats, p: MapParameters) -> bool:
     """Whether two poses (4, 4) are one answer."""
     metres, radians = difference(a, b)
     return metres <= p.place_m and radians <= p.place_rad
+
+
+def at_place(poses: Floats, T: Floats, p: MapParameters) -> NDArray[np.bool_]:
+    """Which of some poses (n, 4, 4) are one answer with T: (n,)."""
+    metres = np.linalg.norm(poses[:, :3, 3] - T[:3, 3], axis=1)
+    cosines = (np.einsum("nij,ij->n", poses[:, :3, :3], T[:3, :3]) - 1.0) / 2.0
+    near: NDArray[np.bool_] = (metres <= p.place_m) & (cosines >= math.cos(p.place_rad))
+    return near

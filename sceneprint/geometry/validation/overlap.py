@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sceneprint.geometry.frame_cache import cached_per_frame
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.pose.rigid import inverses
 from sceneprint.geometry.surface.camera import camera_of, depth_at, grown, project
@@ -115,6 +116,7 @@ def one_of_each(points: Floats32, cube: float) -> Ints32:
     return np.sort(first).astype(np.int32)
 
 
+@cached_per_frame
 def target_of(surface: Surface, nearest: float, reach: float) -> LookupTarget:
     """A surface made ready to be looked up.
 
@@ -201,6 +203,7 @@ class Overlap:
         return violations / max(self.inliers + violations, 1)
 
 
+@cached_per_frame
 def sampled(surface: Surface, stride: int) -> Floats32:
     """Valid pixels of every `stride`-th row and column; of a cloud, about as many points.
 
@@ -497,6 +500,7 @@ def plane_weights(patches: Patches, p: PlaneParameters) -> Floats32:
     return weights
 
 
+@cached_per_frame
 def plane_view(geometry: Geometry, p: PlaneParameters) -> PlaneView:
     """A frame made ready for `explained`."""
     patches = geometry.patches
