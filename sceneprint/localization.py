@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.geometry.pose.average import PoseAverage, average_poses
-from sceneprint.geometry.pose.rigid import distinct, inverse
+from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.validation.acceptance import Strength
 from sceneprint.geometry.validation.association import preferred
 from sceneprint.geometry.validation.icp import error_of, place_covariance, transported
@@ -28,6 +28,7 @@ from sceneprint.geometry.validation.map_verification import (
     ScoredPose,
     at_place,
     compare_poses,
+    different_views,
     map_frame,
     refined_starts,
     same_place,
@@ -132,6 +133,7 @@ class PoseEstimate:
     rival_ratio : the next best place's score by that of the best; None where no map was asked
     votes : accepted matches that have a pose in the parent frame
     members : rows of the matches that vote for the answer
+    guided : how many of these were guided by the others
     """
 
     status: LocalizationStatus
@@ -145,6 +147,7 @@ class PoseEstimate:
     rival_ratio: float | None
     votes: int = 0
     members: tuple[int, ...] = ()
+    guided: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,24 +385,20 @@ def _places(
             groups.append([vote])
 
     def views_of(T: Floats) -> int:
-        return len(_different_views(viewpoints[at_place(suggested, T, p.map)], p.map))
+        return len(different_views(viewpoints[at_place(suggested, T, p.map)], p.map))
 
     left = list(scored)
     places = []
     for group in groups:
         own = next((one for one in left if same_place(group[0].T, one.T, p.map)), None)
         left = [one for one in left if one is not own]
-        # a copy of a view is no second vote
-        different = _different_views(np.stack([vote.viewpoint for vote in group]), p.map)
-        weight = sum(group[i].weight for i in different)
+        # neither a copy of a view nor what other matches gave is a vote of its own
+        voting = [vote for vote in group if not vote.match.validation.guided]
+        seen_from = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)
+        different = different_views(seen_from, p.map)
+        weight = sum(voting[i].weight for i in different)
         places.append(_Place(group, weight, len(different), views_of(group[0].T), own))
     return places + [_Place([], 0.0, 0, views_of(one.T), one) for one in left]
-
-
-def _different_views(viewpoints: Floats, p: MapParameters) -> list[int]:
-    """Indices of the first view from each viewpoint (n, 4, 4)."""
-    order = -np.arange(len(viewpoints), dtype=float)
-    return distinct(viewpoints, order, p.same_m, p.same_rad, len(viewpoints))
 
 
 def _estimate(
@@ -559,17 +558,19 @@ def _found(
         poses = np.stack([vote.T for vote in votes])
         covariance = place_covariance(average, poses, np.stack(told))
     total = sum(vote.accepted for one in places for vote in one.votes)
-    reason = _found_reason(average, len(accepted), total, place.support, verified_by)
+    guided = sum(vote.match.validation.guided for vote in accepted)
+    reason = _found_reason(average, len(accepted), guided, total, place.support, verified_by)
     strength: Strength = "strong" if place.strong else "weak"
     return PoseEstimate(
         "found", reason, parent, average, covariance, strength, verified_by, (), ratio,
-        total, tuple(vote.match.index for vote in accepted),
+        total, tuple(vote.match.index for vote in accepted), guided,
     )  # fmt: skip
 
 
 def _found_reason(
-    average: PoseAverage, agreeing: int, accepted: int, support: int, verified_by: Verifier
-) -> str:
+    average: PoseAverage, agreeing: int, guided: int, accepted: int, support: int,
+    verified_by: Verifier,
+) -> str:  # fmt: skip
     if verified_by == "map":
         return "the map's frames confirm this pose, and no other comes near"
     if verified_by == "prior":
@@ -583,4 +584,6 @@ def _found_reason(
         else ""
     )
     told = f"{agreeing} of {accepted} matches agree on the pose{spread}"
+    if guided:
+        told += f"; {guided} of them followed from the others"
     return f"{told}, all from one viewpoint" if support == 1 else told

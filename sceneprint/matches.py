@@ -5,18 +5,30 @@ candidates of R  --associate-->  matches, C_vld first
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from sceneprint.geometry.pose.average import average_poses
+from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.alignment import are_scans
 from sceneprint.geometry.validation.association import preferred
 from sceneprint.geometry.validation.gravity import Ups
+from sceneprint.geometry.validation.map_verification import (
+    MapParameters,
+    at_place,
+    different_views,
+)
 from sceneprint.geometry.validation.sequence_alignment import Matching
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
-from sceneprint.pipeline import validate, validate_without_up
+from sceneprint.pipeline import validate, validate_guided, validate_without_up
 from sceneprint.types import Floats, Geometry
+
+#: Gives the parent frame and T_parent_sensor (4, 4) of a row of the database, if it has a pose.
+PoseOf = Callable[[int], tuple[str, Floats] | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +62,14 @@ def associate(
     *,
     up: Floats | None = None,
     up_of: Callable[[int], Floats | None] = lambda _: None,
+    pose_of: PoseOf = lambda _: None,
+    known: Mapping[int, PairValidation] | None = None,
 ) -> list[PairMatch]:
     """Candidates validated in the order of R until `k` are accepted: Sec. III-E.
+
+    Where two strong matches from different viewpoints agree on the query's pose, the transforms of
+    later candidates follow from the map's poses: these are refined and checked, and searched for
+    only where the check fails.
 
     Parameters
     ----------
@@ -64,6 +82,9 @@ def associate(
     go_on : asked before each; where it says no, the rest is left
     up : (3,) unit vector in the query's sensor, where it is known
     up_of : the same of a row of the database
+    pose_of : parent frame and T_parent_sensor (4, 4) of a row, None where it has no pose; default:
+        none has, and every transform is searched for
+    known : validations by row that are taken as they are
 
     Returns
     -------
@@ -82,14 +103,19 @@ def associate(
     tried: list[PairMatch] = []
     accepted = 0
     for position in among:
-        if not go_on():
-            break
         index = int(ranking.indices[position])
+        validation = known.get(index) if known else None
+        if validation is None and not go_on():
+            break
         geometry = open_geometry(index)
         if geometry is None:
             continue
         ups = up, up_of(index)
-        validation = validate(query, geometry, seed, p, mode, matching, ups=ups)
+        T = _predicted(tried, index, pose_of) if mode == "full" and validation is None else None
+        if T is not None:
+            validation = validate_guided(query, geometry, T, seed, p, ups)
+        if validation is None:
+            validation = validate(query, geometry, seed, p, mode, matching, ups=ups)
         tried.append(
             PairMatch(
                 index,
@@ -110,6 +136,49 @@ def associate(
     rest = [i for i in range(len(tried)) if i not in first]
     rest.sort(key=lambda i: not tried[i].validation.contradicts_up)
     return [tried[i] for i in [*first, *rest]]
+
+
+def searched(matches: Sequence[PairMatch]) -> dict[int, PairValidation] | None:
+    """Validations that were searched for, by row, for `associate` to search for the rest as well;
+    None where nothing was guided.
+    """
+    if not any(match.validation.guided for match in matches):
+        return None
+    return {m.index: m.validation for m in matches if not m.validation.guided}
+
+
+#: Strong matches from different viewpoints that must agree on a pose before others follow from it.
+_GUIDES = 2
+
+
+def _predicted(tried: Sequence[PairMatch], index: int, pose_of: PoseOf) -> Floats | None:
+    """T_match_query of a candidate by its pose and the matches before; None where these leave it
+    open: too few are strong, or one of them, accepted or ambiguous, is for another pose.
+    """
+    own = pose_of(index)
+    if own is None:
+        return None
+    voting, strong, viewpoints = [], [], []
+    for match in tried:
+        v, known = match.validation, pose_of(match.index)
+        if v.guided or v.T_match_query is None or known is None or known[0] != own[0]:
+            continue
+        T = known[1] @ v.T_match_query
+        if v.status != "rejected":
+            voting.append(T)
+        if v.strength == "strong":
+            strong.append(T)
+            viewpoints.append(known[1])
+    if len(strong) < _GUIDES:
+        return None
+    p = MapParameters()
+    different = different_views(np.stack(viewpoints), p)
+    if len(different) < _GUIDES:
+        return None
+    T_parent_query = average_poses(np.stack(strong)[different]).T
+    if not at_place(np.stack(voting), T_parent_query, p).all():
+        return None
+    return inverse(own[1]) @ T_parent_query
 
 
 #: Candidates that are tried again for a scanner that did not stand upright, or for a wrong `up`.

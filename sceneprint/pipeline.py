@@ -29,6 +29,7 @@ from sceneprint.geometry.validation.patch_descriptors import compress, patch_des
 from sceneprint.geometry.validation.sequence_alignment import Matching
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.geometry.validation.validation import validate as validate_geometry
+from sceneprint.geometry.validation.validation import validate_guided as check_predicted
 from sceneprint.geometry.validation.validation import validate_without_up as check_up
 from sceneprint.models import PRESETS, Model, read_model
 from sceneprint.signing import (
@@ -40,7 +41,7 @@ from sceneprint.signing import (
     patches_for_validation,
     see,
 )
-from sceneprint.types import AnyFrame, Bytes, Geometry, Surface
+from sceneprint.types import AnyFrame, Bytes, Floats, Geometry, Surface
 
 __all__ = [
     "Signature",
@@ -53,6 +54,7 @@ __all__ = [
     "retrieve",
     "sign",
     "validate",
+    "validate_guided",
     "validate_without_up",
 ]
 
@@ -196,6 +198,22 @@ def validate(
     _same_model(query, match)
     p = p or _numbers_of(query)
     return validate_geometry(query, match, seed, p, mode, matching, ups=ups, other_axes=other_axes)
+
+
+def validate_guided(
+    query: Geometry, match: Geometry, T_match_query: Floats, seed: int,
+    p: ValidationParameters | None, ups: Ups,
+) -> PairValidation | None:  # fmt: skip
+    """Check a transform (4, 4) that other matches and the map's poses predict: Sec. III-E.
+
+    See `sceneprint.geometry.validation.validation.validate_guided`.
+
+    Raises
+    ------
+    ModelMismatch : see `validate`.
+    """
+    _same_model(query, match)
+    return check_predicted(query, match, T_match_query, seed, p or _numbers_of(query), ups)
 
 
 def validate_without_up(

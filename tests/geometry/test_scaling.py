@@ -47,6 +47,7 @@ BARE = {
     "SequenceParameters": {"angle_scale", "gap_cost", "swap_cost"},
     "OverlapParameters": {"normal_cosine"},
     "CovarianceParameters": {"independent", "free"},
+    "ValidationParameters": {"guided_rad"},
 }  # fmt: skip
 
 

@@ -52,14 +52,15 @@ class Validation(ApiRecord):
         default=None,
         description="Share that the best rival explains.",
     )
-    search: Literal["correspondences", "plans"] | None = Field(
+    search: Literal["correspondences", "plans", "guided"] | None = Field(
         default=None,
         description="What proposed the transform: patches with alike surroundings, or the plans of "
-        "two scans laid on each other.",
+        "two scans laid on each other. `guided`: other matches and the map's poses; it was refined "
+        "and checked, but not searched for, so it is no vote of its own.",
     )
     directions: list[Literal["query_to_match", "match_to_query"]] = Field(
         default=[],
-        description="In which directions the search found it; of an accepted match, both.",
+        description="In which directions it was found; of an accepted match, both.",
     )
     tilt_deg: float | None = Field(
         default=None,
@@ -119,6 +120,11 @@ class Match(ApiRecord):
     diversity_gain: float | None = Field(description="1 for the first; near 0 for a duplicate.")
     validation: Validation
     transform: Transform | None = Field(description="Query to match; believe it where accepted.")
+    predicted: Transform | None = Field(
+        default=None,
+        description="Of a guided match: `transform` as the map's poses predict it from the matches "
+        "before, up to 15 cm and 6 deg off.",
+    )
     pose_in_map: Transform | None = Field(
         description="The query in the parent frame of the match's pose, where that is known and "
         "the match is not rejected."
@@ -161,6 +167,11 @@ class Location(ApiRecord):
     support: int = Field(
         description="Matches that agree on it; 0 where the map alone confirms it, and 1 is one "
         "view, unconfirmed."
+    )
+    guided: int = Field(
+        default=0,
+        description="How many of these were guided by the others: they make the pose more precise, "
+        "and are no evidence of their own.",
     )
     votes: int = Field(description="Accepted matches, whatever pose they vote for.")
     strength: Literal["strong", "weak"] = Field(

@@ -43,7 +43,7 @@ from sceneprint.geometry.validation.inspection import (
 )
 from sceneprint.geometry.validation.overlap import sampled
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
-from sceneprint.pipeline import validate, validate_without_up
+from sceneprint.pipeline import validate, validate_guided, validate_without_up
 from sceneprint.store import Store
 from sceneprint.store.frames import find_frame, frames_of, refers_to
 from sceneprint.store.maps import find_map, list_maps
@@ -165,6 +165,11 @@ class Pairs:
         key = pair.kept.answer.query_id, pair.blob
 
         def make() -> PairValidation:
+            if pair.match.predicted is not None:
+                T = np.array(pair.match.predicted.matrix)
+                guided = validate_guided(query, match, T, seed, options[0], pair.ups)
+                if guided is not None:
+                    return guided
             found = validate(query, match, seed, *options, ups=pair.ups)
             if found.reason != pair.match.validation.reason and pair.kept.up is not None:
                 # nothing was accepted with `up`, and the surfaces were asked without it

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -39,8 +39,9 @@ from sceneprint.engine.serializers import query_sensor
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.geometry.retrieval.distance import Ints64, pairwise_distances
 from sceneprint.geometry.retrieval.dpp import DiversityParameters, Selection, diversify
+from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.localization import PoseEstimate, PosePrior, QueryFrame
-from sceneprint.matches import PairMatch
+from sceneprint.matches import PairMatch, searched
 from sceneprint.models import Model
 from sceneprint.store import Store
 from sceneprint.store.frames import frames_of
@@ -126,20 +127,48 @@ def answer(
     last = _attempt(store, places, model, asked, query, deadline, prior, clock)
     estimate, p = None, model.parameters.validation
     if asked.geometry is not None:
-        poses = [*(one.T for one in earlier), np.eye(4)]
         attempts = [*before, last]
-        frames = [
-            QueryFrame(one.asked.geometry, one.matches, T)
-            for one, T in zip(attempts, poses, strict=True)
-            if one.asked.geometry is not None
-        ]
-        rows = {number: row for one in attempts for number, row in one.rows.items()}
-        geometries = {n: g for one in attempts for n, g in one.tried.geometries.items()}
-        estimate = placed(
-            store, last.searched, geometries, rows, frames, prior, p, query.validation
-        )
+        poses = [*(one.T for one in earlier), np.eye(4)]
+        estimate = _placed(store, attempts, poses, prior, p, query)
+        if estimate is not None and estimate.status != "found":
+            # guided matches are no votes: what these would say may decide
+            again = [_searched(store, one, query, deadline, p) for one in attempts]
+            if again != attempts:
+                last = again[-1]
+                estimate = _placed(store, again, poses, prior, p, query)
         clock.stage("locate")
     return _answer(store, places, model, last, estimate, query, deadline, clock, len(before))
+
+
+def _placed(
+    store: Store, attempts: Sequence[_Attempt], poses: Sequence[Floats], prior: PosePrior | None,
+    p: ValidationParameters, query: Query,
+) -> PoseEstimate | None:  # fmt: skip
+    """Where the last frame of a query was taken, by those at poses T_query_sensor."""
+    frames = [
+        QueryFrame(one.asked.geometry, one.matches, T)
+        for one, T in zip(attempts, poses, strict=True)
+        if one.asked.geometry is not None
+    ]
+    rows = {number: row for one in attempts for number, row in one.rows.items()}
+    geometries = {n: g for one in attempts for n, g in one.tried.geometries.items()}
+    searched = attempts[-1].searched
+    return placed(store, searched, geometries, rows, frames, prior, p, query.validation)
+
+
+def _searched(
+    store: Store, attempt: _Attempt, query: Query, deadline: Deadline, p: ValidationParameters
+) -> _Attempt:
+    """An attempt whose guided matches are searched for, or itself where it has none."""
+    known, asked = searched(attempt.matches), attempt.asked
+    if known is None:
+        return attempt
+    tried = validated(
+        store, attempt.searched, attempt.tried.chosen, asked.geometry, query, deadline, p,
+        asked.up, known,
+    )  # fmt: skip
+    matches = [one for one in tried.matches if one.index in attempt.rows]
+    return replace(attempt, tried=tried, matches=matches)
 
 
 def _attempt(

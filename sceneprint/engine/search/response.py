@@ -105,6 +105,7 @@ def location_record(found: Candidates, estimate: PoseEstimate | None) -> ToldLoc
         pose=transform(average.T, parent, found.query_frame),
         map=found.maps[int(number)],
         support=len(estimate.members),
+        guided=estimate.guided,
         votes=estimate.votes,
         strength=estimate.strength or "weak",
         verified_by=estimate.verified_by or "matches",
@@ -161,6 +162,11 @@ def _match(
         diversity_gain=gain,
         validation=validation,
         transform=None if T is None else transform(T, sensor_of(row), found.query_frame),
+        predicted=(
+            None
+            if tried is None or tried.predicted is None
+            else transform(tried.predicted, sensor_of(row), found.query_frame)
+        ),
         pose_in_map=(
             None if in_map is None else transform(in_map, str(row.pose_parent), found.query_frame)
         ),

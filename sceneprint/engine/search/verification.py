@@ -23,7 +23,7 @@ from sceneprint.formats.artifact import read_geometry
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.map_verification import MapViews, looks_ahead
-from sceneprint.geometry.validation.validation import ValidationParameters
+from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.localization import (
     LocalizationParameters,
     PoseEstimate,
@@ -99,6 +99,7 @@ def thresholds(
 def validated(
     store: Store, searched: Searched, chosen: Sequence[int], geometry: Geometry | None,
     query: Query, deadline: Deadline, p: ValidationParameters, up: Floats | None = None,
+    known: Mapping[int, PairValidation] | None = None,
 ) -> Validated:  # fmt: skip
     """Try candidates in the order of R.
 
@@ -111,6 +112,8 @@ def validated(
     query, deadline : see there
     p : of the model
     up : (3,) in the query's sensor, where it is known
+    known : validations of an earlier pass, by number; every other candidate is searched now.
+        None: candidates may be guided
     """
     if geometry is None:
         return Validated(chosen, [], {}, NOT_ASKED, deadline.reached)
@@ -118,6 +121,7 @@ def validated(
     with store.queried.read() as connection:
         blobs = geometry_blobs(connection, ranking.indices[list(chosen)].tolist(), model_id)
         ups = {} if up is None else known_ups(connection, ranking.indices.tolist())
+        rows = {} if known is not None else frames_of(connection, list(blobs))
     unreadable: dict[int, str] = {}
     opened: dict[int, Geometry] = {}
 
@@ -133,9 +137,14 @@ def validated(
             opened[number] = geometry_of
         return geometry_of
 
+    def pose_of(number: int) -> tuple[str, Floats] | None:
+        row = rows.get(number)
+        return None if row is None or row.pose is None else (parent_key(row), np.array(row.pose))
+
     matches = associate(
         geometry, ranking, chosen, open_geometry, query.k, query.seed,
-        *thresholds(query.validation, p), deadline.allows, up=up, up_of=ups.get,
+        *thresholds(query.validation, p), deadline.allows, up=up, up_of=ups.get, pose_of=pose_of,
+        known=known,
     )  # fmt: skip
     owner = dict(zip(ranking.indices.tolist(), searched.owners.tolist(), strict=True))
     for i, part in enumerate(searched.parts):

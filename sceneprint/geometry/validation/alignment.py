@@ -2,6 +2,7 @@
 
     Geometry, Geometry  --align-->  Alignment               of one direction alone
     Geometry, Geometry  --align_scans-->  two Alignments    of scans, from one search
+    Geometry, Geometry, T  --align_guided-->  Alignment     without a search, from a known transform
 
 The two directions of depth images are searched independently: that they meet is evidence, which
 one search for both would take away. Scans see so much more that one search is enough; there the
@@ -63,8 +64,8 @@ from sceneprint.geometry.validation.sequence_alignment import (
 )
 from sceneprint.types import Floats, Floats32, Geometry, Ints32, Sphere, Surface
 
-#: What proposed a transform: patches alike, or plans laid on each other.
-Search = Literal["correspondences", "plans"]
+#: What proposed a transform: patches alike, plans laid on each other, or the map's poses.
+Search = Literal["correspondences", "plans", "guided"]
 
 
 @dataclass(frozen=True)
@@ -239,6 +240,21 @@ def align_scans(
     there = _finished(query, match, T, others, p, search)
     back = _finished(match, query, inverse(T), inverses(others), p, search)
     return replace(there, proposed=hypotheses[np.argsort(-scores, kind="stable")]), back
+
+
+def align_guided(
+    source: FrameSamples, target: FrameSamples, T: Floats, p: AlignmentParameters
+) -> Alignment | None:
+    """A transform that is known beforehand, (4, 4) T_target_source, refined in one direction.
+
+    Nothing is searched for. None where the surfaces do not hold it.
+    """
+    surface, onto = source.geometry.surface, target.geometry.surface
+    coarse = refine(sampled(surface, p.coarse.stride), onto, T, p.coarse, kind_of(surface.camera))
+    if coarse is None:
+        return None
+    found = _finished(source, target, coarse.T, np.empty((0, 4, 4)), p, "guided")
+    return None if found.refined is None else found
 
 
 def are_scans(query: Geometry, match: Geometry) -> bool:

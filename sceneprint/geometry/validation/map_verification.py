@@ -370,3 +370,9 @@ def at_place(poses: Floats, T: Floats, p: MapParameters) -> NDArray[np.bool_]:
     cosines = (np.einsum("nij,ij->n", poses[:, :3, :3], T[:3, :3]) - 1.0) / 2.0
     near: NDArray[np.bool_] = (metres <= p.place_m) & (cosines >= math.cos(p.place_rad))
     return near
+
+
+def different_views(viewpoints: Floats, p: MapParameters) -> list[int]:
+    """Indices of the first of some views (n, 4, 4) from each viewpoint."""
+    order = -np.arange(len(viewpoints), dtype=float)
+    return distinct(viewpoints, order, p.same_m, p.same_rad, len(viewpoints))

@@ -18,6 +18,7 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.geometry.pose.rigid import (
+    difference,
     inverse,
     inverses,
     nearest_rotation,
@@ -39,6 +40,7 @@ from sceneprint.geometry.validation.alignment import (
     FrameSamples,
     Search,
     align,
+    align_guided,
     align_scans,
     are_scans,
     samples_of,
@@ -83,6 +85,8 @@ class ValidationParameters:
 
     minimum_patches: int = 10  #: of either frame
     n_hypotheses: int = 4  #: of each direction, beside what was found, that a map may confirm
+    guided_m: float = 0.15  #: from a predicted transform to the one found there, at most
+    guided_rad: float = math.radians(6.0)  #: and between their rotations
     acceptance: AcceptanceParameters = field(default_factory=AcceptanceParameters)
     rivals: AmbiguityParameters = field(default_factory=AmbiguityParameters)
     alignment: AlignmentParameters = field(default_factory=AlignmentParameters)
@@ -121,7 +125,8 @@ class PairValidation:
     around : whether both frames see all around their sensors, as spinning scanners do
     planes : how many distinct planes agree, the mean of both frames
     plane_violations : `violations` with every plane counting the same
-    search : what proposed the transform: correspondences of patches, or the plans of two scans
+    search : what proposed the transform: correspondences of patches, the plans of two scans, or
+        the map's poses
     directions : of the search, in which the transform was found: of an accepted one, both
     T_other : (4, 4) where the two directions disagree, what the other one found; else None
     hypotheses : (n, 4, 4) T_match_query of the best that either direction refined, and of
@@ -130,6 +135,7 @@ class PairValidation:
     tilt_rad : by how much the transform tilts the one up against the other; None where either is
         not known
     contradicts_up : the surfaces alone would be believed, but the transform tilts too much
+    predicted : (4, 4) of a guided one, T_match_query that the map's poses gave; else None
     """
 
     status: Status
@@ -156,6 +162,12 @@ class PairValidation:
     ups: Ups = NO_UPS
     tilt_rad: float | None = None
     contradicts_up: bool = False
+    predicted: Floats | None = None
+
+    @property
+    def guided(self) -> bool:
+        """Whether other matches gave the transform: it is no evidence of its own for the pose."""
+        return self.predicted is not None
 
 
 def middle(a: Floats, b: Floats) -> Floats:
@@ -252,6 +264,49 @@ def validate(
     return _decided(a, b, there, back, seed, p, mode)
 
 
+def validate_guided(
+    query: Geometry,
+    match: Geometry,
+    T_match_query: Floats,
+    seed: int = 0,
+    p: ValidationParameters | None = None,
+    ups: Ups = NO_UPS,
+) -> PairValidation | None:
+    """Check a transform that other matches and the map's poses predict: Sec. III-E without search.
+
+    Both directions are refined from it and must meet, near it, with the evidence that `validate`
+    asks for. Neither other hypotheses nor rivals are looked for, so what is accepted makes a pose
+    more precise, but is no evidence of its own for it.
+
+    Parameters
+    ----------
+    query, match, seed, p, ups : see `validate`
+    T_match_query : (4, 4) predicted
+
+    Returns
+    -------
+    validation : accepted; or None where the frames are to be searched after all
+    """
+    p = p or ValidationParameters()
+    if min(len(query.patches), len(match.patches)) < p.minimum_patches:
+        return None
+    a, b = (
+        samples_of(one, p.agreement.stride, p.rivals.planes, up)
+        for one, up in zip((query, match), ups, strict=True)
+    )
+    there = align_guided(a, b, T_match_query, p.alignment)
+    back = align_guided(b, a, inverse(T_match_query), p.alignment)
+    if there is None or back is None:
+        return None
+    found = _decided(a, b, there, back, seed, p, "full")
+    if found.status != "accepted" or found.T_match_query is None:
+        return None
+    metres, radians = difference(found.T_match_query, T_match_query)
+    if metres > p.guided_m or radians > p.guided_rad:
+        return None
+    return replace(found, predicted=T_match_query)
+
+
 def validate_without_up(
     query: Geometry,
     match: Geometry,
@@ -321,6 +376,8 @@ def _decided(
     elif mode == "paper":
         strength = "weak" if e.violations is None or e.one_sided else "strong"
         status, reason = "accepted", "the two directions agree"
+    elif both[0].search == "guided":
+        status, strength, reason = belief(e, rival.share, p.acceptance)
     else:
         voted = np.concatenate(
             [there.others if there else _NONE, inverses(back.others) if back else _NONE]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +39,8 @@ from sceneprint.lab.evaluation.protocol import (
     pose_error,
     unwatched,
 )
-from sceneprint.localization import QueryFrame, localize, views_of_rows
-from sceneprint.matches import associate
+from sceneprint.localization import PoseEstimate, QueryFrame, localize, views_of_rows
+from sceneprint.matches import PairMatch, associate, searched
 from sceneprint.pipeline import validate
 from sceneprint.types import Bytes, Floats, Geometry
 
@@ -222,19 +222,29 @@ def answer_of(judging: Judge, task: QueryTask) -> JudgedAnswer:
     selected = Ranking(
         np.array(task.selection, np.intp), np.zeros(n, np.int64), np.zeros(n)
     )  # neither distance decides here
-    matches = associate(
-        judging.geometry(task.number), selected, range(n), open_geometry,
-        seed=judging.seed, p=judging.p, mode=judging.mode, matching=judging.matching,
-    )  # fmt: skip
     poses = [frame.pose for frame in judging.database]
     # what a query may not find must not tell poses apart either: a scene of its own
     scenes = [frame.scene if row in allowed else "" for row, frame in enumerate(judging.database)]
-    views_of = views_of_rows(matches, poses, open_geometry, scenes, overlap_p=judging.p.agreement)
-    query = QueryFrame(judging.geometry(task.number), matches)
-    told = localize(
-        [query], poses, scenes, views_of if judging.mode == "full" else None,
-        overlap_p=judging.p.agreement,
+    query = judging.geometry(task.number)
+    validating = partial(
+        associate, query, selected, range(n), open_geometry,
+        seed=judging.seed, p=judging.p, mode=judging.mode, matching=judging.matching,
     )  # fmt: skip
+
+    def located(matches: list[PairMatch]) -> PoseEstimate | None:
+        views_of = views_of_rows(
+            matches, poses, open_geometry, scenes, overlap_p=judging.p.agreement
+        )
+        return localize(
+            [QueryFrame(query, matches)], poses, scenes,
+            views_of if judging.mode == "full" else None, overlap_p=judging.p.agreement,
+        )  # fmt: skip
+
+    matches = validating(pose_of=lambda row: (scenes[row], poses[row]))
+    told = located(matches)
+    known = searched(matches)
+    if known is not None and told is not None and told.status != "found":
+        told = located(validating(known=known))
     spent = 1e3 * (time.perf_counter() - start)
     if told is None or told.average is None:
         return JudgedAnswer("not_found" if told is None else told.status, milliseconds=spent)

@@ -48,8 +48,8 @@ export function evidenceCard(details) {
     ["Residual", residual, "query to match and back, each refined alone"],
     v.ambiguity === 0 && v.status !== "accepted" ? ["Ambiguity", "–", "rivals are searched only if everything else agrees"]
       : ["Ambiguity", percent(v.ambiguity), "of both frames is explained by the best rival"],
-    ["Found by", { plans: "plans", correspondences: "patches" }[v.search] ?? "–",
-      v.directions?.length === 1 ? "in one direction only" : "in both directions"],
+    ["Found by", { plans: "plans", correspondences: "patches", guided: "other matches" }[v.search] ?? "–",
+      v.search === "guided" ? "and the map’s poses, then refined and checked: no vote of its own" : v.directions?.length === 1 ? "in one direction only" : "in both directions"],
     ["Patches", details.patches ? count(details.patches.query.length) : "–", "pairs coincide"],
   ];
   if (!details.transform) return card("Evidence", h("p", { class: "muted" }, "There is no evidence without a transform."));
