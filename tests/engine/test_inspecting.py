@@ -13,7 +13,9 @@ from sceneprint.engine import Engine
 from sceneprint.engine.serializers import transform
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
 from sceneprint.formats.points.ply_export import points_of
+from sceneprint.geometry.pose.rigid import difference
 from sceneprint.geometry.validation.icp import adjoint
+from sceneprint.lab.synth import synthesise_room
 from sceneprint.pipeline import Signature, distance, validate
 from sceneprint.store.frames import find_frame
 from sceneprint.store.maps import find_map
@@ -250,3 +252,32 @@ def test_the_uncertainty_of_a_place_is_told_in_its_axes(full: Engine, uploads: A
     assert match.uncertainty.method == "information-scaled"
     rest = [m for m in answer.matches if m.validation.status != "accepted"]
     assert [m.uncertainty for m in rest] == [None] * len(rest)
+
+
+def test_a_guided_match_is_labelled_and_had_again(
+    empty: Engine, make_upload: Any, work_off: Callable[[Engine], list[Any]]
+) -> None:
+    """Views more than 10 cm apart: two that agree give the transforms of the rest."""
+    frames = synthesise_room(21, 0, 36, along_path=True).frames[::6]
+    for frame in [*frames[:2], *frames[3:]]:
+        one = make_upload(frame, "room")
+        empty.add_frame("hall", one.data, one.meta)
+    work_off(empty)
+    asking = make_upload(frames[2], "room")
+    meta = asking.meta.model_copy(update={"pose": None})
+    answer = empty.query_upload("hall", asking.data, meta, Query())
+    assert answer.location is not None
+    assert (answer.status, answer.location.support, answer.location.guided) == ("found", 5, 3)
+    assert difference(np.array(answer.location.pose.matrix), asking.pose)[0] < 0.02
+    guided = [one for one in answer.matches if one.validation.search == "guided"]
+    assert len(guided) == 3
+    for match in answer.matches:
+        assert (match.predicted is not None) == (match in guided)
+        told = empty.inspection.match(answer.query_id, match.frame_id)
+        assert (told.validation, told.transform) == (match.validation, match.transform)
+        assert told.uncertainty == match.uncertainty
+    for match in guided:
+        assert match.predicted is not None
+        assert match.transform is not None
+        predicted, found = (np.array(T.matrix) for T in (match.predicted, match.transform))
+        assert difference(predicted, found)[0] < 0.05

@@ -90,8 +90,8 @@ function unvalidated({ matches, counts, deadline_reached: late }) {
 }
 
 /** Kind of badge of a pose that is found: an unconfirmed one is to be looked at twice. @param {Object<string, any>} location */
-function sureness({ support, strength, verified_by: by }) {
-  return strength === "strong" && (by === "map" || (by === "matches" && support > 1)) ? "good" : "warn";
+function sureness({ support, guided, strength, verified_by: by }) {
+  return strength === "strong" && (by === "map" || (by === "matches" && support - guided > 1)) ? "good" : "warn";
 }
 
 /**
@@ -99,13 +99,13 @@ function sureness({ support, strength, verified_by: by }) {
  * @param {Object<string, any>} location of an answer
  * @returns {string[]}
  */
-export function grounds({ support, votes, strength, verified_by: by, spread_m: shift, spread_deg: turn }) {
+export function grounds({ support, guided, votes, strength, verified_by: by, spread_m: shift, spread_deg: turn }) {
   const told = [];
   if (by === "map") told.push("confirmed by the map’s frames");
   if (by === "prior") told.push("several poses fit, and the prior decided");
   if (support === 0) told.push("no accepted match");
   else if (support === 1 && by === "matches") told.push("one view, unconfirmed");
-  else told.push(support === 1 ? "one view" : `${count(support)} of ${count(votes)} accepted matches vote for this pose, within ${metres(shift)}, ${degrees(turn)}`);
+  else told.push(support === 1 ? "one view" : `${count(support)} of ${count(votes)} accepted matches vote for this pose${guided > 0 ? `, ${count(guided)} of them guided by the others` : ""}, within ${metres(shift)}, ${degrees(turn)}`);
   if (support > 0) told.push(`${strength} match${support === 1 ? "" : "es"}`);
   const apart = votes - support;
   if (apart > 0) told.push(`${count(apart)} accepted ${apart === 1 ? "match votes" : "matches vote"} for another pose`);

@@ -1,0 +1,152 @@
+"""Candidates whose transform follows from the matches before and the map's poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.pose.rigid import difference, inverse
+from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.validation.validation import ValidationParameters, validate_guided
+from sceneprint.lab.synth import synthesise_room
+from sceneprint.localization import QueryFrame, localize
+from sceneprint.matches import PairMatch, associate, searched
+from sceneprint.pipeline import open_signer, prepare
+from sceneprint.types import Floats, Geometry
+
+Room = tuple[list[Geometry], list[Floats]]
+
+
+@pytest.fixture(scope="module")
+def walk() -> Room:
+    """Six frames along a path through a room, more than 10 cm apart; the third asks the others."""
+    signer = open_signer("depth")
+    frames = synthesise_room(21, 0, 36, along_path=True).frames[::6]
+    frames = (frames[2], *frames[:2], *frames[3:])
+    poses = [frame.pose for frame in frames if frame.pose is not None]
+    return [prepare(frame, signer)[1] for frame in frames], poses
+
+
+def asked_of(walk: Room, rows: list[int], poses: dict[int, Floats]) -> list[PairMatch]:
+    """The first frame asked of others, whose poses are as given."""
+    geometries, _ = walk
+    n = len(rows)
+    ranking = Ranking(np.array(rows, np.intp), np.zeros(n, np.int64), np.zeros(n))
+    matches = associate(
+        geometries[0], ranking, range(n), geometries.__getitem__, n,
+        pose_of=lambda row: ("room", poses[row]) if row in poses else None,
+    )  # fmt: skip
+    return sorted(matches, key=lambda match: rows.index(match.index))
+
+
+def kinds(matches: list[PairMatch]) -> list[str]:
+    return [match.validation.search for match in matches]
+
+
+def test_two_matches_guide_the_rest_to_the_truth(walk: Room) -> None:
+    geometries, poses = walk
+    rows = [1, 2, 3, 4, 5]
+    matches = asked_of(walk, rows, dict(enumerate(poses)))
+    assert kinds(matches) == ["correspondences"] * 2 + ["guided"] * 3
+    for match in matches:
+        v = match.validation
+        assert v.T_match_query is not None
+        metres, radians = difference(v.T_match_query, inverse(poses[match.index]) @ poses[0])
+        assert metres < 0.03
+        assert radians < np.radians(1.0)
+        assert v.guided == (v.predicted is not None) == (match.index > 2)
+    # the same bits from what was predicted: an answer is shown again from it
+    first = matches[2].validation
+    assert first.predicted is not None
+    again = validate_guided(geometries[0], geometries[3], first.predicted)
+    assert again is not None
+    assert again.T_match_query is not None
+    assert again.T_match_query.tobytes() == first.T_match_query.tobytes()  # type: ignore[union-attr]
+    assert (again.overlap, again.inliers) == (first.overlap, first.inliers)
+
+
+def test_guided_matches_make_the_pose_more_precise_and_are_no_votes(walk: Room) -> None:
+    geometries, poses = walk
+    matches = asked_of(walk, [1, 2, 3, 4, 5], dict(enumerate(poses)))
+    found = localize([QueryFrame(geometries[0], matches)], poses)
+    assert found is not None
+    assert found.average is not None
+    assert (found.status, found.votes, len(found.members), found.guided) == ("found", 5, 5, 3)
+    assert found.reason.endswith("3 of them followed from the others")
+    assert found.average.votes == 5
+    # three weak matches elsewhere weigh 1.2: two strong ones do not outweigh that, five would
+    elsewhere = poses[0].copy()
+    elsewhere[0, 3] += 2.0
+    weak = replace(matches[0].validation, strength="weak")
+    against = [
+        PairMatch(i, 9, 0.1, replace(weak, T_match_query=inverse(poses[i]) @ elsewhere))
+        for i in (1, 2, 3)
+    ]
+    unsure = localize([QueryFrame(geometries[0], [*matches, *against])], poses)
+    assert unsure is not None
+    assert unsure.status == "ambiguous"
+    assert (unsure.alternatives[0].weight, unsure.alternatives[0].support) == (2.0, 2)
+
+
+def test_copies_of_one_view_guide_nothing(walk: Room) -> None:
+    _, poses = walk
+    walk[0].append(walk[0][1])
+    try:
+        matches = asked_of(walk, [1, 6, 3], {1: poses[1], 6: poses[1], 3: poses[3]})
+    finally:
+        walk[0].pop()
+    assert kinds(matches) == ["correspondences"] * 3
+
+
+@pytest.mark.parametrize("known", [{}, {1: 1, 2: 2}, {1: 1, 3: 3}])
+def test_without_poses_everything_is_searched(walk: Room, known: dict[int, int]) -> None:
+    poses = {row: walk[1][i] for row, i in known.items()}
+    assert kinds(asked_of(walk, [1, 2, 3], poses)) == ["correspondences"] * 3
+
+
+def test_matches_that_disagree_guide_nothing(walk: Room) -> None:
+    poses = dict(enumerate(walk[1]))
+    poses[2] = poses[2].copy()
+    poses[2][0, 3] += 1.0  # the map is wrong about it, so its match votes for another place
+    assert kinds(asked_of(walk, [1, 2, 3], poses)) == ["correspondences"] * 3
+
+
+def test_a_prediction_that_the_frames_do_not_bear_out_is_searched_for(walk: Room) -> None:
+    geometries, poses = walk
+    wrong = dict(enumerate(poses))
+    wrong[3] = wrong[3].copy()
+    wrong[3][1, 3] += 0.4
+    matches = asked_of(walk, [1, 2, 3], wrong)
+    assert kinds(matches) == ["correspondences"] * 3
+    T = matches[2].validation.T_match_query
+    assert T is not None
+    assert difference(T, inverse(poses[3]) @ poses[0])[0] < 0.03
+    truth = inverse(poses[3]) @ poses[0]
+    near = truth.copy()
+    near[0, 3] += 0.1
+    assert validate_guided(geometries[0], geometries[3], near) is not None
+    strict = ValidationParameters(guided_m=0.05)
+    assert validate_guided(geometries[0], geometries[3], near, p=strict) is None
+
+
+def test_guided_matches_can_be_searched_for_after_all(walk: Room) -> None:
+    geometries, poses = walk
+    rows = [1, 2, 3]
+    matches = asked_of(walk, rows, dict(enumerate(poses)))
+    known = searched(matches)
+    assert known is not None
+    assert sorted(known) == [1, 2]
+    ranking = Ranking(np.array(rows, np.intp), np.zeros(3, np.int64), np.zeros(3))
+    again = associate(
+        geometries[0], ranking, range(3), geometries.__getitem__, 3, known=known,
+    )  # fmt: skip
+    by_row = {match.index: match.validation for match in again}
+    assert by_row[1] is known[1]
+    assert by_row[2] is known[2]
+    assert by_row[3].search == "correspondences"
+    assert searched(again) is None
+    alone = associate(geometries[0], ranking, range(3), geometries.__getitem__, 3)
+    of_alone = {match.index: match.validation.T_match_query for match in alone}
+    np.testing.assert_array_equal(by_row[3].T_match_query, of_alone[3])  # type: ignore[arg-type]
