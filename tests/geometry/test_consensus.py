@@ -51,8 +51,9 @@ def graph(a: Patches, b: Patches, pairs: Ints32) -> tuple[NDArray[np.uint64], ND
     """The compatibility graph as bits and as a matrix."""
     i, j = pairs.T
     bits = np.zeros((len(pairs), (len(pairs) + 63) // 64), np.uint64)
+    rows = (a.means[i], a.normals[i], b.means[j], b.normals[j])
     module._graph(
-        a.means[i], a.normals[i], b.means[j], b.normals[j],
+        *(np.ascontiguousarray(one.T) for one in rows),
         P.distance_tolerance, P.angle_tolerance, P.minimum_distance, bits,
     )  # fmt: skip
     unpacked = np.unpackbits(bits.view(np.uint8), axis=1, bitorder="little")
@@ -110,6 +111,16 @@ def test_common_neighbours_equal_the_product_of_the_matrix(n: int) -> None:
     np.testing.assert_array_equal(common, np.where(matrix, matrix.astype(int) @ matrix, 0))
 
 
+@pytest.mark.parametrize("most", [1, 4, 16, 40])
+def test_largest_are_in_the_order_of_a_stable_sort(most: int) -> None:
+    rng = np.random.default_rng(most)
+    for _ in range(50):
+        row = rng.integers(0, 12, 40).astype(np.int32)
+        order = np.empty(most, np.int32)
+        module._largest(row, order)
+        np.testing.assert_array_equal(order, np.argsort(-row, kind="stable")[:most])
+
+
 def test_fit_equals_scipys() -> None:
     rng = np.random.default_rng(1)
     for _ in range(30):
@@ -118,7 +129,8 @@ def test_fit_equals_scipys() -> None:
         normals, others = rng.normal(size=(2, n, 3))
         weights = rng.uniform(0.1, 1.0, n)
         T = np.zeros((4, 4))
-        assert module._fit(p, normals, q, others, weights, 0.3, T)
+        columns = [np.ascontiguousarray(one.T) for one in (p, normals, q, others)]
+        assert module._fit(*columns, weights, 0.3, T)
         a, b = np.average(p, axis=0, weights=weights), np.average(q, axis=0, weights=weights)
         R = Rotation.align_vectors(
             np.concatenate([q - b, others]),

@@ -485,6 +485,24 @@ def check_registration(module: ModuleType) -> None:
         found = module.refine(some, wall(2.0), np.eye(4), p)
         assert (found and found.points) == points
         assert found is None or np.abs(found.T - np.eye(4)).max() < 2e-3
+    # at first only every second point takes part, at last all do
+    for iterations, last, points in ((1, 0, 3), (1, 1, 6), (3, 1, 6), (3, 0, 3)):
+        p = module.RefinementParameters(
+            1, iterations, 0.1, 0.1, minimum_points=5, thinning=2, last_iterations=last
+        )
+        found = module.refine(some[:6], wall(2.0), np.eye(4), p)
+        assert found is not None
+        assert found.points == points
+    # of points 1 and 3, which alone are off by 6 cm, the first steps know nothing
+    uneven = np.concatenate(
+        [seen_at(pixel, 1.94 if i % 2 else 2.0) for i, pixel in enumerate(ring)]
+    )
+    for thinning, moved in ((2, False), (1, True)):
+        p = module.RefinementParameters(
+            1, 3, 0.1, 0.1, minimum_points=1, thinning=thinning, last_iterations=0
+        )
+        found = module.refine(uneven, wall(2.0), np.eye(4), p)
+        assert (abs(found.T[2, 3]) + np.abs(found.T[:3, :3] - np.eye(3)).max() > 1e-3) == moved
 
 
 def check_registration_of_clouds(module: ModuleType) -> None:
@@ -554,7 +572,8 @@ def patches(means: Floats, normals: Floats) -> Patches:
 def compatible(module: ModuleType, a: Patches, b: Patches) -> bool:
     """Whether two correspondences, of patch 0 and of patch 1, are compatible."""
     bits = np.zeros((2, 1), np.uint64)
-    module._graph(a.means, a.normals, b.means, b.normals, 0.12, 0.5, 0.15, bits)
+    columns = (np.ascontiguousarray(x.T) for x in (a.means, a.normals, b.means, b.normals))
+    module._graph(*columns, 0.12, 0.5, 0.15, bits)
     assert bits[0, 0] in (0, 2)
     assert bits[1, 0] == bits[0, 0] // 2
     return bool(bits[0, 0])
@@ -606,20 +625,23 @@ def check_consensus(module: ModuleType) -> None:
     q[3] = 0.0  # counts for nothing
     found = np.zeros((4, 4))
     weights = np.array([1.0, 2.0, 3.0, 0.0])
-    assert module._fit(source.means, source.normals, q, m, weights, 0.05, found)
+
+    def columns(*arrays: Floats) -> list[Floats]:
+        return [np.ascontiguousarray(one.T) for one in arrays]
+
+    of_source = columns(source.means, source.normals)
+    assert module._fit(*of_source, *columns(q, m), weights, 0.05, found)
     np.testing.assert_allclose(found, T, atol=1e-12)
-    assert not module._fit(
-        source.means, source.normals, q, m, np.array([1.0, 0, 0, 1]), 0.05, found
-    )
+    few = np.array([1.0, 0, 0, 1])
+    assert not module._fit(*of_source, *columns(q, m), few, 0.05, found)
     # what it explains: off by 0, 6 cm, 16 cm, and by 0 but facing elsewhere; (1 - .16)^2
     off = q.copy()
     off[1, 0] += 0.06
     off[2, 2] += 0.16
     off[3] = source.means[3] @ T[:3, :3].T + T[:3, 3]
     m[3] = z
-    total = module._explained(source.means, source.normals, off, m, T, 0.15, 0.85, weights)
+    module._explained(*of_source, *columns(off, m), T, 0.15, 0.85, weights)
     np.testing.assert_allclose(weights, [1, 0.84**2, 0, 0], atol=1e-9)
-    assert abs(total - 1 - 0.84**2) < 1e-9
 
 
 def check_averaging(module: ModuleType) -> None:

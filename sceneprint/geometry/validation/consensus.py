@@ -37,47 +37,66 @@ class ConsensusParameters:
 
 
 @kernel
+def _lengths(points: Floats, i: int, lengths: Floats) -> None:
+    """From point i to each later one; points (3, M)."""
+    x, y, z = points[0], points[1], points[2]
+    ix, iy, iz = x[i], y[i], z[i]
+    for j in range(i + 1, len(lengths)):
+        dx, dy, dz = x[j] - ix, y[j] - iy, z[j] - iz
+        lengths[j] = np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@kernel
+def _compatible(
+    p: Floats, n: Floats, q: Floats, m: Floats, i: int, j: int, tolerance: float, angle: float
+) -> bool:
+    """Whether two pairs of correspondences whose lengths agree have alike normals as well."""
+    ax, ay, az = p[0, j] - p[0, i], p[1, j] - p[1, i], p[2, j] - p[2, i]
+    bx, by, bz = q[0, j] - q[0, i], q[1, j] - q[1, i], q[2, j] - q[2, i]
+    ha = ax * n[0, i] + ay * n[1, i] + az * n[2, i]
+    hb = bx * m[0, i] + by * m[1, i] + bz * m[2, i]
+    if abs(ha - hb) > tolerance:
+        return False
+    ga = ax * n[0, j] + ay * n[1, j] + az * n[2, j]
+    gb = bx * m[0, j] + by * m[1, j] + bz * m[2, j]
+    if abs(ga - gb) > tolerance:
+        return False
+    ca = n[0, i] * n[0, j] + n[1, i] * n[1, j] + n[2, i] * n[2, j]
+    cb = m[0, i] * m[0, j] + m[1, i] * m[1, j] + m[2, i] * m[2, j]
+    ca, cb = min(max(ca, -1.0), 1.0), min(max(cb, -1.0), 1.0)
+    if abs(np.arccos(ca) - np.arccos(cb)) > angle:
+        return False
+    # the signed triple product tells a scene from its mirror image
+    ta = (
+        ax * (n[1, i] * n[2, j] - n[2, i] * n[1, j])
+        + ay * (n[2, i] * n[0, j] - n[0, i] * n[2, j])
+        + az * (n[0, i] * n[1, j] - n[1, i] * n[0, j])
+    )
+    tb = (
+        bx * (m[1, i] * m[2, j] - m[2, i] * m[1, j])
+        + by * (m[2, i] * m[0, j] - m[0, i] * m[2, j])
+        + bz * (m[0, i] * m[1, j] - m[1, i] * m[0, j])
+    )
+    return abs(ta - tb) <= 2 * tolerance
+
+
+@kernel
 def _graph(
     p: Floats, n: Floats, q: Floats, m: Floats,
     tolerance: float, angle: float, minimum: float, bits: NDArray[np.uint64],
 ) -> None:  # fmt: skip
-    """Bit j of row i: correspondences i and j are compatible. All arrays (M, 3)."""
-    count = len(p)
+    """Bit j of row i: correspondences i and j are compatible. All arrays (3, M)."""
+    count = p.shape[1]
+    da, db = np.empty(count), np.empty(count)
     for i in range(count):
+        _lengths(p, i, da)
+        _lengths(q, i, db)
         for j in range(i + 1, count):
-            ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
-            bx, by, bz = q[j, 0] - q[i, 0], q[j, 1] - q[i, 1], q[j, 2] - q[i, 2]
-            da, db = np.sqrt(ax * ax + ay * ay + az * az), np.sqrt(bx * bx + by * by + bz * bz)
-            if abs(da - db) > tolerance or da < minimum or db < minimum:
+            if abs(da[j] - db[j]) > tolerance or da[j] < minimum or db[j] < minimum:
                 continue
-            ha = ax * n[i, 0] + ay * n[i, 1] + az * n[i, 2]
-            hb = bx * m[i, 0] + by * m[i, 1] + bz * m[i, 2]
-            if abs(ha - hb) > tolerance:
-                continue
-            ga = ax * n[j, 0] + ay * n[j, 1] + az * n[j, 2]
-            gb = bx * m[j, 0] + by * m[j, 1] + bz * m[j, 2]
-            if abs(ga - gb) > tolerance:
-                continue
-            ca = n[i, 0] * n[j, 0] + n[i, 1] * n[j, 1] + n[i, 2] * n[j, 2]
-            cb = m[i, 0] * m[j, 0] + m[i, 1] * m[j, 1] + m[i, 2] * m[j, 2]
-            ca, cb = min(max(ca, -1.0), 1.0), min(max(cb, -1.0), 1.0)
-            if abs(np.arccos(ca) - np.arccos(cb)) > angle:
-                continue
-            # the signed triple product tells a scene from its mirror image
-            ta = (
-                ax * (n[i, 1] * n[j, 2] - n[i, 2] * n[j, 1])
-                + ay * (n[i, 2] * n[j, 0] - n[i, 0] * n[j, 2])
-                + az * (n[i, 0] * n[j, 1] - n[i, 1] * n[j, 0])
-            )
-            tb = (
-                bx * (m[i, 1] * m[j, 2] - m[i, 2] * m[j, 1])
-                + by * (m[i, 2] * m[j, 0] - m[i, 0] * m[j, 2])
-                + bz * (m[i, 0] * m[j, 1] - m[i, 1] * m[j, 0])
-            )
-            if abs(ta - tb) > 2 * tolerance:
-                continue
-            bits[i, j >> 6] |= np.uint64(1) << np.uint64(j & 63)
-            bits[j, i >> 6] |= np.uint64(1) << np.uint64(i & 63)
+            if _compatible(p, n, q, m, i, j, tolerance, angle):
+                bits[i, j >> 6] |= np.uint64(1) << np.uint64(j & 63)
+                bits[j, i >> 6] |= np.uint64(1) << np.uint64(i & 63)
 
 
 @kernel
@@ -105,7 +124,9 @@ def _second_order(bits: NDArray[np.uint64], common: Ints32) -> None:
 def _fit(
     p: Floats, n: Floats, q: Floats, m: Floats, weights: Floats, normal_weight: float, T: Floats
 ) -> bool:
-    """Weighted Kabsch over positions and normals; False where fewer than three take part."""
+    """Weighted Kabsch over positions and normals, (3, M) each; False where fewer than three take
+    part.
+    """
     total, used = 0.0, 0
     a, b = np.zeros(3), np.zeros(3)
     for i in range(len(weights)):
@@ -113,8 +134,8 @@ def _fit(
             used += 1
             total += weights[i]
             for d in range(3):
-                a[d] += weights[i] * p[i, d]
-                b[d] += weights[i] * q[i, d]
+                a[d] += weights[i] * p[d, i]
+                b[d] += weights[i] * q[d, i]
     if used < 3:
         return False
     for d in range(3):
@@ -127,7 +148,7 @@ def _fit(
             for r in range(3):
                 for c in range(3):
                     H[r, c] += w * (
-                        (q[i, r] - b[r]) * (p[i, c] - a[c]) + normal_weight * m[i, r] * n[i, c]
+                        (q[r, i] - b[r]) * (p[c, i] - a[c]) + normal_weight * m[r, i] * n[c, i]
                     )
     R = np.empty((3, 3))
     rotation_of_covariance(H, R)
@@ -144,21 +165,39 @@ def _fit(
 def _explained(
     p: Floats, n: Floats, q: Floats, m: Floats, T: Floats,
     distance: float, cosine: float, weights: Floats,
-) -> float:  # fmt: skip
-    """Weight (1 - d^2 / distance^2)^2 of each correspondence under T; returns their sum."""
-    total = 0.0
+) -> None:  # fmt: skip
+    """Weight (1 - d^2 / distance^2)^2 of each correspondence under T; all arrays (3, M)."""
+    px, py, pz, qx, qy, qz = p[0], p[1], p[2], q[0], q[1], q[2]
+    ax, ay, az, bx, by, bz = n[0], n[1], n[2], m[0], m[1], m[2]
+    xx, xy, xz, tx = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    yx, yy, yz, ty = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    zx, zy, zz, tz = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    square = distance * distance
     for i in range(len(weights)):
-        x = T[0, 0] * p[i, 0] + T[0, 1] * p[i, 1] + T[0, 2] * p[i, 2] + T[0, 3] - q[i, 0]
-        y = T[1, 0] * p[i, 0] + T[1, 1] * p[i, 1] + T[1, 2] * p[i, 2] + T[1, 3] - q[i, 1]
-        z = T[2, 0] * p[i, 0] + T[2, 1] * p[i, 1] + T[2, 2] * p[i, 2] + T[2, 3] - q[i, 2]
-        u = 1.0 - (x * x + y * y + z * z) / (distance * distance)
-        nx = T[0, 0] * n[i, 0] + T[0, 1] * n[i, 1] + T[0, 2] * n[i, 2]
-        ny = T[1, 0] * n[i, 0] + T[1, 1] * n[i, 1] + T[1, 2] * n[i, 2]
-        nz = T[2, 0] * n[i, 0] + T[2, 1] * n[i, 1] + T[2, 2] * n[i, 2]
-        agree = nx * m[i, 0] + ny * m[i, 1] + nz * m[i, 2] > cosine
-        weights[i] = u * u if u > 0 and agree else 0.0
-        total += weights[i]
-    return total
+        x = xx * px[i] + xy * py[i] + xz * pz[i] + tx - qx[i]
+        y = yx * px[i] + yy * py[i] + yz * pz[i] + ty - qy[i]
+        z = zx * px[i] + zy * py[i] + zz * pz[i] + tz - qz[i]
+        u = 1.0 - (x * x + y * y + z * z) / square
+        nx = xx * ax[i] + xy * ay[i] + xz * az[i]
+        ny = yx * ax[i] + yy * ay[i] + yz * az[i]
+        nz = zx * ax[i] + zy * ay[i] + zz * az[i]
+        c = nx * bx[i] + ny * by[i] + nz * bz[i]
+        weights[i] = (u * u if u > 0 else 0.0) if c > cosine else 0.0
+
+
+@kernel
+def _largest(row: Ints32, order: Ints32) -> None:
+    """Indices of the largest of a row, largest first, of equals the earlier."""
+    found = 0
+    for j in range(len(row)):
+        if found == len(order) and row[j] <= row[order[found - 1]]:
+            continue
+        place = found if found < len(order) else found - 1
+        while place > 0 and row[order[place - 1]] < row[j]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = j
+        found = min(found + 1, len(order))
 
 
 @kernel
@@ -166,22 +205,25 @@ def _hypotheses(
     p: Floats, n: Floats, q: Floats, m: Floats, common: Ints32, n_seeds: int, n_support: int,
     normal_weight: float, rounds: int, distance: float, cosine: float, T: Floats,
 ) -> int:  # fmt: skip
-    count = len(p)
+    count = len(common)
     support = np.zeros(count)
     for i in range(count):
+        total = 0
         for j in range(count):
-            support[i] += common[i, j]
+            total += common[i, j]
+        support[i] = total
     weights, found = np.zeros(count), 0
+    order = np.empty(min(n_support, count), np.int32)
     for _ in range(n_seeds):
         seed = int(np.argmax(support))
         if support[seed] <= 0:
             break
         row = common[seed]
-        order = np.argsort(-row, kind="mergesort")
+        _largest(row, order)
         weights[:] = 0.0
         weights[seed] = max(row[order[0]], 1)
-        for k in range(min(n_support, count)):
-            weights[order[k]] = max(float(row[order[k]]), weights[order[k]])
+        for k in order:
+            weights[k] = max(float(row[k]), weights[k])
         for j in range(count):  # what this seed speaks for, others need not repeat
             if row[j] > 0:
                 support[j] *= 1.0 - 0.5 * row[j] / row[order[0]]
@@ -211,13 +253,13 @@ def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParam
     """
     if len(pairs) < 3:
         return np.empty((0, 4, 4))
-    a = np.ascontiguousarray(source.means[pairs[:, 0]])
-    n = np.ascontiguousarray(source.normals[pairs[:, 0]])
-    b = np.ascontiguousarray(target.means[pairs[:, 1]])
-    m = np.ascontiguousarray(target.normals[pairs[:, 1]])
-    bits = np.zeros((len(a), (len(a) + 63) // 64), np.uint64)
+    a = np.ascontiguousarray(source.means[pairs[:, 0]].T)
+    n = np.ascontiguousarray(source.normals[pairs[:, 0]].T)
+    b = np.ascontiguousarray(target.means[pairs[:, 1]].T)
+    m = np.ascontiguousarray(target.normals[pairs[:, 1]].T)
+    bits = np.zeros((len(pairs), (len(pairs) + 63) // 64), np.uint64)
     _graph(a, n, b, m, p.distance_tolerance, p.angle_tolerance, p.minimum_distance, bits)
-    common = np.zeros((len(a), len(a)), np.int32)
+    common = np.zeros((len(pairs), len(pairs)), np.int32)
     _second_order(bits, common)
     T = np.zeros((p.n_seeds, 4, 4))
     found = _hypotheses(

@@ -38,6 +38,8 @@ class RefinementParameters:
     weight_depth: float = 1.0  #: where weights begin to fall as 1 / z^4, metres
     nearest: float = 0.1  #: points this near the target's camera are not compared, metres
     reach: float = 0.25  #: to a point of a target in no order, metres
+    thinning: int = 1  #: of the points, only every such one takes part at first
+    last_iterations: int = 2  #: in which all do
 
 
 #: To see whether it leads anywhere.
@@ -45,7 +47,7 @@ QUICK = RefinementParameters(10, 4, 0.25, 0.15)
 #: For hypotheses: few points, wide gates.
 COARSE = RefinementParameters(5, 8, 0.25, 0.08)
 #: For the best of them.
-FINE = RefinementParameters(2, 8, 0.08, 0.03)
+FINE = RefinementParameters(2, 8, 0.08, 0.03, thinning=4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +105,11 @@ def _add(
 
 @kernel
 def _accumulate(
-    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
+    source: Floats32, step: int, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
     gate: float, numbers: Floats, A: Floats, g: Floats,
 ) -> tuple[int, float]:  # fmt: skip
-    """Normal equations of one Gauss-Newton step; returns how many points took part, and the sum
-    of their weighted squares.
+    """Normal equations of one Gauss-Newton step on every `step`-th point; returns how many took
+    part, and the sum of their weighted squares.
     """
     height, width = points.shape[0], points.shape[1]
     least_cosine, reference, kind, per_depth = numbers[3], numbers[4], numbers[8], numbers[7]
@@ -115,7 +117,7 @@ def _accumulate(
     edge = 0.0 if camera[0] == 1 and camera[6] > 0 else 1.0
     row = np.zeros(6)
     used, squares = 0, 0.0
-    for i in range(len(source)):
+    for i in range(0, len(source), step):
         px, py, pz = source[i, 0], source[i, 1], source[i, 2]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
@@ -155,14 +157,14 @@ def _accumulate(
 
 @kernel
 def _accumulate_near(
-    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
-    chain: Ints32, T: Floats, gate: float, numbers: Floats, A: Floats, g: Floats,
+    source: Floats32, step: int, points: Floats32, normals: Floats32, camera: Floats,
+    heads: Ints32, chain: Ints32, T: Floats, gate: float, numbers: Floats, A: Floats, g: Floats,
 ) -> tuple[int, float]:  # fmt: skip
     """As `_accumulate`, on a target whose points are in no order."""
     least_cosine, kind, per_depth = numbers[3], numbers[8], numbers[7]
     row, at, facing = np.zeros(6), np.empty(3), np.empty(3)
     used, squares = 0, 0.0
-    for i in range(len(source)):
+    for i in range(0, len(source), step):
         for a in range(3):
             at[a] = T[a, 3]
             facing[a] = 0.0
@@ -197,24 +199,28 @@ def refine_in_place(
     their mean weighted square before it.
     """
     iterations, minimum = int(numbers[0]), int(numbers[5])
+    thinned = iterations - int(numbers[10])
     A, g, step = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     before, turn = np.zeros((3, 3)), np.zeros((3, 3))
     used, squares = 0, 0.0
     for iteration in range(iterations):
         share = iteration / max(iterations - 1, 1)
         gate = numbers[1] * (numbers[2] / numbers[1]) ** share
+        each = int(numbers[9]) if iteration < thinned else 1
         A[:] = 0.0
         g[:] = 0.0
         if camera[0] == 2:
             used, squares = _accumulate_near(
-                source, points, normals, camera, heads, chain, T, gate, numbers, A, g
+                source, each, points, normals, camera, heads, chain, T, gate, numbers, A, g
             )
         else:
-            used, squares = _accumulate(source, points, normals, camera, T, gate, numbers, A, g)
+            used, squares = _accumulate(
+                source, each, points, normals, camera, T, gate, numbers, A, g
+            )
         for a in range(6):
             for b in range(a):
                 A[b, a] = A[a, b]
-        if used < minimum:
+        if used * each < minimum:
             return 0, 0.0
         for a in range(6):
             for b in range(6):
@@ -241,7 +247,7 @@ def numbers_of(p: RefinementParameters, kind: int) -> Floats:
     """The parameters as the kernel takes them, and the kind of the source's camera."""
     return np.array(
         [p.iterations, p.first_gate, p.last_gate, p.normal_cosine, p.reference_depth,
-         p.minimum_points, p.growth, 1.0 / p.weight_depth, kind],
+         p.minimum_points, p.growth, 1.0 / p.weight_depth, kind, p.thinning, p.last_iterations],
         float,
     )  # fmt: skip
 

@@ -479,23 +479,23 @@ class Explained:
 
 @kernel
 def _count(means: Floats, normals: Floats, cosine: float, apart: float, out: Ints32) -> None:
-    """How many patches lie in the plane of each, itself among them."""
-    for i in range(len(means)):
-        x, y, z = means[i, 0], means[i, 1], means[i, 2]
-        a, b, c = normals[i, 0], normals[i, 1], normals[i, 2]
+    """How many patches lie in the plane of each, itself among them; arrays (3, P)."""
+    x, y, z, nx, ny, nz = means[0], means[1], means[2], normals[0], normals[1], normals[2]
+    for i in range(len(out)):
+        ix, iy, iz, a, b, c = x[i], y[i], z[i], nx[i], ny[i], nz[i]
         count = 0
-        for j in range(len(means)):
-            offset = (means[j, 0] - x) * a + (means[j, 1] - y) * b + (means[j, 2] - z) * c
-            alike = normals[j, 0] * a + normals[j, 1] * b + normals[j, 2] * c > cosine
-            if j == i or (alike and abs(offset) < apart):
-                count += 1
-        out[i] = count
+        for j in range(len(out)):
+            offset = (x[j] - ix) * a + (y[j] - iy) * b + (z[j] - iz) * c
+            alike = nx[j] * a + ny[j] * b + nz[j] * c > cosine
+            count += 1 if alike & (abs(offset) < apart) else 0
+        out[i] = max(count, 1)
 
 
 def plane_weights(patches: Patches, p: PlaneParameters) -> Floats32:
     """Weights of patches: 1 over the number of patches that lie in the plane of each, (P,)."""
     counts = np.zeros(len(patches), np.int32)
-    _count(patches.means, patches.normals, math.cos(p.coplanar), p.same_plane, counts)
+    columns = (np.ascontiguousarray(one.T) for one in (patches.means, patches.normals))
+    _count(*columns, math.cos(p.coplanar), p.same_plane, counts)
     weights: Floats32 = (1.0 / counts).astype(np.float32)
     return weights
 
