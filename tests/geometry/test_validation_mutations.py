@@ -151,7 +151,7 @@ CONSENSUS = [
     ("if abs(ha - hb) > tolerance:", "if abs(ha - hb) > 9:"),
     ("if abs(ga - gb) > tolerance:", "if abs(ga - gb) > 9:"),
     ("if abs(np.arccos(ca) - np.arccos(cb)) > angle:", "if False:"),
-    ("return abs(ta - tb) <= 2 * tolerance", "return abs(abs(ta) - abs(tb)) <= 2 * tolerance"),
+    ("abs(ta - tb) <= 2 * tolerance", "abs(abs(ta) - abs(tb)) <= 2 * tolerance"),
     ("bits[j, i >> 6] |= np.uint64(1) << np.uint64(i & 63)", "pass"),
     ("if used < 3:", "if used < 1:"),
     ("a[d] /= total", "a[d] /= used"),

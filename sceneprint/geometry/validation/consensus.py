@@ -77,7 +77,8 @@ def _compatible(
         + by * (m[2, i] * m[0, j] - m[0, i] * m[2, j])
         + bz * (m[0, i] * m[1, j] - m[1, i] * m[0, j])
     )
-    return abs(ta - tb) <= 2 * tolerance
+    alike: bool = abs(ta - tb) <= 2 * tolerance
+    return alike
 
 
 @kernel

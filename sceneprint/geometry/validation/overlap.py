@@ -494,8 +494,8 @@ def _count(means: Floats, normals: Floats, cosine: float, apart: float, out: Int
 def plane_weights(patches: Patches, p: PlaneParameters) -> Floats32:
     """Weights of patches: 1 over the number of patches that lie in the plane of each, (P,)."""
     counts = np.zeros(len(patches), np.int32)
-    columns = (np.ascontiguousarray(one.T) for one in (patches.means, patches.normals))
-    _count(*columns, math.cos(p.coplanar), p.same_plane, counts)
+    means, normals = (np.ascontiguousarray(x.T) for x in (patches.means, patches.normals))
+    _count(means, normals, math.cos(p.coplanar), p.same_plane, counts)
     weights: Floats32 = (1.0 / counts).astype(np.float32)
     return weights
 
