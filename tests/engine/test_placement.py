@@ -31,6 +31,11 @@ def prior_at(upload: Any, shift: float = 0.0, **more: Any) -> dict[str, Any]:
     return {"pose": {"matrix": T.tolist(), "parent_frame": upload.room}, **more}
 
 
+def listed(covariance: Any) -> list[float]:
+    found: list[float] = covariance.ravel().tolist()
+    return found
+
+
 def test_frames_are_found_by_where_they_were_taken(full: Engine, uploads: Any, ids: Ids) -> None:
     poses = [np.array(one.pose)[:3, 3] for one in uploads]
     with full.store.database.read() as connection:
@@ -67,16 +72,56 @@ def test_a_prior_is_read_and_changes_no_answer_that_is_sure(full: Engine, upload
     for prior in (prior_at(uploads[8], 0.2), prior_at(uploads[8], 3.0)):
         there = localized(full, uploads[8], prior=prior)
         assert (there.status, there.verified_by, there.pose) == ("found", "matches", alone.pose)
-    covariance = (np.eye(6) * 0.04).ravel().tolist()
-    given = Prior.model_validate(prior_at(uploads[8], covariance=covariance))
+    covariance = np.eye(6) * 0.04
+    given = Prior.model_validate(prior_at(uploads[8], covariance=listed(covariance)))
     assert localized(full, uploads[8], prior=given).pose == alone.pose
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"deviation_m": 1e-6, "deviation_deg": 1e-4},
+        {"covariance": np.diag([1e-12] * 6)},
+        {"covariance": np.diag([1e6] * 6)},
+        {"covariance": np.diag([1e6, 1e-12] * 3)},
+        {"covariance": np.eye(6) * 1e-4 + np.full((6, 6), 1.0)},  # mostly of all axes at once
+    ],
+)
+def test_priors_of_any_deviation_in_range_are_used(
+    full: Engine, uploads: Any, how: dict[str, Any]
+) -> None:
+    told = {name: listed(one) if name == "covariance" else one for name, one in how.items()}
+    for away in (0.3, 9e8):
+        there = localized(full, uploads[8], prior=prior_at(uploads[8], away, **told))
+        assert (there.status, there.verified_by) == ("found", "matches")
 
 
 def test_a_prior_that_cannot_be_used_says_why(full: Engine, uploads: Any) -> None:
     flat = np.eye(6)
     flat[0, 0] = 0.0
     with pytest.raises(InvalidRequest, match="covariance of the prior is not one"):
-        localized(full, uploads[8], prior=prior_at(uploads[8], covariance=flat.ravel().tolist()))
+        localized(full, uploads[8], prior=prior_at(uploads[8], covariance=listed(flat)))
+    unlike = np.eye(6)
+    unlike[0, 1] = 0.5  # the first axis with the second, and not the second with the first
+    equal = np.ones((6, 6)) * 0.04  # an error of all axes at once, and of none alone
+    hostile = np.eye(6)
+    hostile[0, 1], hostile[1, 0] = 1e308, -1e308
+    for given in (unlike, equal, hostile, -np.eye(6)):
+        with pytest.raises(InvalidRequest, match="covariance of the prior is not one"):
+            localized(full, uploads[8], prior=prior_at(uploads[8], covariance=listed(given)))
+    for least, most, told in (
+        (1e-320, 1.0, "from 1e-160 to 1, and"), (0.9e-12, 1.0, "from 9.49e-07 to 1, and"),
+        (1.0, 1e308, r"from 1 to 1e\+154, and"), (1e-4, 1.1e6, r"from 0.01 to 1.05e\+03, and"),
+    ):  # fmt: skip
+        given = np.diag([least, 1.0, most, 1.0, 1.0, 1.0])
+        with pytest.raises(InvalidRequest, match=told):
+            localized(full, uploads[8], prior=prior_at(uploads[8], covariance=listed(given)))
+    for deviation in ({"deviation_m": 1e-200}, {"deviation_deg": 1e-320}):
+        with pytest.raises(ValueError, match="greater than or equal to"):
+            Prior.model_validate(prior_at(uploads[8], **deviation))
+    for away in (1.1e9, 1e300, -1.7e308):
+        with pytest.raises(InvalidRequest, match="more than 1,000,000,000 m from the origin"):
+            localized(full, uploads[8], prior=prior_at(uploads[8], away))
     skew = prior_at(uploads[8])
     skew["pose"]["matrix"][0][0] += 0.5
     with pytest.raises(InvalidPose, match="The prior"):
