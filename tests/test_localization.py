@@ -507,7 +507,7 @@ def test_votes_bear_few_violations(votes: int, farther: int, nearer: int, status
     [
         (30, 4, 0, "ambiguous"),  # 4 / 34, and the map is at one with itself
         (30, 4, 4, "found"),
-        (24, 12, 14, "ambiguous"),  # of 14 / 50 but a fifth is believed
+        (24, 12, 15, "ambiguous"),  # 12 / 36, and of 15 / 51 but a fifth is believed
         (24, 12, 0, "ambiguous"),
     ],
 )
@@ -539,6 +539,10 @@ def test_weak_matches_suffice_where_nothing_is_known_of_free_space(blank: Geomet
         assert found is not None
         assert found.status == status
     assert (found.strength, found.verified_by) == ("weak", "matches")  # type: ignore[union-attr]
+    unsure = [suggested_at(0.0, row, "ambiguous") for row in range(3)]
+    none = localize([QueryFrame(lost, unsure)], ROWS)
+    assert none is not None
+    assert (none.status, none.reason) == ("ambiguous", "no candidate is accepted")
 
 
 # The map alone
@@ -677,23 +681,27 @@ def test_a_prior_speaks_against_votes_where_another_pose_fits(
 
 
 def test_a_prior_chooses_the_parent_frame_unless_matches_have() -> None:
-    parents = ["here", "here", "there"]
-    views_of = told_by([WHOLE] * 8, parent="there")
+    parents = ["here", "here", "there", "there"]
+    views_of = told_by([WHOLE] * 8, [picture((42, SAME))], parent="there")
 
-    def asked(matches: Sequence[PairMatch], parent: str) -> tuple[str, str, str | None]:
-        prior = PosePrior(parent, shifted(0.0), np.eye(6) * 0.01)
+    def asked(
+        matches: Sequence[PairMatch], parent: str, x: float = 0.0
+    ) -> tuple[str, str, str | None]:
+        prior = PosePrior(parent, shifted(x), np.eye(6) * 0.01)
         frames = [QueryFrame(WHOLE, matches)]
-        found = localize(frames, ROWS[:3], parents, views_of, prior, BY_HAND, FIXED)
+        found = localize(frames, ROWS[:4], parents, views_of, prior, BY_HAND, FIXED)
         assert found is not None
         return found.status, found.parent, found.verified_by
 
     tried = [suggested_at(0.0, row) for row in range(3)]  # two of them here
     assert asked(tried, "here")[1] == "here"
     assert asked(tried, "there") == ("found", "there", "map")
-    # of a parent frame that no match has, the prior tells nothing about that of the accepted
-    accepted = seen_at(0.0, [2])
-    assert asked([*tried[:2], *accepted], "here") == ("found", "there", "matches")
-    both = [*seen_at(0.0, [0]), *accepted]
+    # of a parent frame that no match has, the prior tells nothing about that of the accepted:
+    # its numbers are those of a pose there that fits too
+    accepted = [*seen_at(0.0, [2, 3]), suggested_at(APART, 2)]
+    assert asked([*tried[:2], *accepted], "here", APART) == ("found", "there", "matches")
+    assert asked([*tried[:2], *accepted], "there", APART)[0] == "ambiguous"
+    both = [*seen_at(0.0, [0, 1]), *seen_at(0.0, [2])]
     assert asked(both, "there")[1] == "there"
 
 
