@@ -18,6 +18,7 @@ from sceneprint.geometry.validation.map_verification import (
     compare_poses,
     map_frame,
     score_pose,
+    starts_about,
 )
 from sceneprint.geometry.validation.overlap import OverlapParameters
 from sceneprint.geometry.validation.validation import PairValidation
@@ -27,13 +28,14 @@ from sceneprint.localization import (
     PoseEstimate,
     PosePrior,
     QueryFrame,
+    ViewsOf,
     is_expected,
     localize,
     views_of_rows,
 )
 from sceneprint.matches import PairMatch, associate
 from sceneprint.pipeline import Signer, open_signer, prepare, retrieve
-from sceneprint.types import DepthFrame, Floats, Geometry
+from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics, Patches, Surface
 
 
 def outcome(
@@ -267,6 +269,13 @@ def test_a_room_bears_out_the_true_pose_alone(signer: Signer) -> None:
     moved = MapViews(W @ poses[1:3], geometries[1:3].__getitem__, p, overlap_p)
     again = score_pose([query], W @ poses[0], moved, p, overlap_p)
     assert again.score == pytest.approx(here.score, abs=0.02)
+    # nor on what the pose is told of: here of a frame that was taken elsewhere, by odometry
+    before = shifted(-1.0) @ about_up(20.0)
+    earlier = map_frame(geometries[0], before, p, overlap_p)
+    start = poses[0] @ inverse(before)
+    start[:3, 3] += 0.05, -0.04, 0.03
+    (drawn, *_) = compare_poses([earlier], start[None], views, p, overlap_p)
+    np.testing.assert_allclose(drawn.T, poses[0] @ inverse(before), atol=0.02)
 
 
 def box_query(
@@ -326,6 +335,414 @@ def test_a_pose_is_expected_within_the_mass_of_its_prior() -> None:
     assert not is_expected(shifted(1.0) @ about_up(math.degrees(0.02 * math.sqrt(22.6))), prior)
 
 
+# What the map's frames decide, by hand
+
+#: A picture of so many tiles shows a wall in each, square to the optical axis. No two are one
+#: plane, so that each tile weighs 1.
+TILES = 60
+TILED = Intrinsics(100, 60, 100.0, 100.0, 49.5, 29.5)
+#: How much farther off than in the query's picture a wall is, metres: it agrees, the map saw
+#: through the query's, or the query through the map's; or there is none.
+SAME, FARTHER, NEARER, NOTHING = 0.0, 20.0, -10.0, math.nan
+#: Lengths do not grow with depth, poses are not refined, and the map is not asked for its noise.
+FIXED = OverlapParameters(growth=0)
+BY_HAND = LocalizationParameters(map=MapParameters(n_refining=0, n_noise=0))
+#: Places of the map lie so far apart, metres: what one shows tells nothing of another.
+APART = 100.0
+
+
+def picture(*tiles: tuple[int, float]) -> Geometry:
+    """Runs of tiles, the first row first: how many, and how much farther off."""
+    off = np.full(TILES, NOTHING)
+    told = np.repeat([away for _, away in tiles], [count for count, _ in tiles])
+    off[: len(told)] = told
+    depth = np.nan_to_num(20.0 + 0.1 * np.arange(TILES) + off)
+    image = np.kron(depth.reshape(6, 10), np.ones((10, 10)))
+    y, x = np.mgrid[:60, :100]
+    rays = np.dstack([(x - TILED.cx) / TILED.fx, (y - TILED.cy) / TILED.fy, np.ones_like(image)])
+    points, valid = rays * image[..., None], image > 0
+    normals = np.where(valid[..., None], (0.0, 0.0, -1.0), 0.0)
+    surface = Surface(
+        points.astype(np.float32), normals.astype(np.float32), valid,
+        valid.astype(np.float32), TILED,
+    )  # fmt: skip
+    shown = depth > 0
+    means = points[5::10, 5::10].reshape(-1, 3)[shown]
+    n = len(means)
+    patches = Patches(
+        means, np.tile((0.0, 0.0, -1.0), (n, 1)), np.ones(n), np.full(n, 100, np.int32), np.ones(n)
+    )
+    return Geometry(surface, patches, np.zeros((n, 16), np.uint8), "a" * 64)
+
+
+WHOLE = picture((TILES, SAME))
+
+
+def told_by(*places: Sequence[Geometry], parent: str = "") -> ViewsOf:
+    """A map with these pictures at each place, in the parent frame of that name alone."""
+    pictures = [one for place in places for one in place]
+    poses = [shifted(APART * k) for k, place in enumerate(places) for _ in place]
+
+    def views_of(asked: str, at: Floats) -> MapViews:
+        opened = pictures.__getitem__ if asked == parent else lambda _: None
+        return MapViews(np.stack(poses), opened, BY_HAND.map, FIXED)
+
+    return views_of
+
+
+def suggested_at(x: float, row: int, status: str = "rejected") -> PairMatch:
+    """A match that votes for nothing, or for little, and suggests a pose."""
+    return match(row, outcome(status, T=inverse(ROWS[row]) @ shifted(x)))
+
+
+def judged(
+    matches: Sequence[PairMatch], *places: Sequence[Geometry], query: Geometry = WHOLE,
+    prior: PosePrior | None = None, p: LocalizationParameters = BY_HAND,
+) -> PoseEstimate:  # fmt: skip
+    """What comes of matches of the whole picture where the map has these."""
+    frames = [QueryFrame(query, matches)]
+    found = localize(frames, ROWS, None, told_by(*places), prior, p, FIXED)
+    assert found is not None
+    return found
+
+
+def at_place(k: int, found: PoseEstimate) -> bool:
+    return found.average is not None and np.allclose(found.average.T, shifted(APART * k))
+
+
+def near_place(k: int, deviation: float = 0.1) -> PosePrior:
+    return PosePrior("", shifted(APART * k), np.eye(6) * deviation**2)
+
+
+def test_a_score_by_hand() -> None:
+    views = told_by([
+        picture((40, SAME), (10, FARTHER)),
+        picture((45, SAME), (5, NOTHING), (3, NEARER)),
+        picture((30, SAME), (10, FARTHER)),
+        picture((1, SAME), (20, NEARER)),  # agrees too little to have a say in what is hidden
+        picture(),
+    ])("", np.empty((0, 4, 4)))  # fmt: skip
+    query = map_frame(WHOLE, np.eye(4), BY_HAND.map, FIXED)
+    told = score_pose([query], np.eye(4), views, BY_HAND.map, FIXED)
+    # tiles 0 to 39 have more for than against, 40 to 44 as much, 45 to 49 are seen through
+    violations, hidden = 5 / 45, 3 / (40 + 45 + 30 + 3)
+    assert (told.asked, told.views, told.planes) == (5, ((0, 1), (0, 0), (0, 2)), 40.0)
+    assert (told.share, told.violations, told.hidden) == pytest.approx(
+        (40 / 60, violations, hidden)
+    )
+    assert told.score == pytest.approx(40 / 60 * (1 - 2 * (violations + hidden)))
+
+
+def test_frames_that_look_the_same_way_are_asked_first() -> None:
+    """Of a camera the middle of what it sees counts, 1.5 m ahead, and its direction."""
+    back, aside = shifted(0.0), shifted(0.0)
+    back[:3, :3] = aside[:3, :3] = np.diag([-1.0, 1.0, -1.0])
+    back[2, 3] = 3.0  # looks at the same from the other side: 3 m for that
+    poses = np.stack([back, shifted(3.4), shifted(1.0), shifted(3.6), aside])
+    views = MapViews(poses, lambda _: None, MapParameters(), FIXED)
+    assert views.near(np.eye(4), True) == [2, 0, 1]
+    assert views.near(np.eye(4), True, np.array([4, 1, 2])) == [2, 1]
+    assert views.near(np.eye(4), False) == [4, 2, 0, 1, 3]  # 0, 1, 3, 3.4 and 3.6 m
+    assert views.near(shifted(15.5), False) == [3, 1, 2]  # no farther than 15 m
+
+
+@pytest.mark.parametrize(
+    ("votes", "rival", "why"),
+    [
+        (2, 35, None),
+        (2, 37, "another pose explains the frame as well"),  # nine tenths of 40 are 36
+        (1, 11, None),
+        (1, 13, "too little speaks for the pose"),  # three tenths are 12
+        (1, 37, "another pose explains the frame as well"),
+    ],
+)
+def test_votes_need_a_pose_that_no_other_comes_near(
+    votes: int, rival: int, why: str | None
+) -> None:
+    matches = [*seen_at(0.0, range(votes)), suggested_at(APART, 9)]
+    found = judged(matches, [picture((40, SAME))], [picture((rival, SAME))])
+    assert found.rival_ratio == pytest.approx(rival / 40)
+    if why is None:
+        assert (found.status, found.verified_by) == ("found", "matches")
+        assert at_place(0, found)
+    else:
+        assert found.status == "ambiguous"
+        assert found.reason.startswith(why)
+        told = [(one.weight, one.T[0, 3]) for one in found.alternatives]
+        # a pose without votes is told where it explains half as much, and three tenths of all
+        assert told == [(votes, 0.0), (0.0, APART)][: 1 + (rival >= 20)]
+
+
+def test_votes_need_six_planes_of_the_map() -> None:
+    for planes, status in ((5, "ambiguous"), (6, "found")):
+        found = judged(seen_at(0.0, [0, 1]), [picture((planes, SAME))])
+        assert found.status == status
+        assert ("only 5 distinct planes agree" in found.reason) is (planes == 5)
+
+
+@pytest.mark.parametrize(
+    ("votes", "farther", "nearer", "status"),
+    [
+        (1, 1, 0, "found"),
+        (1, 2, 0, "ambiguous"),  # 2 / 32
+        (1, 0, 1, "found"),
+        (1, 0, 2, "ambiguous"),
+        (1, 1, 1, "ambiguous"),  # both sides together
+        (2, 3, 0, "found"),  # 3 / 33, and twice as much is allowed
+        (2, 4, 0, "ambiguous"),
+        (2, 0, 4, "ambiguous"),
+    ],
+)
+def test_votes_bear_few_violations(votes: int, farther: int, nearer: int, status: str) -> None:
+    there = picture((30, SAME), (farther, FARTHER), (nearer, NEARER))
+    found = judged(seen_at(0.0, range(votes)), [there])
+    assert found.status == status
+    if status == "ambiguous":
+        excess = farther / (30 + farther) + nearer / (30 + nearer)
+        assert f"a pose fits, but {excess:.0%} of what should be in sight" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("same", "missing", "unlike", "status"),
+    [
+        (30, 4, 0, "ambiguous"),  # 4 / 34, and the map is at one with itself
+        (30, 4, 4, "found"),
+        (24, 12, 15, "ambiguous"),  # 12 / 36, and of 15 / 51 but a fifth is believed
+        (24, 12, 0, "ambiguous"),
+    ],
+)
+def test_violations_that_the_map_shows_of_itself_are_borne(
+    same: int, missing: int, unlike: int, status: str
+) -> None:
+    """Its two frames see the same, but for so many tiles that the query does not show."""
+    shown = same + missing
+    query = picture((shown, SAME))
+    frames = [
+        picture((same, SAME), (missing, FARTHER), (unlike, away)) for away in (SAME, FARTHER)
+    ]  # fmt: skip
+    noisy = replace(BY_HAND, map=MapParameters(n_refining=0))
+    [pose] = compare_poses(
+        [map_frame(query, np.eye(4), noisy.map, FIXED)], np.eye(4)[None],
+        told_by(frames)("", np.eye(4)[None]), noisy.map, FIXED,
+    )  # fmt: skip
+    assert pose.violations == pytest.approx(missing / shown)
+    assert pose.noise == pytest.approx(unlike / (shown + unlike))
+    assert judged(seen_at(0.0, [0]), frames, query=query, p=noisy).status == status
+
+
+def test_weak_matches_suffice_where_nothing_is_known_of_free_space(blank: Geometry) -> None:
+    """A cloud without a viewpoint has no strong ones."""
+    weak = seen_at(0.0, [0, 1, 2], "weak")
+    lost = replace(blank, surface=replace(blank.surface, camera=None))
+    for geometry, status in ((blank, "ambiguous"), (lost, "found")):
+        found = localize([QueryFrame(geometry, weak)], ROWS)
+        assert found is not None
+        assert found.status == status
+    assert (found.strength, found.verified_by) == ("weak", "matches")  # type: ignore[union-attr]
+    unsure = [suggested_at(0.0, row, "ambiguous") for row in range(3)]
+    none = localize([QueryFrame(lost, unsure)], ROWS)
+    assert none is not None
+    assert (none.status, none.reason) == ("ambiguous", "no candidate is accepted")
+
+
+# The map alone
+
+
+@pytest.mark.parametrize(
+    ("query", "same", "farther", "frames", "rival", "confirmed"),
+    [
+        (60, 40, 0, 8, 11, True),
+        (60, 40, 0, 8, 13, False),  # of another place three tenths at most
+        (60, 40, 0, 7, 11, False),  # eight frames
+        (60, 19, 0, 8, 0, True),
+        (60, 17, 0, 8, 0, False),  # three tenths of all
+        (30, 12, 0, 8, 0, True),
+        (30, 11, 0, 8, 0, False),  # twelve planes
+        (60, 40, 2, 8, 0, True),
+        (60, 40, 3, 8, 0, False),  # 3 / 43 violations
+    ],
+)
+def test_the_map_alone_confirms_a_pose(
+    query: int, same: int, farther: int, frames: int, rival: int, confirmed: bool
+) -> None:
+    matches = [suggested_at(0.0, 0), suggested_at(APART, 1)]
+    places = [picture((same, SAME), (farther, FARTHER))] * frames, [picture((rival, SAME))]
+    found = judged(matches, *places, query=picture((query, SAME)))
+    assert (found.status == "found") is confirmed
+    assert (found.verified_by == "map") is confirmed
+    assert at_place(0, found) is confirmed
+
+
+@pytest.mark.parametrize(("strength", "confirmed"), [("weak", True), ("strong", False)])
+def test_the_map_alone_overrules_no_strong_match(strength: str, confirmed: bool) -> None:
+    matches = [suggested_at(0.0, 0), *seen_at(APART, [1], strength)]
+    found = judged(matches, [picture((40, SAME))] * 8, [picture((10, SAME))])
+    assert (found.status, at_place(0, found)) == (
+        ("found", True) if confirmed else ("ambiguous", False)
+    )
+
+
+def test_a_few_planes_that_fit_are_no_answer() -> None:
+    for planes, status in ((11, "not_found"), (12, "ambiguous")):
+        found = judged([suggested_at(0.0, 0)], [picture((planes, SAME))], query=picture((30, SAME)))
+        assert (found.status, len(found.alternatives)) == (status, planes - 11)
+
+
+def test_poses_that_the_map_bears_out_are_told() -> None:
+    """Those of half the best score and three tenths of all, the best first."""
+    matches = [suggested_at(APART * k, k) for k in range(4)]
+    places = [[picture((count, SAME))] for count in (17, 36, 24, 16)]
+    found = judged(matches, *places)
+    assert [one.T[0, 3] for one in found.alternatives] == [APART, 2 * APART]
+    assert [one.score for one in found.alternatives] == pytest.approx([0.6, 0.4])
+    assert [(one.weight, one.support) for one in found.alternatives] == [(0.0, 0)] * 2
+
+
+def test_a_pose_against_which_up_speaks_is_not_suggested() -> None:
+    suggested = suggested_at(0.0, 0)
+    assert judged([suggested], [WHOLE] * 8).status == "found"
+    tilted = replace(suggested.validation, contradicts_up=True)
+    frames = [QueryFrame(WHOLE, [match(0, tilted)])]
+    assert localize(frames, ROWS, None, told_by([WHOLE] * 8), None, BY_HAND, FIXED) is None
+
+
+def test_where_no_match_is_accepted_the_pose_is_that_of_the_map() -> None:
+    """What an ambiguous match says is but the first to be looked at."""
+    aside = inverse(ROWS[0])
+    aside[2, 3] = 0.2
+    unsure = match(0, outcome("ambiguous", T=aside))
+    found = judged([unsure, suggested_at(0.0, 1)], [WHOLE] * 8)
+    assert (found.status, found.verified_by) == ("found", "map")
+    assert at_place(0, found)
+
+
+# Priors
+
+
+@pytest.mark.parametrize(
+    ("query", "same", "farther", "elsewhere", "confirmed"),
+    [
+        (60, 36, 0, 36, True),
+        (60, 36, 0, 39, True),
+        (60, 36, 0, 41, False),  # nine tenths of the best of all
+        (60, 19, 0, 19, True),
+        (60, 17, 0, 17, False),  # three tenths of the whole
+        (15, 6, 0, 6, True),
+        (15, 5, 0, 5, False),  # six planes
+        (60, 40, 2, 36, True),
+        (60, 40, 3, 36, False),  # 3 / 43 violations
+    ],
+)
+def test_a_prior_decides_for_what_the_map_bears_out(
+    query: int, same: int, farther: int, elsewhere: int, confirmed: bool
+) -> None:
+    matches = [suggested_at(0.0, 0), suggested_at(APART, 1)]
+    places = [picture((elsewhere, SAME))], [picture((same, SAME), (farther, FARTHER))]
+    whole = picture((query, SAME))
+    assert judged(matches, *places, query=whole).status != "found"
+    found = judged(matches, *places, query=whole, prior=near_place(1))
+    assert (found.status == "found") is confirmed
+    assert (found.verified_by == "prior") is confirmed
+    assert at_place(1, found) is confirmed
+
+
+@pytest.mark.parametrize(("second", "confirmed"), [(22, True), (25, False)])
+def test_a_prior_does_not_decide_between_poses_that_it_expects(
+    second: int, confirmed: bool
+) -> None:
+    matches = [suggested_at(APART * k, k) for k in (0, 1, 5)]
+    places = [[picture((36, SAME))], [picture((second, SAME))], [], [], [], [picture((36, SAME))]]
+    found = judged(matches, *places, prior=near_place(0, deviation=30.0))
+    assert at_place(0, found) is confirmed  # 0.65 of 36 are 23.4
+    assert judged(matches, *places, prior=near_place(0)).verified_by == "prior"
+
+
+@pytest.mark.parametrize(
+    ("expected", "near", "why"),
+    [
+        (0, 28, None),  # the prior agrees with the matches
+        (1, 25, None),  # what the prior expects does not fit: 0.65 of 40 are 26
+        (1, 28, "the matches agree on a pose that the prior rules out"),
+        (2, 28, None),  # nothing is where the prior expects it
+    ],
+)
+def test_a_prior_speaks_against_votes_where_another_pose_fits(
+    expected: int, near: int, why: str | None
+) -> None:
+    matches = [*seen_at(0.0, [0, 1]), suggested_at(APART, 9)]
+    places = [picture((40, SAME))], [picture((near, SAME))]
+    found = judged(matches, *places, prior=near_place(expected))
+    if why is None:
+        assert (found.status, found.verified_by) == ("found", "matches")
+        assert at_place(0, found)
+    else:
+        assert found.status == "ambiguous"
+        assert found.reason.startswith(why)
+
+
+def test_a_prior_chooses_the_parent_frame_unless_matches_have() -> None:
+    parents = ["here", "here", "there", "there"]
+    views_of = told_by([WHOLE] * 8, [picture((42, SAME))], parent="there")
+
+    def asked(
+        matches: Sequence[PairMatch], parent: str, x: float = 0.0
+    ) -> tuple[str, str, str | None]:
+        prior = PosePrior(parent, shifted(x), np.eye(6) * 0.01)
+        frames = [QueryFrame(WHOLE, matches)]
+        found = localize(frames, ROWS[:4], parents, views_of, prior, BY_HAND, FIXED)
+        assert found is not None
+        return found.status, found.parent, found.verified_by
+
+    tried = [suggested_at(0.0, row) for row in range(3)]  # two of them here
+    assert asked(tried, "here")[1] == "here"
+    assert asked(tried, "there") == ("found", "there", "map")
+    # of a parent frame that no match has, the prior tells nothing about that of the accepted:
+    # its numbers are those of a pose there that fits too
+    accepted = [*seen_at(0.0, [2, 3]), suggested_at(APART, 2)]
+    assert asked([*tried[:2], *accepted], "here", APART) == ("found", "there", "matches")
+    assert asked([*tried[:2], *accepted], "there", APART)[0] == "ambiguous"
+    both = [*seen_at(0.0, [0, 1]), *seen_at(0.0, [2])]
+    assert asked(both, "there")[1] == "there"
+
+
+def test_the_parent_frame_is_that_of_the_strongest_matches(blank: Geometry) -> None:
+    parents = ["here", "here", "there"]
+    weak, strong = seen_at(0.0, [0, 1], "weak"), seen_at(0.0, [2])
+    tried = [suggested_at(0.0, 0), suggested_at(0.0, 1)]
+    for matches in ([*weak, *strong], [*tried, *seen_at(0.0, [2], "weak")]):
+        found = localize([QueryFrame(blank, matches)], ROWS[:3], parents)
+        assert found is not None
+        assert (found.parent, found.votes) == ("there", 1)
+
+
+def test_poses_about_a_prior_are_drawn_to_where_the_map_fits(
+    box_views: tuple[list[Floats], list[Geometry]], signer: Signer
+) -> None:
+    """Also where no candidate suggests any."""
+    poses, views = box_views
+    T = looking_at_the_box(45.0)
+    query = prepare(DepthFrame(render(symmetric_box(), T, KINECT), KINECT, "query", T), signer)[1]
+    off = T.copy()
+    off[:3, 3] += 0.1, -0.1, 0.05
+    prior = PosePrior("", off, np.diag([0.1**2] * 3 + [0.05**2] * 3))
+    views_of = views_of_rows([], poses, views.__getitem__)
+    found = localize([QueryFrame(query, [])], poses, None, views_of, prior)
+    assert found is not None
+    assert found.average is not None
+    assert (found.status, found.votes) == ("found", 0)
+    np.testing.assert_allclose(found.average.T, T, atol=0.03)
+
+
+def test_starts_lie_a_deviation_about_a_prior() -> None:
+    T = shifted(1.0, 2.0) @ about_up(30.0)
+    starts = starts_about(T, np.diag([0.04, 0.09, 4.0, 1.0, 1.0, 1.0]))
+    np.testing.assert_array_equal(starts[:, :3, :3], np.tile(T[:3, :3], (7, 1, 1)))
+    by_hand = [
+        (0, 0, 0), (0.2, 0, 0), (-0.2, 0, 0), (0, 0.3, 0), (0, -0.3, 0), (0, 0, 0.5), (0, 0, -0.5),
+    ]  # fmt: skip
+    np.testing.assert_allclose(starts[:, :3, 3] - T[:3, 3], by_hand, atol=1e-12)
+
+
 # Several frames
 
 
@@ -344,6 +761,22 @@ def test_frames_of_a_sequence_vote_for_the_pose_of_the_last(blank: Geometry) -> 
     assert found.average is not None
     assert (found.status, found.average.support, found.votes) == ("found", 3, 4)
     np.testing.assert_allclose(found.average.T, truth, atol=1e-12)
+
+
+def test_candidates_of_an_earlier_frame_suggest_poses_of_the_last() -> None:
+    """Both frames are looked up where odometry puts them, and planes are those of one frame."""
+    query = picture((30, SAME))
+    before = QueryFrame(query, [suggested_at(0.0, 0)], shifted(-APART))  # a place behind
+    for planes, status in ((11, "not_found"), (12, "found")):
+        map_frames = [picture((planes, SAME))] * 4
+        views_of = told_by(map_frames, map_frames)
+        found = localize(
+            [before, QueryFrame(query, [])], ROWS, None, views_of, None, BY_HAND, FIXED
+        )
+        assert found is not None
+        assert found.status == status
+    assert found is not None
+    assert (found.verified_by, at_place(1, found)) == ("map", True)
 
 
 def test_the_numbers_are_those_of_the_docs() -> None:

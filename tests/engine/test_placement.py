@@ -3,19 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from sceneprint.engine import Engine
+from sceneprint.engine.maps.maps import edit_frame
+from sceneprint.engine.search.outcome import Outcome, outcome_of
 from sceneprint.engine.search.query import localization_of
+from sceneprint.engine.search.verification import Validated
 from sceneprint.errors import InvalidPose, InvalidRequest
 from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
+from sceneprint.localization import (
+    AlternativePose,
+    LocalizationStatus,
+    PoseEstimate,
+    QueryFrame,
+    localize,
+    views_of_rows,
+)
+from sceneprint.matches import PairMatch, associate
+from sceneprint.pipeline import Signature, Signer, diversify, retrieve
 from sceneprint.store.frame_queries import placed_frames
-from sceneprint_client.api import Localization, Prior, Query
+from sceneprint.types import Geometry, Patches
+from sceneprint_client.api import Counts, Localization, Prior, Query
 
+Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]
 
 
@@ -29,6 +46,11 @@ def prior_at(upload: Any, shift: float = 0.0, **more: Any) -> dict[str, Any]:
     T = np.array(upload.pose)
     T[0, 3] += shift
     return {"pose": {"matrix": T.tolist(), "parent_frame": upload.room}, **more}
+
+
+def listed(covariance: Any) -> list[float]:
+    found: list[float] = covariance.ravel().tolist()
+    return found
 
 
 def test_frames_are_found_by_where_they_were_taken(full: Engine, uploads: Any, ids: Ids) -> None:
@@ -62,21 +84,153 @@ def test_frames_are_found_by_where_they_were_taken(full: Engine, uploads: Any, i
     assert 3 not in {one.number for one in left}
 
 
+@pytest.mark.parametrize(
+    ("asked", "candidates", "without"),
+    [(8, 10, ()), (8, 1, ()), (8, 10, (1, 2, 3, 7)), (2, 1, (3, 9))],
+)
+def test_poses_are_scored_on_the_frames_that_pass_alone(
+    full: Engine, prepared: Prepared, signer: Signer, uploads: Any, ids: Ids,
+    asked: int, candidates: int, without: Sequence[int],
+) -> None:  # fmt: skip
+    """Neither the frame that asks nor what a filter excludes bears a pose out."""
+    names = ids(full)
+    others = [i for i in range(len(prepared)) if i != asked and i not in without]
+    signatures = [prepared[i][0] for i in others]
+    geometries = [prepared[i][1] for i in others]
+    query, seen = prepared[asked]
+    p = signer.model.parameters.validation
+    p = replace(p, acceptance=replace(p.acceptance, ambiguous=0.0))  # no match is accepted
+    ranking = retrieve(query, signatures, signer.model)
+    chosen = diversify(ranking, signatures, candidates).indices.tolist()
+    matches = associate(seen, ranking, chosen, geometries.__getitem__, 5, 0, p)
+    poses, rooms = [uploads[i].pose for i in others], [uploads[i].room for i in others]
+    views_of = views_of_rows(matches, poses, geometries.__getitem__, rooms)
+    by_library = localize([QueryFrame(seen, matches)], poses, rooms, views_of)
+    assert by_library is not None
+    assert by_library.status == "ambiguous"
+
+    how: dict[str, Any] = {"candidates": candidates, "validation": {"ambiguous": 0.0}}
+    if without:
+        how["filter"] = {"exclude_frames": [names[i] for i in without]}
+    answer = full.query_frame("hall", names[asked], Query.model_validate(how))
+    assert answer.status == "ambiguous"
+    assert len(answer.alternatives) == len(by_library.alternatives)
+    for told, one in zip(answer.alternatives, by_library.alternatives, strict=True):
+        np.testing.assert_allclose(told.pose.matrix, one.T, atol=1e-9)
+        assert told.support == one.support
+        assert (told.weight, told.score) == pytest.approx((one.weight, one.score))
+
+
+#: A query of which no match is accepted, so that the poses that it suggests are told.
+UNSURE = {"validation": {"ambiguous": 0.0}}
+
+
+def test_frames_of_other_parent_frames_tell_nothing_of_a_pose(
+    full: Engine, uploads: Any, ids: Ids
+) -> None:
+    """Whatever their coordinates: here those of the room that is asked about."""
+    before = localized(full, uploads[8], **UNSURE)
+    assert before.status == "ambiguous"
+    for frame_id, own, there in zip(ids(full), uploads[:6], uploads[6:], strict=False):
+        pose = {"matrix": there.pose.tolist(), "parent_frame": own.room}
+        edit_frame(full.store, "hall", frame_id, {"pose": pose})
+    after = localized(full, uploads[8], **UNSURE)
+    assert after.alternatives == before.alternatives
+
+
+def test_frames_about_each_pose_are_asked(full: Engine, uploads: Any) -> None:
+    """A prior where nothing was taken is looked at too, and first."""
+    alone = localized(full, uploads[8], candidates=1, **UNSURE)
+    prior = prior_at(uploads[8], 50.0)
+    there = localized(full, uploads[8], candidates=1, prior=prior, **UNSURE)
+    assert there.alternatives == alone.alternatives
+    assert alone.status == "ambiguous"
+
+
+def test_the_paper_s_test_asks_no_other_frames(full: Engine, uploads: Any) -> None:
+    for mode, told in (("full", True), ("paper", False)):
+        there = localized(full, uploads[8], validation={"mode": mode})
+        assert (there.status, there.verified_by) == ("found", "matches")
+        assert (there.rival_ratio is not None) is told
+
+
+def test_candidates_near_a_prior_are_tried_first(full: Engine, uploads: Any, ids: Ids) -> None:
+    """Those of its parent frame, here the other room: they are rejected before the right one."""
+    rooms = dict(zip(ids(full), (one.room for one in uploads), strict=True))
+
+    def tried(prior: dict[str, Any] | None) -> list[str]:
+        query = Query.model_validate({"keep": False, "k": 1, "prior": prior})
+        meta = uploads[8].meta.model_copy(update={"pose": None})
+        answer = full.query_upload("hall", uploads[8].data, meta, query)
+        assert len(answer.matches) == 10
+        elsewhere = [one for one in answer.matches if rooms[one.frame_id] == uploads[0].room]
+        assert len(elsewhere) > 1
+        return [one.validation.status for one in elsewhere]
+
+    assert set(tried(None)) == {"skipped"}  # the nearest of all is a match
+    assert set(tried(prior_at(uploads[0]))) == {"rejected"}
+    assert set(tried(prior_at(uploads[8]))) == {"skipped"}
+    # of coordinates alone, either room is as near
+    here = prior_at(uploads[0])
+    here["pose"]["parent_frame"] = uploads[8].room
+    assert set(tried(here)) == {"skipped"}
+
+
 def test_a_prior_is_read_and_changes_no_answer_that_is_sure(full: Engine, uploads: Any) -> None:
     alone = localized(full, uploads[8])
     for prior in (prior_at(uploads[8], 0.2), prior_at(uploads[8], 3.0)):
         there = localized(full, uploads[8], prior=prior)
         assert (there.status, there.verified_by, there.pose) == ("found", "matches", alone.pose)
-    covariance = (np.eye(6) * 0.04).ravel().tolist()
-    given = Prior.model_validate(prior_at(uploads[8], covariance=covariance))
+    covariance = np.eye(6) * 0.04
+    given = Prior.model_validate(prior_at(uploads[8], covariance=listed(covariance)))
     assert localized(full, uploads[8], prior=given).pose == alone.pose
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"deviation_m": 1e-6, "deviation_deg": 1e-4},
+        {"covariance": np.diag([1e-12] * 6)},
+        {"covariance": np.diag([1e6] * 6)},
+        {"covariance": np.diag([1e6, 1e-12] * 3)},
+        {"covariance": np.eye(6) * 1e-4 + np.full((6, 6), 1.0)},  # mostly of all axes at once
+    ],
+)
+def test_priors_of_any_deviation_in_range_are_used(
+    full: Engine, uploads: Any, how: dict[str, Any]
+) -> None:
+    told = {name: listed(one) if name == "covariance" else one for name, one in how.items()}
+    for away in (0.3, 9e8):
+        there = localized(full, uploads[8], prior=prior_at(uploads[8], away, **told))
+        assert (there.status, there.verified_by) == ("found", "matches")
 
 
 def test_a_prior_that_cannot_be_used_says_why(full: Engine, uploads: Any) -> None:
     flat = np.eye(6)
     flat[0, 0] = 0.0
     with pytest.raises(InvalidRequest, match="covariance of the prior is not one"):
-        localized(full, uploads[8], prior=prior_at(uploads[8], covariance=flat.ravel().tolist()))
+        localized(full, uploads[8], prior=prior_at(uploads[8], covariance=listed(flat)))
+    unlike = np.eye(6)
+    unlike[0, 1] = 0.5  # the first axis with the second, and not the second with the first
+    equal = np.ones((6, 6)) * 0.04  # an error of all axes at once, and of none alone
+    hostile = np.eye(6)
+    hostile[0, 1], hostile[1, 0] = 1e308, -1e308
+    for given in (unlike, equal, hostile, -np.eye(6)):
+        with pytest.raises(InvalidRequest, match="covariance of the prior is not one"):
+            localized(full, uploads[8], prior=prior_at(uploads[8], covariance=listed(given)))
+    for least, most, told in (
+        (1e-320, 1.0, "from 1e-160 to 1, and"), (0.9e-12, 1.0, "from 9.49e-07 to 1, and"),
+        (1.0, 1e308, r"from 1 to 1e\+154, and"), (1e-4, 1.1e6, r"from 0.01 to 1.05e\+03, and"),
+    ):  # fmt: skip
+        given = np.diag([least, 1.0, most, 1.0, 1.0, 1.0])
+        with pytest.raises(InvalidRequest, match=told):
+            localized(full, uploads[8], prior=prior_at(uploads[8], covariance=listed(given)))
+    for deviation in ({"deviation_m": 1e-200}, {"deviation_deg": 1e-320}):
+        with pytest.raises(ValueError, match="greater than or equal to"):
+            Prior.model_validate(prior_at(uploads[8], **deviation))
+    for away in (1.1e9, 1e300, -1.7e308):
+        with pytest.raises(InvalidRequest, match="more than 1,000,000,000 m from the origin"):
+            localized(full, uploads[8], prior=prior_at(uploads[8], away))
     skew = prior_at(uploads[8])
     skew["pose"]["matrix"][0][0] += 0.5
     with pytest.raises(InvalidPose, match="The prior"):
@@ -143,8 +297,6 @@ def test_what_is_not_found_names_its_likeliest_cause(
         meta = upload.meta.model_copy(update={"depth_scale": 5000.0, "pose": None})
         answer = full.query_upload("hall", upload.data, meta, Query(keep=False))
     else:
-        from dataclasses import replace
-
         # a slanted wall, which fills the view
         slant = 1.5 + np.linspace(0.0, 1.0, frame.depth.shape[1])[None, :]
         depth = np.broadcast_to(slant, frame.depth.shape).astype(np.float32)
@@ -155,3 +307,66 @@ def test_what_is_not_found_names_its_likeliest_cause(
     assert [m.pose_in_map for m in answer.matches if m.validation.status == "rejected"] == [
         None for m in answer.matches if m.validation.status == "rejected"
     ]
+
+
+# What came of a query, by hand
+
+
+def came_of(
+    geometry: Geometry, *statuses: str, estimate: PoseEstimate | None = None, late: bool = False,
+    others: Sequence[Geometry] = (),
+) -> Outcome:  # fmt: skip
+    """Of a query with matches of these statuses, compared with these others."""
+    matches = []
+    for i, status in enumerate(statuses):
+        made = PairValidation(
+            status, "strong" if status == "accepted" else None, f"as given {i}",  # type: ignore[arg-type]
+            np.eye(4), 0.01, 0.01, 0.5, 0.4, 0.0, 100, 0.0, None, 0,
+        )  # fmt: skip
+        matches.append(PairMatch(i, 10, 0.5, made))
+    n = len(matches)
+    tried = Validated(range(n + late), matches, {}, "", late, dict(enumerate(others)))
+    counts = Counts(
+        map=9, passed=9, compared=9, ranked=9, selected=n + late, validated=n,
+        accepted=statuses.count("accepted"),
+    )  # fmt: skip
+    p = ValidationParameters()
+    return outcome_of(Query(), estimate, tried, matches, counts, geometry, p, posed=True)
+
+
+def supported(*scores: float) -> PoseEstimate:
+    """Poses of the map that no match votes for, so borne out."""
+    told = tuple(AlternativePose(np.eye(4), 0.0, 0, one) for one in scores)
+    status: LocalizationStatus = "ambiguous" if told else "not_found"
+    return PoseEstimate(status, "the map's say", "hall", None, None, None, None, told, None)
+
+
+def test_poses_of_the_map_are_told_where_no_match_is_accepted(prepared: Prepared) -> None:
+    seen = prepared[0][1]
+    told = came_of(seen, "rejected", estimate=supported(0.5, 0.4), others=[seen])
+    assert (told.status, told.reason, told.cause) == ("ambiguous", "the map's say", None)
+    none = came_of(seen, "rejected", estimate=supported(), others=[seen])
+    assert (none.status, none.cause) == ("not_found", "nothing_alike")
+    assert "(the nearest: as given 0)" in none.reason
+    # what is wrong with the match itself says more than that the map bears nothing out
+    unsure = came_of(seen, "rejected", "ambiguous", estimate=supported(), others=[seen])
+    assert (unsure.status, unsure.reason) == (
+        "ambiguous", "the best fit is not unique: as given 1",
+    )  # fmt: skip
+    late = came_of(seen, "rejected", estimate=supported(), late=True, others=[seen])
+    assert (late.status, late.cause) == ("unvalidated", "deadline")
+    assert "1 of 2 candidates were validated" in late.reason
+
+
+def test_what_in_view_is_no_help_is_the_cause(prepared: Prepared) -> None:
+    seen, other = prepared[0][1], prepared[1][1]
+    few = Patches(*(one[:9] for one in vars(seen.patches).values()))
+    told = came_of(replace(seen, patches=few), "rejected", others=[other])
+    assert (told.status, told.cause) == ("not_found", "too_little_in_view")
+    assert "the frame has 9 surface patches, and 10 are needed" in told.reason
+    cloud = replace(other, surface=replace(other.surface, camera=None))
+    for others, cause in (
+        ([cloud], "other_sensor"), ([cloud, cloud], "other_sensor"), ([], "nothing_alike"),
+        ([cloud, other], "nothing_alike"), ([other], "nothing_alike"),
+    ):  # fmt: skip
+        assert came_of(seen, "rejected", others=others).cause == cause

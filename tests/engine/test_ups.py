@@ -193,7 +193,8 @@ def test_a_wrong_up_is_told_and_gives_no_pose(level: Engine, uploads: Any) -> No
     assert first.tilt_deg == pytest.approx(20, abs=1.5)
     assert "only tilted by" in first.reason
     assert "check the IMU" in first.reason.replace("Check", "check")
-    assert first.reason in localization_of(told).reason
+    assert (told.cause, told.reason) == ("gravity", first.reason)
+    assert localization_of(told).reason == first.reason
     assert told.matches[0].uncertainty is None
     # looked at again, it is what it was
     again = level.inspection.match(told.query_id, told.matches[0].frame_id)

@@ -148,6 +148,16 @@ def test_what_cannot_be_asked_is_refused(served, maps, shots, refused, make_map)
     ):  # fmt: skip
         refuse(query, {"frame_id": maps["ask-a"][0], field: value}, *bad, field)
     refuse(query, {"k": 3}, *bad, "`frame_id`")
+    matrix = [[float(i == j) for j in range(4)] for i in range(4)]
+    pose, far = ({"matrix": [[1.0, 0.0, 0.0, x], *matrix[1:]], "parent_frame": "r1/room 0"}
+                 for x in (0.0, 1e300))  # fmt: skip
+    for prior, text in (
+        ({"pose": pose, "deviation_m": 1e-200}, "greater than or equal to"),
+        ({"pose": pose, "covariance": [1e308] * 36}, "deviations of the prior reach from 1e+154"),
+        ({"pose": pose, "covariance": [0.0] * 36}, "must be symmetric with eigenvalues above 0"),
+        ({"pose": far}, "1,000,000,000 m from the origin"),
+    ):
+        refuse(query, {"frame_id": maps["ask-a"][0], "prior": prior}, *bad, text)
     refuse("/v1/maps/ask-a/localize", {"frame_id": "x", "stages": ["retrieve"]}, *bad, "validated")
     explained = {"frame_id": maps["ask-a"][0], "explain_frame": maps["ask-b"][0]}
     refuse(query, explained, 404, "unknown-frame", "in map 'ask-a'")

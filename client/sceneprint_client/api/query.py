@@ -33,6 +33,11 @@ from sceneprint_client.api.options import (
 AnswerStatus = Literal["found", "ambiguous", "not_found", "unvalidated"]
 #: Frames of a sequence that is asked at once, at most.
 MOST_OF_SEQUENCE = 10
+#: Deviations of a prior, from and to, metres and radians: what is beyond means nothing, or cannot
+#: be computed with.
+LEAST_DEVIATION, MOST_DEVIATION = 1e-6, 1000.0
+#: How far from the origin of its parent frame a prior may lie, metres.
+FARTHEST_PRIOR = 1e9
 #: The likeliest cause of an answer `not_found`.
 Cause = Literal[
     "no_frames", "deadline", "too_little_in_view", "one_plane", "gravity", "other_sensor", "scale",
@@ -44,18 +49,23 @@ class Prior(Given):
     """What a robot believes of its pose before it asks: T_parent_query and how sure that is."""
 
     pose: GivenPose = Field(
-        description="Of the query's sensor in a parent frame of the map; `parent_frame` is needed."
+        description="Of the query's sensor in a parent frame of the map; `parent_frame` is needed. "
+        f"Along each axis {FARTHEST_PRIOR:,.0f} m from the origin at most."
     )
     covariance: Annotated[list[float], Field(min_length=36, max_length=36)] | None = Field(
         default=None,
         description="6 x 6, row by row, of errors (x, y, z, rx, ry, rz) in the parent's axes, as "
-        "ROS orders PoseWithCovariance: metres and radians.",
+        "ROS orders PoseWithCovariance: metres and radians. The deviations, which are the roots of "
+        f"its diagonal, are from {LEAST_DEVIATION} to {MOST_DEVIATION:.0f}.",
     )
     deviation_m: float = Field(
-        default=0.3, gt=0, le=20, description="In place of `covariance`: along each axis."
+        default=0.3,
+        ge=LEAST_DEVIATION,
+        le=20,
+        description="In place of `covariance`: along each axis.",
     )
     deviation_deg: float = Field(
-        default=10.0, gt=0, le=180, description="In place of `covariance`: about each axis."
+        default=10.0, ge=1e-4, le=180, description="In place of `covariance`: about each axis."
     )
 
     @model_validator(mode="after")

@@ -38,7 +38,8 @@ from sceneprint.store.frames import frames_of
 from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import Floats, Geometry
-from sceneprint_client.api import Query, ValidationOptions
+from sceneprint_client.api import Prior, Query, ValidationOptions
+from sceneprint_client.api.query import FARTHEST_PRIOR, LEAST_DEVIATION, MOST_DEVIATION
 
 #: Candidates that are selected and validated, unless more matches are wanted: more cost time.
 CANDIDATES = 10
@@ -240,17 +241,14 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
             "A prior is a pose in one map. Ask that map alone, or leave `prior` out.",
             (("prior", "of several maps"),),
         )
-    deviations = [given.deviation_m] * 3 + [math.radians(given.deviation_deg)] * 3
-    covariance = np.diag(np.square(deviations))
-    if given.covariance is not None:
-        covariance = np.array(given.covariance).reshape(6, 6)
-        whole = np.isfinite(covariance).all() and np.allclose(covariance, covariance.T)
-        if not whole or np.linalg.eigvalsh(covariance)[0] <= 0:
-            raise InvalidRequest(
-                "The covariance of the prior is not one: it must be symmetric with eigenvalues "
-                "above 0. Send the 36 numbers row by row, or `deviation_m` and `deviation_deg`.",
-                (("prior.covariance", "not positive definite"),),
-            )
+    covariance = _prior_covariance(given)
+    T = pose_matrix(given.pose, "The prior")
+    if np.abs(T[:3, 3]).max() > FARTHEST_PRIOR:
+        raise InvalidRequest(
+            f"The prior lies more than {FARTHEST_PRIOR:,.0f} m from the origin of its parent "
+            "frame. Give the pose in metres, or leave `prior` out.",
+            (("prior.pose", "too far off"),),
+        )
     row, name = places[0].row, str(given.pose.parent_frame)
     with store.queried.read() as connection:
         if not has_parent_frame(connection, row.number, name):
@@ -260,7 +258,42 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
                 (("prior.pose.parent_frame", "not of this map"),),
             )
     parent = f"{row.number} {name}"
-    return PosePrior(parent, pose_matrix(given.pose, "The prior"), covariance)
+    return PosePrior(parent, T, covariance)
+
+
+#: Least eigenvalue of a covariance once its deviations are 1: what is less is rounding.
+_LEAST_EIGENVALUE = 1e-12
+
+
+def _prior_covariance(given: Prior) -> Floats:
+    """The covariance (6, 6) of a prior; InvalidRequest where it is none."""
+    if given.covariance is None:
+        metres, radians = given.deviation_m, math.radians(given.deviation_deg)
+        return np.diag(np.square([metres] * 3 + [radians] * 3))
+    covariance = np.array(given.covariance).reshape(6, 6)
+    variances = np.diag(covariance)
+    if (variances > 0).all():
+        deviations = np.sqrt(variances)
+        # a little more, as a square that is rounded has another root
+        within = LEAST_DEVIATION * (1 - 1e-9), MOST_DEVIATION * (1 + 1e-9)
+        if deviations.min() < within[0] or deviations.max() > within[1]:
+            raise InvalidRequest(
+                f"The deviations of the prior reach from {deviations.min():.3g} to "
+                f"{deviations.max():.3g}, and can be from {LEAST_DEVIATION} to "
+                f"{MOST_DEVIATION:.0f}, metres and radians. The diagonal of its covariance has "
+                "their squares: give others, or leave `prior` out.",
+                (("prior.covariance", "deviations out of range"),),
+            )
+        # no entry of a covariance is above the largest variance, and no product overflows then
+        if np.abs(covariance).max() <= variances.max():
+            told = covariance / np.outer(deviations, deviations)
+            if np.allclose(told, told.T) and np.linalg.eigvalsh(told)[0] > _LEAST_EIGENVALUE:
+                return covariance
+    raise InvalidRequest(
+        "The covariance of the prior is not one: it must be symmetric with eigenvalues "
+        "above 0. Send the 36 numbers row by row, or `deviation_m` and `deviation_deg`.",
+        (("prior.covariance", "not positive definite"),),
+    )
 
 
 def nearest_first(
