@@ -56,6 +56,7 @@ class LocalizationParameters:
     rival: float = 0.9  #: of its score, above which another pose makes it ambiguous
     rival_unsure: float = 0.3  #: the same of a place with less weight, and without any
     violations: float = 0.05  #: most, beyond the map's own, for each unit of weight of a pose
+    map_confirms: bool = True  #: whether the map's frames may decide without a strong match
     map_score: float = 0.3  #: least score of a pose that the map confirms without a strong match
     map_planes: float = 12.0  #: and least number of distinct planes that agree
     map_views: int = 8  #: and least number of frames of the map that agree
@@ -426,7 +427,8 @@ def _estimate(
     least = max(p.map_score, 0.5 * best.score)
     told = [
         place for place in sorted(places, key=lambda one: (-one.weight, -one.score))
-        if place.votes or place.score >= least
+        # what a caller asks of a match, a pose that no match votes for does not meet
+        if place.votes or (p.map_confirms and place.score >= least)
     ]  # fmt: skip
     if not any(one.votes or _planes(one) >= p.map_planes for one in told):
         told = []  # a few planes fit in many places
@@ -477,7 +479,7 @@ def _against_votes(
 
 def _map_confirms(best: _Place, places: Sequence[_Place], p: LocalizationParameters) -> bool:
     """Whether the map alone decides for the place with the best score."""
-    if best.scored is None:
+    if best.scored is None or not p.map_confirms:
         return False
     others = [place for place in places if place is not best]
     frames = {i for _, i in best.scored.views}

@@ -426,7 +426,7 @@ def test_a_score_by_hand() -> None:
     told = score_pose([query], np.eye(4), views, BY_HAND.map, FIXED)
     # tiles 0 to 39 have more for than against, 40 to 44 as much, 45 to 49 are seen through
     violations, hidden = 5 / 45, 3 / (40 + 45 + 30 + 3)
-    assert (told.asked, told.views, told.planes) == (5, ((0, 1), (0, 0), (0, 2)), 40.0)
+    assert (told.views, told.planes) == (((0, 1), (0, 0), (0, 2)), 40.0)
     assert (told.share, told.violations, told.hidden) == pytest.approx(
         (40 / 60, violations, hidden)
     )
@@ -442,8 +442,17 @@ def test_frames_that_look_the_same_way_are_asked_first() -> None:
     views = MapViews(poses, lambda _: None, MapParameters(), FIXED)
     assert views.near(np.eye(4), True) == [2, 0, 1]
     assert views.near(np.eye(4), True, np.array([4, 1, 2])) == [2, 1]
-    assert views.near(np.eye(4), False) == [4, 2, 0, 1, 3]  # 0, 1, 3, 3.4 and 3.6 m
-    assert views.near(shifted(15.5), False) == [3, 1, 2]  # no farther than 15 m
+    # of a scan where it stands, 1.5, 1.5, 1.8, 3.7 and 3.9 m from what the cameras see
+    assert views.near(np.eye(4), False) == [0, 4, 2, 1, 3]
+    scans = MapViews(poses, lambda _: None, MapParameters(), FIXED, ahead=[False] * 5)
+    assert scans.near(np.eye(4), False) == [4, 2, 0, 1, 3]  # 0, 1, 3, 3.4 and 3.6 m
+    assert scans.near(shifted(15.5), False) == [3, 1, 2]  # no farther than 15 m
+    # a camera sees 1.5 m ahead of where the scans stand, whichever way their axes point; frame 2
+    # is a camera, 0.9 of its reach off in what it sees
+    mixed = MapViews(
+        poses, lambda _: None, MapParameters(), FIXED, ahead=[False, False, True, False, False]
+    )
+    assert mixed.near(shifted(-2.15), True) == [0, 4, 1, 3, 2]
 
 
 @pytest.mark.parametrize(
@@ -542,7 +551,10 @@ def test_weak_matches_suffice_where_nothing_is_known_of_free_space(blank: Geomet
     unsure = [suggested_at(0.0, row, "ambiguous") for row in range(3)]
     none = localize([QueryFrame(lost, unsure)], ROWS)
     assert none is not None
-    assert (none.status, none.reason) == ("ambiguous", "no candidate is accepted")
+    assert (none.status, none.reason) == (
+        "ambiguous",
+        "no match is accepted, and the map's frames confirm none of the poses that fit",
+    )
 
 
 # The map alone
@@ -565,7 +577,7 @@ def test_weak_matches_suffice_where_nothing_is_known_of_free_space(blank: Geomet
 def test_the_map_alone_confirms_a_pose(
     query: int, same: int, farther: int, frames: int, rival: int, confirmed: bool
 ) -> None:
-    matches = [suggested_at(0.0, 0), suggested_at(APART, 1)]
+    matches = [suggested_at(0.0, 0), suggested_at(0.0, 2), suggested_at(APART, 1)]
     places = [picture((same, SAME), (farther, FARTHER))] * frames, [picture((rival, SAME))]
     found = judged(matches, *places, query=picture((query, SAME)))
     assert (found.status == "found") is confirmed
@@ -575,11 +587,32 @@ def test_the_map_alone_confirms_a_pose(
 
 @pytest.mark.parametrize(("strength", "confirmed"), [("weak", True), ("strong", False)])
 def test_the_map_alone_overrules_no_strong_match(strength: str, confirmed: bool) -> None:
-    matches = [suggested_at(0.0, 0), *seen_at(APART, [1], strength)]
+    matches = [suggested_at(0.0, 0), suggested_at(0.0, 2), *seen_at(APART, [1], strength)]
     found = judged(matches, [picture((40, SAME))] * 8, [picture((10, SAME))])
     assert (found.status, at_place(0, found)) == (
         ("found", True) if confirmed else ("ambiguous", False)
     )
+
+
+@pytest.mark.parametrize(
+    ("rows", "status", "confirmed"),
+    [
+        ((0,), "rejected", False),
+        ((0, 0), "rejected", False),  # a copy of a view suggests nothing new
+        ((0, 2), "rejected", True),
+        ((0,), "ambiguous", True),  # a vote, if a weak one
+    ],
+)
+def test_the_map_confirms_what_two_views_suggest_or_one_votes_for(
+    rows: tuple[int, ...], status: str, confirmed: bool
+) -> None:
+    found = judged([suggested_at(0.0, row, status) for row in rows], [WHOLE] * 8)
+    assert (found.status == "found") is confirmed
+    assert (found.alternatives == ()) is confirmed
+    if not confirmed:
+        strict = replace(BY_HAND, map_confirms=False)
+        told = judged([suggested_at(0.0, row) for row in rows], [WHOLE] * 8, p=strict)
+        assert (told.status, told.alternatives) == ("not_found", ())
 
 
 def test_a_few_planes_that_fit_are_no_answer() -> None:
@@ -599,10 +632,10 @@ def test_poses_that_the_map_bears_out_are_told() -> None:
 
 
 def test_a_pose_against_which_up_speaks_is_not_suggested() -> None:
-    suggested = suggested_at(0.0, 0)
-    assert judged([suggested], [WHOLE] * 8).status == "found"
-    tilted = replace(suggested.validation, contradicts_up=True)
-    frames = [QueryFrame(WHOLE, [match(0, tilted)])]
+    suggested = [suggested_at(0.0, row) for row in (0, 2)]
+    assert judged(suggested, [WHOLE] * 8).status == "found"
+    tilted = [match(m.index, replace(m.validation, contradicts_up=True)) for m in suggested]
+    frames = [QueryFrame(WHOLE, tilted)]
     assert localize(frames, ROWS, None, told_by([WHOLE] * 8), None, BY_HAND, FIXED) is None
 
 
@@ -681,7 +714,7 @@ def test_a_prior_speaks_against_votes_where_another_pose_fits(
 
 
 def test_a_prior_chooses_the_parent_frame_unless_matches_have() -> None:
-    parents = ["here", "here", "there", "there"]
+    parents = ["here", "here", "here", "there", "there"]
     views_of = told_by([WHOLE] * 8, [picture((42, SAME))], parent="there")
 
     def asked(
@@ -689,19 +722,19 @@ def test_a_prior_chooses_the_parent_frame_unless_matches_have() -> None:
     ) -> tuple[str, str, str | None]:
         prior = PosePrior(parent, shifted(x), np.eye(6) * 0.01)
         frames = [QueryFrame(WHOLE, matches)]
-        found = localize(frames, ROWS[:4], parents, views_of, prior, BY_HAND, FIXED)
+        found = localize(frames, ROWS[:5], parents, views_of, prior, BY_HAND, FIXED)
         assert found is not None
         return found.status, found.parent, found.verified_by
 
-    tried = [suggested_at(0.0, row) for row in range(3)]  # two of them here
+    tried = [suggested_at(0.0, row) for row in range(5)]  # three of them here
     assert asked(tried, "here")[1] == "here"
     assert asked(tried, "there") == ("found", "there", "map")
     # of a parent frame that no match has, the prior tells nothing about that of the accepted:
     # its numbers are those of a pose there that fits too
-    accepted = [*seen_at(0.0, [2, 3]), suggested_at(APART, 2)]
+    accepted = [*seen_at(0.0, [3, 4]), suggested_at(APART, 3)]
     assert asked([*tried[:2], *accepted], "here", APART) == ("found", "there", "matches")
     assert asked([*tried[:2], *accepted], "there", APART)[0] == "ambiguous"
-    both = [*seen_at(0.0, [0, 1]), *seen_at(0.0, [2])]
+    both = [*seen_at(0.0, [0, 1]), *seen_at(0.0, [3])]
     assert asked(both, "there")[1] == "there"
 
 
@@ -766,7 +799,8 @@ def test_frames_of_a_sequence_vote_for_the_pose_of_the_last(blank: Geometry) -> 
 def test_candidates_of_an_earlier_frame_suggest_poses_of_the_last() -> None:
     """Both frames are looked up where odometry puts them, and planes are those of one frame."""
     query = picture((30, SAME))
-    before = QueryFrame(query, [suggested_at(0.0, 0)], shifted(-APART))  # a place behind
+    suggested = [suggested_at(0.0, row) for row in (0, 2)]
+    before = QueryFrame(query, suggested, shifted(-APART))  # a place behind
     for planes, status in ((11, "not_found"), (12, "found")):
         map_frames = [picture((planes, SAME))] * 4
         views_of = told_by(map_frames, map_frames)

@@ -200,7 +200,7 @@ def placed(
     frames = [replace(one, matches=[m for m in one.matches if m.index in poses]) for one in asked]
     own_p = LocalizationParameters()
     if options is not None:
-        own_p = replace(own_p, map_score=math.inf)
+        own_p = replace(own_p, map_confirms=False)
     reaches = _NEAR_M if all(looks_ahead(one.geometry) for one in asked) else _NEAR_SCANS_M
 
     def views_of(parent: str, at: Floats) -> MapViews:
