@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sceneprint.errors import ModelMismatch
+from sceneprint.geometry.cores import both
 from sceneprint.geometry.retrieval.distance import (
     Metric,
     Ranking,
@@ -84,8 +85,10 @@ def prepare(frame: AnyFrame, signer: Signer) -> tuple[Signature, Geometry]:
     """
     p = signer.model.parameters
     seen = see(frame, p)
-    signature = encode(hierarchy_of(seen, p, frame.name), signer, frame.name)
-    return signature, geometry_of(seen, signer.model)
+    return both(
+        lambda: encode(hierarchy_of(seen, p, frame.name), signer, frame.name),
+        lambda: geometry_of(seen, signer.model),
+    )
 
 
 def geometry_of(seen: Surface, model: Model) -> Geometry:

@@ -35,6 +35,7 @@ from sceneprint.engine.upkeep.deletion import Purging, Retention
 from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
 from sceneprint.engine.upkeep.repair import collect_deleted_blobs
 from sceneprint.errors import ModelError, StoreAway, UnusableStore
+from sceneprint.geometry.cores import Cores
 from sceneprint.models import Model
 from sceneprint.settings import Settings
 from sceneprint.store import frames as stored_frames
@@ -94,7 +95,8 @@ class Engine:
             settings, self.store.blobs, lambda kept: ResultValidity(self.store).asked(kept)
         )
         self.inspection = Inspection(self.store, self.signers, self.kept)
-        self.queries = Queries(self.store, self.signers, self._readers, self.kept)
+        self._cores = Cores(settings.query_cores)
+        self.queries = Queries(self.store, self.signers, self._readers, self.kept, self._cores)
         self.again = Rerun(self.store, self.kept, self.queries)
         # threads of the service work side by side, and sums have one order: the same bytes always
         self._limits = threadpool_limits(1)
@@ -120,6 +122,7 @@ class Engine:
     def close(self) -> None:
         """Give back what was opened."""
         self._limits.restore_original_limits()
+        self._cores.close()
         self.bell.close()
         self.store.close()
 

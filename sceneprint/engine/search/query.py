@@ -24,6 +24,7 @@ from sceneprint.engine.search.retrieval import (
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import model_label, sensor_frame, transform
 from sceneprint.errors import Busy, InvalidRequest, ModelMismatch, SceneprintError, UnknownMap
+from sceneprint.geometry.cores import Cores
 from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.retrieval.distance import distances, similarity
 from sceneprint.geometry.validation.icp import PAIR_METHOD
@@ -237,13 +238,14 @@ class Queries:
     ----------
     store, signers, readers : of the engine
     kept : where answers are kept for a while
+    cores : that queries share
     """
 
     def __init__(
-        self, store: Store, signers: Signers, readers: Readers, kept: StoredResults
+        self, store: Store, signers: Signers, readers: Readers, kept: StoredResults, cores: Cores
     ) -> None:
         self._store, self._signers, self._readers = store, signers, readers
-        self._kept = kept
+        self._kept, self._cores = kept, cores
 
     def upload(
         self, maps: Sequence[str], data: bytes, meta: FrameMeta, query: Query,
@@ -270,7 +272,7 @@ class Queries:
             signer = self._signers(rows[0].model_id)
             return self.answer(rows, prepare_upload(data, meta, signer, query), query, deadline)
 
-        return read_through(self._store.replica, lambda: steadily(self._store, maps, ask))
+        return self._steadily(maps, ask)
 
     def sequence(
         self, map_name: str, frames: Sequence[tuple[bytes, FrameMeta]], query: Query,
@@ -302,7 +304,7 @@ class Queries:
             ]
             return self.answer(rows, last, query, deadline, earlier)
 
-        return read_through(self._store.replica, lambda: steadily(self._store, [map_name], ask))
+        return self._steadily([map_name], ask)
 
     def stored(
         self, maps: Sequence[str], frame: NamedFrame, query: Query, since: float | None = None
@@ -318,7 +320,7 @@ class Queries:
 
         home = [] if frame.map in maps else [frame.map]
         names = [*maps, *home]
-        return read_through(self._store.replica, lambda: steadily(self._store, names, ask))
+        return self._steadily(names, ask)
 
     def answer(
         self, asked_of: Sequence[MapRow], asked: PreparedQuery, query: Query, deadline: Deadline,
@@ -349,9 +351,14 @@ class Queries:
             self._kept.keep(kept)
         return told
 
+    def _steadily(self, maps: Sequence[str], ask: Callable[[list[MapRow]], Answer]) -> Answer:
+        with self._cores.lent():
+            return read_through(self._store.replica, lambda: steadily(self._store, maps, ask))
+
     def compare(self, a: Side, b: Side, how: Comparison) -> Similarity:
         """Compare two frames; see `compare`."""
-        return compare(self._store, self._signers, a, b, how)
+        with self._cores.lent():
+            return compare(self._store, self._signers, a, b, how)
 
     def maps_of(
         self, query: SeveralQuery, may_read: Callable[[str], bool] = lambda _: True

@@ -31,37 +31,76 @@ class SegmentationParameters:
 
 
 @kernel
+def _spread(
+    centres: Floats32, row: int, shift: int, cells: Ints32, columns: int, out: Floats32
+) -> None:
+    """The centre in a row of cells, `shift` beside that of each pixel: (7, w); dead where none."""
+    for x in range(len(cells)):
+        column = cells[x] + shift
+        if row < 0 or row * columns >= len(centres) or column < 0 or column >= columns:
+            out[6, x] = 0.0
+            continue
+        for d in range(7):
+            out[d, x] = centres[row * columns + column, d]
+
+
+@kernel
+def _centre_distances(
+    pixels: Floats32, y: int, centres: Floats32, normal_weight: np.float32, distance: Floats32
+) -> None:
+    """Distance of each pixel of a row to its own centre, of (6, h, w) and (7, w); far if dead."""
+    px, py, pz = pixels[0, y], pixels[1, y], pixels[2, y]
+    nx, ny, nz = pixels[3, y], pixels[4, y], pixels[5, y]
+    cx, cy, cz, mx, my, mz = (
+        centres[0], centres[1], centres[2], centres[3], centres[4], centres[5]
+    )  # fmt: skip
+    scale = centres[6]  # (1 / metric seed spacing)^2; 0 for a dead centre
+    for x in range(len(distance)):
+        dx, dy, dz = px[x] - cx[x], py[x] - cy[x], pz[x] - cz[x]
+        cosine = nx[x] * mx[x] + ny[x] * my[x] + nz[x] * mz[x]
+        found = (dx * dx + dy * dy + dz * dz) * scale[x] + normal_weight * (
+            np.float32(1.0) - cosine
+        )
+        distance[x] = found if scale[x] > 0 else np.float32(np.inf)
+
+
+@kernel
 def _assign(
-    points: Floats32, normals: Floats32, valid: NDArray[np.bool_], centres: Floats32,
-    spacing: float, normal_weight: np.float32, columns: int, labels: Ints32,
+    pixels: Floats32, valid: NDArray[np.bool_], centres: Floats32, spacing: float,
+    normal_weight: np.float32, columns: int, labels: Ints32,
 ) -> None:  # fmt: skip
-    """Give every pixel the nearest of the centres seeded in the nine cells around it."""
+    """Give every pixel, of (6, h, w), the nearest of the centres seeded in the nine cells around
+    it.
+
+    Rows of pixels are compared with one centre each at a time, and loops write one array each, so
+    that the compiler works on eight pixels at once.
+    """
     height, width = valid.shape
     rows = len(centres) // columns
+    cells = np.empty(width, np.int32)
+    for x in range(width):
+        cells[x] = min(int(x / spacing), columns - 1)
+    around = np.zeros((9, 7, width), np.float32)
+    distance, best = np.empty(width, np.float32), np.empty(width, np.float32)
+    cell = -1
     for y in range(height):
-        cell_y = min(int(y / spacing), rows - 1)
+        if min(int(y / spacing), rows - 1) != cell:
+            cell = min(int(y / spacing), rows - 1)
+            for n in range(9):
+                _spread(centres, cell + n // 3 - 1, n % 3 - 1, cells, columns, around[n])
+        best[:] = np.inf
+        own = labels[y]
         for x in range(width):
-            labels[y, x] = -1
-            if not valid[y, x]:
-                continue
-            cell_x = min(int(x / spacing), columns - 1)
-            px, py, pz = points[y, x, 0], points[y, x, 1], points[y, x, 2]
-            nx, ny, nz = normals[y, x, 0], normals[y, x, 1], normals[y, x, 2]
-            best = np.float32(np.inf)
-            for cy in range(max(cell_y - 1, 0), min(cell_y + 2, rows)):
-                for cx in range(max(cell_x - 1, 0), min(cell_x + 2, columns)):
-                    k = cy * columns + cx
-                    scale = centres[k, 6]  # (1 / metric seed spacing)^2; 0 for a dead centre
-                    if scale <= 0:
-                        continue
-                    dx, dy, dz = px - centres[k, 0], py - centres[k, 1], pz - centres[k, 2]
-                    cosine = nx * centres[k, 3] + ny * centres[k, 4] + nz * centres[k, 5]
-                    distance = (dx * dx + dy * dy + dz * dz) * scale + normal_weight * (
-                        np.float32(1.0) - cosine
-                    )
-                    if distance < best:
-                        best = distance
-                        labels[y, x] = k
+            own[x] = -1
+        for n in range(9):
+            k = (cell + n // 3 - 1) * columns + n % 3 - 1
+            _centre_distances(pixels, y, around[n], normal_weight, distance)
+            for x in range(width):
+                own[x] = k + cells[x] if distance[x] < best[x] else own[x]
+            for x in range(width):
+                best[x] = min(distance[x], best[x])
+        for x in range(width):
+            own[x] = own[x] if valid[y, x] else -1
 
 
 @kernel
@@ -124,14 +163,15 @@ def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
     labels: Ints32 = np.where(surface.valid, cell_y * columns + cell_x, -1).astype(np.int32)
     ones = np.ones((height, width), np.float32)
     n = rows * columns
+    pixels = np.concatenate([surface.points, surface.normals], axis=2).transpose(2, 0, 1)
+    pixels = np.ascontiguousarray(pixels)
     for _ in range(p.iterations):
         centres = _centres(
             _sums(surface.points, surface.normals, ones, labels, n), spacing, focal_length
         )
         _assign(
-            surface.points, surface.normals, surface.valid, centres,
-            spacing, np.float32(p.normal_weight), columns, labels,
-        )  # fmt: skip
+            pixels, surface.valid, centres, spacing, np.float32(p.normal_weight), columns, labels
+        )
     smallest = max(p.minimum_pixels, p.minimum_size * spacing * spacing)
     return compact_labels(labels, np.bincount(labels[labels >= 0], minlength=n) >= smallest)
 

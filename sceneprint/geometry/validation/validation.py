@@ -17,6 +17,7 @@ from typing import Literal
 
 import numpy as np
 
+from sceneprint.geometry.cores import both
 from sceneprint.geometry.pose.rigid import (
     difference,
     inverse,
@@ -254,8 +255,10 @@ def validate(
         found = align_scans(a, b, rng, *numbers, other_axes=other_axes)
         there, back = found or (None, None)
     else:
-        there = align(a, b, np.random.default_rng((seed, 0)), *numbers)
-        back = align(b, a, np.random.default_rng((seed, 1)), *numbers)
+        there, back = both(
+            lambda: align(a, b, np.random.default_rng((seed, 0)), *numbers),
+            lambda: align(b, a, np.random.default_rng((seed, 1)), *numbers),
+        )
     if there is None and back is None:
         why = "no correspondences agree on a transform that the surfaces bear out"
         if tilt_of(np.eye(4), ups) is not None:
@@ -294,8 +297,10 @@ def validate_guided(
         samples_of(one, p.agreement.stride, p.rivals.planes, up)
         for one, up in zip((query, match), ups, strict=True)
     )
-    there = align_guided(a, b, T_match_query, p.alignment)
-    back = align_guided(b, a, inverse(T_match_query), p.alignment)
+    there, back = both(
+        lambda: align_guided(a, b, T_match_query, p.alignment),
+        lambda: align_guided(b, a, inverse(T_match_query), p.alignment),
+    )
     if there is None or back is None:
         return None
     found = _decided(a, b, there, back, seed, p, "full")
@@ -359,13 +364,13 @@ def _decided(
     seed: int, p: ValidationParameters, mode: Mode,
 ) -> PairValidation:  # fmt: skip
     residual, found = _estimates(there, back, p.acceptance)
-    both = [one for one in (there, back) if one is not None]
+    found_by = [one for one in (there, back) if one is not None]
     views = query.planes, match.planes
     transforms = list(found.values())
     seen = explained(*views, np.stack(transforms), p.agreement)
     best = int(np.argmax(seen.share - p.alignment.rank_violations * seen.violations))
     (directions, T), *others = sorted(found.items(), key=lambda one: one[1] is not transforms[best])
-    e, inliers = _evidence(query, match, both, T, residual, seen, best, p)
+    e, inliers = _evidence(query, match, found_by, T, residual, seen, best, p)
     T_other = others[0][1] if others else None
     rival, ups = Rival(0.0, None), (query.up, match.up)
     tilt = tilt_of(T, ups)
@@ -376,7 +381,7 @@ def _decided(
     elif mode == "paper":
         strength = "weak" if e.violations is None or e.one_sided else "strong"
         status, reason = "accepted", "the two directions agree"
-    elif both[0].search == "guided":
+    elif found_by[0].search == "guided":
         status, strength, reason = belief(e, rival.share, p.acceptance)
     else:
         voted = np.concatenate(
@@ -397,7 +402,7 @@ def _decided(
         status, strength, reason, T, e.residual_m, e.residual_rad, e.overlap, e.plane_overlap,
         e.violations, inliers, rival.share, rival.T, seed, covariance,
         _sees_around(query.geometry) and _sees_around(match.geometry),
-        e.planes, e.plane_violations, both[0].search, directions, T_other,
+        e.planes, e.plane_violations, found_by[0].search, directions, T_other,
         _hypotheses(there, back, transforms, rival.T, p.n_hypotheses), ups, tilt,
     )  # fmt: skip
 
@@ -450,7 +455,7 @@ def _sees_around(frame: Geometry) -> bool:
 
 
 def _evidence(
-    query: FrameSamples, match: FrameSamples, both: Sequence[Alignment], T: Floats,
+    query: FrameSamples, match: FrameSamples, found_by: Sequence[Alignment], T: Floats,
     residual: tuple[float, float], by_planes: Explained, k: int, p: ValidationParameters,
 ) -> tuple[Evidence, int]:  # fmt: skip
     """What speaks for a transform, number k of those explained, and against it; how many points
@@ -468,7 +473,7 @@ def _evidence(
         overlap=inliers / max(of_query.points + of_match.points, 1),
         plane_overlap=float(by_planes.share[k]),
         violations=violated / max(agreeing + violated, 1) if seen else None,
-        stiffness=min(one.stiffness for one in both),
+        stiffness=min(one.stiffness for one in found_by),
         one_sided=len(seen) == 1,
         planes=float(by_planes.share[k]) * weights / 2,
         plane_violations=float(by_planes.violations[k]),
