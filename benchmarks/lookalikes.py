@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from sceneprint.errors import UselessFrame
 from sceneprint.lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
 from sceneprint.lab.evaluation.measures import answers
 from sceneprint.lab.evaluation.protocol import (
@@ -27,7 +28,7 @@ from sceneprint.lab.evaluation.protocol import (
     overlaps,
     view_of,
 )
-from sceneprint.lab.synth import LookalikeSite, synthesise_lookalike
+from sceneprint.lab.synth import synthesise_lookalike
 from sceneprint.lab.synth.lookalikes import KINDS
 from sceneprint.models import PRESETS, read_model
 from sceneprint.pipeline import Signer, open_signer, prepare
@@ -59,14 +60,22 @@ class Told:
 
 def signed(
     frames: Sequence[DepthFrame], scene: str, signer: Signer, first: int
-) -> tuple[list[SignedFrame], list[Geometry]]:
-    """Frames as an evaluation has them, numbered from `first`, and their geometry."""
-    made = [prepare(frame, signer) for frame in frames]
-    members = []
-    for number, (frame, (signature, _)) in enumerate(zip(frames, made, strict=True), first):
+) -> tuple[list[DepthFrame], list[SignedFrame], list[Geometry]]:
+    """Those frames that show anything, as an evaluation has them, and their geometry."""
+    kept: list[DepthFrame] = []
+    members: list[SignedFrame] = []
+    geometries: list[Geometry] = []
+    for frame in frames:
+        try:
+            signature, geometry = prepare(frame, signer)
+        except UselessFrame:
+            continue
         pose = np.eye(4) if frame.pose is None else frame.pose
+        number = first + len(members)
         members.append(SignedFrame(number, frame.name, scene, pose, signature.vector))
-    return members, [geometry for _, geometry in made]
+        geometries.append(geometry)
+        kept.append(frame)
+    return kept, members, geometries
 
 
 def ask_site(
@@ -82,10 +91,10 @@ def ask_site(
     """
     kind, index, queries = work
     site = synthesise_lookalike(kind, seed, index, queries=queries)
-    database, of_map = signed(site.map, site.name, signer, 0)
+    shown, database, of_map = signed(site.map, site.name, signer, 0)
     # of another place: a pose in its own frame is a pose in no map
     scene = site.name if site.same_frame else f"{site.name}, elsewhere"
-    asked, of_queries = signed(site.queries, scene, signer, len(database))
+    sent, asked, of_queries = signed(site.queries, scene, signer, len(database))
     geometries = [*of_map, *of_queries]
     p = signer.model.parameters.validation
     judge = Judge(geometries.__getitem__, "full", 0, p, database=database)
@@ -94,7 +103,7 @@ def ask_site(
         np.ones((len(asked), len(database)), np.bool_), metric=signer.model.metric,
         candidates=candidates,
     )  # fmt: skip
-    able = _answerable(site)
+    able = _answerable(shown, sent) if site.present else [False] * len(sent)
     told = []
     for number, (query, one) in enumerate(zip(asked, ranked, strict=True)):
         among = tuple(
@@ -106,10 +115,8 @@ def ask_site(
     return told
 
 
-def _answerable(site: LookalikeSite) -> list[bool]:
-    if not site.present:
-        return [False] * len(site.queries)
-    seen = overlaps([view_of(q) for q in site.queries], [view_of(d) for d in site.map])
+def _answerable(shown: Sequence[DepthFrame], sent: Sequence[DepthFrame]) -> list[bool]:
+    seen = overlaps([view_of(q) for q in sent], [view_of(d) for d in shown])
     return [bool(most >= ANSWERABLE) for most in seen.least.max(axis=1)]
 
 

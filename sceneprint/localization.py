@@ -53,15 +53,18 @@ class LocalizationParameters:
     outweigh: float = 2.0  #: times as much weight as any other place
     sure_weight: float = 2.0  #: of a place, that two strong matches give it
     planes: float = 6.0  #: distinct ones that must agree at any pose, where the map is asked
-    rival: float = 0.9  #: of its score, above which another pose makes it ambiguous
+    rival: float = 0.6  #: of its score, above which another pose makes it ambiguous
     rival_unsure: float = 0.3  #: the same of a place with less weight, and without any
-    violations: float = 0.05  #: most, beyond the map's own, for each unit of weight of a pose
+    violations: float = 0.05  #: most, beyond the map's own, for each unit of weight, two at most
+    lone_views: int = 3  #: viewpoints of frames that agree with a pose that only one suggests
     map_confirms: bool = True  #: whether the map's frames may decide without a strong match
     map_score: float = 0.3  #: least score of a pose that the map confirms without a strong match
     map_planes: float = 12.0  #: and least number of distinct planes that agree
+    map_violations: float = 0.03  #: and most violations, beyond the map's own
     map_views: int = 8  #: and least number of frames of the map that agree
     map_viewpoints: int = 2  #: from which candidates suggest it, where no match votes for it
     prior_rival: float = 0.65  #: of its score that another pose near the prior may reach
+    prior_share: float = 0.9  #: least score of that pose, beside the best anywhere
     most_noise: float = 0.2  #: violations of the map's own that are believed
     map: MapParameters = field(default_factory=MapParameters)
 
@@ -174,12 +177,14 @@ class _Place:
     ----------
     weight, support : of the votes from different viewpoints
     viewpoints : from which a candidate suggests it, voting or not
+    seen_from : viewpoints of the map's frames that agree with it
     """
 
     votes: list[_Vote]
     weight: float
     support: int
     viewpoints: int
+    seen_from: int = 0
     scored: ScoredPose | None = None
 
     @property
@@ -245,13 +250,14 @@ def localize(
     ]  # fmt: skip
     suggested, viewpoints = _suggested(own, poses)
     scored: list[ScoredPose] = []
+    views: MapViews | None = None
     if views_of is not None and (len(suggested) or prior is not None):
         ready = [map_frame(one.geometry, one.T, p.map, overlap_p) for one in frames]
         starts = _NONE if prior is None else starts_about(prior.T, prior.covariance)
         views = views_of(parent, np.concatenate([starts[:1], suggested]))
         near = refined_starts(ready, starts, views, p.map, overlap_p)
         scored = compare_poses(ready, np.concatenate([near, suggested]), views, p.map, overlap_p)
-    places = _places(_votes(own, poses, p), scored, suggested, viewpoints, p)
+    places = _places(_votes(own, poses, p), scored, suggested, viewpoints, views, p)
     if not places:
         return None
     blind = all(frame.geometry.surface.camera is None for frame in frames)
@@ -373,7 +379,7 @@ def _votes(
 
 def _places(
     votes: Sequence[_Vote], scored: Sequence[ScoredPose], suggested: Floats, viewpoints: Floats,
-    p: LocalizationParameters,
+    views: MapViews | None, p: LocalizationParameters,
 ) -> list[_Place]:  # fmt: skip
     """Votes and scored poses by place: those with votes first, then by score."""
     groups: list[list[_Vote]] = []
@@ -385,8 +391,14 @@ def _places(
         else:
             groups.append([vote])
 
-    def views_of(T: Floats) -> int:
+    def suggesting(T: Floats) -> int:
         return len(different_views(viewpoints[at_place(suggested, T, p.map)], p.map))
+
+    def seen_from(pose: ScoredPose | None) -> int:
+        if pose is None or views is None:
+            return 0
+        agreeing = np.unique([i for _, i in pose.views]).astype(np.intp)
+        return len(different_views(views.poses[agreeing], p.map))
 
     left = list(scored)
     places = []
@@ -395,11 +407,12 @@ def _places(
         left = [one for one in left if one is not own]
         # neither a copy of a view nor what other matches gave is a vote of its own
         voting = [vote for vote in group if not vote.match.validation.guided]
-        seen_from = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)
-        different = different_views(seen_from, p.map)
+        from_where = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)
+        different = different_views(from_where, p.map)
         weight = sum(voting[i].weight for i in different)
-        places.append(_Place(group, weight, len(different), views_of(group[0].T), own))
-    return places + [_Place([], 0.0, 0, views_of(one.T), one) for one in left]
+        suggested_by = suggesting(group[0].T)
+        places.append(_Place(group, weight, len(different), suggested_by, seen_from(own), own))
+    return places + [_Place([], 0.0, 0, suggesting(one.T), seen_from(one), one) for one in left]
 
 
 def _estimate(
@@ -414,8 +427,6 @@ def _estimate(
         ratio = min(max(next_best / best.score, 0.0), 1.0) if best.score > 0 else 1.0
     voted = max(places, key=lambda place: (place.accepted, place.weight, place.score))
     against = _against_votes(voted, places, mapped, blind, p)
-    if against is None and prior is not None:
-        against = _against_by_prior(voted, by_score, prior, p)
     if against is None:
         return _found(parent, voted, places, "matches", ratio, p)
     if mapped and _map_confirms(best, places, p):
@@ -467,11 +478,14 @@ def _against_votes(
                 "places"
             )
         excess = _excess(voted, p)
-        if excess > p.violations * max(voted.weight, 1.0):
+        # more votes are no more evidence: in a room of two like ends all are for the wrong one
+        if excess > p.violations * min(max(voted.weight, 1.0), p.sure_weight):
             return (
                 f"a pose fits, but {excess:.0%} of what should be in sight there is missing: "
                 "another place may look like this one, or this one has changed"
             )
+        if voted.viewpoints == 1 and voted.seen_from >= p.lone_views:
+            return f"one view alone suggests this pose, of {voted.seen_from} that see the place"
     if not voted.strong and not blind:
         return "the accepted matches are weak, and the map's other frames do not confirm them"
     return None
@@ -490,7 +504,7 @@ def _map_confirms(best: _Place, places: Sequence[_Place], p: LocalizationParamet
         and best.scored.planes >= p.map_planes
         and len(frames) >= p.map_views
         and max((place.weight for place in others), default=0.0) < 1.0
-        and _excess(best, p) <= p.violations
+        and _excess(best, p) <= p.map_violations
     )
 
 
@@ -507,22 +521,10 @@ def _confirmed_by_prior(
         best.score >= p.map_score
         and _planes(best) >= p.planes
         and next_best <= p.prior_rival * best.score
-        and best.score >= p.rival * by_score[0].score
+        and best.score >= p.prior_share * by_score[0].score
         and _excess(best, p) <= p.violations
     )
     return best if sure else None
-
-
-def _against_by_prior(
-    voted: _Place, by_score: Sequence[_Place], prior: PosePrior, p: LocalizationParameters
-) -> str | None:
-    """Why a place that the prior does not expect is not the answer; None where it is."""
-    if is_expected(voted.pose, prior):
-        return None
-    near = max((one.score for one in by_score if is_expected(one.pose, prior)), default=0.0)
-    if near <= p.prior_rival * voted.score:
-        return None
-    return "the matches agree on a pose that the prior rules out, and one near the prior fits too"
 
 
 def is_expected(T: Floats, prior: PosePrior) -> bool:

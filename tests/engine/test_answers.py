@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -191,3 +193,18 @@ def test_what_is_not_there_cannot_be_asked(full: Engine, uploads: Any) -> None:
     with pytest.raises(InvalidRequest, match="is received: Stored durably") as caught:
         full.query_frame("other", added.frame_id, Query())
     assert caught.value.fields == (("frame_id", "is received"),)
+
+
+def test_answers_are_the_same_on_one_core_and_on_two(
+    signed_folder: Path, make_engine: Callable[..., Engine], uploads: Any, tmp_path: Path
+) -> None:
+    told = []
+    for cores in (1, 2):
+        folder = tmp_path / str(cores)
+        shutil.copytree(signed_folder, folder)
+        engine = make_engine(folder, query_cores=cores)
+        meta = uploads[8].meta.model_copy(update={"pose": None})
+        answer = engine.query_upload("hall", uploads[8].data, meta, Query(k=5, seed=3))
+        assert answer.status == "found"
+        told.append(answer)
+    assert same(*told)

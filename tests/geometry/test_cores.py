@@ -1,0 +1,104 @@
+"""Two halves at once: where a core is free, and never more than there are."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from sceneprint.geometry.cores import Cores, both
+
+
+@pytest.fixture
+def two() -> Iterator[Cores]:
+    cores = Cores(2)
+    yield cores
+    cores.close()
+
+
+def meeting() -> tuple[Callable[[], int], Callable[[], int]]:
+    """Two computations that only end if they run at once."""
+    barrier = threading.Barrier(2)
+
+    def half(number: int) -> Callable[[], int]:
+        def run() -> int:
+            barrier.wait(10.0)
+            return number
+
+        return run
+
+    return half(1), half(2)
+
+
+def threads_of(halves: int = 2) -> list[str]:
+    """Which threads run the halves."""
+    names: list[str] = []
+
+    def note() -> None:
+        names.append(threading.current_thread().name)
+
+    both(note, note)
+    assert len(names) == halves
+    return sorted(names)
+
+
+def test_halves_run_at_once_where_a_core_is_free(two: Cores) -> None:
+    with two.lent():
+        assert both(*meeting()) == (1, 2)
+        assert both(lambda: both(lambda: 1, lambda: 2), lambda: 3) == ((1, 2), 3)
+
+
+def test_halves_run_in_turn_without_a_free_core(two: Cores) -> None:
+    own = threading.current_thread().name
+    assert threads_of() == [own, own]  # not lent
+    with two.lent():
+        assert threads_of() != [own, own]
+        with two.lent():  # as by another query
+            assert threads_of() == [own, own]
+        assert threads_of() != [own, own]  # given back
+    assert threads_of() == [own, own]
+    alone = Cores(1)
+    with alone.lent():
+        assert threads_of() == [own, own]
+    alone.close()
+
+
+def test_a_half_takes_no_core_of_its_own_half(two: Cores) -> None:
+    """What a half calls runs in turn: it has one core, and the other half the other."""
+    inner: list[tuple[str, list[str]]] = []
+    barrier = threading.Barrier(2)
+
+    def half() -> None:
+        barrier.wait(10.0)
+        inner.append((threading.current_thread().name, threads_of()))
+        barrier.wait(10.0)
+
+    with two.lent():
+        both(half, half)
+    assert len(inner) == 2
+    assert all(names == [own, own] for own, names in inner)
+
+
+@pytest.mark.parametrize("lent", [True, False])
+def test_what_a_half_raises_is_raised_and_the_core_is_free_again(two: Cores, lent: bool) -> None:
+    def fail(why: str) -> Callable[[], int]:
+        def run() -> int:
+            raise ValueError(why)
+
+        return run
+
+    def ask(first: Callable[[], int], second: Callable[[], int]) -> tuple[int, int]:
+        if not lent:
+            return both(first, second)
+        with two.lent():
+            return both(first, second)
+
+    with pytest.raises(ValueError, match="first"):
+        ask(fail("first"), lambda: 2)
+    with pytest.raises(ValueError, match="second"):
+        ask(lambda: 1, fail("second"))
+    with pytest.raises(ValueError, match="first"):
+        ask(fail("first"), fail("second"))
+    with two.lent():
+        assert both(*meeting()) == (1, 2)
