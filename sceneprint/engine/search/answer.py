@@ -152,14 +152,15 @@ def _placed(
     ]
     rows = {number: row for one in attempts for number, row in one.rows.items()}
     geometries = {n: g for one in attempts for n, g in one.tried.geometries.items()}
-    searched = attempts[-1].searched
-    return placed(store, searched, geometries, rows, frames, prior, p, query.validation)
+    return placed(
+        store, attempts[-1].searched, geometries, rows, frames, prior, p, query.validation
+    )  # fmt: skip
 
 
 def _searched(
     store: Store, attempt: _Attempt, query: Query, deadline: Deadline, p: ValidationParameters
 ) -> _Attempt:
-    """An attempt whose guided matches are searched for, or itself where it has none."""
+    """An attempt whose guided matches are searched for; itself where it has none, or time is up."""
     known, asked = searched(attempt.matches), attempt.asked
     if known is None:
         return attempt
@@ -167,6 +168,8 @@ def _searched(
         store, attempt.searched, attempt.tried.chosen, asked.geometry, query, deadline, p,
         asked.up, known,
     )  # fmt: skip
+    if tried.late:
+        return attempt
     matches = [one for one in tried.matches if one.index in attempt.rows]
     return replace(attempt, tried=tried, matches=matches)
 
