@@ -1,0 +1,74 @@
+"""What depends on one frame is worked out once, and forgotten with the frame."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from dataclasses import replace
+
+import numpy as np
+
+from sceneprint.geometry.frame_cache import cached_per_frame
+from sceneprint.geometry.validation.ambiguity import AmbiguityParameters, symmetries
+from sceneprint.geometry.validation.overlap import (
+    OverlapParameters,
+    PlaneParameters,
+    looked_up,
+    plane_view,
+    sampled,
+)
+from sceneprint.pipeline import open_signer, prepare
+from sceneprint.types import DepthFrame
+
+
+class Frame:
+    """Anything that a weak reference can be had of."""
+
+
+def test_a_frame_is_worked_out_once_for_each_of_the_other_arguments() -> None:
+    calls: list[tuple[int, int]] = []
+
+    @cached_per_frame
+    def squared(frame: Frame, n: int, *, less: int = 0) -> list[int]:
+        calls.append((n, less))
+        return [n * n - less]
+
+    one, other = Frame(), Frame()
+    assert squared(one, 3) is squared(one, 3)
+    assert squared(one, 4) == [16]
+    assert squared(one, 3, less=1) == [8]
+    assert squared(other, 3) == [9]
+    assert squared(other, 3) is not squared(one, 3)
+    assert calls == [(3, 0), (4, 0), (3, 1), (3, 0)]
+    assert squared.__name__ == "squared"
+    gone = weakref.ref(one)
+    del one
+    gc.collect()
+    assert gone() is None
+
+
+def test_nothing_of_a_frame_is_kept_when_it_is_gone(room_frames: tuple[DepthFrame, ...]) -> None:
+    """No result may hold the frame that it is kept with."""
+    geometry = prepare(room_frames[0], open_signer("depth"))[1]
+    made = (
+        sampled(geometry.surface, 5),
+        looked_up(geometry.surface, OverlapParameters()).points,
+        plane_view(geometry, PlaneParameters()).weights,
+        symmetries(geometry.patches, AmbiguityParameters()),
+    )
+    again = replace(geometry, surface=replace(geometry.surface), patches=replace(geometry.patches))
+    for one, other in zip(
+        made,
+        (
+            sampled(again.surface, 5),
+            looked_up(again.surface, OverlapParameters()).points,
+            plane_view(again, PlaneParameters()).weights,
+            symmetries(again.patches, AmbiguityParameters()),
+        ),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one, other)
+    parts = [weakref.ref(one) for one in (geometry, geometry.surface, geometry.patches)]
+    del geometry, one, other
+    gc.collect()
+    assert [part() for part in parts] == [None, None, None]
