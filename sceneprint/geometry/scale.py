@@ -22,7 +22,6 @@ from sceneprint.geometry.validation.overlap import OverlapParameters, PlaneParam
 from sceneprint.geometry.validation.patch_descriptors import PatchDescriptorParameters
 from sceneprint.geometry.validation.plan_search import PlanParameters
 from sceneprint.geometry.validation.sequence_alignment import SequenceParameters
-from sceneprint.geometry.validation.validation import ValidationParameters
 
 T = TypeVar("T")
 
@@ -55,7 +54,6 @@ POWERS: dict[type, dict[str, int]] = {
     CovarianceParameters: {"least_square": 2, "most": 1, "lever": 1},
     PlaneParameters: {"same_plane": 1},
     PlanParameters: {"cell": 1, "voxel": 1, "height_step": 1, "height_range": 1},
-    ValidationParameters: {"guided_m": 1},
     RefinementParameters: {
         "first_gate": 1,
         "last_gate": 1,

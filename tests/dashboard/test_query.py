@@ -203,9 +203,9 @@ def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
     def told(**change: object) -> tuple[list[str], str, str]:
         pose = {"parent_frame": "hall", "translation": {"x": 1, "y": 2, "z": 0.5}}
         location = {
-            "map": "house", "pose": pose, "support": 3, "votes": 3, "strength": "strong",
-            "verified_by": "matches", "rival_ratio": 0.42, "spread_m": 0.02, "spread_deg": 0.5,
-            "uncertainty": None, **change,
+            "map": "house", "pose": pose, "support": 3, "guided": 0, "votes": 3,
+            "strength": "strong", "verified_by": "matches", "rival_ratio": 0.42,
+            "spread_m": 0.02, "spread_deg": 0.5, "uncertainty": None, **change,
         }  # fmt: skip
         answer = {
             "status": "found", "reason": "3 of 3", "cause": None, "matches": [], "counts": {},
@@ -227,8 +227,14 @@ def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
         [*lone, "no other place fits"], "warn", "Found"
     )  # fmt: skip
     assert told(support=0, votes=0, verified_by="map", strength="weak")[:2] == (
-        ["confirmed by the map’s frames", "no accepted match", near], "good"
+        ["confirmed by the map’s frames", "no accepted match", near], "warn"
     )  # fmt: skip
+    assert told(verified_by="map")[1] == "good"
+    followed = "5 of 5 accepted matches vote for this pose, 3 of them guided by the others, within"
+    for guided, kind in ((3, "good"), (4, "warn")):  # what was guided confirms nothing
+        details, shown_as, _ = told(support=5, votes=5, guided=guided)
+        assert details[0].startswith(followed.replace("3", str(guided)))
+        assert shown_as == kind
     assert told(support=1, votes=1, verified_by="prior", strength="weak", rival_ratio=None)[:2] == (
         ["several poses fit, and the prior decided", "one view", "weak match",
          "not compared with other places"], "warn"

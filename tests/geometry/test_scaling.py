@@ -47,7 +47,7 @@ BARE = {
     "SequenceParameters": {"angle_scale", "gap_cost", "swap_cost"},
     "OverlapParameters": {"normal_cosine"},
     "CovarianceParameters": {"independent", "free"},
-    "ValidationParameters": {"guided_rad"},
+    "ValidationParameters": {"guided_m", "guided_rad"},  # how far the poses of a map drift
 }  # fmt: skip
 
 
