@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -44,6 +45,8 @@ def test_events_are_followed_line_by_line(service_url: str) -> None:
         process = subprocess.Popen(
             [*command, "--after", newest, "--kind", "map.", "--json"],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            # shells start what they run in the background with the signal ignored
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )  # fmt: skip
         assert process.stdout is not None
         assert process.stderr is not None
@@ -52,7 +55,7 @@ def test_events_are_followed_line_by_line(service_url: str) -> None:
                 client.create_map(name, model="depth")
                 assert json.loads(process.stdout.readline())["map"] == name
         finally:
-            process.send_signal(2)
+            process.send_signal(signal.SIGINT)
             process.wait(30)
         assert (process.returncode, process.stderr.read()) == (130, "sceneprint events: stopped\n")
         process.stdout.close()
