@@ -309,7 +309,8 @@ def validate_guided(
     metres, radians = difference(found.T_match_query, T_match_query)
     if metres > p.guided_m or radians > p.guided_rad:
         return None
-    return replace(found, predicted=T_match_query)
+    reason = "surfaces agree where other matches place the query"
+    return replace(found, reason=reason, predicted=T_match_query)
 
 
 def validate_without_up(

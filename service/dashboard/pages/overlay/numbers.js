@@ -46,7 +46,7 @@ export function evidenceCard(details) {
     ["Violations", v.free_space_violations === null ? "–" : percent(v.free_space_violations),
       v.free_space_violations === null ? "free space is unknown without a viewpoint" : "of these and the inliers: the other sensor saw through them"],
     ["Residual", residual, "query to match and back, each refined alone"],
-    v.ambiguity === 0 && v.status !== "accepted" ? ["Ambiguity", "–", "rivals are searched only if everything else agrees"]
+    v.search === "guided" ? ["Ambiguity", "–", "rivals are not searched: the map’s frames decide"] : v.ambiguity === 0 && v.status !== "accepted" ? ["Ambiguity", "–", "rivals are searched only if everything else agrees"]
       : ["Ambiguity", percent(v.ambiguity), "of both frames is explained by the best rival"],
     ["Found by", { plans: "plans", correspondences: "patches", guided: "other matches" }[v.search] ?? "–",
       v.search === "guided" ? "and the map’s poses, then refined and checked: no vote of its own" : v.directions?.length === 1 ? "in one direction only" : "in both directions"],

@@ -159,8 +159,8 @@ export function figures(validation) {
     ["Plane overlap", percent(planes)],
     ["Inliers", count(inliers)],
     ["Violations", through === null ? "unknown" : percent(through)],
-    // rivals are looked for only where nothing else speaks against it
-    ["Ambiguity", ambiguity === 0 && validation.status !== "accepted" ? "–" : percent(ambiguity)],
+    // rivals are looked for only where nothing else speaks against it, and not of a guided match
+    ["Ambiguity", ambiguity === 0 && (validation.status !== "accepted" || validation.search === "guided") ? "–" : percent(ambiguity)],
     ...(tilt === null || tilt === undefined ? [] : [/** @type {[string, string]} */ (["Tilt", degrees(tilt)])]),
   ];
 }
