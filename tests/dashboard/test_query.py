@@ -216,7 +216,7 @@ def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
         return one["details"], one["kind"], one["title"]
 
     near = "the next best place fits 42 % as well"
-    firm = "3 of 3 accepted matches vote for this pose, within 20 mm, 0.5°"
+    firm = "3 of 3 accepted matches agree on this pose, within 20 mm, 0.5°"
     assert told() == ([firm, "strong matches", near], "good", "Found")
     apart = firm.replace("of 3", "of 5")
     assert told(votes=5) == (
@@ -230,7 +230,7 @@ def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
         ["confirmed by the map’s frames", "no accepted match", near], "warn"
     )  # fmt: skip
     assert told(verified_by="map")[1] == "good"
-    followed = "5 of 5 accepted matches vote for this pose, 3 of them guided by the others, within"
+    followed = "5 of 5 accepted matches agree on this pose, 3 of them guided by the others, within"
     for guided, kind in ((3, "good"), (4, "warn")):  # what was guided confirms nothing
         details, shown_as, _ = told(support=5, votes=5, guided=guided)
         assert details[0].startswith(followed.replace("3", str(guided)))

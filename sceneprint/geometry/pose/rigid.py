@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Floats
@@ -54,6 +55,14 @@ def difference(a: Floats, b: Floats) -> tuple[float, float]:
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), rotation_angle(a[:3, :3] @ b[:3, :3].T)
 
 
+def are_near(transforms: Floats, T: Floats, metres: float, radians: float) -> NDArray[np.bool_]:
+    """Which of some transforms (n, 4, 4) are no farther than that from T in both, (n,)."""
+    apart = np.linalg.norm(transforms[:, :3, 3] - T[:3, 3], axis=1)
+    cosines = (np.einsum("nij,ij->n", transforms[:, :3, :3], T[:3, :3]) - 1.0) / 2.0
+    found: NDArray[np.bool_] = (apart <= metres) & (cosines >= math.cos(radians))
+    return found
+
+
 def distinct(
     transforms: Floats, scores: Floats, metres: float, radians: float, most: int
 ) -> list[int]:
@@ -71,10 +80,7 @@ def distinct(
     while left.any() and len(chosen) < most:
         best = int(order[np.argmax(left[order])])
         chosen.append(best)
-        T = transforms[best]
-        apart = np.linalg.norm(transforms[:, :3, 3] - T[:3, 3], axis=1)
-        cosines = (np.einsum("nij,ij->n", transforms[:, :3, :3], T[:3, :3]) - 1) / 2
-        left &= (apart > metres) | (cosines < math.cos(radians))
+        left &= ~are_near(transforms, transforms[best], metres, radians)
         left[best] = False
     return chosen
 

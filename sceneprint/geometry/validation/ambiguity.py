@@ -23,7 +23,7 @@ import numpy as np
 
 from sceneprint.geometry.frame_cache import cached_per_frame
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.pose.rigid import distinct
+from sceneprint.geometry.pose.rigid import are_near, distinct
 from sceneprint.geometry.validation.gravity import NO_UPS, Ups, are_level
 from sceneprint.geometry.validation.icp import COARSE, QUICK, RefinementParameters, refined_all
 from sceneprint.geometry.validation.overlap import (
@@ -155,10 +155,7 @@ def _turn(axis: Floats, middle: Floats, quarters: int) -> Floats:
 
 def far_from(T: Floats, others: Floats, p: AmbiguityParameters) -> Floats:
     """Those of the others (n, 4, 4) that differ from T enough to be another answer."""
-    metres = np.linalg.norm(others[:, :3, 3] - T[:3, 3], axis=1)
-    cosines = (np.einsum("nij,ij->n", others[:, :3, :3], T[:3, :3]) - 1.0) / 2.0
-    far: Floats = others[(metres > p.rival_m) | (cosines < math.cos(p.rival_rad))]
-    return far
+    return others[~are_near(others, T, p.rival_m, p.rival_rad)]
 
 
 class Rival(NamedTuple):

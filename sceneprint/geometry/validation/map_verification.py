@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.pose.average import average_poses
-from sceneprint.geometry.pose.rigid import difference, distinct, inverse
+from sceneprint.geometry.pose.rigid import are_near, distinct, inverse
 from sceneprint.geometry.validation.icp import COARSE, RefinementParameters
 from sceneprint.geometry.validation.overlap import (
     AGREES,
@@ -360,16 +360,12 @@ def best_of_places(scored: list[ScoredPose], p: MapParameters) -> list[ScoredPos
 
 def same_place(a: Floats, b: Floats, p: MapParameters) -> bool:
     """Whether two poses (4, 4) are one answer."""
-    metres, radians = difference(a, b)
-    return metres <= p.place_m and radians <= p.place_rad
+    return bool(at_place(a[None], b, p)[0])
 
 
 def at_place(poses: Floats, T: Floats, p: MapParameters) -> NDArray[np.bool_]:
     """Which of some poses (n, 4, 4) are one answer with T: (n,)."""
-    metres = np.linalg.norm(poses[:, :3, 3] - T[:3, 3], axis=1)
-    cosines = (np.einsum("nij,ij->n", poses[:, :3, :3], T[:3, :3]) - 1.0) / 2.0
-    near: NDArray[np.bool_] = (metres <= p.place_m) & (cosines >= math.cos(p.place_rad))
-    return near
+    return are_near(poses, T, p.place_m, p.place_rad)
 
 
 def different_views(viewpoints: Floats, p: MapParameters) -> list[int]:

@@ -56,14 +56,12 @@ class ScanPlan:
 
     Parameters
     ----------
-    parameters : it was drawn with
     R : (3, 3) R_level_sensor: rows are two level axes, then up
     points, normals : (N, 3) float32 each, one per voxel, along the level axes
     azimuths : (n_yaws,) how much upright surface faces each way
     heights : (2, n) how much surface that faces up, and down, is at each height
     """
 
-    parameters: PlanParameters
     R: Floats
     points: Floats32
     normals: Floats32
@@ -157,7 +155,7 @@ def plan_of(
     R = np.stack([level, np.cross(up, level), up])
     where, facing = where @ R.T, facing @ R.T
     return ScanPlan(
-        p, R, where.astype(np.float32), facing.astype(np.float32),
+        R, where.astype(np.float32), facing.astype(np.float32),
         _azimuths(facing, p.n_yaws), _heights(where, facing, p),
     )  # fmt: skip
 

@@ -243,10 +243,7 @@ def validate(
             "apart",
             seed, query, match, ups,
         )  # fmt: skip
-    a, b = (
-        samples_of(one, p.agreement.stride, p.rivals.planes, up)
-        for one, up in zip((query, match), ups, strict=True)
-    )
+    a, b = _samples(query, match, ups, p)
     numbers = p.alignment, p.agreement, matching
     there: Alignment | None
     back: Alignment | None
@@ -265,6 +262,13 @@ def validate(
             why += " without tilting against `up`"
         return _nothing(why, seed, query, match, ups)
     return _decided(a, b, there, back, seed, p, mode)
+
+
+def _samples(
+    query: Geometry, match: Geometry, ups: Ups, p: ValidationParameters
+) -> tuple[FrameSamples, FrameSamples]:
+    stride, planes = p.agreement.stride, p.rivals.planes
+    return samples_of(query, stride, planes, ups[0]), samples_of(match, stride, planes, ups[1])
 
 
 def validate_guided(
@@ -293,10 +297,7 @@ def validate_guided(
     p = p or ValidationParameters()
     if min(len(query.patches), len(match.patches)) < p.minimum_patches:
         return None
-    a, b = (
-        samples_of(one, p.agreement.stride, p.rivals.planes, up)
-        for one, up in zip((query, match), ups, strict=True)
-    )
+    a, b = _samples(query, match, ups, p)
     there, back = both(
         lambda: align_guided(a, b, T_match_query, p.alignment),
         lambda: align_guided(b, a, inverse(T_match_query), p.alignment),

@@ -105,7 +105,7 @@ export function grounds({ support, guided, votes, strength, verified_by: by, spr
   if (by === "prior") told.push("several poses fit, and the prior decided");
   if (support === 0) told.push("no accepted match");
   else if (support === 1 && by === "matches") told.push("one view, unconfirmed");
-  else told.push(support === 1 ? "one view" : `${count(support)} of ${count(votes)} accepted matches vote for this pose${guided > 0 ? `, ${count(guided)} of them guided by the others` : ""}, within ${metres(shift)}, ${degrees(turn)}`);
+  else told.push(support === 1 ? "one view" : `${count(support)} of ${count(votes)} accepted matches agree on this pose${guided > 0 ? `, ${count(guided)} of them guided by the others` : ""}, within ${metres(shift)}, ${degrees(turn)}`);
   if (support > 0) told.push(`${strength} match${support === 1 ? "" : "es"}`);
   const apart = votes - support;
   if (apart > 0) told.push(`${count(apart)} accepted ${apart === 1 ? "match votes" : "matches vote"} for another pose`);
