@@ -281,3 +281,28 @@ def test_a_guided_match_is_labelled_and_had_again(
         assert match.transform is not None
         predicted, found = (np.array(T.matrix) for T in (match.predicted, match.transform))
         assert difference(predicted, found)[0] < 0.05
+
+
+def test_guided_matches_are_searched_for_where_the_answer_is_undecided(
+    empty: Engine, make_upload: Any, work_off: Callable[[Engine], list[Any]]
+) -> None:
+    """Two frames whose poses are 3 m off vote elsewhere, after others have guided the rest."""
+    path = synthesise_room(21, 0, 48, along_path=True).frames
+    for i in (6, 18, 0, 24, 21, 3, 29, 32):
+        frame, pose = path[i], path[i].pose
+        assert pose is not None
+        if i in (29, 32):
+            pose = pose.copy()
+            pose[0, 3] += 3.0
+        one = make_upload(replace(frame, pose=pose), "room")
+        empty.add_frame("hall", one.data, one.meta)
+    work_off(empty)
+    asking = make_upload(path[12], "room")
+    meta = asking.meta.model_copy(update={"pose": None})
+    answer = empty.query_upload("hall", asking.data, meta, Query(k=8, candidates=8))
+    assert answer.status == "ambiguous"
+    assert {one.validation.search for one in answer.matches} == {"correspondences"}
+    first, second = answer.alternatives[:2]
+    assert first.support > 2  # that many had guided the others, which vote now as well
+    assert difference(np.array(first.pose.matrix), asking.pose)[0] < 0.02
+    assert np.array(second.pose.matrix)[0, 3] - asking.pose[0, 3] == pytest.approx(3.0, abs=0.1)
