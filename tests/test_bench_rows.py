@@ -107,6 +107,7 @@ def test_pairs_by_hand() -> None:
     assert len(pairs_among([wall(), wall(), wall()], apart=2)) == 1
 
 
+@pytest.mark.thorough
 def test_pairs_of_rooms_and_of_no_recordings(tmp_path: Path) -> None:
     assert real_pairs(tmp_path, 5) == []
     (pair,) = synthetic_pairs(1)

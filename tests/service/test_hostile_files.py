@@ -68,6 +68,7 @@ def nearest(server, frame_id: str) -> dict[str, Any]:
     return dict(answer.json())
 
 
+@pytest.mark.thorough
 def test_an_index_that_is_damaged_changes_no_answer(folder, tmp_path, begin):
     """Each file of the newest generation while a service uses it, and at its next start."""
     with opened(folder, index_dir=tmp_path / "none") as engine:  # by the database alone
