@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import math
 import struct
-import zlib
 from typing import NoReturn
 
 import numpy as np
+from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidIntrinsics, UnreadableGeometry
@@ -275,7 +275,7 @@ def write_geometry(geometry: Geometry) -> bytes:
         ]
     )
     schema = SCHEMA_VERSION if isinstance(camera, Intrinsics) else CLOUD_SCHEMA
-    return _HEAD.pack(MAGIC, schema, zlib.crc32(body)) + body
+    return _HEAD.pack(MAGIC, schema, crc32(body)) + body
 
 
 def read_geometry(data: bytes) -> Geometry:
@@ -307,7 +307,7 @@ def read_geometry(data: bytes) -> Geometry:
     numbers = 5 if schema == CLOUD_SCHEMA and told[0] == _POINTS else 3
     arrays = [width * height * 2 * numbers, count * _PATCH.itemsize, count * length]
     ends = np.cumsum([layout.size, *arrays])
-    if len(body) != ends[-1] or zlib.crc32(body) != checksum:
+    if len(body) != ends[-1] or crc32(body) != checksum:
         _refuse("The geometry artifact is damaged: its checksum does not fit.")
     packed = np.frombuffer(body[ends[0] : ends[1]], "<u2").reshape(height, width, numbers)
     try:

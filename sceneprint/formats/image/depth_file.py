@@ -12,9 +12,11 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from isal import isal_zlib
+from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidIntrinsics, UnreadableFrame, UselessFrame, naming
@@ -99,7 +101,7 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
         if end + 4 > len(data):
             raise UnreadableFrame(_TRUNCATED)
         kind = data[position + 4 : position + 8]
-        if struct.unpack_from(">I", data, end)[0] != zlib.crc32(view[position + 4 : end]):
+        if struct.unpack_from(">I", data, end)[0] != crc32(view[position + 4 : end]):
             raise UnreadableFrame(
                 f"The PNG is damaged: the check sum of its {kind!r} chunk is wrong. "
                 "Copy or write the file again."
@@ -138,6 +140,10 @@ def _checked_header(content: memoryview) -> bytes:
     return bytes(content)
 
 
+#: Its stub declares an instance.
+_DAMAGED = cast(type[Exception], isal_zlib.error)
+
+
 def _inflate(pixels: bytes, header: bytes) -> bytes:
     """Return the filtered rows, exactly as many bytes as the header announces."""
     width, height, interlaced = *struct.unpack_from(">II", header), header[12]
@@ -147,10 +153,10 @@ def _inflate(pixels: bytes, header: bytes) -> bytes:
         columns, rows = -(-(width - column) // across), -(-(height - row) // down)
         if columns > 0 and rows > 0:  # an empty pass has no filter bytes either
             expected += rows * (1 + 2 * columns)
-    stream = zlib.decompressobj()
+    stream = isal_zlib.decompressobj()
     try:
         rows_bytes = stream.decompress(pixels, expected + 1)
-    except zlib.error as cause:
+    except _DAMAGED as cause:
         raise UnreadableFrame(
             f"The PNG is damaged: its pixels do not decompress ({cause}). Write it again."
         ) from cause
@@ -167,7 +173,7 @@ def _samples(header: bytes, rows: bytes) -> NDArray[np.uint16]:
     from PIL.PngImagePlugin import PngImageFile
 
     def chunk(kind: bytes, content: bytes) -> bytes:
-        check = zlib.crc32(content, zlib.crc32(kind))
+        check = crc32(content, crc32(kind))
         return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check)
 
     plain = PNG_SIGNATURE + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows, 0))
