@@ -31,9 +31,10 @@ from sceneprint.engine.search.query import Queries
 from sceneprint.engine.serializers import frame_records, map_record
 from sceneprint.engine.sessions.association_job import Associating
 from sceneprint.engine.sessions.associations import ASSOCIATE, AssociationJobs
-from sceneprint.engine.upkeep.deletion import Purging, Retention
+from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
-from sceneprint.engine.upkeep.repair import collect_deleted_blobs
+from sceneprint.engine.upkeep.purge import Purging
+from sceneprint.engine.upkeep.retention import Retention
 from sceneprint.errors import ModelError, StoreAway, UnusableStore
 from sceneprint.geometry.cores import Cores
 from sceneprint.models import Model
