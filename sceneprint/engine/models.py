@@ -10,9 +10,9 @@ import numpy as np
 
 from sceneprint.errors import FrameError
 from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.geometry.retrieval.distance import distances, pairwise_distances
 from sceneprint.geometry.validation.inspection import patches_at, residuals
-from sceneprint.geometry.validation.overlap import sampled
 from sceneprint.index import Tail, search
 from sceneprint.models import Model, parse_model
 from sceneprint.pipeline import Signer, open_signer, prepare, validate

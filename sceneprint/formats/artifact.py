@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidIntrinsics, UnreadableGeometry
 from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.registration.overlap import thinned
 from sceneprint.geometry.surface.camera import camera_of
 from sceneprint.geometry.surface.range_image import directions
-from sceneprint.geometry.validation.overlap import thinned
 from sceneprint.types import Bytes, Floats, Floats32, Geometry, Intrinsics, Patches, Sphere, Surface
 
 Packed = NDArray[np.uint16]

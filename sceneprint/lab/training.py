@@ -20,6 +20,7 @@ import numpy as np
 
 from sceneprint.errors import FrameError, TrainingError
 from sceneprint.formats.dataset import FrameReference
+from sceneprint.geometry.registration.patch_descriptors import fit_compression, patch_descriptors
 from sceneprint.geometry.retrieval.distance import Metric, pairwise_distances
 from sceneprint.geometry.scale import scaled
 from sceneprint.geometry.signature.fisher_vector import quantise
@@ -40,7 +41,6 @@ from sceneprint.geometry.signature.whitening import (
     whiten,
 )
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
-from sceneprint.geometry.validation.patch_descriptors import fit_compression, patch_descriptors
 from sceneprint.lab.synth import synthesise_room, synthesise_survey
 from sceneprint.models import Model, ModelParameters
 from sceneprint.signing import (

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.validation import overlap as module
-from sceneprint.geometry.validation.overlap import OverlapParameters, overlap_counts, sampled
+from sceneprint.geometry.registration import overlap as module
+from sceneprint.geometry.registration.overlap import OverlapParameters, overlap_counts, sampled
 from sceneprint.types import Floats, Floats32, Surface
 
 P = OverlapParameters()

@@ -6,9 +6,9 @@ from types import ModuleType
 
 import numpy as np
 
+from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.geometry.signature.segmentation import SegmentationParameters, patches_of, segment
 from sceneprint.geometry.validation.inspection import patches_at
-from sceneprint.geometry.validation.overlap import sampled
 from sceneprint.types import Floats, Patches
 
 

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from sceneprint.geometry.pose.average import average_poses
 from sceneprint.geometry.pose.rigid import inverse
-from sceneprint.geometry.validation.icp import (
+from sceneprint.geometry.registration.icp import (
     FINE,
     CovarianceParameters,
     Free,
@@ -26,7 +26,7 @@ from sceneprint.geometry.validation.icp import (
     refine,
     transported,
 )
-from sceneprint.geometry.validation.overlap import sampled
+from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.lab.synth import KINECT, KINECT_V1, take, trajectory
 from sceneprint.lab.synth.dataset import own_sensor, room_and_rng
 from sceneprint.models import Model, read_model

@@ -10,17 +10,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.pose.rigid import difference, inverse, inverses, moved
+from sceneprint.geometry.registration.overlap import (
+    OverlapParameters,
+    explained,
+    plane_view,
+    plane_weights,
+)
 from sceneprint.geometry.validation.ambiguity import (
     AmbiguityParameters,
     best_alternative,
     far_from,
     symmetries,
-)
-from sceneprint.geometry.validation.overlap import (
-    OverlapParameters,
-    explained,
-    plane_view,
-    plane_weights,
 )
 from sceneprint.lab.synth import KINECT, take
 from sceneprint.lab.synth.dataset import room_and_rng

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
-from sceneprint.geometry.validation.patch_descriptors import (
+from sceneprint.geometry.registration.patch_descriptors import (
     ANGLES,
     RANGE,
     Compression,

@@ -28,9 +28,10 @@ from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.points.ply_export import points_of, write_ply
 from sceneprint.formats.points.web import LIMIT, encode_points, thinned
 from sceneprint.geometry.pose.rigid import inverse, moved
+from sceneprint.geometry.registration.gravity import NO_UPS, Ups
+from sceneprint.geometry.registration.icp import PAIR_METHOD
+from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.geometry.retrieval.distance import pairwise_distances, similarity
-from sceneprint.geometry.validation.gravity import NO_UPS, Ups
-from sceneprint.geometry.validation.icp import PAIR_METHOD
 from sceneprint.geometry.validation.inspection import (
     AGREES,
     VIOLATES,
@@ -41,7 +42,6 @@ from sceneprint.geometry.validation.inspection import (
     residuals,
     trace,
 )
-from sceneprint.geometry.validation.overlap import sampled
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.pipeline import validate, validate_guided, validate_without_up
 from sceneprint.store import Store

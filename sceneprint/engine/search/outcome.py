@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.engine.search.verification import Validated
-from sceneprint.geometry.validation.overlap import PlaneParameters, plane_weights
+from sceneprint.geometry.registration.overlap import PlaneParameters, plane_weights
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.localization import PoseEstimate
 from sceneprint.matches import PairMatch

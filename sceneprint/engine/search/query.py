@@ -26,8 +26,8 @@ from sceneprint.engine.serializers import model_label, sensor_frame, transform
 from sceneprint.errors import Busy, InvalidRequest, ModelMismatch, SceneprintError, UnknownMap
 from sceneprint.geometry.cores import Cores
 from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.registration.icp import PAIR_METHOD
 from sceneprint.geometry.retrieval.distance import distances, similarity
-from sceneprint.geometry.validation.icp import PAIR_METHOD
 from sceneprint.models import PRESETS, read_model
 from sceneprint.pipeline import Signer, validate
 from sceneprint.store import Store

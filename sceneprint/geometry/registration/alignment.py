@@ -19,15 +19,14 @@ import numpy as np
 
 from sceneprint.geometry.frame_cache import cached_per_frame
 from sceneprint.geometry.pose.rigid import distinct, inverse, inverses
-from sceneprint.geometry.surface.camera import kind_of
-from sceneprint.geometry.validation.consensus import ConsensusParameters, consensus
-from sceneprint.geometry.validation.gravity import (
+from sceneprint.geometry.registration.consensus import ConsensusParameters, consensus
+from sceneprint.geometry.registration.gravity import (
     GravityParameters,
     Ups,
     are_level,
     slopes,
 )
-from sceneprint.geometry.validation.icp import (
+from sceneprint.geometry.registration.icp import (
     COARSE,
     FINE,
     Refined,
@@ -36,7 +35,7 @@ from sceneprint.geometry.validation.icp import (
     refined_all,
     refined_with_index,
 )
-from sceneprint.geometry.validation.overlap import (
+from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
     PlaneParameters,
     PlaneView,
@@ -45,23 +44,24 @@ from sceneprint.geometry.validation.overlap import (
     plane_view,
     sampled,
 )
-from sceneprint.geometry.validation.patch_descriptors import (
+from sceneprint.geometry.registration.patch_descriptors import (
     MatchingParameters,
     SlopeGate,
     correspondences,
 )
-from sceneprint.geometry.validation.plan_search import (
+from sceneprint.geometry.registration.plan_search import (
     PlanParameters,
     ScanPlan,
     other_plans,
     plan_hypotheses,
     plan_of,
 )
-from sceneprint.geometry.validation.sequence_alignment import (
+from sceneprint.geometry.registration.sequence_alignment import (
     Matching,
     SequenceParameters,
     sequence_correspondences,
 )
+from sceneprint.geometry.surface.camera import kind_of
 from sceneprint.types import Floats, Floats32, Geometry, Ints32, Sphere, Surface
 
 #: What proposed a transform: patches alike, plans laid on each other, or the map's poses.

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.validation.plan_search import up_of
+from sceneprint.geometry.registration.plan_search import up_of
 from sceneprint.types import Floats, Geometry
 
 #: Unit vectors (3,), up in the coordinates of source and target; None where it is not known.

@@ -1,4 +1,4 @@
-"""Sec. III-E, refinement: a transform to the one near it that lays two surfaces together.
+"""Sec. III-E, refinement: point-to-plane ICP, from a transform to the best one near it.
 
     points of the source, surface of the target, T  --refine-->  T, information
 
@@ -18,8 +18,8 @@ import numpy as np
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.pose.average import PoseAverage
 from sceneprint.geometry.pose.rigid import rotation_angle, solve_positive, turned
+from sceneprint.geometry.registration.overlap import LookupTarget, nearest_alike, sampled, target_of
 from sceneprint.geometry.surface.camera import PINHOLE, depth_at, depth_of, grown, kind_of, project
-from sceneprint.geometry.validation.overlap import LookupTarget, nearest_alike, sampled, target_of
 from sceneprint.types import Floats, Floats32, Ints32, Surface
 
 

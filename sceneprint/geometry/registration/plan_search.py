@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.pose.rigid import distinct
-from sceneprint.geometry.validation.overlap import one_of_each
+from sceneprint.geometry.registration.overlap import one_of_each
 from sceneprint.types import Floats, Floats32, Ints32, Sphere, Surface
 
 #: Normals this near a candidate speak for it as up; twice as much as one across it.
