@@ -33,11 +33,11 @@ from sceneprint_client.api.reconstructions import NewReconstruction
 from sceneprint_client.api.sessions import NewAssociation
 from service import dashboard, problems
 from service.context import Context, Gate
-from service.events import Feed
+from service.event_stream import Feed
 from service.guards import origins_of
-from service.limits import Limits
 from service.metrics import Metrics, housekeeping
 from service.middleware import RequestMiddleware
+from service.rate_limits import Limits
 from service.routes import (
     admin,
     frame_data,

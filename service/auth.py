@@ -24,7 +24,7 @@ from sceneprint.store.queue import unknown_job
 from sceneprint_client.api import Job
 from sceneprint_client.api.admin import EVERY, Scope, allows
 from service.context import Here
-from service.limits import Limit, place_of
+from service.rate_limits import Limit, place_of
 
 _bearer = HTTPBearer(auto_error=False, description="A key made by `sceneprint keys`.")
 

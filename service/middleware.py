@@ -28,9 +28,9 @@ from service.guards import (
     stranger,
     too_large,
 )
-from service.limits import RateState
 from service.metrics import Metrics
 from service.problems import problem, status_of
+from service.rate_limits import RateState
 
 log = logging.getLogger(__name__)
 

@@ -37,7 +37,7 @@ from sceneprint.fusion import BAND, FusionParameters, fuse, within
 from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.surface.coverage import added_areas, observed_volume, of_views, share_seen
 from sceneprint.geometry.surface.depth_image import doubled
-from sceneprint.libraries import open3d
+from sceneprint.open3d_loader import open3d
 from sceneprint.rendering import PALETTE, reconstruction_picture
 from sceneprint.store import Store, queue
 from sceneprint.store.frames import find_frame

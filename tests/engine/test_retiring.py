@@ -7,7 +7,7 @@ import time
 import pytest
 from sqlalchemy import select, text, update
 
-from sceneprint.engine.maps.maps import edit_map
+from sceneprint.engine.maps.map_lifecycle import edit_map
 from sceneprint.engine.upkeep import retention
 from sceneprint.engine.upkeep.retention import Retention
 from sceneprint.errors import InvalidRequest, StoreLocked

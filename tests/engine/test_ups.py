@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.engine.maps.maps import edit_frame, edit_map
+from sceneprint.engine.maps.map_lifecycle import edit_frame, edit_map
 from sceneprint.engine.results.stored_results import read, written
-from sceneprint.engine.search.gravity import known_ups
 from sceneprint.engine.search.query import localization_of
+from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.serializers import EDITABLE, frame_tag, map_tag, tag_of
 from sceneprint.errors import FrameConflict, InvalidRequest, MapExists
 from sceneprint.store.frames import find_frame

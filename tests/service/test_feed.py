@@ -11,8 +11,8 @@ import pytest
 from sceneprint.errors import Busy
 from sceneprint.store import Database, open_store
 from sceneprint.store.events import EventRow, Wanted, record_event, remove_events
-from service import events as feeds
-from service.events import Feed
+from service import event_stream as feeds
+from service.event_stream import Feed
 
 Batch = tuple[list[EventRow], int]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.limits import Limit, RateState, place_of
+from service.rate_limits import Limit, RateState, place_of
 
 
 class Clock:

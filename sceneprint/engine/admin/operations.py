@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sceneprint.engine.admin.statistics import Statistics, anchors
-from sceneprint.engine.maps.maps import Catalogue
+from sceneprint.engine.maps.model_catalogue import Catalogue
 from sceneprint.engine.serializers import when
 from sceneprint.errors import InvalidRequest, SceneprintError
 from sceneprint.settings import Settings

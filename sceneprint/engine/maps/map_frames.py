@@ -17,8 +17,8 @@ import numpy as np
 
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_stored
-from sceneprint.engine.models import Signers
 from sceneprint.engine.serializers import frame_records, model_label, sensor_of, tag_of, when
+from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.dataset import trajectory_row, trajectory_text

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from sceneprint.engine.results.inspection import check_geometry
+from sceneprint.engine.results.result_views import check_geometry
 from sceneprint.engine.results.stored_results import StoredResult, StoredResults
 from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, PreparedQuery, check_taken

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
-from sceneprint.engine.models import Signers
-from sceneprint.engine.search.gravity import known_ups
 from sceneprint.engine.search.local_index import Readers
 from sceneprint.engine.search.map_view import MapView
+from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import transform
 from sceneprint.engine.sessions.associations import Plan, eligible, runs_of
+from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
 from sceneprint.formats.artifact import read_geometry

@@ -18,8 +18,8 @@ from sceneprint.store import Store
 from sceneprint.store.blobs.folder import Condition
 from sceneprint.store.frames import find_frame, frames_of, renew_upload
 from sceneprint.store.maps import find_map
-from sceneprint.store.model_switch import REENCODE
 from sceneprint.store.queue import enqueue, last_of
+from sceneprint.store.reencoding_rows import REENCODE
 from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import MapRow
 from sceneprint_client.api import FrameState

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Literal
 
 from sceneprint.errors import DamagedBlob, SnapshotError, UnusableStore
-from sceneprint.maintenance.fsck.repair import opened_blobs
+from sceneprint.maintenance.fsck.repair_actions import opened_blobs
 from sceneprint.maintenance.snapshot import database_copy
 from sceneprint.maintenance.snapshot.files import check_room, full_disk_explained, put_new, staging
 from sceneprint.maintenance.snapshot.format import (

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from sceneprint.errors import UselessFrame
-from sceneprint.libraries import open3d
+from sceneprint.open3d_loader import open3d
 from sceneprint.types import AnyFrame, Cloud, Floats, Floats32
 
 #: Voxel of the points, reach of normals and of features, metres, for a sensor of RANGE metres;

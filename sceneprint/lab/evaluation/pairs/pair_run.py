@@ -51,8 +51,8 @@ from sceneprint.lab.evaluation.protocol import (
     view_of,
 )
 from sceneprint.lab.evaluation.run import OFF_PLANE, PLANAR, overlaps_of, plane_share
-from sceneprint.libraries import open3d
 from sceneprint.models import Model, ModelParameters
+from sceneprint.open3d_loader import open3d
 from sceneprint.pipeline import Signer, geometry_of
 from sceneprint.signing import see
 from sceneprint.types import AnyFrame, Cloud, DepthFrame, Floats, Geometry

@@ -1,6 +1,6 @@
 """What came of a query: its status, why, and where nothing was found, the likeliest cause.
 
-PoseEstimate, matches, counts  --outcome_of-->  Outcome
+PoseEstimate, matches, counts  --answer_status-->  Outcome
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Outcome:
     cause: Cause | None = None
 
 
-def outcome_of(
+def answer_status(
     query: Query, estimate: PoseEstimate | None, tried: Validated, matches: Sequence[PairMatch],
     counts: Counts, geometry: Geometry | None, p: ValidationParameters, *, posed: bool,
 ) -> Outcome:  # fmt: skip

@@ -1,6 +1,6 @@
 """Changing a map's model: its frames are signed again from their uploads, then the map switches.
 
-    begin  -->  jobs  --workers-->  a second signature of each frame  --Reencoding.run-->  switch
+    begin  -->  jobs  --workers-->  a second signature of each frame  --Reencodings.run-->  switch
 
 Queries go on with the model that the map has. The switch is one commit, made when no frame lacks
 the next model's signature; whoever is killed in between leaves what the next one goes on with.
@@ -23,7 +23,7 @@ from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.index import Generation
 from sceneprint.models import Model, read_model, write_model
 from sceneprint.store import Store, signatures
-from sceneprint.store import model_switch as stored
+from sceneprint.store import reencoding_rows as stored
 from sceneprint.store.maps import find_map, keep_model, list_maps, model_names
 from sceneprint.store.queue import cancel_jobs
 from sceneprint.store.tables import MapRow, jobs
@@ -94,7 +94,7 @@ def cancel(store: Store, map_name: str) -> Map:
         return map_record(connection, find_map(connection, map_name))
 
 
-class ModelSwitches:
+class Reencodings:
     """Brings maps on to their next models, and removes what the former left.
 
     Parameters

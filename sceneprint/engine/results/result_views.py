@@ -17,12 +17,12 @@ import numpy as np
 
 from sceneprint import errors
 from sceneprint.engine.maps.map_frames import FORM, Output, find_indexed, geometry_of, placed
-from sceneprint.engine.models import Signers
 from sceneprint.engine.results.stored_results import StoredResult, StoredResults
-from sceneprint.engine.search.gravity import known_ups
 from sceneprint.engine.search.response import uncertainty_record, validation_record
+from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import query_sensor, sensor_of, tag_of, transform
+from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.points.ply_export import points_of, write_ply

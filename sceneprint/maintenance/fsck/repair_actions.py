@@ -17,8 +17,8 @@ from sceneprint.store import Blobs, Database, FolderBlobs, open_blobs
 from sceneprint.store.database import reach_database
 from sceneprint.store.events import record_event
 from sceneprint.store.maps import map_of, next_revision
-from sceneprint.store.model_switch import REENCODE
 from sceneprint.store.queue import enqueue
+from sceneprint.store.reencoding_rows import REENCODE
 from sceneprint.store.tables import frames
 from sceneprint_client.api import FrameState
 
