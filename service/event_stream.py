@@ -26,7 +26,7 @@ from sceneprint.errors import Busy, SceneprintError
 from sceneprint.store import Database
 from sceneprint.store.events import EventRow, Wanted, list_events, newest_number
 from sceneprint_client.api.admin import Event
-from service.guards import Broken
+from service.body_limits import Broken
 
 log = logging.getLogger(__name__)
 

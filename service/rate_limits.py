@@ -1,4 +1,4 @@
-"""How often a caller may ask.
+"""Rate limits: how often a caller may ask; beyond, 429.
 
 A bucket of tokens for each: every request takes one, and they come back at a steady rate. A full
 bucket and no bucket are the same, so that those not seen for long may be forgotten.
@@ -13,6 +13,10 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
+
+from starlette.requests import Request
+
+from sceneprint.errors import RateLimited
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,8 @@ class RateState:
         ]
 
 
-class Limit:
-    """The buckets of all callers; may be asked by several threads.
+class TokenBucket:
+    """A bucket of tokens for each caller; may be used by several threads.
 
     Parameters
     ----------
@@ -96,7 +100,7 @@ class Limit:
         return len(self._buckets)
 
 
-class Limits:
+class RateLimits:
     """What callers of one service are held to.
 
     Parameters
@@ -106,11 +110,23 @@ class Limits:
     """
 
     def __init__(self, requests_per_s: float, failed_per_minute: float) -> None:
-        self.requests = Limit("requests", requests_per_s, requests_per_s * 5)
-        self.failed_keys = Limit("wrong-keys", failed_per_minute / 60, failed_per_minute)
+        self.requests = TokenBucket("requests", requests_per_s, requests_per_s * 5)
+        self.failed_keys = TokenBucket("wrong-keys", failed_per_minute / 60, failed_per_minute)
 
 
-def place_of(address: str) -> str:
+def enforce_rate_limit(request: Request, bucket: TokenBucket, whose: str) -> None:
+    """Count a request, before its body is read; RateLimited where there are too many."""
+    state = bucket.take(whose)
+    request.state.rate = state
+    if state is not None and not state.allowed:
+        raise RateLimited(
+            f"Too many {bucket.what}: {state.quota} at once and then "
+            f"{state.quota / state.window_s:g} a second are allowed. Retry in "
+            f"{state.wait_s} s."
+        )
+
+
+def network_of(address: str) -> str:
     """Whose an address is: of IPv6, whoever has one has the 2^64 of its network."""
     try:
         found = ipaddress.ip_address(address.partition("%")[0])

@@ -1,4 +1,4 @@
-"""Models made ready to sign, each once a process."""
+"""Signers, cached: each model is made ready to sign once a process."""
 
 from __future__ import annotations
 

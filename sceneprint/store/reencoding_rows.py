@@ -1,4 +1,4 @@
-"""A map that is being signed with another model: what lacks it, what is queued, and the switch.
+"""Rows of a re-encoding: which frames lack the next model, which are queued, and the switch.
 
 Until the switch every frame keeps the signature that is searched; each gets a second one beside
 it. What was made for a model that a map no longer has, or never came to have, is removed in blocks.

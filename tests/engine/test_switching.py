@@ -363,13 +363,7 @@ while True:
     [
         ("sceneprint.engine.jobs.signature_job", "replace_signature", 5, "after", False),
         ("sceneprint.engine.upkeep.index_upkeep", "publish", 1, "after", False),
-        (
-            "sceneprint.store.reencoding_rows",
-            "switch_model",
-            1,
-            "after",
-            False,
-        ),  # and not committed
+        ("sceneprint.store.reencoding_rows", "switch_model", 1, "after", False),  # not committed
         ("sceneprint.store.signatures", "remove_signature", 4, "after", True),
     ],
 )

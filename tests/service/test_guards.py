@@ -12,7 +12,7 @@ import pytest
 
 from sceneprint.errors import InvalidRequest
 from sceneprint.settings import Settings
-from service.guards import origins_of
+from service.browser_security import origins_of
 
 FLEET = "https://fleet.example"
 NOTHING = "default-src 'none'; frame-ancestors 'none'"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.rate_limits import Limit, RateState, place_of
+from service.rate_limits import RateState, TokenBucket, network_of
 
 
 class Clock:
@@ -17,7 +17,7 @@ class Clock:
 
 def test_a_rested_caller_may_ask_at_once_and_then_at_the_rate():
     clock = Clock()
-    limit = Limit("key", per_s=2.0, burst=3, clock=clock)
+    limit = TokenBucket("key", per_s=2.0, burst=3, clock=clock)
     told = [limit.take("a") for _ in range(4)]
     assert [one.allowed for one in told] == [True, True, True, False]
     assert [one.left for one in told] == [2, 1, 0, 0]
@@ -31,7 +31,7 @@ def test_a_rested_caller_may_ask_at_once_and_then_at_the_rate():
 def test_who_is_refused_pays_nothing_for_it():
     """Else a caller that does not wait would never be let in again."""
     clock = Clock()
-    limit = Limit("key", per_s=1.0, burst=1, clock=clock)
+    limit = TokenBucket("key", per_s=1.0, burst=1, clock=clock)
     assert limit.take("a").allowed
     for _ in range(9):
         clock.now += 0.1
@@ -42,7 +42,7 @@ def test_who_is_refused_pays_nothing_for_it():
 
 def test_over_a_long_time_the_rate_is_kept_to():
     clock = Clock()
-    limit = Limit("key", per_s=5.0, burst=10, clock=clock)
+    limit = TokenBucket("key", per_s=5.0, burst=10, clock=clock)
     let_in = 0
     for _ in range(4_000):  # 40 a second for 100 s
         clock.now += 0.025
@@ -51,7 +51,7 @@ def test_over_a_long_time_the_rate_is_kept_to():
 
 
 def test_callers_do_not_pay_for_each_other():
-    limit = Limit("key", per_s=1.0, burst=1, clock=Clock())
+    limit = TokenBucket("key", per_s=1.0, burst=1, clock=Clock())
     assert limit.take("a").allowed
     assert not limit.take("a").allowed
     assert limit.take("b").allowed
@@ -59,7 +59,7 @@ def test_callers_do_not_pay_for_each_other():
 
 def test_the_wait_is_long_enough_and_no_second_longer():
     clock = Clock()
-    limit = Limit("key", per_s=0.1, burst=1, clock=clock)
+    limit = TokenBucket("key", per_s=0.1, burst=1, clock=clock)
     assert limit.take("a").wait_s == 10
     clock.now += 3.5
     told = limit.take("a")
@@ -69,14 +69,14 @@ def test_the_wait_is_long_enough_and_no_second_longer():
 
 
 def test_zero_is_no_limit():
-    limit = Limit("key", per_s=0.0, burst=1)
+    limit = TokenBucket("key", per_s=0.0, burst=1)
     assert {limit.take("a") for _ in range(1000)} == {None}
     assert len(limit) == 0
 
 
 def test_a_crowd_of_addresses_takes_no_more_room_and_frees_none_that_was_just_seen():
     clock = Clock()
-    limit = Limit("address", per_s=0.001, burst=1, most=50, clock=clock)
+    limit = TokenBucket("address", per_s=0.001, burst=1, most=50, clock=clock)
     assert limit.take("busy").allowed
     for number in range(1_000):
         clock.now += 0.001
@@ -86,7 +86,7 @@ def test_a_crowd_of_addresses_takes_no_more_room_and_frees_none_that_was_just_se
 
 
 def test_it_is_told_as_the_draft_has_it():
-    limit = Limit("key", per_s=100.0, burst=250, clock=Clock())
+    limit = TokenBucket("key", per_s=100.0, burst=250, clock=Clock())
     assert limit.take("a").headers() == [
         (b"ratelimit-policy", b'"key";q=250;w=3'),
         (b"ratelimit", b'"key";r=249;t=1'),
@@ -105,4 +105,4 @@ def test_it_is_told_as_the_draft_has_it():
     ],
 )
 def test_who_has_an_address_of_ipv6_has_its_network(address, place):
-    assert place_of(address) == place
+    assert network_of(address) == place

@@ -1,4 +1,4 @@
-"""Changing a map's model: its frames are signed again from their uploads, then the map switches.
+"""Re-encoding of a map: its frames are signed again with another model, then the map switches.
 
     begin  -->  jobs  --workers-->  a second signature of each frame  --Reencodings.run-->  switch
 
