@@ -1,7 +1,7 @@
 """The paper's Fig. 1 as functions, one line a stage.
 
 frame --prepare--> signature, geometry
-signature, database --retrieve--> R --diversify--> C --associate--> C_vld --locate--> pose
+signature, database --retrieve--> R --diversify--> C --associate--> C_vld --localize--> pose
 """
 
 from __future__ import annotations

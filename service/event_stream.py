@@ -1,6 +1,6 @@
 """One poller a process, and the streams of events that it feeds.
 
-    database  --poll-->  the newest events in memory  -->  every stream, each at its own place
+    database  --Feed-->  the newest events in memory  -->  every stream, each at its own place
 
 A stream that is further behind than memory reaches reads the database itself until it has caught
 up. So nobody who reads slowly costs memory, and nobody who waits costs a look at the database.

@@ -1,7 +1,7 @@
 """Reconstructions: the accepted matches of an answer, fused to a surface by a worker.
 
 Kept, NewReconstruction  --begin-->  job
-job  --(in a worker) _fuse-->  mesh.ply, picture.png, Coverage
+job  --_fuse, in a worker-->  mesh.ply, picture.png, Coverage
 """
 
 from __future__ import annotations

@@ -238,7 +238,7 @@ def train(
     Parameters
     ----------
     name : what to call the model
-    model_p, mixture_p : its parameters, such as those of a preset: see `recipes.py`
+    model_p, mixture_p : its parameters, such as those of a preset: see `preset_parameters`
     p : see TrainingParameters
     references : frames of one's own beside the rooms, each with the name of its place
     jobs : processes that make and segment frames

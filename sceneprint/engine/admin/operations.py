@@ -48,7 +48,7 @@ from sceneprint_client.api.admin import (
 
 # Following events: where a reader begins, and what comes next.
 #
-# after  --begin-->  place  --read_on-->  events and the next place, again and again
+# after  --begin-->  place  --next_events-->  events and the next place, again and again
 #
 # A place counts events of all maps, and stays in the process; what a reader is told of it is
 # `seen`, the last event up to there that it may be told.

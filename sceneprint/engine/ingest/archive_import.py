@@ -1,6 +1,6 @@
-"""Archives of sequences into a map: taken whole at the door, and frame by frame by a worker.
+"""Archives of sequences into a map: stored whole on upload, then read frame by frame by a worker.
 
-chunks  --Receiver-->  a blob that can be sought in  --begin-->  job  --handler-->  items
+chunks  --Receiver-->  a seekable blob  --Imports.begin-->  job  --Imports.handle-->  items
 """
 
 from __future__ import annotations

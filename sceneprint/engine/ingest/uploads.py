@@ -1,6 +1,6 @@
 """Uploads into the store: checked, durable, and queued, many in one commit.
 
-    Upload  --prepare-->  Prepared  --blob-->  durable  --commit-->  Added
+    Upload  --read_upload-->  decoded  --Store.blobs-->  durable blob  --add_frame-->  Added
 
 When an upload is answered, nothing can lose it. The disk is waited for by many at once.
 """

@@ -350,7 +350,7 @@ def npy_of(vector: bytes) -> bytes:
 
 # What a frame is made of, out of the store: cloud, picture, patches, signature, upload.
 #
-# frame  --Outputs-->  Output: a tag that stands for the content, and how to make it
+# frame  --FrameFiles-->  Output: a tag that stands for the content, and how to make it
 
 
 class FrameFiles:

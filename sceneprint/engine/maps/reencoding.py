@@ -1,6 +1,6 @@
 """Re-encoding of a map: its frames are signed again with another model, then the map switches.
 
-    begin  -->  jobs  --workers-->  a second signature of each frame  --Reencodings.run-->  switch
+    begin  -->  jobs  -->  a second signature of each frame  --Reencodings.run-->  switch
 
 Queries go on with the model that the map has. The switch is one commit, made when no frame lacks
 the next model's signature; whoever is killed in between leaves what the next one goes on with.

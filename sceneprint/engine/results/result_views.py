@@ -414,7 +414,7 @@ class PointClouds:
         self, map_name: str, frame_id: str, within: CloudFrame = "optical", limit: int = LIMIT
     ) -> Output[bytes]:
         """Points of a frame, with normals and patches. Parameters and errors as of
-        `Outputs.cloud`.
+        `FrameFiles.cloud`.
         """
         found = find_indexed(self._store, map_name, frame_id)
         name, matrix = placed(found.frame, within)

@@ -1,6 +1,6 @@
 """A session against another, or against itself, frame by frame: a job in slices.
 
-plan --> frame, frame, ... a slice at a time --> edges --conclude--> verdicts, joins
+plan  -->  frames, a slice at a time  -->  edges  --finish_association-->  verdicts, joins
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from sceneprint_client.api.sessions import Join, NewAssociation
 
 # What all edges of an association say together: which to believe, and how sessions lie.
 #
-# edges, frames with poses  --conclude-->  verdicts, joins
+# edges, frames with poses  --finish_association-->  verdicts, joins
 
 #: What a vote of a weak edge counts beside that of a strong one.
 _WEAK = 0.5

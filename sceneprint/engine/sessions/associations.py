@@ -349,7 +349,7 @@ def _edge(item: dict[str, Any], stops: dict[int, PathFrame]) -> Edge:
 
 # The graph of an association: vertices in one frame as far as sessions are joined, and edges.
 #
-# frames, edges that were kept, joins  --placed | odometry-->  Graph  --tell-->  g2o, TUM, JSON
+# frames, edges that were kept, joins  --pose_graph-->  PoseGraph  --graph_text-->  g2o, TUM, JSON
 
 #: Deviation of an edge without a covariance of its own, metres and radians.
 _UNTOLD = (0.05, math.radians(1.5))

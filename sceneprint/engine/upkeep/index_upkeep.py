@@ -396,7 +396,7 @@ def _blocks(
 
 # Vectors of signatures in PostgreSQL, made and filled by workers beside everything else.
 #
-# models of the maps  -->  a table for each dimension  --fill, block by block-->  complete, a graph
+# models of the maps  --VectorTables.run-->  a table for each dimension, filled block by block
 
 #: Seconds for which a worker adds vectors before it looks for frames to sign again.
 FILL_S = 2.0

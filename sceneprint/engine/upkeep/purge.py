@@ -29,7 +29,7 @@ _YOUNG_S = 60.0
 #: Longest time for blobs that were left: frames wait to be signed.
 _SWEEP_S = 20.0
 #: Times that making an index anew takes, for which its map is left in peace afterwards: of a large
-#: one it costs hours, and a deletion an hour would keep the workers at it for ever.
+#: one it costs hours, and a deletion an hour would keep the workers at it forever.
 PAUSE = 10.0
 
 

@@ -1,6 +1,6 @@
 """Sec. III-E, evidence: how well two surfaces agree under a transform.
 
-    points of the source, surface of the target, T  --agreement-->  inliers, violations
+    points of the source, surface of the target, T  --agreements-->  inliers, violations
 
 Points are looked up where the target's camera would see them: no search tree, and what the
 sensor saw *through* counts too. A point that lies before the surface that the target saw

@@ -1,6 +1,6 @@
 """Sec. III-E, descriptors: how all other patches lie about each patch, as histograms.
 
-    Patches (P)  --surroundings-->  (P, D) float32  --compress-->  (P, d) uint8
+    Patches (P)  --patch_descriptors-->  (P, D) float32  --compress-->  (P, d) uint8
 
 The properties are of the kind of Eq. (1), and as macro-scale: of every other patch within reach,
 how far off in the plane of the patch it lies, how high over it, and how its normal stands to that

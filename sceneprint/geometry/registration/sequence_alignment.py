@@ -1,6 +1,6 @@
 """Sec. III-E, matching as the paper has it: sequences of neighbours, aligned.
 
-    Patches  --neighbour_sequences-->  Sequences        two patches' sequences  --alignment-->  cost
+    Patches  --neighbour_sequences-->  Sequences
     Patches, Patches  --sequence_correspondences-->  pairs (M, 2)
 
 Reading R10 (docs/paper.md): of the paper's patch matching (GASP, 3DV 2014) only the idea is

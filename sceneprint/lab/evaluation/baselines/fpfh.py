@@ -1,6 +1,6 @@
 """Local features, aggregated: Open3D's FPFH, and VLAD over a vocabulary of the database.
 
-frame  --features-->  (n, 33)  --vlad-->  (64 * 33,)      two of them  --L2-->  distance
+frame  --features-->  (n, 33)  --vlad-->  (64 * 33,)      two of them  -->  L2 distance
 
 Rusu et al., Fast point feature histograms, ICRA 2009; Jegou et al., Aggregating local descriptors,
 CVPR 2010. The vocabulary is learnt on the database that is searched, which favours the baseline:
