@@ -49,7 +49,10 @@ def definitions(
 
 
 def test_no_file_and_no_definition_has_a_retired_name() -> None:
-    found = [path for path in modules() if Path(path).stem in RETIRED]
+    tests = (path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("test_*.py"))
+    found = [
+        path for path in (*modules(), *tests) if Path(path).stem.removeprefix("test_") in RETIRED
+    ]
     for path, tree in modules().items():
         found += [f"{path}:{one.name}" for one in definitions(tree) if one.name in RETIRED]
     furniture = "sceneprint/lab/synth/furniture.py:shelf"  # a shelf, for once

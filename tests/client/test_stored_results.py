@@ -1,4 +1,4 @@
-"""What is looked at after a query."""
+"""Stored results of a query, through the client."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Healing while serving: what was made of an upload and is damaged is soon made again."""
+"""Repair while serving: damaged derived data is soon made again from the upload."""
 
 from __future__ import annotations
 

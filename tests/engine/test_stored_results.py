@@ -1,4 +1,4 @@
-"""Answers that are kept: whole or not at all, within bounds, and never at a query's cost."""
+"""Stored results: whole or absent, bounded, and a failure never costs a query its answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rivals: motions that leave a room's planes in themselves, and planes that count the same."""
+"""Ambiguity: motions that leave a room's planes in themselves, and planes that count the same."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Agreement of two surfaces: by hand, and against a loop that reads like the definition."""
+"""Overlap of two surfaces: by hand, and against a loop that reads like the definition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bell over NOTIFY: who waits on any host is woken, and nothing harms who rings."""
+"""Wakeup by NOTIFY: workers of any host wake up, and no failure harms the sender."""
 
 from __future__ import annotations
 

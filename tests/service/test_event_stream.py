@@ -1,4 +1,4 @@
-"""The feed of events: one poller, streams that are far behind, silence, and the end."""
+"""Event streams: one poller, streams that are far behind, silence, and the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who asks again under one Idempotency-Key, and whether it is the same that he asks."""
+"""Idempotency keys: whether a repeated request is the same one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A kept query once more: as it was asked, or otherwise, an upload without its file."""
+"""Rerun of a stored query: with the same options or others, without uploading the file again."""
 
 from __future__ import annotations
 

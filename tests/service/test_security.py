@@ -1,4 +1,4 @@
-"""What guards a service whoever asks: headers, origins, proxies, rates, and who may change keys."""
+"""Security of the service: headers, origins, proxies, rate limits, and keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""After a query, over HTTP: looked at again by whoever may read all that was asked."""
+"""Stored results over HTTP: for callers who may read every map of the query."""
 
 from __future__ import annotations
 

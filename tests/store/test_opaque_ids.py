@@ -1,4 +1,4 @@
-"""Seals: read by the store that made them alone, and telling nothing."""
+"""Opaque ids: only the store that made one can read it, and it reveals nothing."""
 
 from __future__ import annotations
 

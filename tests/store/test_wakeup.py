@@ -1,4 +1,4 @@
-"""The bell: who waits is woken, and nothing that is wrong with it harms who rings."""
+"""Wakeup by FIFOs: waiting workers wake up, and nothing wrong with a FIFO harms the sender."""
 
 from __future__ import annotations
 
