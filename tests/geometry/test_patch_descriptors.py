@@ -1,4 +1,4 @@
-"""Patch descriptors, histograms of the patches around: by hand, against another formula, and what must not change them."""
+"""Patch descriptors: by hand, against another formula, and what must not change them."""
 
 from __future__ import annotations
 
