@@ -19,7 +19,7 @@ import numpy as np
 
 from sceneprint.geometry.pose.average import PoseAverage, average_poses
 from sceneprint.geometry.pose.rigid import inverse
-from sceneprint.geometry.registration.icp import error_of, place_covariance, transported
+from sceneprint.geometry.registration.covariance import error_of, place_covariance, transported
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.validation.acceptance import Strength
 from sceneprint.geometry.validation.map_verification import (

@@ -12,7 +12,8 @@ from typing import Any, TypeVar
 
 from sceneprint.geometry.registration.alignment import AlignmentParameters
 from sceneprint.geometry.registration.consensus import ConsensusParameters
-from sceneprint.geometry.registration.icp import CovarianceParameters, RefinementParameters
+from sceneprint.geometry.registration.covariance import CovarianceParameters
+from sceneprint.geometry.registration.icp import RefinementParameters
 from sceneprint.geometry.registration.overlap import OverlapParameters, PlaneParameters
 from sceneprint.geometry.registration.patch_descriptors import PatchDescriptorParameters
 from sceneprint.geometry.registration.plan_search import PlanParameters

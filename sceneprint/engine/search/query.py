@@ -26,7 +26,7 @@ from sceneprint.engine.signers import Signers
 from sceneprint.errors import Busy, InvalidRequest, ModelMismatch, SceneprintError, UnknownMap
 from sceneprint.geometry.cores import Cores
 from sceneprint.geometry.pose.rigid import inverse
-from sceneprint.geometry.registration.icp import PAIR_METHOD
+from sceneprint.geometry.registration.covariance import PAIR_METHOD
 from sceneprint.geometry.retrieval.distance import distances, similarity
 from sceneprint.models import PRESETS, read_model
 from sceneprint.pipeline import Signer, validate

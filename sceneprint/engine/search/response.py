@@ -10,7 +10,7 @@ import numpy as np
 
 from sceneprint.engine.serializers import sensor_of, transform
 from sceneprint.geometry.pose.rigid import inverse
-from sceneprint.geometry.registration.icp import (
+from sceneprint.geometry.registration.covariance import (
     PAIR_METHOD,
     PLACE_METHOD,
     CovarianceParameters,

@@ -36,14 +36,9 @@ from sceneprint.geometry.registration.alignment import (
     are_scans,
     samples_of,
 )
+from sceneprint.geometry.registration.covariance import CovarianceParameters, pair_covariance
 from sceneprint.geometry.registration.gravity import NO_UPS, Ups, contradiction, tilt_of
-from sceneprint.geometry.registration.icp import (
-    FINE,
-    CovarianceParameters,
-    RefinementParameters,
-    pair_covariance,
-    refine,
-)
+from sceneprint.geometry.registration.icp import FINE, RefinementParameters, refine
 from sceneprint.geometry.registration.overlap import (
     Explained,
     OverlapParameters,
