@@ -2,7 +2,7 @@
 
 query id  --Inspection-->  Answer | PLY | Similarities | MatchDetails
 
-A match is validated once more, with the seed and the options of the query: see `pairs.py`.
+A match is validated once more, with the seed and the options of the query: see `Pairs`.
 """
 
 from __future__ import annotations

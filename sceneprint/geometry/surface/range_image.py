@@ -4,7 +4,7 @@
 
 On the sphere about the viewpoint the inverse range of a plane is linear in the direction u:
 1/r = a . u. A least-squares fit of a over a window gives normal and denoised point at once,
-always facing the viewpoint, as `normals.py` does in the image of a depth sensor.
+always facing the viewpoint, as `depth_image.py` does in the image of a depth sensor.
 """
 
 from __future__ import annotations
