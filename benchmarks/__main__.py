@@ -9,11 +9,12 @@ import sys
 import tempfile
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks import dashboard, disk, dpp, readiness, registration, scan, search, service
+from benchmarks import dashboard, disk, dpp, readiness, registration, scan, search, service, summary
 from benchmarks.encode import EncodeFigures, measure
 from benchmarks.machine import (
     Machine,
@@ -122,6 +123,9 @@ def page(machine: Machine, rows: Rows, start: float) -> str:
         "compare ratios, not milliseconds.",
         "",
     ]
+    of_depth = rows.encode.get(PRESETS[0])
+    if of_depth is not None:
+        lines += summary.table(of_depth[0], rows.search[0], rows.service)
     for preset, (figures, peak) in rows.encode.items():
         lines += table(preset, figures, peak)
     lines += service.table(rows.service)
@@ -187,9 +191,11 @@ def main() -> int:
     }
     options.json.write_text(json.dumps(result, indent=1) + "\n")
     if options.page is not None:
-        text = options.page.read_text()
-        before, rest = text.split(BEGIN)
-        options.page.write_text(before + section + rest.split(END)[1])
+        before, rest = options.page.read_text().split(BEGIN)
+        number, today = version("sceneprint"), f"{datetime.now(UTC):%Y-%m-%d}"
+        own = summary.version_of(number, today, rows.encode[PRESETS[0]][0], rows.service)
+        text = before + section + rest.split(END)[1]
+        options.page.write_text(summary.with_version(text, own))
     return 0
 
 

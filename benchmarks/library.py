@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
+
+import numpy as np
 
 from benchmarks.encode import Clock
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.formats.dataset import FrameReference
-from sceneprint.matches import associate
+from sceneprint.localization import PoseEstimate, QueryFrame, localize, views_of_rows
+from sceneprint.matches import PairMatch, associate, searched
 from sceneprint.pipeline import Signature, diversify, open_signer, prepare, retrieve
+from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Answer
 
 #: What a match is compared by: place in the database, and its transform row by row.
@@ -27,10 +32,13 @@ class Library:
         self._signer = open_signer("depth")
         self._signatures: list[Signature] = []
         self._artifacts: list[bytes] = []
-        for frame in frames:
-            signature, geometry = prepare(frame.read(), self._signer)
+        self._poses: list[Floats | None] = []
+        for reference in frames:
+            frame = reference.read()
+            signature, geometry = prepare(frame, self._signer)
             self._signatures.append(signature)
             self._artifacts.append(write_geometry(geometry))
+            self._poses.append(frame.pose)
 
     def ask(self, query: FrameReference, k: int = 5) -> tuple[dict[str, float], Matches]:
         """Milliseconds of each stage, and the accepted matches."""
@@ -42,22 +50,33 @@ class Library:
         )
         selection = clock.run("diversify", lambda: diversify(ranking, self._signatures))
         geometry = read_geometry(write_geometry(seen))  # as both have it
-        matches = clock.run(
-            "validate",
-            lambda: associate(
-                geometry,
-                ranking,
-                selection.indices.tolist(),
-                lambda i: read_geometry(self._artifacts[i]),
-                k,
-            ),
+        matching = partial(
+            associate, geometry, ranking, selection.indices.tolist(), self._geometry, k
         )
-        found = [
+        matches = clock.run("validate", lambda: matching(pose_of=self._pose))
+        found = clock.run("locate", lambda: self._locate(geometry, matches))
+        known = searched(matches)
+        if known is not None and found is not None and found.status != "found":  # as a service does
+            matches = matching(known=known)
+        return clock.stages, [
             (match.index, match.validation.T_match_query.tolist())
             for match in matches
             if match.validation.status == "accepted" and match.validation.T_match_query is not None
         ]
-        return clock.stages, found
+
+    def _geometry(self, index: int) -> Geometry:
+        return read_geometry(self._artifacts[index])
+
+    def _pose(self, index: int) -> tuple[str, Floats] | None:
+        pose = self._poses[index]
+        return None if pose is None else ("", pose)
+
+    def _locate(self, query: Geometry, matches: list[PairMatch]) -> PoseEstimate | None:
+        poses = [np.eye(4) if pose is None else pose for pose in self._poses]
+        if any(pose is None for pose in self._poses):
+            return None
+        views = views_of_rows(matches, poses, self._geometry)
+        return localize([QueryFrame(query, matches)], poses, None, views)
 
 
 def accepted(answer: Answer, names: Mapping[str, int]) -> Matches:

@@ -8,6 +8,8 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,3 +88,26 @@ def own_bytes(process: Path) -> int:
     """Memory that a process, by its folder under /proc, shares with no other."""
     lines = (process / "smaps_rollup").read_text().splitlines()
     return sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Private_"))
+
+
+def memory_of(folder: Path, command: str) -> int:
+    """Bytes that the processes of a command on a data folder have for themselves."""
+    return sum(_of_processes(folder, command, own_bytes))
+
+
+def processor_seconds(folder: Path, command: str) -> float:
+    """Processor time that the processes of a command on a data folder have used, in seconds."""
+
+    def used(process: Path) -> int:
+        threads = process.glob("task/*/schedstat")
+        return sum(int(path.read_text().split()[0]) for path in threads)
+
+    return 1e-9 * sum(_of_processes(folder, command, used))
+
+
+def _of_processes(folder: Path, command: str, figure: Callable[[Path], int]) -> Iterator[int]:
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):  # it ended meanwhile
+            words = path.read_bytes().split(b"\0")
+            if str(folder).encode() in words and command.encode() in words:
+                yield figure(path.parent)

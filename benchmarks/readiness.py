@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 import time
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,7 +18,7 @@ from zlib import crc32
 import numpy as np
 from sqlalchemy import insert, update
 
-from benchmarks.machine import own_bytes
+from benchmarks.machine import memory_of
 from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import FrameReference, find_sequences
@@ -77,7 +76,7 @@ def measure(
     """
     with TemporaryDirectory() as folder:
         data = Path(folder) / "large"
-        length = _fill(data, frames, model)
+        length = fill_map(data, frames, model)
         ready, first, memory, _ = _start(data, frame)
         shutil.rmtree(data / "index", ignore_errors=True)  # of psi there is none
         _, bare, bare_memory, exact = _start(data, frame)
@@ -85,8 +84,8 @@ def measure(
     return ReadinessFigures(frames, length, ready, first, memory, bare, bare_memory, exact, signed)
 
 
-def _fill(data: Path, frames: int, model: Preset) -> int:
-    """A map of frames with random signatures; returns the bytes of each."""
+def fill_map(data: Path, frames: int, model: Preset) -> int:
+    """Make the map of frames with random signatures; returns the bytes of each."""
     rng = np.random.default_rng(0)
     with Engine(Settings(data_dir=data)) as engine:
         engine.create_map(NewMap(name=MAP, model=model))
@@ -112,7 +111,7 @@ def _fill(data: Path, frames: int, model: Preset) -> int:
                 connection.execute(insert(signatures), [{**stored, **one} for one in signed])
                 now = {"revision": numbers[-1], "used_frames": numbers[-1]}
                 connection.execute(update(maps).where(maps.c.number == row.number).values(**now))
-        if engine.view(MAP)[1].metric == "l2":
+        if frames and engine.view(MAP)[1].metric == "l2":
             engine.rebuild_index(MAP)
     return length
 
@@ -129,17 +128,6 @@ def _start(data: Path, frame: FrameReference) -> tuple[float, float, float, bool
         answer = client.query(MAP, frame, stages=("retrieve",))
         first = time.perf_counter() - begun
         return ready, first, memory_of(data, "serve") / 1e6, answer.exact
-
-
-def memory_of(folder: Path, command: str) -> int:
-    """Bytes that the processes of a command on a data folder have for themselves."""
-    total = 0
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        with suppress(OSError):  # it ended meanwhile
-            words = path.read_bytes().split(b"\0")
-            if str(folder).encode() in words and command.encode() in words:
-                total += own_bytes(path.parent)
-    return total
 
 
 def _sign(data: Path, frames: list[FrameReference], n: int, model: Preset) -> float:

@@ -65,6 +65,8 @@ class Settings(BaseSettings):
     concurrency: int = Field(default_factory=lambda: max(os.cpu_count() or 1, 2), ge=1, le=256)
     #: Cores that the queries of a service process share; one that finds a core free is faster.
     query_cores: int = Field(default_factory=lambda: os.cpu_count() or 1, ge=1, le=256)
+    #: Memory of a process for geometry of frames that it compared lately, bytes; 0 for none.
+    geometry_bytes: int = Field(default=256 << 20, ge=0)
     #: Uploads and queries that may wait; more are asked to come back (503).
     waiting: int = Field(default=64, ge=0, le=10_000)
     #: Seconds that an upload or a query may wait for its turn; then it is asked to come back (503).

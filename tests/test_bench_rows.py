@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import disk, dpp, readiness, registration, scan, search, service
+from benchmarks import disk, dpp, readiness, registration, scan, search, service, summary
 from benchmarks.__main__ import BEGIN, END, Rows, page
 from benchmarks.encode import EncodeFigures, points_of
 from benchmarks.machine import Machine
@@ -107,6 +107,7 @@ def test_pairs_by_hand() -> None:
     assert len(pairs_among([wall(), wall(), wall()], apart=2)) == 1
 
 
+@pytest.mark.thorough
 def test_pairs_of_rooms_and_of_no_recordings(tmp_path: Path) -> None:
     assert real_pairs(tmp_path, 5) == []
     (pair,) = synthetic_pairs(1)
@@ -188,7 +189,20 @@ def test_page_and_json_hold_every_row() -> None:
             )
         ],
         service.ServiceFigures(
-            300, 20, {"decode": 5.0}, 200.0, 210.0, 1.05, (1.0, 2.0), (9.0, 30.0), 7.5
+            10_000,
+            20,
+            {"decode": 5.0},
+            200.0,
+            (201.0, 210.0, 230.0),
+            (80.0, 90.0, 99.5),
+            1.05,
+            (1.0, 2.0),
+            (9.0, 30.0),
+            7.5,
+            {
+                1: service.Throughput(5.0, 200.0, 260.0, 1.0),
+                8: service.Throughput(9.0, 850.0, 1500.0, 0.93),
+            },
         ),
         disk=[disk.DiskFigures(60, 384, 1500.0, 76e3, 174e3)],
     )
@@ -196,7 +210,11 @@ def test_page_and_json_hold_every_row() -> None:
     assert section.startswith(BEGIN)
     assert section.endswith(END)
     for wanted in (
-        "### A query over HTTP, 300 frames in the map",
+        "### A query over HTTP, 10,000 frames in the map",
+        "| **over HTTP** | **210.0 (201.0 to 230.0)** |",
+        "| **processor time of the service** | **90.0 (80.0 to 99.5)** |",
+        "| 8 | 9.0 | 850 | 1500 | 0.93 |",
+        "8 clients are answered **1.80** times as often as one.",
         "| **HTTP / library** | **1.05** |",
         "| /healthz while 4 clients query and a worker signs: p50, p99 | 9.0, 30.0 |",
         "| 1,000 | 384 | 16 lists | 1.50 | 3.00 | 0.50 | 0.9960 | 5.0 | 0.9 | 0.02 | 7, 384 |",
@@ -218,10 +236,34 @@ def test_page_and_json_hold_every_row() -> None:
     assert json.loads(json.dumps(asdict(rows.search[0]))) == asdict(rows.search[0])
 
 
+def test_the_history_has_one_row_of_each_version() -> None:
+    encode = EncodeFigures(3, {}, 2.0, {}, 170_000, {}, 50.0, 0.5, 0.75, "")
+    served = service.ServiceFigures(
+        10_000, 20, {}, 120.0, (1.0, 130.4, 200.0), (1.0, 90.0, 100.0), 1.0, (1.0, 2.0), (1.0, 2.0),
+        7.0, {1: service.Throughput(5.0, 1.0, 2.0, 1.0), 8: service.Throughput(9.5, 1.0, 2.0, 1.0)},
+    )  # fmt: skip
+    first = summary.version_of("0.1.0", "2026-01-01", encode, served)
+    row = "| 0.1.0 | 2026-01-01 | 0.50 | 0.75 | 2.40 | 130 | 90 | 1.90 |"
+    assert first.row() == row
+    text = f"a\n{summary.BEGIN}\n{summary.END}\nz\n"
+    text = summary.with_version(text, first)
+    bare = replace(encode, fpfh=None, ratio=None, ratio_with_artifact=None)
+    text = summary.with_version(text, summary.version_of("0.2.0", "2026-02-01", bare, served))
+    text = summary.with_version(text, replace(first, measured="2026-03-01"))
+    assert text.splitlines() == [
+        "a", summary.BEGIN, *summary.HEAD,
+        "| 0.2.0 | 2026-02-01 |  |  |  | 130 | 90 | 1.90 |", row.replace("01-01", "03-01"),
+        summary.END, "z",
+    ]  # fmt: skip
+    with pytest.raises(ValueError, match="the page has no section"):
+        summary.with_version("a", first)
+
+
 @pytest.fixture
 def few_clients(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two processes query and not four."""
     monkeypatch.setattr(service, "CLIENTS", 2)
+    monkeypatch.setattr(service, "CROWD", 2)
 
 
 @pytest.mark.thorough
@@ -229,11 +271,15 @@ def few_clients(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_service_and_library_do_the_same_work(building: Path) -> None:
     """`measure` compares every answer with the library's."""
     with service.frames_of(building, 8) as frames:
-        found = service.measure(frames, 2, seconds=1.0)
+        found = service.measure(frames, 2, seconds=1.0, map_frames=0)
     assert (found.frames, found.queries) == (6, 2)
     assert list(found.stages) == [
-        "decode", "sign, with geometry", "retrieve", "diversify", "validate"
+        "decode", "sign, with geometry", "retrieve", "diversify", "validate", "locate"
     ]  # fmt: skip
+    assert 0 < found.cpu[0] <= found.cpu[1] <= found.cpu[2]
+    assert list(found.throughput) == [1, 2]
+    assert all(0 < one.p50 <= one.p99 for one in found.throughput.values())
+    assert all(0 <= one.least <= 1 for one in found.throughput.values())
     assert found.ratio > 0
     assert 0 < found.idle[0] <= found.idle[1]
     assert 0 < found.loaded[0] <= found.loaded[1]

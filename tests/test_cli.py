@@ -76,6 +76,7 @@ def tree_hash(folder: Path) -> dict[str, str]:
     }
 
 
+@pytest.mark.thorough
 def test_synth_writes_the_layout(rooms: Path, tmp_path: Path) -> None:
     names = list(tree_hash(rooms))
     assert names == [

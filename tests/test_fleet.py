@@ -50,6 +50,7 @@ def recording(
     return folder.parent
 
 
+@pytest.mark.thorough
 def test_a_fleet_loses_nothing(
     tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

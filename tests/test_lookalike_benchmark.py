@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from benchmarks.lookalikes import Told, ask_site, table
 from sceneprint.lab.evaluation.measures import upper_bound
 from sceneprint.lab.evaluation.protocol import Error, JudgedAnswer
@@ -38,6 +40,7 @@ def test_the_table_by_hand() -> None:
     )
 
 
+@pytest.mark.thorough
 def test_a_site_is_asked_and_every_answer_is_one_of_three(small_signer: Signer) -> None:
     answers = ask_site(small_signer, ("object", 0, 2), seed=5)
     assert [(one.site, one.query, one.answerable) for one in answers] == [

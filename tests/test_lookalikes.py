@@ -181,7 +181,7 @@ def scans_model() -> Model:
     return read_model("lidar")
 
 
-@pytest.mark.parametrize("doors", [24, 60])
+@pytest.mark.parametrize("doors", [24, pytest.param(60, marks=pytest.mark.thorough)])
 def test_scans_of_a_corridor_of_equal_doors_are_not_believed(
     doors: int, scans_model: Model
 ) -> None:
@@ -192,6 +192,7 @@ def test_scans_of_a_corridor_of_equal_doors_are_not_believed(
     assert counted["ambiguous"] >= 6  # and not for want of a transform
 
 
+@pytest.mark.thorough
 def test_scans_of_a_hall_of_equal_bays_are_seldom_believed(scans_model: Model) -> None:
     """Half a turn maps an empty hall onto itself: what tells is no more than noise."""
     room = corridor(10, 6.0, 14.0, 6.0)

@@ -23,7 +23,8 @@ GROUPS = {
 
 
 @pytest.mark.usefixtures("postgres")  # skips where there is no server
-@pytest.mark.parametrize("group", ["engine", pytest.param("service", marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("group", ["engine", "service"])
 def test_what_holds_on_sqlite_holds_on_postgresql(group: str, tmp_path: Path) -> None:
     outside = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     done = subprocess.run(

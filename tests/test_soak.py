@@ -20,9 +20,10 @@ from benchmarks.soak.load import shots
 from benchmarks.soak.writers import Plan
 
 
+@pytest.mark.thorough  # test_kill kills a service in every run
 @pytest.mark.parametrize(
     ("frames", "n_kills", "queries"),  # of each frame that stays its ranking, of some validated
-    [(10, 3, 9 + 9), pytest.param(60, 14, 54 + 9, marks=pytest.mark.thorough)],
+    [(10, 3, 9 + 9), (60, 14, 54 + 9)],
 )
 def test_kills_lose_nothing(
     frames: int, n_kills: int, queries: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -49,6 +49,7 @@ def test_processes_do_not_matter(trained: tuple[Model, object]) -> None:
     assert other.id != alone.id
 
 
+@pytest.mark.thorough
 def test_progress_is_told_to_the_end(trained: tuple[Model, list[tuple[str, int, int]]]) -> None:
     steps = trained[1]
     assert [s for s in steps if s[0] == "rooms"] == [("rooms", i, 4) for i in range(1, 5)]
@@ -111,6 +112,7 @@ def whitened_model() -> Model:
     return train("tiny", MODEL, MIXTURE, p, jobs=2)
 
 
+@pytest.mark.thorough
 def test_a_whitening_is_learnt_from_more_rooms(
     trained: tuple[Model, object], whitened_model: Model
 ) -> None:

@@ -26,6 +26,7 @@ def trained() -> Model:
     return train("tiny", small, MixtureParameters(n_components=16, iterations=3), TRAINING)
 
 
+@pytest.mark.thorough
 def test_provenance_says_sites(trained: Model) -> None:
     seen = trained.provenance
     assert seen["training"]["scenes"] == "sites"

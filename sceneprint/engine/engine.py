@@ -83,7 +83,7 @@ class Engine:
         self.store = open_store(
             settings.database, settings.blobs,
             None if replica is None else replica.get_secret_value(), settings.replica_lag_s,
-            settings.purge_s,
+            settings.geometry_bytes,
         )  # fmt: skip
         self.signers = Signers(self.store.database, settings.cache_dir)
         self._upkeep = Upkeep(
@@ -176,6 +176,7 @@ class Engine:
                 self._readers.tidy(connection)
                 return
             self._purged = time.monotonic()
+            self.store.geometries.forget_older(self.settings.purge_s / 2)
             self._readers.purge(connection)
         self.kept.forget(ResultValidity(self.store).all_of)  # this node may have no worker
 

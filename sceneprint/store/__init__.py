@@ -22,6 +22,7 @@ from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.blobs.object_store import ObjectBlobs
 from sceneprint.store.database import Database, is_there, open_database
 from sceneprint.store.database_errors import unusable
+from sceneprint.store.geometry_cache import GeometryCache
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint.store.postgres.connection import SessionLocks
 from sceneprint.store.postgres.replica import Replica, current
@@ -41,12 +42,18 @@ class Store:
     database: Database
     blobs: Blobs
     replica: Replica | None = None
+    geometry_bytes: int = 0
 
     @property
     def queried(self) -> Database:
         """What the query in hand is answered from: a replica, or `database`; see `asked`."""
         near = current()
         return self.database if near is None else near.database
+
+    @cached_property
+    def geometries(self) -> GeometryCache:
+        """Geometry artifacts, those that were read lately from memory."""
+        return GeometryCache(self.blobs, self.geometry_bytes)
 
     @cached_property
     def seals(self) -> OpaqueIds:
@@ -63,7 +70,7 @@ class Store:
 
 def open_store(
     url: str, blobs: Path | str, replica_url: str | None = None, replica_lag_s: float = 0.0,
-    purge_s: float = 3600.0,
+    geometry_bytes: int = 0,
 ) -> Store:  # fmt: skip
     """Open both, made where both are missing.
 
@@ -75,13 +82,13 @@ def open_store(
     url : of the database
     blobs : folder, or URL of an object store
     replica_url, replica_lag_s : see Replica; it need not be there
-    purge_s : see `open_blobs`
+    geometry_bytes : see GeometryCache
 
     Raises
     ------
     UnusableStore, NewerSchema : see `open_database`, `open_blobs` and Replica.
     """
-    opened = _open_store(url, blobs, purge_s)
+    opened = replace(_open_store(url, blobs), geometry_bytes=geometry_bytes)
     if replica_url is None:
         return opened
     try:
@@ -91,7 +98,7 @@ def open_store(
         raise
 
 
-def _open_store(url: str, blobs: Path | str, purge_s: float) -> Store:
+def _open_store(url: str, blobs: Path | str) -> Store:
     new = not is_read_only(url) and not is_there(url)
     if isinstance(blobs, Path):
         kept = FolderBlobs(blobs, make=new)  # the data folder is made with it
@@ -100,16 +107,15 @@ def _open_store(url: str, blobs: Path | str, purge_s: float) -> Store:
         _make_folder_of(url)
     database = open_database(url)
     try:
-        return Store(database, open_blobs(blobs, database, purge_s=purge_s))
+        return Store(database, open_blobs(blobs, database))
     except BaseException:
         database.close()
         raise
 
 
 def open_blobs(
-    blobs: Path | str, database: Database, *, make: bool = False, claim: bool = True,
-    purge_s: float = 3600.0,
-) -> Blobs:  # fmt: skip
+    blobs: Path | str, database: Database, *, make: bool = False, claim: bool = True
+) -> Blobs:
     """Open the blobs that a database refers to.
 
     An object store that is away is no error yet: what is asked of it is refused while it is.
@@ -120,7 +126,6 @@ def open_blobs(
     database : whose they are
     make : a folder that is missing
     claim : mark a prefix of an object store that is nobody's yet; else it is looked at alone
-    purge_s : seconds after which nothing is left in memory of what another process removed
 
     Raises
     ------
@@ -136,7 +141,7 @@ def open_blobs(
         raise UnusableStore("Blobs in an object store need a database that is kept: name a file.")
     else:
         locks = SessionLocks(database)
-    found = ObjectBlobs(objects, locks, lambda: OpaqueIds(database).owner, purge_s)
+    found = ObjectBlobs(objects, locks, lambda: OpaqueIds(database).owner)
     try:
         found.claim(anew=claim and not database.read_only)
     except StoreAway as error:

@@ -85,6 +85,7 @@ def right(
     return [(names[i], int(apart[i])) for i in np.argsort(apart, kind="stable")]
 
 
+@pytest.mark.thorough
 def test_no_answer_mixes_models_while_a_map_goes_to_and_fro(
     full: Engine, make_engine: Make, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
     by_model: dict[str, tuple[Signer, Bytes]],
@@ -361,10 +362,31 @@ while True:
 @pytest.mark.parametrize(
     ("module", "step", "call", "when", "switched"),
     [
-        ("sceneprint.engine.jobs.signature_job", "replace_signature", 5, "after", False),
-        ("sceneprint.engine.upkeep.index_upkeep", "publish", 1, "after", False),
+        pytest.param(
+            "sceneprint.engine.jobs.signature_job",
+            "replace_signature",
+            5,
+            "after",
+            False,
+            marks=pytest.mark.thorough,
+        ),
+        pytest.param(
+            "sceneprint.engine.upkeep.index_upkeep",
+            "publish",
+            1,
+            "after",
+            False,
+            marks=pytest.mark.thorough,
+        ),
         ("sceneprint.store.reencoding_rows", "switch_model", 1, "after", False),  # not committed
-        ("sceneprint.store.signatures", "remove_signature", 4, "after", True),
+        pytest.param(
+            "sceneprint.store.signatures",
+            "remove_signature",
+            4,
+            "after",
+            True,
+            marks=pytest.mark.thorough,
+        ),
     ],
 )
 def test_whoever_is_killed_on_the_way_leaves_what_another_ends(

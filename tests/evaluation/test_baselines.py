@@ -200,6 +200,7 @@ def evaluated(folder: Path, *arguments: object) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.thorough
 def test_baselines_are_rows_of_the_same_table(
     room: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
+from sceneprint.geometry.registration import patch_descriptors as patch_descriptors_module
 from sceneprint.geometry.registration.patch_descriptors import (
     ANGLES,
     RANGE,
@@ -243,3 +244,24 @@ def test_components_that_cannot_be_learnt() -> None:
         with pytest.raises(ValueError, match=f"{dimension} components of"):
             fit_compression(rows[:count], dimension)
     assert fit_compression(rows, 12).matrix.shape == (12, 12)
+
+
+@pytest.mark.parametrize("filled", range(10))
+def test_compression_skips_empty_bins_to_the_last_bit(filled: int) -> None:
+    """Any number of filled bins, of which four are taken at a time, against one after the other."""
+    rng = np.random.default_rng(filled)
+    histograms = np.zeros((3, 24), np.float32)
+    for row in histograms:
+        row[rng.choice(24, filled, replace=False)] = rng.random(
+            filled, dtype=np.float32
+        ) + np.float32(0.1)
+    by = Compression(
+        rng.random(24, dtype=np.float32), rng.standard_normal((5, 24)).astype(np.float32)
+    )
+    plain = np.tile(-by.offset, (3, 1))
+    for i, row in enumerate(histograms):
+        for b in np.flatnonzero(row):
+            plain[i] += row[b] * by.matrix[:, b]
+    out = np.empty((3, 5), np.float32)
+    patch_descriptors_module._project(histograms, np.ascontiguousarray(by.matrix.T), by.offset, out)
+    assert np.array_equal(out, plain)

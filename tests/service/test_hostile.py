@@ -96,7 +96,7 @@ def mountable() -> tuple[str, ...] | None:
 MOUNT = "mount -t tmpfs -o size=24m tmpfs $0 && exec $1 serve --port 0 --data $0 --workers 1"
 
 
-@pytest.fixture(params=[Mounted, Limited])
+@pytest.fixture(params=[pytest.param(Mounted, marks=pytest.mark.thorough), Limited])
 def narrow(request, begin, tmp_path):
     if request.param is Limited:
         return Limited(begin(folder=tmp_path / "data", lease_s=3))
@@ -174,6 +174,7 @@ def kept(begin, make_map, small_shots):
     return server
 
 
+@pytest.mark.thorough
 def test_another_process_that_keeps_writing_stops_uploads_alone(kept, small_shots, refused, until):
     path = "/v1/maps/hall"
 
@@ -246,7 +247,7 @@ def stored(small_shots, tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(params=["mounted", "permissions"])
+@pytest.fixture(params=[pytest.param("mounted", marks=pytest.mark.thorough), "permissions"])
 def sealed(request, stored) -> Iterator[Callable[..., tuple[str, ...]]]:
     """The words before a command that may read the folder and not write it."""
     sceneprint = str(BIN / "sceneprint")

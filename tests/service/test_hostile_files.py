@@ -68,6 +68,7 @@ def nearest(server, frame_id: str) -> dict[str, Any]:
     return dict(answer.json())
 
 
+@pytest.mark.thorough
 def test_an_index_that_is_damaged_changes_no_answer(folder, tmp_path, begin):
     """Each file of the newest generation while a service uses it, and at its next start."""
     with opened(folder, index_dir=tmp_path / "none") as engine:  # by the database alone
@@ -109,7 +110,10 @@ def test_an_index_that_is_damaged_changes_no_answer(folder, tmp_path, begin):
         assert (found(answer.model_dump()), answer.index_generation) == (right[0], 1)
 
 
-def test_blobs_that_are_missing_cost_what_needs_them(folder, begin, small_shots, refused, rows):
+def test_blobs_that_are_missing_cost_what_needs_them(
+    folder, begin, small_shots, refused, rows, monkeypatch
+):
+    monkeypatch.setenv("SCENEPRINT_GEOMETRY_BYTES", "0")  # of which none is in memory
     server = begin("--workers", "0", folder=folder)
     frames = [one["frame_id"] for one in server.client.get(f"{HALL}/frames").json()["items"]]
     asked = "SELECT s.geometry FROM signatures s JOIN frames f ON f.number = s.frame_number"

@@ -182,6 +182,7 @@ def both(tmp_path_factory, small_shots, small_model, postgres, open_house) -> li
     return found
 
 
+@pytest.mark.thorough
 def test_what_happens_in_other_maps_moves_nothing_that_is_told(both):
     quiet, busy, server = both
     assert len(quiet) > 60

@@ -8,19 +8,16 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from benchmarks.fleet.s3 import ObjectServer
-from sceneprint.errors import DamagedBlob, StoreAway, UnusableStore
-from sceneprint.store.blobs import object_client, object_store
+from sceneprint.errors import StoreAway, UnusableStore
+from sceneprint.store.blobs import object_client
 from sceneprint.store.blobs import object_client as module
-from sceneprint.store.blobs.folder import FileLocks
 from sceneprint.store.blobs.object_client import PART, check_objects, open_objects
-from sceneprint.store.blobs.object_store import ObjectBlobs
 
 HALF_WAY = """
 import sys, time
@@ -170,49 +167,3 @@ def test_a_server_that_never_answers_is_given_up(
         objects = open_objects(bucket)
         with pytest.raises(StoreAway, match="cannot be read"):
             objects.get("a")
-
-
-def test_what_was_read_lately_is_held_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(object_store, "MOST", 100)
-    held = object_store.Recent(3600.0)
-    for number in range(12):
-        held.put(f"{number}", bytes([number]) * 10)
-    assert [held.get(f"{number}") for number in range(3)] == [None, None, b"\2" * 10]
-    held.put("2", b"x" * 10)  # read anew: the newest again
-    held.put("12", b"y" * 5)
-    assert (held.get("2"), held.get("3")) == (b"x" * 10, None)
-    held.put("large", bytes(object_store.LARGEST + 1))
-    assert held.get("large") is None
-    held.remove("2")
-    assert held.get("2") is None
-    held.close()
-    assert held.get("12") is None
-
-
-def test_what_was_read_lately_goes_by_itself() -> None:
-    held = object_store.Recent(0.05)
-    held.put("a", b"x")
-    _until_empty(held)  # nobody asks for it
-    assert held._bytes == 0
-    held.put("b", b"y")  # and so does what comes later
-    _until_empty(held)
-
-
-def _until_empty(held: object_store.Recent) -> None:
-    end = time.monotonic() + 60
-    while held._held:
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
-def test_a_blob_is_read_once_by_a_process_that_needs_it_often(tmp_path: Path) -> None:
-    objects = open_objects("memory:///")
-    locks = FileLocks(tmp_path / "lock", make=True)
-    one, other = (ObjectBlobs(objects, locks, lambda: "me", 3600.0) for _ in range(2))
-    digest = one.put(b"depth")
-    assert one.get(digest) == b"depth"
-    other.remove(digest)
-    assert one.get(digest) == b"depth"  # until `purge_s` is over
-    one.remove(digest)
-    with pytest.raises(DamagedBlob):
-        one.get(digest)

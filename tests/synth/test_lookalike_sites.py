@@ -91,6 +91,7 @@ def test_there_is_no_other_kind() -> None:
         synthesise_lookalike("stairs", 0, 0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("make", OBJECTS)
 def test_the_body_of_an_object_is_the_same_turned_by_its_symmetry(
     make: Callable[[np.random.Generator], SymmetricObject],
@@ -108,6 +109,7 @@ def test_the_body_of_an_object_is_the_same_turned_by_its_symmetry(
             assert share_that_differs(whole, T, angle, 0.02) < 0.05
 
 
+@pytest.mark.thorough
 def test_details_break_the_symmetry_of_a_cabinet() -> None:
     """Over eight cabinets, from all around, turned by 180 degrees: something differs, not much."""
     shares = []
@@ -171,6 +173,7 @@ def test_bays_repeat() -> None:
         assert alike.mean() > 0.8
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("kind", "scenes"), [("object", 1), ("kitchens", 2)])
 def test_the_layout_is_read_back(kind: str, scenes: int, tmp_path: Path) -> None:
     out = tmp_path / "sites"

@@ -16,7 +16,6 @@ from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import NOT_ASKED, Validated, thresholds
 from sceneprint.engine.serializers import sensor_of, transform
 from sceneprint.errors import DamagedBlob, UnknownFrame, UnreadableGeometry
-from sceneprint.formats.artifact import read_geometry
 from sceneprint.geometry.retrieval.distance import Ints64, distances, similarity
 from sceneprint.geometry.retrieval.dpp import DUPLICATE, DiversityParameters, remaining
 from sceneprint.geometry.validation.validation import PairValidation
@@ -286,7 +285,7 @@ def _aligned(
         if blob is None:
             return ToldValidation(status="skipped", reason="it was deleted during the query"), None
         try:
-            own = read_geometry(asking.store.blobs.get(blob))
+            own = asking.store.geometries.read(blob)
         except (DamagedBlob, UnreadableGeometry) as error:
             return ToldValidation(status="skipped", reason=str(error)), None
         query = asking.query

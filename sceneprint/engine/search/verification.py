@@ -19,7 +19,6 @@ from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.serializers import pose_matrix
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, InvalidRequest, UnreadableGeometry
-from sceneprint.formats.artifact import read_geometry
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.map_verification import MapViews, looks_ahead
@@ -130,7 +129,7 @@ def validated(
         if number not in blobs:  # deleted in the meantime
             return None
         try:  # when its turn comes: 200 at once would be 125 MB
-            geometry_of = read_geometry(store.blobs.get(blobs[number]))
+            geometry_of = store.geometries.read(blobs[number])
         except (DamagedBlob, UnreadableGeometry) as error:  # one frame must not cost the answer
             unreadable[number] = str(error)
             return None
@@ -215,7 +214,7 @@ def placed(
             if number in known:
                 return geometries[number]
             try:
-                return read_geometry(store.blobs.get(near[number].geometry))
+                return store.geometries.read(near[number].geometry)
             except (DamagedBlob, UnreadableGeometry):
                 return None  # one frame of many: the others tell the poses apart
 

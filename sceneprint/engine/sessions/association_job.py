@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import OrderedDict
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,6 @@ from sceneprint.engine.sessions.associations import Plan, eligible, runs_of
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
-from sceneprint.formats.artifact import read_geometry
 from sceneprint.geometry.pose.loops import (
     LoopEdges,
     RobotPath,
@@ -148,10 +147,6 @@ Verdicts,
     return told
 
 
-#: Artifacts that a slice keeps opened, of some 600 kB each.
-_OPENED = 64
-
-
 class Associating:
     """The handler of the jobs."""
 
@@ -164,9 +159,8 @@ class Associating:
         progress = dict(task.progress) or self._begin(task, asked)
         plan = Plan(progress["source"], progress["target"], progress["taken"])
         items: list[dict[str, Any]] = []
-        opened = _Opened(self._store)
         while progress["done"] < len(plan.source):
-            edges, tried = self._frame(task, asked, plan, progress["done"], opened)
+            edges, tried = self._frame(task, asked, plan, progress["done"])
             items += edges
             progress["validated"] += tried or 0
             progress["skipped"] += tried is None
@@ -195,7 +189,7 @@ class Associating:
         }  # fmt: skip
 
     def _frame(
-        self, task: LongJob, asked: NewAssociation, plan: Plan, place: int, opened: _Opened
+        self, task: LongJob, asked: NewAssociation, plan: Plan, place: int
     ) -> tuple[list[dict[str, Any]], int | None]:
         """Edges of one frame, and how many candidates were tried; None where it is gone."""
         number = plan.source[place]
@@ -206,7 +200,8 @@ class Associating:
         with self._store.database.read() as connection:
             vectors = stored_signatures(connection, [number], row.model_id)
             alive = number in frames_of(connection, [number])
-        geometry = opened.geometry(row, number)
+            blobs = geometry_blobs(connection, [number], row.model_id)
+        geometry = self._geometry(row, number, blobs)
         if number not in vectors or not alive or geometry is None:
             if alive:  # damaged, and made again behind this
                 resign_frames(self._store, row, [number], row.model_id)
@@ -224,8 +219,9 @@ class Associating:
         chosen = diversify(ranking.distances, distances, asked.candidates).indices.tolist()
         with self._store.database.read() as connection:
             ups = known_ups(connection, [number, *ranking.indices.tolist()])
+            blobs = geometry_blobs(connection, ranking.indices[chosen].tolist(), row.model_id)
         matches = associate(
-            geometry, ranking, chosen, lambda key: opened.geometry(row, key), asked.k,
+            geometry, ranking, chosen, lambda key: self._geometry(row, key, blobs), asked.k,
             asked.seed, *thresholds(asked.validation, model.parameters.validation),
             up=ups.get(number), up_of=ups.get,
         )  # fmt: skip
@@ -239,6 +235,16 @@ class Associating:
             _item(number, one) for one in accepted if one.validation.overlap >= asked.min_overlap
         ]
         return edges, len(matches)
+
+    def _geometry(self, row: MapRow, number: int, blobs: Mapping[int, str]) -> Geometry | None:
+        """The artifact of a frame, of those that `blobs` names; None where it is damaged."""
+        if number not in blobs:  # deleted in the meantime
+            return None
+        try:
+            return self._store.geometries.read(blobs[number])
+        except (DamagedBlob, UnreadableGeometry):  # one frame must not cost the others
+            resign_frames(self._store, row, [number], row.model_id)
+            return None
 
     def _view(self, of: MapRow) -> tuple[MapRow, Model, MapView]:
         """The map as it is now: frames of it may be deleted, and its model may change.
@@ -257,32 +263,6 @@ class Associating:
                 if row.model_id == model.id:
                     views = self._readers.views(connection, self._store.database, [row])
                     return row, model, views[0]
-
-
-class _Opened:
-    """Artifacts that were opened lately: frames near each other have the same candidates."""
-
-    def __init__(self, store: Store) -> None:
-        self._store = store
-        self._held: OrderedDict[tuple[int, str], Geometry] = OrderedDict()
-
-    def geometry(self, row: MapRow, number: int) -> Geometry | None:
-        """The artifact of a frame; None where it is gone or damaged."""
-        key = (number, row.model_id)
-        if key not in self._held:
-            with self._store.database.read() as connection:
-                blob = geometry_blobs(connection, [number], row.model_id).get(number)
-            if blob is None:
-                return None
-            try:
-                self._held[key] = read_geometry(self._store.blobs.get(blob))
-            except (DamagedBlob, UnreadableGeometry):  # one frame must not cost the others
-                resign_frames(self._store, row, [number], row.model_id)
-                return None
-        self._held.move_to_end(key)
-        while len(self._held) > _OPENED:
-            self._held.popitem(last=False)
-        return self._held[key]
 
 
 def _item(number: int, match: PairMatch) -> dict[str, Any]:

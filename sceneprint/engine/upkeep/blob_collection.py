@@ -33,6 +33,7 @@ def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
     removes them later.
     """
     done = 0
+    store.geometries.forget(blobs)
     while done < len(blobs):
         with store.database.write() as connection, store.blobs.removing() as allowed:
             if not allowed:

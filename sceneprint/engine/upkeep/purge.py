@@ -73,6 +73,7 @@ class Purging:
         if time.monotonic() < self._next:
             return None
         self._next = time.monotonic() + self._every_s
+        self._store.geometries.forget_older(self._every_s)
         before = time.time() - min(_YOUNG_S, self._every_s)
         return self._all(before, self._upkeep.is_rested, seconds=min(_SWEEP_S, self._every_s))
 

@@ -170,17 +170,29 @@ def patch_descriptors(patches: Patches, p: PatchDescriptorParameters) -> Floats3
 
 @kernel
 def _project(histograms: Floats32, matrix: Floats32, offset: Floats32, out: Floats32) -> None:
-    """Rows times matrix (D, d), less the offset; most bins of a histogram are empty."""
+    """Rows times matrix (D, d), less the offset; most bins of a histogram are empty.
+
+    Four bins at a time, added in their order: a row is read and written a quarter as often.
+    """
+    filled = np.empty(histograms.shape[1], np.int32)
     for i in range(len(histograms)):
-        row = out[i]
+        histogram, row, count = histograms[i], out[i], 0
+        for b in range(len(histogram)):
+            filled[count] = b
+            count += 1 if histogram[b] > 0 else 0
         for k in range(len(row)):
             row[k] = -offset[k]
-        for b in range(histograms.shape[1]):
-            value = histograms[i, b]
-            if value > 0:
-                component = matrix[b]
-                for k in range(len(row)):
-                    row[k] += value * component[k]
+        fours = count - count % 4
+        for at in range(0, fours, 4):
+            b0, b1, b2, b3 = filled[at], filled[at + 1], filled[at + 2], filled[at + 3]
+            h0, h1, h2, h3 = histogram[b0], histogram[b1], histogram[b2], histogram[b3]
+            m0, m1, m2, m3 = matrix[b0], matrix[b1], matrix[b2], matrix[b3]
+            for k in range(len(row)):
+                row[k] = (((row[k] + h0 * m0[k]) + h1 * m1[k]) + h2 * m2[k]) + h3 * m3[k]
+        for at in range(fours, count):
+            value, component = histogram[filled[at]], matrix[filled[at]]
+            for k in range(len(row)):
+                row[k] += value * component[k]
 
 
 def compress(histograms: Floats32, by: Compression) -> Bytes:

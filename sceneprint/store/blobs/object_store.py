@@ -126,81 +126,6 @@ class BucketOwner:
         )
 
 
-# Blobs that were read lately, in memory: a query reads ten artifacts, each a request otherwise.
-
-#: Bytes of all together, and the most of one.
-MOST, LARGEST = 64 << 20, 2 << 20
-
-
-class Recent:
-    """Bounded in bytes and in age; safe to share between threads.
-
-    Parameters
-    ----------
-    seconds : after which nothing is left of one, whether it is asked for or not: what was deleted
-        elsewhere must go here too
-    """
-
-    def __init__(self, seconds: float) -> None:
-        self._seconds = seconds
-        self._lock = threading.Lock()
-        self._held: OrderedDict[str, tuple[float, bytes]] = OrderedDict()  # the oldest first
-        self._bytes = 0
-        self._timer: threading.Timer | None = None
-
-    def get(self, digest: str) -> bytes | None:
-        """The bytes, where they are held."""
-        with self._lock:
-            found = self._held.get(digest)
-        return None if found is None or found[0] <= time.monotonic() else found[1]
-
-    def put(self, digest: str, data: bytes) -> None:
-        """Hold them; the oldest go."""
-        if len(data) > LARGEST:
-            return
-        with self._lock:
-            self._remove(digest)
-            self._held[digest] = (time.monotonic() + self._seconds, data)
-            self._bytes += len(data)
-            while self._bytes > MOST:
-                self._remove(next(iter(self._held)))
-            self._wind()
-
-    def remove(self, digest: str) -> None:
-        """Hold them no more."""
-        with self._lock:
-            self._remove(digest)
-
-    def close(self) -> None:
-        """Hold nothing."""
-        with self._lock:
-            self._held.clear()
-            self._bytes = 0
-            if self._timer is not None:
-                self._timer.cancel()
-                self._timer = None
-
-    def _remove(self, digest: str) -> None:
-        found = self._held.pop(digest, None)
-        if found is not None:
-            self._bytes -= len(found[1])
-
-    def _wind(self) -> None:
-        if self._timer is None and self._held:
-            until, _ = next(iter(self._held.values()))
-            self._timer = threading.Timer(max(until - time.monotonic(), 0.01), self._expire)
-            self._timer.daemon = True
-            self._timer.start()
-
-    def _expire(self) -> None:
-        with self._lock:
-            self._timer = None
-            now = time.monotonic()
-            while self._held and next(iter(self._held.values()))[0] <= now:
-                self._remove(next(iter(self._held)))
-            self._wind()
-
-
 #: Under the prefix: the blobs.
 FOLDER = "blobs/"
 #: Blobs that this process has put last, of which it knows whether any can have been removed since.
@@ -217,15 +142,11 @@ class ObjectBlobs(Blobs):
     objects : of the prefix
     locks : of all that share it
     owner : tells what the store is called that they belong to
-    purge_s : seconds after which nothing is left in memory of what another process removed
     """
 
-    def __init__(
-        self, objects: Objects, locks: Locks, owner: Callable[[], str], purge_s: float = 3600.0
-    ) -> None:
+    def __init__(self, objects: Objects, locks: Locks, owner: Callable[[], str]) -> None:
         super().__init__(locks)
         self.objects = objects
-        self._recent = Recent(purge_s)
         self._owner = owner
         self._claimed = False
         self._put: OrderedDict[str, int] = OrderedDict()  # removals until then, by digest
@@ -288,9 +209,6 @@ class ObjectBlobs(Blobs):
     def get(self, digest: str) -> bytes:
         """The bytes of a digest, checked against it; see `Blobs.get`."""
         require_digest(digest)
-        recent = self._recent.get(digest)
-        if recent is not None:
-            return recent
         try:
             data = self.objects.get(_key(digest))
         except FileNotFoundError as error:
@@ -303,7 +221,6 @@ class ObjectBlobs(Blobs):
                 f"The blob {digest[:12]} is damaged: its content has another hash. Restore it "
                 "from a copy, or delete the frame and upload it again."
             )
-        self._recent.put(digest, data)
         return data
 
     def open(self, digest: str) -> BinaryIO:
@@ -335,7 +252,6 @@ class ObjectBlobs(Blobs):
         self.claim()
         with self._lock:
             self._put.pop(digest, None)
-        self._recent.remove(digest)
         self.objects.delete(_key(digest))
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
@@ -415,11 +331,6 @@ class ObjectBlobs(Blobs):
         except UnusableStore as error:
             return error
         return None
-
-    def close(self) -> None:
-        """Give back the connections of its locks, and what was read lately."""
-        super().close()
-        self._recent.close()
 
 
 def _key(digest: str) -> str:

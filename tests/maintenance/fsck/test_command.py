@@ -91,6 +91,7 @@ def variant(upload: Any, n: int) -> bytes:
     return out.getvalue()
 
 
+@pytest.mark.thorough
 def test_beside_a_service_nothing_is_lost(house: Any, uploads: Any) -> None:
     """Robots upload and delete while fsck repairs without grace: worse than an operator does."""
     record = house.place / "found.json"

@@ -74,6 +74,7 @@ def killed(what: str, source: Path, folder: Path) -> Iterator[list[int]]:
     yield made
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["snapshot", "restore"])
 def test_killed_at_any_moment(kind, master, archive, tmp_path, content, settings):
     hidden = ".sceneprint-snapshot-" if kind == "snapshot" else ".restoring-"

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+import pytest
+
 from sceneprint.cli.demo import serving
 from sceneprint.engine import Engine
 from sceneprint.maintenance.snapshot.creation import take_snapshot
@@ -72,6 +74,7 @@ def at_work(url: str, uploads: list) -> Iterator[list[Robot]]:
     assert [robot.failed for robot in robots] == [[], []]
 
 
+@pytest.mark.thorough
 def test_it_holds_one_state_and_all_of_it(data, tmp_path, uploads, rows, answers, settings):
     asked = uploads[:6]
     archives = [tmp_path / f"{i}.tar" for i in range(3)]

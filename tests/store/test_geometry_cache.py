@@ -1,0 +1,103 @@
+"""Decoded artifacts in memory: what they hold, in which bounds, and that they go when they must."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+from sceneprint.geometry.validation.overlap import sampled
+
+from sceneprint.errors import DamagedBlob
+from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.lab.synth import synthesise_room
+from sceneprint.pipeline import Signer, prepare
+from sceneprint.store.blobs.folder import FolderBlobs
+from sceneprint.store.geometry_cache import GeometryCache
+
+
+@pytest.fixture(scope="module")
+def artifacts(small_signer: Signer) -> list[bytes]:
+    room = synthesise_room(3, 0, 4)
+    return [write_geometry(prepare(frame, small_signer)[1]) for frame in room.frames]
+
+
+@pytest.fixture
+def blobs(tmp_path: Path) -> FolderBlobs:
+    return FolderBlobs(tmp_path / "blobs", make=True)
+
+
+def test_what_is_read_again_is_the_same_object_with_what_was_worked_out_of_it(blobs, artifacts):
+    cache, digest = GeometryCache(blobs, 1 << 30), blobs.put(artifacts[0])
+    first = cache.read(digest)
+    assert write_geometry(first) == artifacts[0]
+    points = sampled(first.surface, 4)
+    assert cache.read(digest) is first
+    assert sampled(cache.read(digest).surface, 4) is points
+
+
+def test_the_least_recently_used_goes_first_and_memory_stays_within_its_bound(blobs, artifacts):
+    digests = [blobs.put(one) for one in artifacts]
+    size = _size_of_one(blobs, digests[0])
+    cache = GeometryCache(blobs, int(3.5 * size))
+    read = [cache.read(digest) for digest in digests[:3]]
+    assert 2.5 * size < cache.bytes_held <= 3.5 * size
+    assert cache.read(digests[0]) is read[0]  # used: the second is the oldest now
+    cache.read(digests[3])
+    assert cache.bytes_held <= 3.5 * size
+    assert cache.read(digests[0]) is read[0]
+    assert cache.read(digests[2]) is read[2]
+    assert cache.read(digests[1]) is not read[1]
+
+
+def test_none_is_kept_where_there_is_no_room(blobs, artifacts):
+    cache, digest = GeometryCache(blobs, 0), blobs.put(artifacts[0])
+    first = cache.read(digest)
+    assert cache.bytes_held == 0
+    again = cache.read(digest)
+    assert again is not first
+    assert write_geometry(again) == write_geometry(first)
+
+
+def test_a_deleted_frame_leaves_nothing(blobs, artifacts):
+    cache = GeometryCache(blobs, 1 << 30)
+    digests = [blobs.put(one) for one in artifacts[:2]]
+    kept = [cache.read(digest) for digest in digests][1]
+    blobs.remove(digests[0])
+    cache.forget([digests[0], "f" * 64])
+    with pytest.raises(DamagedBlob):
+        cache.read(digests[0])
+    assert cache.read(digests[1]) is kept
+    cache.forget(digests)
+    assert cache.bytes_held == 0
+
+
+def test_what_was_read_long_ago_goes_however_often_it_is_used(
+    blobs, artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    cache, digests = GeometryCache(blobs, 1 << 30), [blobs.put(one) for one in artifacts[:2]]
+    first = cache.read(digests[0])
+    now[0] = 130.0
+    second = cache.read(digests[1])
+    cache.read(digests[0])
+    cache.forget_older(31.0)
+    assert cache.read(digests[0]) is first
+    cache.forget_older(30.0)
+    assert cache.read(digests[1]) is second
+    assert cache.read(digests[0]) is not first
+
+
+def test_the_estimate_covers_the_arrays(blobs, artifacts):
+    digest = blobs.put(artifacts[0])
+    geometry = read_geometry(artifacts[0])
+    surface = geometry.surface
+    least = sum(one.nbytes for one in (surface.points, surface.normals, surface.areas))
+    assert least < _size_of_one(blobs, digest) < 2 * least
+
+
+def _size_of_one(blobs: FolderBlobs, digest: str) -> int:
+    cache = GeometryCache(blobs, 1 << 30)
+    cache.read(digest)
+    return cache.bytes_held
