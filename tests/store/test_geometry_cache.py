@@ -6,10 +6,10 @@ import time
 from pathlib import Path
 
 import pytest
-from sceneprint.geometry.validation.overlap import sampled
 
 from sceneprint.errors import DamagedBlob
 from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.pipeline import Signer, prepare
 from sceneprint.store.blobs.folder import FolderBlobs
