@@ -15,7 +15,7 @@ from sceneprint.geometry.signature.segmentation import hierarchy, patch_weights,
 from sceneprint.geometry.signature.whitening import whiten
 from sceneprint.geometry.surface.depth_image import inverse_depth, surface
 from sceneprint.lab.evaluation.pairs.pair_run import FEATURES, NORMALS, VOXEL, Clock, points_of
-from sceneprint.libraries import open3d
+from sceneprint.open3d_loader import open3d
 from sceneprint.pipeline import Signer, geometry_of, sign
 from sceneprint.signing import float_signature, see
 from sceneprint.types import DepthFrame, Floats

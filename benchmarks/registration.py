@@ -19,8 +19,8 @@ from benchmarks.pairs import FramePair
 from sceneprint.errors import MissingDependency
 from sceneprint.geometry.pose.rigid import difference
 from sceneprint.lab.evaluation.pairs.pair_run import METHODS, register
-from sceneprint.libraries import open3d
 from sceneprint.models import Model
+from sceneprint.open3d_loader import open3d
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats

@@ -17,7 +17,7 @@ from sceneprint.errors import InvalidRequest, UselessFrame
 from sceneprint.geometry.pose.rigid import inverse, moved
 from sceneprint.geometry.surface.coverage import TriangleMesh
 from sceneprint.geometry.surface.depth_image import halved
-from sceneprint.libraries import open3d
+from sceneprint.open3d_loader import open3d
 from sceneprint.types import DepthFrame, Floats, Floats32
 
 #: Voxels along the edge of a block: space is kept in blocks, where a surface is.

@@ -19,9 +19,9 @@ import numpy as np
 
 from sceneprint.geometry.pose.average import PoseAverage, average_poses
 from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.registration.covariance import error_of, place_covariance, transported
+from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.validation.acceptance import Strength
-from sceneprint.geometry.validation.association import preferred
-from sceneprint.geometry.validation.icp import error_of, place_covariance, transported
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
     MapViews,
@@ -34,7 +34,7 @@ from sceneprint.geometry.validation.map_verification import (
     same_place,
     starts_about,
 )
-from sceneprint.geometry.validation.overlap import OverlapParameters
+from sceneprint.geometry.validation.match_ranking import preferred
 from sceneprint.matches import PairMatch
 from sceneprint.types import Floats, Geometry
 

@@ -12,17 +12,17 @@ import numpy as np
 
 from sceneprint.geometry.pose.average import average_poses
 from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.registration.alignment import are_scans
+from sceneprint.geometry.registration.gravity import Ups
+from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
-from sceneprint.geometry.validation.alignment import are_scans
-from sceneprint.geometry.validation.association import preferred
-from sceneprint.geometry.validation.gravity import Ups
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
     at_place,
     different_views,
 )
-from sceneprint.geometry.validation.sequence_alignment import Matching
+from sceneprint.geometry.validation.match_ranking import preferred
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.pipeline import validate, validate_guided, validate_without_up
 from sceneprint.types import Floats, Geometry

@@ -1,6 +1,6 @@
 """What the geometry sees of a frame, as a picture.
 
-Frame  --panels-->  depth, normals, patches of each level  --save_picture-->  PNG
+Frame  --save_picture-->  PNG: depth, normals, patches of each level
 """
 
 from __future__ import annotations

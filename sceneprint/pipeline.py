@@ -1,7 +1,7 @@
 """The paper's Fig. 1 as functions, one line a stage.
 
 frame --prepare--> signature, geometry
-signature, database --retrieve--> R --diversify--> C --associate--> C_vld --locate--> pose
+signature, database --retrieve--> R --diversify--> C --associate--> C_vld --localize--> pose
 """
 
 from __future__ import annotations
@@ -12,6 +12,9 @@ import numpy as np
 
 from sceneprint.errors import ModelMismatch
 from sceneprint.geometry.cores import both
+from sceneprint.geometry.registration.gravity import NO_UPS, Ups
+from sceneprint.geometry.registration.patch_descriptors import compress, patch_descriptors
+from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.retrieval.distance import (
     Metric,
     Ranking,
@@ -25,9 +28,6 @@ from sceneprint.geometry.retrieval.dpp import diversify as select
 from sceneprint.geometry.surface.range_image import range_image
 from sceneprint.geometry.surface.voxels import Voxels
 from sceneprint.geometry.validation.acceptance import Mode
-from sceneprint.geometry.validation.gravity import NO_UPS, Ups
-from sceneprint.geometry.validation.patch_descriptors import compress, patch_descriptors
-from sceneprint.geometry.validation.sequence_alignment import Matching
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.geometry.validation.validation import validate as validate_geometry
 from sceneprint.geometry.validation.validation import validate_guided as check_predicted

@@ -1,6 +1,6 @@
 """A frame as a small picture, for people: what the sensor saw, by view.
 
-Surface | labels  --view-->  (h, w, 3) colours and what they mean  --png-->  bytes
+Surface, labels  --depth_view | normals_view | patches_view-->  colours  --picture-->  PNG
 """
 
 from __future__ import annotations

@@ -32,12 +32,12 @@ from sceneprint_client.api.listing import FrameEdit, MapEdit
 from sceneprint_client.api.reconstructions import NewReconstruction
 from sceneprint_client.api.sessions import NewAssociation
 from service import dashboard, problems
+from service.browser_security import origins_of
 from service.context import Context, Gate
-from service.events import Feed
-from service.guards import origins_of
-from service.limits import Limits
+from service.event_stream import Feed
 from service.metrics import Metrics, housekeeping
 from service.middleware import RequestMiddleware
+from service.rate_limits import RateLimits
 from service.routes import (
     admin,
     frame_data,
@@ -147,7 +147,7 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
             # they mostly wait for the disk: the engine sees to how many are decoded at once
             uploads = Gate(max(UPLOADS, settings.concurrency), settings.waiting, settings.wait_s)
             feed = Feed(engine.store.database, settings.event_streams, settings.events_kept)
-            limits = Limits(settings.requests_per_s, settings.failed_keys_per_minute)
+            limits = RateLimits(settings.requests_per_s, settings.failed_keys_per_minute)
             app.state.context = Context(
                 engine, gate, uploads, figures, settings.asks_for_keys, feed=feed, limits=limits
             )

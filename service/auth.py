@@ -18,13 +18,13 @@ from anyio import to_thread
 from fastapi import APIRouter, Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
-from sceneprint.errors import Forbidden, KeyRequired, RateLimited
+from sceneprint.errors import Forbidden, KeyRequired
 from sceneprint.store.maps import unknown_map
 from sceneprint.store.queue import unknown_job
 from sceneprint_client.api import Job
 from sceneprint_client.api.admin import EVERY, Scope, allows
 from service.context import Here
-from service.limits import Limit, place_of
+from service.rate_limits import enforce_rate_limit, network_of
 
 _bearer = HTTPBearer(auto_error=False, description="A key made by `sceneprint keys`.")
 
@@ -131,12 +131,12 @@ async def caller(
         raise KeyRequired(_why(request, here))
     key = await to_thread.run_sync(here.engine.find_key, given.credentials)
     if key is None or (key.expires_at is not None and key.expires_at <= time.time()):
-        _admit(request, here.limits.failed_keys, place_of(address_of(request)))
+        enforce_rate_limit(request, here.limits.failed_keys, network_of(address_of(request)))
         raise KeyRequired(_why(request, here) if key is None else _EXPIRED)
     request.state.caller = key.name
     found = Caller(key.name, key.grants, key.expires_at)
     request.state.changed = found.changed
-    _admit(request, here.limits.requests, key.name)
+    enforce_rate_limit(request, here.limits.requests, key.name)
     return found
 
 
@@ -185,18 +185,6 @@ def requires_key(request: Request, here: Here) -> bool:
 def address_of(request: Request) -> str:
     """Where a request came from: of the connection itself, whatever its headers say."""
     return "" if request.client is None else request.client.host
-
-
-def _admit(request: Request, limit: Limit, whose: str) -> None:
-    """Count a request, before its body is read; RateLimited where there are too many."""
-    standing = limit.take(whose)
-    request.state.standing = standing
-    if standing is not None and not standing.allowed:
-        raise RateLimited(
-            f"Too many {limit.what}: {standing.quota} at once and then "
-            f"{standing.quota / standing.window_s:g} a second are allowed. Retry in "
-            f"{standing.wait_s} s."
-        )
 
 
 _EXPIRED = "The key has expired. Ask the operator for a new one."

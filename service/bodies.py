@@ -475,7 +475,7 @@ def _text(values: list[UploadFile | str], name: str) -> str:
 
 # Many frames in one form, each with its own metadata and its own answer.
 #
-# form  --frames_of-->  Incoming  --read-->  Upload, ...  --told-->  Batch
+# form  --frames_of-->  FormFrames  --read-->  Upload, ...  --upload_responses-->  Batch
 
 
 @dataclass(frozen=True, eq=False)

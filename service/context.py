@@ -13,9 +13,9 @@ from fastapi import Depends, Request
 
 from sceneprint.engine import Engine
 from sceneprint.errors import Busy
-from service.events import Feed
-from service.limits import Limits
+from service.event_stream import Feed
 from service.metrics import Metrics
+from service.rate_limits import RateLimits
 
 T = TypeVar("T")
 
@@ -99,7 +99,7 @@ class Context:
     metrics: Metrics
     keys: bool
     feed: Feed
-    limits: Limits
+    limits: RateLimits
 
 
 async def _context(request: Request) -> Context:

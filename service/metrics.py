@@ -26,7 +26,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.admin.statistics import SERVICE, Figures, Latencies
 from sceneprint.errors import SceneprintError
 from sceneprint.store import Database
-from sceneprint.store.metrics import add_sample
+from sceneprint.store.store_counts import add_sample
 from sceneprint_client.api import Answer, FrameState, JobState
 from sceneprint_client.api.admin import ReplicaSeen
 

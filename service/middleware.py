@@ -16,21 +16,19 @@ from sceneprint.errors import Busy, RateLimited, SceneprintError
 from sceneprint.logs import name_request
 from sceneprint.settings import Settings
 from service.audit import note
-from service.guards import (
-    Broken,
+from service.body_limits import Broken, RequestBody, too_large
+from service.browser_security import (
     Headers,
     Origins,
-    RequestBody,
     forwarded,
-    guards,
     is_preflight,
     preflight_headers,
+    security_headers,
     stranger,
-    too_large,
 )
-from service.limits import RateState
 from service.metrics import Metrics
 from service.problems import problem, status_of
+from service.rate_limits import RateState
 
 log = logging.getLogger(__name__)
 
@@ -90,13 +88,13 @@ class RequestMiddleware:
                 return  # whatever the application makes of the broken body; ours follows
             if message["type"] == "http.response.start":
                 status = message["status"]
-                standing: RateState | None = state.get("standing")
+                standing: RateState | None = state.get("rate")
                 said = [
                     *message["headers"],
                     *own,
                     *([] if standing is None else standing.headers()),
                 ]
-                message["headers"] = said + guards(scope["path"], said)
+                message["headers"] = said + security_headers(scope["path"], said)
                 await note(scope, status, said)
             await send(message)
 

@@ -16,7 +16,7 @@ from starlette.exceptions import HTTPException
 
 from sceneprint import errors
 from sceneprint_client.api import Problem
-from service.guards import guards
+from service.browser_security import security_headers
 
 log = logging.getLogger(__name__)
 
@@ -122,9 +122,9 @@ def install(app: FastAPI) -> None:
         if isinstance(error, errors.UnusableStore):
             detail = next(UNUSABLE[kind] for kind in type(error).__mro__ if kind in UNUSABLE)
         answer = problem(_id(request), type(error).__name__, status, detail, fields)
-        standing = getattr(request.state, "standing", None)
-        if standing is not None and isinstance(error, errors.RateLimited):
-            answer.headers["Retry-After"] = str(standing.wait_s)
+        rate = getattr(request.state, "rate", None)
+        if rate is not None and isinstance(error, errors.RateLimited):
+            answer.headers["Retry-After"] = str(rate.wait_s)
         if type(error) in LATER_S:
             answer.headers["Retry-After"] = LATER_S[type(error)]
         return answer
@@ -155,7 +155,7 @@ def install(app: FastAPI) -> None:
         # `RequestMiddleware` does not see this one
         for name, value in getattr(request.state, "headers", ()):
             answer.headers[name.decode()] = value.decode()
-        for name, value in guards(request.url.path, answer.raw_headers):
+        for name, value in security_headers(request.url.path, answer.raw_headers):
             answer.headers[name.decode()] = value.decode()
         answer.headers["Connection"] = "close"  # as uvicorn does, unsaid, after an exception
         return answer

@@ -23,12 +23,15 @@ from sqlalchemy import Connection, NullPool, create_engine
 from benchmarks.fleet.postgres import NoServer, Server
 from benchmarks.fleet.s3 import ObjectServer
 from sceneprint.cli.demo import write_building
+from sceneprint.geometry.registration.patch_descriptors import (
+    Compression,
+    PatchDescriptorParameters,
+)
 from sceneprint.geometry.signature.mixture import Mixture
 from sceneprint.geometry.signature.pair_features import Projection
 from sceneprint.geometry.signature.pair_table import TableLayout
 from sceneprint.geometry.signature.segmentation import HierarchyParameters, SegmentationParameters
 from sceneprint.geometry.signature.whitening import Whitening
-from sceneprint.geometry.validation.patch_descriptors import Compression, PatchDescriptorParameters
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, open_signer

@@ -27,8 +27,8 @@ from sceneprint.formats.dataset import Camera, find_sequences, write_depth_png, 
 from sceneprint.geometry.retrieval.distance import distances, pairwise_distances, rank
 from sceneprint.geometry.retrieval.dpp import diversify
 from sceneprint.lab.evaluation.pairs.pair_run import register
-from sceneprint.libraries import open3d
 from sceneprint.models import Model
+from sceneprint.open3d_loader import open3d
 from sceneprint.pipeline import open_signer, prepare
 from sceneprint.types import DepthFrame, Floats, Intrinsics
 

@@ -218,7 +218,7 @@ class Without:
             raise ImportError("libX11.so.6: cannot open shared object file")
 sys.meta_path.insert(0, Without())
 import sceneprint.cli, sceneprint_client.client, sceneprint.fusion, service.app, worker.loop
-from sceneprint.libraries import open3d
+from sceneprint.open3d_loader import open3d
 from sceneprint.errors import MissingDependency
 try:
     open3d("A reconstruction")

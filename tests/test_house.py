@@ -24,7 +24,7 @@ RETIRED = {
     "racks": "snapshot storage", "shelf": "snapshot catalog", "endings": "job outcome",
     "truth": "database check", "accepting": "compatibility", "happenings": "event cursor",
     "belonging": "patch lookup", "growing": "append buffer", "rivals": "ambiguity",
-    "switches": "model switch", "agreement": "overlap", "choosing": "search routing",
+    "switches": "reencoding", "agreement": "overlap", "choosing": "search routing",
     "surroundings": "patch descriptors", "stored": "pgvector search", "once": "idempotency",
     "remembered": "signature cache", "slowness": "body timeout", "healing": "repair",
     "raw": "binary body", "sweeping": "blob garbage collection", "Around": "RequestMiddleware",
@@ -49,11 +49,52 @@ def definitions(
 
 
 def test_no_file_and_no_definition_has_a_retired_name() -> None:
-    found = [path for path in modules() if Path(path).stem in RETIRED]
+    tests = (path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("test_*.py"))
+    found = [
+        path for path in (*modules(), *tests) if Path(path).stem.removeprefix("test_") in RETIRED
+    ]
     for path, tree in modules().items():
         found += [f"{path}:{one.name}" for one in definitions(tree) if one.name in RETIRED]
     furniture = "sceneprint/lab/synth/furniture.py:shelf"  # a shelf, for once
     assert [one for one in found if one != furniture] == []
+
+
+def names_in(tree: ast.Module) -> Iterator[str]:
+    """Functions, classes, methods and fields of a module, and what it imports."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            yield node.target.id
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            yield from (one.asname or one.name.rpartition(".")[2] for one in node.names)
+
+
+def arrow_names(text: str) -> Iterator[str]:
+    """Names above the arrows of a text; what is said beside them, after a comma, is prose."""
+    for label in re.findall(r"--([^-<>\n]+)-->", text):
+        parts = re.split(r"\s*[|,]\s*", label.strip())
+        yield from (one for one in parts if re.fullmatch(r"[A-Za-z_]\w*(\.\w+)?", one))
+
+
+def test_the_names_above_arrows_are_read() -> None:
+    found = arrow_names("a  --take | give, at once-->  b --Queue.end--> c  -->  d <-- e")
+    assert list(found) == ["take", "give", "Queue.end"]
+
+
+def test_what_an_arrow_names_is_there() -> None:
+    known = defaultdict(set)
+    for path, tree in modules().items():
+        known[Path(path).parent] |= set(names_in(tree))
+    anywhere = set().union(*known.values())
+    found = [
+        f"{path}: {one}"
+        for path in modules()
+        for one in arrow_names((ROOT / path).read_text())
+        if one.partition(".")[0] not in known[Path(path).parent]
+        or one.rpartition(".")[2] not in anywhere
+    ]
+    assert found == []
 
 
 def distance(a: Path, b: Path) -> int:

@@ -12,6 +12,7 @@ import pytest
 
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.validation.map_verification import (
     MapParameters,
     MapViews,
@@ -20,7 +21,6 @@ from sceneprint.geometry.validation.map_verification import (
     score_pose,
     starts_about,
 )
-from sceneprint.geometry.validation.overlap import OverlapParameters
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.lab.synth import KINECT, render, symmetric_box, synthesise_room
 from sceneprint.localization import (

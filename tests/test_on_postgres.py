@@ -16,7 +16,7 @@ GROUPS = {
         "on_postgres/test_switch.py", "engine/test_uploads.py", "engine/test_jobs.py",
     ),
     "service": (
-        "service/test_maps_and_frames.py", "service/test_events.py", "service/test_once.py",
+        "service/test_maps_and_frames.py", "service/test_events.py", "service/test_idempotency.py",
         "service/test_faults.py",
     ),
 }  # fmt: skip

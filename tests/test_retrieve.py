@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import ModelMismatch, UselessFrame
+from sceneprint.geometry.registration.patch_descriptors import compress, patch_descriptors
 from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.geometry.retrieval.dpp import diversify as select
 from sceneprint.geometry.signature.segmentation import patches_of, segment
-from sceneprint.geometry.validation.association import expected_error, preferred
-from sceneprint.geometry.validation.patch_descriptors import compress, patch_descriptors
+from sceneprint.geometry.validation.match_ranking import expected_error, preferred
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.lab.evaluation.judgement import voters
 from sceneprint.lab.synth import KINECT, take, trajectory

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import TrainingError
+from sceneprint.geometry.registration.patch_descriptors import patch_descriptors
 from sceneprint.geometry.signature.mixture import MixtureParameters
 from sceneprint.geometry.signature.pair_table import TableLayout
 from sceneprint.geometry.signature.segmentation import (
@@ -18,7 +19,6 @@ from sceneprint.geometry.signature.segmentation import (
     segment,
 )
 from sceneprint.geometry.signature.whitening import WhiteningParameters
-from sceneprint.geometry.validation.patch_descriptors import patch_descriptors
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.lab.training import TrainingParameters, preset_parameters, preset_whitening, train
 from sceneprint.models import Model, ModelParameters

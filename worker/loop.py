@@ -22,8 +22,8 @@ from worker.traces import Trace
 
 log = logging.getLogger(__name__)
 
-#: Shortest pause before another look at a queue that had nothing, and the longest: for jobs of
-#: which no bell tells, as those that another machine queued.
+#: Shortest pause before another look at a queue that had nothing, and the longest: for jobs
+#: that no wakeup announces, such as those that another machine queued.
 SHORTEST_S, LONGEST_S = 0.05, 2.0
 #: Seconds between two looks at the indexes, and after one for which there was no memory.
 UPKEEP_S, POOR_S = 5.0, 300.0

@@ -502,7 +502,7 @@ def prepare_presets(settings: Settings, say: Callable[[str], None] | None = None
     settings : see Settings
     say : what tells of each step, as it takes a while (default: lines on standard error)
     """
-    from sceneprint.engine.models import warm
+    from sceneprint.engine.signers import warm
 
     if _is_new():
         tell, begun = say or _print, time.monotonic()

@@ -558,7 +558,7 @@ def _verified(archive: Path) -> tuple[Snapshot, str]:
 
 def _filled(archive: Path, settings: Settings, options: argparse.Namespace) -> tuple[Snapshot, str]:
     """Restored into the database of a fleet."""
-    from sceneprint.maintenance.snapshot.postgres import restore_to_fleet
+    from sceneprint.maintenance.snapshot.postgres_restore import restore_to_fleet
     from sceneprint.store.database import reach_database
 
     database = reach_database(settings.database)
@@ -789,7 +789,7 @@ def add_reencode(commands: Any) -> None:
 def run_reencode(options: argparse.Namespace) -> int:
     """Begin, watch or give up; returns 2 where waiting was no use."""
     from sceneprint.engine import Engine
-    from sceneprint.engine.maps import model_switch
+    from sceneprint.engine.maps import reencoding
 
     settings = settings_of(options)
     require_database(settings)
@@ -798,7 +798,7 @@ def run_reencode(options: argparse.Namespace) -> int:
             told = engine.reencode(options.map, options.model)
             engine.audit.command("reencode --model", map_name=options.map, model=str(options.model))
         elif options.cancel:
-            told = model_switch.cancel(engine.store, options.map)
+            told = reencoding.cancel(engine.store, options.map)
             engine.audit.command("reencode --cancel", map_name=options.map)
         else:
             told = engine.get_map(options.map)

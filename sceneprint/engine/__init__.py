@@ -1,6 +1,6 @@
-"""The one place that joins numbers and truth: frames in, answers out.
+"""The one place that joins computation and storage: frames in, answers out.
 
-Engine.add_frame  -->  store  --Engine.work-->  signature in the store  --Engine.query-->  Answer
+frame  --Engine.add_frame-->  store  --Engine.run-->  signature  --Engine.query_upload-->  Answer
 """
 
 from sceneprint.engine.engine import Engine

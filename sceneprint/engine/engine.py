@@ -17,13 +17,12 @@ from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.jobs.lifecycle import Work, put_back
 from sceneprint.engine.jobs.tasks import LongJob, Tasks
-from sceneprint.engine.maps import maps, model_switch
+from sceneprint.engine.maps import map_lifecycle, reencoding
 from sceneprint.engine.maps.map_frames import FrameFiles, list_frames
-from sceneprint.engine.maps.model_switch import ModelSwitches
-from sceneprint.engine.models import Signers, warm
+from sceneprint.engine.maps.reencoding import Reencodings
 from sceneprint.engine.reconstruction import ReconstructionJobs
-from sceneprint.engine.results.inspection import Inspection, PointClouds
 from sceneprint.engine.results.rerun import Rerun
+from sceneprint.engine.results.result_views import Inspection, PointClouds
 from sceneprint.engine.results.stored_results import ResultValidity, open_results
 from sceneprint.engine.search.local_index import Readers
 from sceneprint.engine.search.map_view import IndexView
@@ -31,9 +30,11 @@ from sceneprint.engine.search.query import Queries
 from sceneprint.engine.serializers import frame_records, map_record
 from sceneprint.engine.sessions.association_job import Associating
 from sceneprint.engine.sessions.associations import ASSOCIATE, AssociationJobs
-from sceneprint.engine.upkeep.deletion import Purging, Retention
+from sceneprint.engine.signers import Signers, warm
+from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
-from sceneprint.engine.upkeep.repair import collect_deleted_blobs
+from sceneprint.engine.upkeep.purge import Purging
+from sceneprint.engine.upkeep.retention import Retention
 from sceneprint.errors import ModelError, StoreAway, UnusableStore
 from sceneprint.geometry.cores import Cores
 from sceneprint.models import Model
@@ -43,7 +44,7 @@ from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import open_store, queue
 from sceneprint.store.deletion import remove_map
-from sceneprint.store.model_switch import models_of
+from sceneprint.store.reencoding_rows import models_of
 from sceneprint.store.tables import MapRow
 from sceneprint.store.wakeup import Notices, Wakeup
 from sceneprint_client.api import (
@@ -88,7 +89,7 @@ class Engine:
         self._upkeep = Upkeep(
             self.store, self.signers, settings.indexes, settings.tail_frames, settings.scrub_s
         )
-        self._reencoding = ModelSwitches(self.store, self._upkeep)
+        self._reencoding = Reencodings(self.store, self._upkeep)
         self._readers = Readers(self.signers, settings.indexes, settings.search)
         self._vector_tables = VectorTables(self.signers, settings.search)
         self.kept = open_results(
@@ -139,8 +140,8 @@ class Engine:
     # maps
 
     def create_map(self, new: NewMap) -> tuple[Map, bool]:
-        """Make a map, or find it there as wanted; see `maps.create_map`."""
-        return maps.create_map(self.store, new)
+        """Make a map, or find it there as wanted; see `map_lifecycle.create_map`."""
+        return map_lifecycle.create_map(self.store, new)
 
     def list_maps(self) -> Page[Map]:
         """All maps by name."""
@@ -162,9 +163,9 @@ class Engine:
 
     def reencode(self, name: str, model: str | Path | Model) -> Map:
         """Have a map signed with another model, to which it then switches; see
-        `model_switch.begin`.
+        `reencoding.begin`.
         """
-        told = model_switch.begin(self.store, name, model)
+        told = reencoding.begin(self.store, name, model)
         self.bell.ring()
         return told
 

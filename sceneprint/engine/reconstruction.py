@@ -1,7 +1,7 @@
 """Reconstructions: the accepted matches of an answer, fused to a surface by a worker.
 
 Kept, NewReconstruction  --begin-->  job
-job  --(in a worker) _fuse-->  mesh.ply, picture.png, Coverage
+job  --_fuse, in a worker-->  mesh.ply, picture.png, Coverage
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
 from sceneprint.engine.maps.map_frames import living
 from sceneprint.engine.results.stored_results import ResultValidity, StoredResult
 from sceneprint.engine.serializers import when
-from sceneprint.engine.upkeep.repair import collect_deleted_blobs
+from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
 from sceneprint.errors import (
     DamagedBlob,
     FrameError,
@@ -37,7 +37,7 @@ from sceneprint.fusion import BAND, FusionParameters, fuse, within
 from sceneprint.geometry.pose.rigid import inverse
 from sceneprint.geometry.surface.coverage import added_areas, observed_volume, of_views, share_seen
 from sceneprint.geometry.surface.depth_image import doubled
-from sceneprint.libraries import open3d
+from sceneprint.open3d_loader import open3d
 from sceneprint.rendering import PALETTE, reconstruction_picture
 from sceneprint.store import Store, queue
 from sceneprint.store.frames import find_frame

@@ -19,8 +19,8 @@ from sceneprint.geometry.pose.rigid import quaternion_of, rotation_of
 from sceneprint.store.deletion import DAY_S, count_old
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import model_names
-from sceneprint.store.model_switch import switch_progress
 from sceneprint.store.queue import jobs_of
+from sceneprint.store.reencoding_rows import switch_progress
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
 from sceneprint.types import Floats
 from sceneprint_client.api import (

@@ -1,6 +1,7 @@
 """Surfaces as 16-bit numbers, and back: what geometry artifacts hold of what a sensor saw.
 
-    Surface  --pack_*-->  (h, w, 3) or (N, 5) uint16        --unpack_*-->  Surface
+    Surface  --pack_image | pack_points-->  (h, w, 3) or (N, 5) uint16
+    uint16  --unpack_image | unpack_points-->  Surface
 
 A pinhole's pixels are inverse depths (its steps are far below a sensor's noise), a sphere's are
 ranges, points in no order are offsets in a cube. A normal is 2 x 16 bits on an octahedron. Steps
@@ -19,9 +20,9 @@ from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidIntrinsics, UnreadableGeometry
 from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.registration.overlap import thinned
 from sceneprint.geometry.surface.camera import camera_of
 from sceneprint.geometry.surface.range_image import directions
-from sceneprint.geometry.validation.overlap import thinned
 from sceneprint.types import Bytes, Floats, Floats32, Geometry, Intrinsics, Patches, Sphere, Surface
 
 Packed = NDArray[np.uint16]

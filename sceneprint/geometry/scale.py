@@ -10,18 +10,19 @@ from __future__ import annotations
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
+from sceneprint.geometry.registration.alignment import AlignmentParameters
+from sceneprint.geometry.registration.consensus import ConsensusParameters
+from sceneprint.geometry.registration.covariance import CovarianceParameters
+from sceneprint.geometry.registration.icp import RefinementParameters
+from sceneprint.geometry.registration.overlap import OverlapParameters, PlaneParameters
+from sceneprint.geometry.registration.patch_descriptors import PatchDescriptorParameters
+from sceneprint.geometry.registration.plan_search import PlanParameters
+from sceneprint.geometry.registration.sequence_alignment import SequenceParameters
 from sceneprint.geometry.signature.pair_features import PropertyParameters
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
-from sceneprint.geometry.validation.alignment import AlignmentParameters
 from sceneprint.geometry.validation.ambiguity import AmbiguityParameters
-from sceneprint.geometry.validation.consensus import ConsensusParameters
-from sceneprint.geometry.validation.icp import CovarianceParameters, RefinementParameters
-from sceneprint.geometry.validation.overlap import OverlapParameters, PlaneParameters
-from sceneprint.geometry.validation.patch_descriptors import PatchDescriptorParameters
-from sceneprint.geometry.validation.plan_search import PlanParameters
-from sceneprint.geometry.validation.sequence_alignment import SequenceParameters
 
 T = TypeVar("T")
 

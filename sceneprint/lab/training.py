@@ -20,6 +20,7 @@ import numpy as np
 
 from sceneprint.errors import FrameError, TrainingError
 from sceneprint.formats.dataset import FrameReference
+from sceneprint.geometry.registration.patch_descriptors import fit_compression, patch_descriptors
 from sceneprint.geometry.retrieval.distance import Metric, pairwise_distances
 from sceneprint.geometry.scale import scaled
 from sceneprint.geometry.signature.fisher_vector import quantise
@@ -40,7 +41,6 @@ from sceneprint.geometry.signature.whitening import (
     whiten,
 )
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
-from sceneprint.geometry.validation.patch_descriptors import fit_compression, patch_descriptors
 from sceneprint.lab.synth import synthesise_room, synthesise_survey
 from sceneprint.models import Model, ModelParameters
 from sceneprint.signing import (
@@ -238,7 +238,7 @@ def train(
     Parameters
     ----------
     name : what to call the model
-    model_p, mixture_p : its parameters, such as those of a preset: see `recipes.py`
+    model_p, mixture_p : its parameters, such as those of a preset: see `preset_parameters`
     p : see TrainingParameters
     references : frames of one's own beside the rooms, each with the name of its place
     jobs : processes that make and segment frames

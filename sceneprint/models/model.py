@@ -13,6 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableModel
+from sceneprint.geometry.registration.patch_descriptors import (
+    Compression,
+    PatchDescriptorParameters,
+)
 from sceneprint.geometry.retrieval.distance import Metric
 from sceneprint.geometry.signature.mixture import Mixture
 from sceneprint.geometry.signature.pair_features import Projection, PropertyParameters
@@ -25,7 +29,6 @@ from sceneprint.geometry.signature.segmentation import (
 from sceneprint.geometry.signature.whitening import Ints8, Whitening
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters, NormalParameters
-from sceneprint.geometry.validation.patch_descriptors import Compression, PatchDescriptorParameters
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.types import Floats32
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from sceneprint.atomic_files import write_whole
 from sceneprint.errors import UnreadableModel
+from sceneprint.geometry.registration.patch_descriptors import Compression
 from sceneprint.geometry.signature.mixture import Mixture
 from sceneprint.geometry.signature.pair_features import (
     FEATURE_DIMENSION,
@@ -21,7 +22,6 @@ from sceneprint.geometry.signature.pair_features import (
 )
 from sceneprint.geometry.signature.whitening import Whitening
 from sceneprint.geometry.surface.cloud import CloudParameters
-from sceneprint.geometry.validation.patch_descriptors import Compression
 from sceneprint.models.model import (
     PSI_SCHEMA_VERSION,
     SCHEMA_VERSION,

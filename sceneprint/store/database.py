@@ -425,7 +425,7 @@ def open_database(url: str) -> Database:
 # Writers that come while another one writes are written together in the next transaction: a commit
 # waits for the disk, whatever is in it, and eight clients need not wait eight times.
 #
-#     run(a), run(b), run(c)  --one commit-->  each gets its own result
+#     run(a), run(b), run(c)  --Grouping.run, in one commit-->  each gets its own result
 
 T = TypeVar("T")
 

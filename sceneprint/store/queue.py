@@ -14,8 +14,8 @@ would stand in the way of uploads. What keeps them apart is the row of the job, 
 - a claim, and an end (`finish`, `fail`, `go_on`, `give_back`, `check_held`) by a worker whose
   lease is over: the end locks the job first and the claim passes it over, or the claim was first
   and the end finds another token;
-- a claim, and `cancel`, a deletion, `bury` or `fail_of_dead`: these lock the job before all else.
-  Where the claim was first they wait for its commit, and see the job as it is then (READ
+- a claim, and `cancel`, a deletion, `dead_letter` or `fail_of_dead`: these lock the job before all
+  else. Where the claim was first they wait for its commit, and see the job as it is then (READ
   COMMITTED looks at WHERE once more); where they were, the claim passes it over;
 - a renewal, and any of these: an UPDATE of the token's own row, which waits for the other, and
   then finds that it holds no more, or finds nothing.
@@ -253,7 +253,7 @@ def due_in_s(connection: Connection) -> float | None:
 
 
 def has_due(connection: Connection) -> bool:
-    """Whether there is a job to claim or to bury; costs no lock."""
+    """Whether there is a job to claim or to move to the dead letters; costs no lock."""
     at = now(connection)
     waiting = and_(jobs.c.state == JobState.QUEUED, jobs.c.run_after <= at)
     silent = and_(jobs.c.state == JobState.RUNNING, jobs.c.leased_until < at)
@@ -443,7 +443,7 @@ def _lost(held: JobRow) -> LostLease:
 
 
 def is_given_up(connection: Connection) -> bool:
-    """Whether there is a job to `bury`; costs no lock."""
+    """Whether there is a job to `dead_letter`; costs no lock."""
     asked = select(jobs.c.number).where(*_out_of_tries(now(connection))).limit(1)
     return connection.execute(asked).first() is not None
 

@@ -10,7 +10,7 @@ from zlib import crc32
 from sqlalchemy import ColumnElement, Connection, delete, func, insert, select, update
 
 from sceneprint.errors import DamagedSignature
-from sceneprint.store import model_switch
+from sceneprint.store import reencoding_rows
 from sceneprint.store.maps import next_revision
 from sceneprint.store.postgres import vectors
 from sceneprint.store.queue import PENDING
@@ -242,10 +242,10 @@ def stale_signatures(connection: Connection, row: MapRow, after: int) -> list[tu
         .join(frames, frames.c.number == signatures.c.frame_number)
         .where(
             frames.c.map_number == row.number, frames.c.number > after,
-            signatures.c.model_id.not_in(model_switch.models_of(row)),
+            signatures.c.model_id.not_in(reencoding_rows.models_of(row)),
         )
         .order_by(frames.c.number)
-        .limit(model_switch.REMOVED_AT_ONCE)
+        .limit(reencoding_rows.REMOVED_AT_ONCE)
     )  # fmt: skip
     return [(number, model_id) for number, model_id in found]
 
@@ -264,9 +264,10 @@ def stale_jobs(connection: Connection, row: MapRow) -> list[int]:
         select(jobs.c.number)
         .join(frames, frames.c.number == jobs.c.frame_number)
         .where(
-            jobs.c.state.in_(PENDING), jobs.c.kind == model_switch.REENCODE,
-            jobs.c.model_id.not_in(model_switch.models_of(row)), frames.c.map_number == row.number,
+            jobs.c.state.in_(PENDING), jobs.c.kind == reencoding_rows.REENCODE,
+            jobs.c.model_id.not_in(reencoding_rows.models_of(row)),
+            frames.c.map_number == row.number,
         )
-        .limit(model_switch.QUEUED_AT_ONCE)
+        .limit(reencoding_rows.QUEUED_AT_ONCE)
     )  # fmt: skip
     return list(found.scalars())

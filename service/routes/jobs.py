@@ -19,7 +19,7 @@ from sceneprint_client.api import Job, JobState, Page
 from sceneprint_client.api.admin import EventPage
 from service.auth import Asking, Caller, v1_router
 from service.context import Context, Here
-from service.events import BEGIN, MEDIA_TYPE, EventStream, Feed, alive, message
+from service.event_stream import BEGIN, MEDIA_TYPE, EventStream, Feed, alive, message
 from service.problems import declared
 
 router = v1_router("/jobs", "jobs")

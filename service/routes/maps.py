@@ -10,7 +10,7 @@ from anyio import to_thread
 from fastapi import Depends, Query, Request, Response
 from pydantic import ValidationError
 
-from sceneprint.engine.maps.maps import LIMITS, edit_frame, edit_map
+from sceneprint.engine.maps.map_lifecycle import LIMITS, edit_frame, edit_map
 from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint_client.api import Frame, Map, NewMap, Page
 from sceneprint_client.api.listing import OPERATORS

@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import select
 
 from sceneprint.engine import Engine
-from sceneprint.engine.maps.maps import edit_frame, edit_map
+from sceneprint.engine.maps.map_lifecycle import edit_frame, edit_map
 from sceneprint.errors import (
     FrameConflict,
     InvalidPose,

@@ -13,7 +13,7 @@ from sceneprint.engine import Engine
 from sceneprint.engine.admin import statistics as measuring
 from sceneprint.engine.maps import map_frames as growing
 from sceneprint.engine.maps.map_frames import growth, trajectory, trajectory_file
-from sceneprint.engine.maps.maps import edit_frame
+from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.errors import UnknownMap
 from sceneprint.formats.dataset import read_trajectory
 from sceneprint.store.maps import find_map

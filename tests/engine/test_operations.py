@@ -21,7 +21,7 @@ from sceneprint.engine.search import local_index
 from sceneprint.errors import Conflict, InvalidRequest, UnknownMap
 from sceneprint.models import PRESETS, read_model
 from sceneprint.store.events import Wanted, record_event
-from sceneprint.store.metrics import add_sample, samples_since
+from sceneprint.store.store_counts import add_sample, samples_since
 from sceneprint.store.tables import events, jobs, samples
 from sceneprint_client.api import NewMap, Query
 from sceneprint_client.api.admin import IndexRecall

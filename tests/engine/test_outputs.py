@@ -22,7 +22,7 @@ from sceneprint.engine.maps.map_frames import (
     trajectory_file,
     upload_type,
 )
-from sceneprint.engine.maps.maps import edit_frame
+from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnknownFrame, UnknownMap
 from sceneprint.formats.dataset import read_trajectory
 from sceneprint.geometry.pose.rigid import rotation_of

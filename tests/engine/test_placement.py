@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sceneprint.engine import Engine
-from sceneprint.engine.maps.maps import edit_frame
-from sceneprint.engine.search.outcome import Outcome, outcome_of
+from sceneprint.engine.maps.map_lifecycle import edit_frame
+from sceneprint.engine.search.answer_status import Outcome, answer_status
 from sceneprint.engine.search.query import localization_of
 from sceneprint.engine.search.verification import Validated
 from sceneprint.errors import InvalidPose, InvalidRequest
@@ -331,7 +331,7 @@ def came_of(
         accepted=statuses.count("accepted"),
     )  # fmt: skip
     p = ValidationParameters()
-    return outcome_of(Query(), estimate, tried, matches, counts, geometry, p, posed=True)
+    return answer_status(Query(), estimate, tried, matches, counts, geometry, p, posed=True)
 
 
 def supported(*scores: float) -> PoseEstimate:

@@ -114,10 +114,10 @@ def test_one_match_is_validated_once(
     full: Engine, asked: Answer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     best, made = asked.matches[0].frame_id, []
-    from sceneprint.engine.results import inspection
+    from sceneprint.engine.results import result_views
 
-    whole = inspection.validate
-    monkeypatch.setattr(inspection, "validate", lambda *a, **b: made.append(1) or whole(*a, **b))
+    whole = result_views.validate
+    monkeypatch.setattr(result_views, "validate", lambda *a, **b: made.append(1) or whole(*a, **b))
     told = full.inspection.match(asked.query_id, best)
     for side in ("query", "match"):
         full.points.match(asked.query_id, best, side=side).make()  # type: ignore[arg-type]

@@ -18,8 +18,8 @@ from sqlalchemy import inspect, text
 from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.search.local_index import index_folder
-from sceneprint.engine.upkeep import deletion, index_upkeep
-from sceneprint.engine.upkeep.deletion import Purging
+from sceneprint.engine.upkeep import index_upkeep, purge
+from sceneprint.engine.upkeep.purge import Purging
 from sceneprint.errors import BusyIndex, UnknownJob, UnknownQuery
 from sceneprint.index import newest, newest_number
 from sceneprint.index.generation_files import building
@@ -222,7 +222,7 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
         return found
 
     monkeypatch.setattr(index_upkeep, "publish", slow)
-    monkeypatch.setattr(deletion, "PAUSE", 1e4)
+    monkeypatch.setattr(purge, "PAUSE", 1e4)
     second = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2, purge_s=1)
     workers = [
         Purging(one.store, one._upkeep, one.kept, one.reconstructions, 0.0)

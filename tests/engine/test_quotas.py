@@ -11,7 +11,7 @@ from PIL import Image
 from sqlalchemy import select
 
 from sceneprint.engine.ingest.uploads import Upload
-from sceneprint.engine.maps.maps import edit_map
+from sceneprint.engine.maps.map_lifecycle import edit_map
 from sceneprint.errors import InvalidRequest, MapExists, QuotaExceeded
 from sceneprint.store import frames as stored
 from sceneprint.store.keys import IdempotentRequest

@@ -20,7 +20,7 @@ from sceneprint.engine.search import local_index, map_view
 from sceneprint.engine.search import query as querying
 from sceneprint.errors import InvalidRequest
 from sceneprint.geometry.retrieval.distance import distances
-from sceneprint.maintenance.snapshot.postgres import copy_into
+from sceneprint.maintenance.snapshot.postgres_restore import copy_into
 from sceneprint.models import Model
 from sceneprint.settings import Settings
 from sceneprint.store import open_database

@@ -16,8 +16,8 @@ from sceneprint.formats.points.ply_export import write_ply
 from sceneprint.geometry.pose.rigid import difference
 from sceneprint.lab.evaluation.pairs.pair_run import BINS, METHODS, points_of, register
 from sceneprint.lab.evaluation.protocol import every_frame
-from sceneprint.libraries import open3d
 from sceneprint.models import Model, save_model
+from sceneprint.open3d_loader import open3d
 from sceneprint.types import Floats
 
 

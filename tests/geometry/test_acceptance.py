@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sceneprint.geometry.registration.alignment import AlignmentParameters, FrameSamples, _scores
+from sceneprint.geometry.registration.overlap import OverlapParameters, PlaneView, agreements
 from sceneprint.geometry.validation.acceptance import (
     AcceptanceParameters,
     Evidence,
     belief,
     objection,
 )
-from sceneprint.geometry.validation.alignment import AlignmentParameters, FrameSamples, _scores
-from sceneprint.geometry.validation.overlap import OverlapParameters, PlaneView, agreements
 from sceneprint.lab.training import preset_parameters
 from sceneprint.types import Floats32, Geometry, Intrinsics, Patches, Surface
 

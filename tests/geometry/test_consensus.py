@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.pose.rigid import difference, inverse, moved
-from sceneprint.geometry.validation import consensus as module
-from sceneprint.geometry.validation.consensus import ConsensusParameters, consensus
+from sceneprint.geometry.registration import consensus as module
+from sceneprint.geometry.registration.consensus import ConsensusParameters, consensus
 from sceneprint.types import Floats, Ints32, Patches
 
 P = ConsensusParameters()

@@ -13,20 +13,18 @@ from scipy.stats import chi2
 
 from sceneprint.geometry.pose.average import average_poses
 from sceneprint.geometry.pose.rigid import inverse
-from sceneprint.geometry.validation.icp import (
-    FINE,
+from sceneprint.geometry.registration.covariance import (
     CovarianceParameters,
     Free,
-    Refined,
     adjoint,
     error_of,
     free_directions,
     pair_covariance,
     place_covariance,
-    refine,
     transported,
 )
-from sceneprint.geometry.validation.overlap import sampled
+from sceneprint.geometry.registration.icp import FINE, Refined, refine
+from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.lab.synth import KINECT, KINECT_V1, take, trajectory
 from sceneprint.lab.synth.dataset import own_sensor, room_and_rng
 from sceneprint.models import Model, read_model

@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 
 from sceneprint.geometry.frame_cache import cached_per_frame
-from sceneprint.geometry.validation.ambiguity import AmbiguityParameters, symmetries
-from sceneprint.geometry.validation.overlap import (
+from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
     PlaneParameters,
     looked_up,
     plane_view,
     sampled,
 )
+from sceneprint.geometry.validation.ambiguity import AmbiguityParameters, symmetries
 from sceneprint.pipeline import open_signer, prepare
 from sceneprint.types import DepthFrame
 

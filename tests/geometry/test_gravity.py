@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.pose.average import mean_direction
 from sceneprint.geometry.pose.rigid import difference, inverse, inverses
-from sceneprint.geometry.validation.ambiguity import AmbiguityParameters, best_alternative
-from sceneprint.geometry.validation.gravity import (
+from sceneprint.geometry.registration.gravity import (
     NO_UPS,
     GravityParameters,
     are_level,
@@ -22,12 +21,13 @@ from sceneprint.geometry.validation.gravity import (
     tilt_of,
     tilts,
 )
-from sceneprint.geometry.validation.overlap import OverlapParameters, plane_view
-from sceneprint.geometry.validation.patch_descriptors import (
+from sceneprint.geometry.registration.overlap import OverlapParameters, plane_view
+from sceneprint.geometry.registration.patch_descriptors import (
     MatchingParameters,
     SlopeGate,
     correspondences,
 )
+from sceneprint.geometry.validation.ambiguity import AmbiguityParameters, best_alternative
 from sceneprint.geometry.validation.validation import validate, validate_without_up
 from sceneprint.lab.synth import KINECT, symmetric_box, take, trajectory
 from sceneprint.lab.synth.dataset import room_and_rng

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.geometry.validation.patch_descriptors import MatchingParameters, correspondences
+from sceneprint.geometry.registration.patch_descriptors import MatchingParameters, correspondences
 from sceneprint.types import Bytes, Ints32
 
 

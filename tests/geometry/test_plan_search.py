@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.pose.rigid import difference, distinct, inverse, moved
-from sceneprint.geometry.retrieval.distance import Ranking
-from sceneprint.geometry.validation.plan_search import (
+from sceneprint.geometry.registration.plan_search import (
     PlanParameters,
     _lifts,
     other_plans,
@@ -19,6 +18,7 @@ from sceneprint.geometry.validation.plan_search import (
     plan_of,
     up_of,
 )
+from sceneprint.geometry.retrieval.distance import Ranking
 from sceneprint.lab.synth import synthesise_survey
 from sceneprint.matches import associate
 from sceneprint.models import Model, read_model

@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.pose.rigid import difference
-from sceneprint.geometry.validation import icp as module
-from sceneprint.geometry.validation.icp import COARSE, FINE, RefinementParameters, refine
-from sceneprint.geometry.validation.overlap import sampled
+from sceneprint.geometry.registration import icp as module
+from sceneprint.geometry.registration.icp import COARSE, FINE, RefinementParameters, refine
+from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.lab.synth import KINECT, render, trajectory
 from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.models import Model

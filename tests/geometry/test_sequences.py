@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.pose.rigid import difference, inverse, moved
-from sceneprint.geometry.validation.alignment import AlignmentParameters
-from sceneprint.geometry.validation.sequence_alignment import (
+from sceneprint.geometry.registration.alignment import AlignmentParameters
+from sceneprint.geometry.registration.sequence_alignment import (
     SequenceParameters,
     _cyclic,
     coarse,

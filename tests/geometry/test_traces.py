@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.registration.overlap import OverlapParameters, overlap_counts, sampled
 from sceneprint.geometry.validation.inspection import (
     AGREES,
     NEITHER,
@@ -24,7 +25,6 @@ from sceneprint.geometry.validation.inspection import (
     residuals,
     trace,
 )
-from sceneprint.geometry.validation.overlap import OverlapParameters, overlap_counts, sampled
 from sceneprint.types import Floats, Geometry, Patches, Surface
 
 P = OverlapParameters(stride=3)

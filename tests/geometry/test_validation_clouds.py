@@ -13,6 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.pose.rigid import difference, inverse, moved
+from sceneprint.geometry.registration.icp import FINE, refine
+from sceneprint.geometry.registration.overlap import (
+    OverlapParameters,
+    agreements,
+    looked_up,
+    sampled,
+)
 from sceneprint.geometry.scale import scaled
 from sceneprint.geometry.validation.acceptance import (
     AcceptanceParameters,
@@ -20,8 +27,6 @@ from sceneprint.geometry.validation.acceptance import (
     belief,
     objection,
 )
-from sceneprint.geometry.validation.icp import FINE, refine
-from sceneprint.geometry.validation.overlap import OverlapParameters, agreements, looked_up, sampled
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters, validate
 from sceneprint.lab.synth import KINECT, take
 from sceneprint.lab.synth.dataset import room_and_rng

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.pose import average, rigid
+from sceneprint.geometry.registration import consensus, icp, overlap
 from sceneprint.geometry.surface import camera
-from sceneprint.geometry.validation import consensus, icp, overlap
 
 RIGID = [
     ("-T[:3, :3].T @ T[:3, 3]", "T[:3, :3].T @ T[:3, 3]"),

@@ -12,9 +12,9 @@ import pytest
 from safetensors.numpy import load, save
 
 from sceneprint.errors import UnreadableModel
+from sceneprint.geometry.registration.patch_descriptors import PatchDescriptorParameters
 from sceneprint.geometry.signature.segmentation import SegmentationParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters
-from sceneprint.geometry.validation.patch_descriptors import PatchDescriptorParameters
 from sceneprint.models import PRESETS, Model, parse_model, read_model, save_model
 
 

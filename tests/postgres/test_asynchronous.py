@@ -17,7 +17,7 @@ from sceneprint.settings import Settings
 from sceneprint.store import Database
 from sceneprint.store.events import EventRow, Wanted
 from sceneprint_client.api import JobState, NewMap, Query
-from service.events import Feed
+from service.event_stream import Feed
 
 ASKED = Query(k=5, candidates=5, keep=False)
 

@@ -19,9 +19,9 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from sceneprint.settings import Settings
-from service import guards
+from service import body_limits
 from service import server as connections
-from service.guards import Origins
+from service.browser_security import Origins
 from service.metrics import Metrics
 from service.middleware import RequestMiddleware
 from service.server import Connection
@@ -61,7 +61,7 @@ def opened(monkeypatch) -> Iterator[Callable[..., socket.socket]]:
     """Connections to a service that is soon tired of waiting."""
     monkeypatch.setattr(connections, "HEAD_S", 0.8)
     monkeypatch.setattr(connections, "READING_S", 1.0)
-    monkeypatch.setattr(guards, "IDLE_S", 0.8)
+    monkeypatch.setattr(body_limits, "IDLE_S", 0.8)
     settings = Settings(body_s=1, upload_bytes=1 << 20, cors_origins=())
     made: list[socket.socket] = []
     with running(RequestMiddleware(app, settings, Origins(()), Metrics())) as address:
@@ -229,7 +229,7 @@ def test_a_body_that_drips_is_refused_in_the_end(opened):
 def test_each_mebibyte_that_came_gives_more_time(monkeypatch):
     """By hand: 2 s, and 4 s for each MiB; each part took 3 s of waiting."""
     now = [0.0]
-    monkeypatch.setattr(guards.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(body_limits.time, "monotonic", lambda: now[0])
     left = []
 
     class Timeout:
@@ -240,14 +240,14 @@ def test_each_mebibyte_that_came_gives_more_time(monkeypatch):
 
         async def __aexit__(self, *_: object) -> None: ...
 
-    monkeypatch.setattr(guards.asyncio, "timeout", Timeout)
+    monkeypatch.setattr(body_limits.asyncio, "timeout", Timeout)
 
     async def receive() -> dict[str, Any]:
         now[0] += 3
         return {"type": "http.request", "body": bytes(1 << 20), "more_body": True}
 
     async def read() -> None:
-        body = guards.RequestBody(receive, 1 << 30, 2.0)
+        body = body_limits.RequestBody(receive, 1 << 30, 2.0)
         for _ in range(4):
             await body.next()
 

@@ -19,7 +19,7 @@ from sceneprint.engine import Engine
 from sceneprint.logs import JsonFormatter, name_request, of_request, request_id
 from sceneprint.settings import Settings
 from sceneprint.store import database
-from sceneprint.store.metrics import samples_since
+from sceneprint.store.store_counts import samples_since
 from sceneprint_client.api import Answer
 from service.metrics import Sampler
 

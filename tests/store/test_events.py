@@ -12,7 +12,7 @@ from sqlalchemy import insert, select
 from sceneprint.store import Store
 from sceneprint.store.events import Wanted, list_events, newest_seen
 from sceneprint.store.maps import add_map, keep_model
-from sceneprint.store.metrics import count_events
+from sceneprint.store.store_counts import count_events
 from sceneprint.store.tables import events
 from sceneprint_client.api.admin import KINDS
 

@@ -9,7 +9,7 @@ import pytest
 
 from sceneprint.errors import DamagedBlob
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.validation.overlap import sampled
+from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.lab.synth import synthesise_room
 from sceneprint.pipeline import Signer, prepare
 from sceneprint.store.blobs.folder import FolderBlobs

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sceneprint.engine.admin.statistics import Statistics, anchors
-from sceneprint.engine.maps.maps import Catalogue
+from sceneprint.engine.maps.model_catalogue import Catalogue
 from sceneprint.engine.serializers import when
 from sceneprint.errors import InvalidRequest, SceneprintError
 from sceneprint.settings import Settings
@@ -48,7 +48,7 @@ from sceneprint_client.api.admin import (
 
 # Following events: where a reader begins, and what comes next.
 #
-# after  --begin-->  place  --read_on-->  events and the next place, again and again
+# after  --begin-->  place  --next_events-->  events and the next place, again and again
 #
 # A place counts events of all maps, and stays in the process; what a reader is told of it is
 # `seen`, the last event up to there that it may be told.

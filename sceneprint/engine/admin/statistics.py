@@ -24,7 +24,7 @@ from sceneprint.engine.serializers import when
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
 from sceneprint.index.generation_files import GenerationManifest, manifests, read_manifest
 from sceneprint.settings import Settings
-from sceneprint.store import Blobs, Database, FolderBlobs, Store, frame_queries, metrics
+from sceneprint.store import Blobs, Database, FolderBlobs, Store, frame_queries, store_counts
 from sceneprint.store.events import anchor_number, newest_number
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import find_map, list_maps
@@ -319,22 +319,22 @@ class Statistics:
         with self._store.database.read() as connection:
             row = None if map_name is None else find_map(connection, map_name)
             kinds = [f"frame.{outcome}" for outcome in OUTCOMES]
-            happened = metrics.count_events(connection, kinds, start, MINUTE_S, map_name)
-            samples: list[metrics.Sample] | None = None
+            happened = store_counts.count_events(connection, kinds, start, MINUTE_S, map_name)
+            samples: list[store_counts.Sample] | None = None
             if row is None:
                 frames, jobs = count_states(connection), count_jobs(connection)
                 maps, indexes = (
-                    metrics.count_maps(connection),
+                    store_counts.count_maps(connection),
                     index_states(connection, self._indexes),
                 )
-                samples = metrics.samples_since(connection, SERVICE, start)
-                oldest = metrics.oldest_waiting(connection)
+                samples = store_counts.samples_since(connection, SERVICE, start)
+                oldest = store_counts.oldest_waiting(connection)
                 workers = self.workers(connection)
             else:
                 frames = count_states(connection, row.number)
                 jobs = count_jobs(connection, row.number)
                 maps, indexes = 1, [index_state(connection, self._indexes, row)]
-                oldest, workers = metrics.oldest_waiting(connection, row.number), None
+                oldest, workers = store_counts.oldest_waiting(connection, row.number), None
             taken = None if row is None else self._sizes_of_map(connection, row)
         return Stats(
             at=when(now),
@@ -376,17 +376,17 @@ class Statistics:
     def began(self, worker: str) -> None:
         """Note that a worker has begun; where that cannot be written, nobody will know."""
         with suppress(SceneprintError), self._store.database.write(turn=False) as connection:
-            metrics.add_sample(connection, WORKER, worker, {})
+            store_counts.add_sample(connection, WORKER, worker, {})
 
     def _look(self) -> Figures:
         stats = self.tell(minutes=1)
         with self._store.database.read() as connection:
-            began = metrics.count_samples(connection, WORKER, time.time() - HOUR_S)
+            began = store_counts.count_samples(connection, WORKER, time.time() - HOUR_S)
             return Figures(stats, began, newest_number(connection))
 
     def workers(self, connection: Connection) -> list[WorkerSeen]:
         """Processes that wait for jobs, with SQLite on this machine, and those that have one."""
-        busy = metrics.at_work(connection, read_clock(connection))
+        busy = store_counts.at_work(connection, read_clock(connection))
         names = sorted({*self._bell.listeners(connection), *busy})
         return [WorkerSeen(name=name, job_id=busy.get(name)) for name in names]
 
@@ -419,12 +419,12 @@ def _use(row: MapRow) -> MapUse:
 
 def _minutes(
     happened: Mapping[tuple[int, str], int],
-    samples: list[metrics.Sample] | None,
+    samples: list[store_counts.Sample] | None,
     start: float,
     count: int,
 ) -> list[Minute]:
     """What happened in each minute; a minute in which nothing did is told too."""
-    of_minute: dict[int, list[metrics.Sample]] = {place: [] for place in range(count)}
+    of_minute: dict[int, list[store_counts.Sample]] = {place: [] for place in range(count)}
     for sample in samples or ():
         place = int((sample.at - start) // MINUTE_S)
         if place in of_minute:  # a clock that was set back may be ahead of now
@@ -441,7 +441,9 @@ def _minutes(
 
 
 def _recent_counts(
-    happened: Mapping[tuple[int, str], int], places: range, samples: list[metrics.Sample] | None
+    happened: Mapping[tuple[int, str], int],
+    places: range,
+    samples: list[store_counts.Sample] | None,
 ) -> dict[str, Any]:
     """Fields of `Counted` for some minutes."""
     told: dict[str, Any] = {

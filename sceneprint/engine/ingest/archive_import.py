@@ -1,6 +1,6 @@
-"""Archives of sequences into a map: taken whole at the door, and frame by frame by a worker.
+"""Archives of sequences into a map: stored whole on upload, then read frame by frame by a worker.
 
-chunks  --Receiver-->  a blob that can be sought in  --begin-->  job  --handler-->  items
+chunks  --Receiver-->  a seekable blob  --Imports.begin-->  job  --Imports.handle-->  items
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sceneprint.engine.ingest.uploads import Upload, Uploads, item_of
 from sceneprint.engine.ingest.uploads import UploadResult as UploadOutcome
 from sceneprint.engine.jobs.lifecycle import get_job
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
-from sceneprint.engine.upkeep.repair import collect_deleted_blobs
+from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
 from sceneprint.formats.archive.archive import Archive, open_archive
 from sceneprint.formats.archive.entries import Inflater
 from sceneprint.formats.dataset import FrameReference

@@ -18,9 +18,9 @@ from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import frame_of, set_state
 from sceneprint.store.maps import map_of
-from sceneprint.store.model_switch import REENCODE
 from sceneprint.store.queue import fail_of_dead
 from sceneprint.store.queue import list_jobs as list_stored
+from sceneprint.store.reencoding_rows import REENCODE
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
 from sceneprint_client.api import FrameState, Job, JobState, Page
 

@@ -15,9 +15,9 @@ from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_stored
 from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.jobs.tasks import LongJob
-from sceneprint.engine.models import Signers
 from sceneprint.engine.search.local_index import Readers
-from sceneprint.engine.upkeep.repair import collect_blobs
+from sceneprint.engine.signers import Signers
+from sceneprint.engine.upkeep.blob_collection import collect_blobs
 from sceneprint.formats.artifact import write_geometry
 from sceneprint.geometry.retrieval.distance import Metric, distance_share, distances
 from sceneprint.models import Model
@@ -25,7 +25,7 @@ from sceneprint.pipeline import prepare
 from sceneprint.store import Database, Store, queue
 from sceneprint.store.frames import frame_of, set_state
 from sceneprint.store.maps import find_map, map_of
-from sceneprint.store.model_switch import REENCODE, enqueue_all, models_of
+from sceneprint.store.reencoding_rows import REENCODE, enqueue_all, models_of
 from sceneprint.store.signatures import (
     StoredSignature,
     changes_since,

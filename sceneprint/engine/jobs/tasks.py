@@ -1,6 +1,6 @@
 """Jobs that are of no single frame: long ones, done in slices.
 
-    begin  -->  queued  --claim-->  Task  --handler, a slice at a time-->  Outcome, stored at once
+    begin  -->  queued  --claim-->  Task  --Tasks.run-->  a SliceResult for each slice
 
 What a slice found, how far it came, and that the job goes on or is over, is one commit, fenced by
 the job's token. A slice whose worker died is done again from where the last one ended.
@@ -17,7 +17,7 @@ from typing import Any
 
 from sceneprint.engine.jobs.lifecycle import LEFT_S, failure_texts, renewed
 from sceneprint.engine.serializers import job_record
-from sceneprint.engine.upkeep.repair import collect_deleted_blobs
+from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
 from sceneprint.errors import (
     Conflict,
     FrameError,
@@ -67,7 +67,7 @@ class LongJob:
 
     @property
     def progress(self) -> dict[str, Any]:
-        """How far the slices before have come: of the last `Outcome`; empty before the first."""
+        """Progress as of the last slice; empty before the first."""
         return self.job.progress or {}
 
     @property

@@ -17,8 +17,8 @@ import numpy as np
 
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_stored
-from sceneprint.engine.models import Signers
 from sceneprint.engine.serializers import frame_records, model_label, sensor_of, tag_of, when
+from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
@@ -350,7 +350,7 @@ def npy_of(vector: bytes) -> bytes:
 
 # What a frame is made of, out of the store: cloud, picture, patches, signature, upload.
 #
-# frame  --Outputs-->  Output: a tag that stands for the content, and how to make it
+# frame  --FrameFiles-->  Output: a tag that stands for the content, and how to make it
 
 
 class FrameFiles:

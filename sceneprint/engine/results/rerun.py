@@ -1,6 +1,6 @@
 """A kept query once more: how it was asked, what it saw, and what other options would answer.
 
-query id  --Again-->  Question | PNG | Answer
+query id  --Rerun-->  Question | PNG | Answer
 
 An operator is told the id of a robot's query, and has neither the frame nor the robot. The
 signature and the points that are kept with the answer are all that asking again needs.
@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from sceneprint.engine.results.inspection import check_geometry
+from sceneprint.engine.results.result_views import check_geometry
 from sceneprint.engine.results.stored_results import StoredResult, StoredResults
 from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, PreparedQuery, check_taken
@@ -140,7 +140,7 @@ def _given_options(kept: StoredResult) -> dict[str, Any]:
 
 
 def _ready(kept: StoredResult, query: Query) -> PreparedQuery:
-    """As `ask_upload` made it."""
+    """The query as `Queries.upload` prepared it."""
     artifact = kept.geometry
     validates = "validate" in query.stages
     return PreparedQuery(

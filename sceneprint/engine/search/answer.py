@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sceneprint.engine.search.answer_status import answer_status
 from sceneprint.engine.search.explanation import ExplainedQuery, explain, why
-from sceneprint.engine.search.outcome import outcome_of
 from sceneprint.engine.search.response import (
     Candidates,
     alternative_records,
@@ -228,7 +228,7 @@ def _answer(
         for one in matches
         if one.validation.status == "accepted"
     )
-    outcome = outcome_of(query, estimate, tried, matches, total, asked.geometry, p, posed=posed)
+    outcome = answer_status(query, estimate, tried, matches, total, asked.geometry, p, posed=posed)
     told = Answer(
         query_id=uuid.uuid4().hex,
         status=outcome.status,

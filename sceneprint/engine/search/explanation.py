@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.engine.search import retrieval
-from sceneprint.engine.search.gravity import known_ups
 from sceneprint.engine.search.response import Candidates, validation_record
+from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import NOT_ASKED, Validated, thresholds
 from sceneprint.engine.serializers import sensor_of, transform
 from sceneprint.errors import DamagedBlob, UnknownFrame, UnreadableGeometry

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, select
 
-from sceneprint.engine.models import Signers
 from sceneprint.engine.search.map_view import IndexView, MapView, StoredMaps
+from sceneprint.engine.signers import Signers
 from sceneprint.errors import UnusableStore
 from sceneprint.index import Generation, Tail, newest, newest_number
 from sceneprint.models import Model

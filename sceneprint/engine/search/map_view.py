@@ -140,7 +140,7 @@ class IndexView(MapView):
 
 # Maps searched in PostgreSQL, by a node that does not hold their signatures.
 #
-# query  --nearest vectors of pgvector-->  candidates  --signatures-->  Hits
+# query  --vectors.nearest-->  candidates  --signatures-->  Hits
 #
 # All maps of a query are asked in one statement, as of one state of the database: a frame that is
 # deleted there is found by none of it.

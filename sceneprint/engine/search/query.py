@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-from sceneprint.engine.models import Signers
 from sceneprint.engine.results.stored_results import StoredResult, StoredResults
 from sceneprint.engine.search.answer import SequenceFrame, answer
 from sceneprint.engine.search.local_index import Readers
@@ -23,11 +22,12 @@ from sceneprint.engine.search.retrieval import (
 )
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import model_label, sensor_frame, transform
+from sceneprint.engine.signers import Signers
 from sceneprint.errors import Busy, InvalidRequest, ModelMismatch, SceneprintError, UnknownMap
 from sceneprint.geometry.cores import Cores
 from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.registration.covariance import PAIR_METHOD
 from sceneprint.geometry.retrieval.distance import distances, similarity
-from sceneprint.geometry.validation.icp import PAIR_METHOD
 from sceneprint.models import PRESETS, read_model
 from sceneprint.pipeline import Signer, validate
 from sceneprint.store import Store

@@ -10,15 +10,15 @@ import numpy as np
 
 from sceneprint.engine.serializers import sensor_of, transform
 from sceneprint.geometry.pose.rigid import inverse
-from sceneprint.geometry.retrieval.distance import Ranking
-from sceneprint.geometry.retrieval.dpp import Selection
-from sceneprint.geometry.validation.icp import (
+from sceneprint.geometry.registration.covariance import (
     PAIR_METHOD,
     PLACE_METHOD,
     CovarianceParameters,
     Method,
     free_directions,
 )
+from sceneprint.geometry.retrieval.distance import Ranking
+from sceneprint.geometry.retrieval.dpp import Selection
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.localization import PoseEstimate
 from sceneprint.matches import PairMatch

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import read_upload
-from sceneprint.engine.search.gravity import known_ups
 from sceneprint.engine.search.map_view import MapView, Stored, search_stored
+from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.retrieval.distance import Ranking, ranking_size, similarity

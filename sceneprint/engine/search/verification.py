@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sceneprint.engine.search.gravity import known_ups
 from sceneprint.engine.search.retrieval import Deadline, Searched, SearchedMap
+from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.serializers import pose_matrix
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, InvalidRequest, UnreadableGeometry

@@ -1,6 +1,6 @@
 """A session against another, or against itself, frame by frame: a job in slices.
 
-plan --> frame, frame, ... a slice at a time --> edges --conclude--> verdicts, joins
+plan  -->  frames, a slice at a time  -->  edges  --finish_association-->  verdicts, joins
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
-from sceneprint.engine.models import Signers
-from sceneprint.engine.search.gravity import known_ups
 from sceneprint.engine.search.local_index import Readers
 from sceneprint.engine.search.map_view import MapView
+from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import transform
 from sceneprint.engine.sessions.associations import Plan, eligible, runs_of
+from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
 from sceneprint.geometry.pose.loops import (
@@ -53,7 +53,7 @@ from sceneprint_client.api.sessions import Join, NewAssociation
 
 # What all edges of an association say together: which to believe, and how sessions lie.
 #
-# edges, frames with poses  --conclude-->  verdicts, joins
+# edges, frames with poses  --finish_association-->  verdicts, joins
 
 #: What a vote of a weak edge counts beside that of a strong one.
 _WEAK = 0.5

@@ -14,7 +14,7 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.jobs.tasks import Tasks
 from sceneprint.engine.serializers import sensor_frame, transform, when
-from sceneprint.engine.upkeep.repair import collect_deleted_blobs
+from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.formats.pose_graph import PoseEdge, g2o, information_of
@@ -349,7 +349,7 @@ def _edge(item: dict[str, Any], stops: dict[int, PathFrame]) -> Edge:
 
 # The graph of an association: vertices in one frame as far as sessions are joined, and edges.
 #
-# frames, edges that were kept, joins  --placed | odometry-->  Graph  --tell-->  g2o, TUM, JSON
+# frames, edges that were kept, joins  --pose_graph-->  PoseGraph  --graph_text-->  g2o, TUM, JSON
 
 #: Deviation of an edge without a covariance of its own, metres and radians.
 _UNTOLD = (0.05, math.radians(1.5))

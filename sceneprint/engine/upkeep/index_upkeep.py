@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
-from sceneprint.engine.models import Signers
 from sceneprint.engine.search.local_index import (
     READ_MOST,
     Setting,
@@ -26,6 +25,7 @@ from sceneprint.engine.search.local_index import (
     is_index_folder,
     trusted,
 )
+from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import BusyIndex, InvalidRequest, ModelError, SceneprintError, UnknownMap
 from sceneprint.geometry.retrieval.distance import Metric
@@ -33,9 +33,9 @@ from sceneprint.index import Generation, clear, manifests, newest, newest_number
 from sceneprint.store import Store
 from sceneprint.store.events import anchor_of
 from sceneprint.store.maps import find_map, list_maps
-from sceneprint.store.model_switch import is_complete, models_of
 from sceneprint.store.postgres import vectors
 from sceneprint.store.postgres.connection import allow
+from sceneprint.store.reencoding_rows import is_complete, models_of
 from sceneprint.store.signatures import changes_since, count_gone, count_indexed, deleted_since
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Bytes
@@ -396,7 +396,7 @@ def _blocks(
 
 # Vectors of signatures in PostgreSQL, made and filled by workers beside everything else.
 #
-# models of the maps  -->  a table for each dimension  --fill, block by block-->  complete, a graph
+# models of the maps  --VectorTables.run-->  a table for each dimension, filled block by block
 
 #: Seconds for which a worker adds vectors before it looks for frames to sign again.
 FILL_S = 2.0

@@ -1,11 +1,10 @@
-"""What is damaged, lost or left over: derived data is made again, a lost upload is taken when the
-same content comes again, and blobs that nothing refers to any more are removed.
+"""Repair of frames: what is damaged is signed again from its upload, and a lost upload is replaced
+when the same content comes again.
 """
 
 from __future__ import annotations
 
 import logging
-import math
 import random
 import re
 import time
@@ -14,14 +13,13 @@ from collections.abc import Sequence
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
-from sceneprint.errors import SceneprintError, UnknownFrame, UnusableStore
+from sceneprint.errors import SceneprintError, UnknownFrame
 from sceneprint.store import Store
 from sceneprint.store.blobs.folder import Condition
-from sceneprint.store.deletion import doom, doomed_blobs, settle
-from sceneprint.store.frames import find_frame, frames_of, refers_to, renew_upload
+from sceneprint.store.frames import find_frame, frames_of, renew_upload
 from sceneprint.store.maps import find_map
-from sceneprint.store.model_switch import REENCODE
 from sceneprint.store.queue import enqueue, last_of
+from sceneprint.store.reencoding_rows import REENCODE
 from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import MapRow
 from sceneprint_client.api import FrameState
@@ -142,75 +140,3 @@ def take_upload(store: Store, map_name: str, frame_id: str, data: bytes) -> list
     if any(store.blobs.condition(artifact) != "sound" for artifact in artifacts.values()):
         resign_frames(store, row, [now.number], row.model_id)
     return [] if blob == frame.blob else [frame.blob]
-
-
-# Blobs that nothing refers to any more, removed.
-
-#: Blobs that are removed in one transaction, and seconds after which it ends anyhow: writers wait
-#: meanwhile, and a store of objects may be far away.
-SWEPT_AT_ONCE, SWEPT_S = 200, 0.5
-#: Blobs of deleted frames that are asked for at once.
-_LEFT_AT_ONCE = 1_000
-
-
-def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
-    """Remove blobs that nothing refers to any more.
-
-    In writing transactions, so that no upload comes to refer to one in between, and short ones.
-    While a snapshot is being taken they stay, as it may refer to them: `collect_doomed_blobs`
-    removes them later.
-    """
-    done = 0
-    store.geometries.forget(blobs)
-    while done < len(blobs):
-        with store.database.write() as connection, store.blobs.removing() as allowed:
-            if not allowed:
-                doom(connection, blobs[done : done + SWEPT_AT_ONCE])
-                done += SWEPT_AT_ONCE
-                log.info("blob removal deferred", extra={"blobs": len(blobs)})
-                continue
-            until, block = time.monotonic() + SWEPT_S, blobs[done : done + SWEPT_AT_ONCE]
-            swept = 0
-            for blob in block:
-                if not refers_to(connection, blob):
-                    store.blobs.remove(blob)
-                swept += 1
-                if time.monotonic() > until:
-                    break
-            settle(connection, block[:swept])
-            done += swept
-
-
-def collect_deleted_blobs(store: Store, blobs: Sequence[str]) -> None:
-    """As `sweep`, after a deletion that took effect already and is not to be refused any more."""
-    try:
-        collect_blobs(store, blobs)
-    except UnusableStore as error:
-        log.warning("blob removal failed", extra={"blobs": len(blobs), "error": str(error)})
-
-
-def collect_doomed_blobs(
-    store: Store, before: float | None = None, seconds: float = math.inf
-) -> int:
-    """Remove what was doomed and is still there: its process died, or a snapshot was being taken.
-
-    Parameters
-    ----------
-    store : see Store
-    before : only what was doomed before this time, seconds since 1970: of what is younger,
-        somebody may be at it
-    seconds : after which the rest is left for another time
-
-    Returns
-    -------
-    swept : number of blobs that were looked at
-    """
-    until, last, count = time.monotonic() + seconds, "", 0
-    while time.monotonic() < until:
-        with store.database.read() as connection:
-            blobs = doomed_blobs(connection, _LEFT_AT_ONCE, before, last)
-        if not blobs:
-            break
-        collect_blobs(store, blobs)
-        count, last = count + len(blobs), blobs[-1]
-    return count

@@ -4,7 +4,7 @@
 
 On the sphere about the viewpoint the inverse range of a plane is linear in the direction u:
 1/r = a . u. A least-squares fit of a over a window gives normal and denoised point at once,
-always facing the viewpoint, as `normals.py` does in the image of a depth sensor.
+always facing the viewpoint, as `depth_image.py` does in the image of a depth sensor.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from sceneprint.types import Cloud, Floats, Floats32, Sphere, Surface
 
 # The camera of a range image: which pole, how wide, and where its pixels look.
 #
-# points (N, 3)  --angles_of-->  azimuth, elevation, range  --framed-->  Sphere
+# points (N, 3)  --to_angles-->  azimuth, elevation, range  --framed-->  Sphere
 
 #: Closer to an axis than this a point is near its poles: cosine of 30 degrees.
 _NEAR_POLE = math.cos(math.radians(30.0))

@@ -1,1 +1,1 @@
-"""Two frames to a transform, and whether to believe it."""
+"""Whether to believe a transform: acceptance, ambiguity, validation in the map."""

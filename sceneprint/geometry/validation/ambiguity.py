@@ -24,9 +24,9 @@ import numpy as np
 from sceneprint.geometry.frame_cache import cached_per_frame
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.pose.rigid import are_near, distinct
-from sceneprint.geometry.validation.gravity import NO_UPS, Ups, are_level
-from sceneprint.geometry.validation.icp import COARSE, QUICK, RefinementParameters, refined_all
-from sceneprint.geometry.validation.overlap import (
+from sceneprint.geometry.registration.gravity import NO_UPS, Ups, are_level
+from sceneprint.geometry.registration.icp import COARSE, QUICK, RefinementParameters, refined_all
+from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
     PlaneParameters,
     PlaneView,

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.pose.rigid import inverse, moved
-from sceneprint.geometry.validation.consensus import ConsensusParameters
-from sceneprint.geometry.validation.overlap import (
+from sceneprint.geometry.registration.consensus import ConsensusParameters
+from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
     looked_up,
     sampled,

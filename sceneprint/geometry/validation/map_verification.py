@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from sceneprint.geometry.pose.average import average_poses
 from sceneprint.geometry.pose.rigid import are_near, distinct, inverse
-from sceneprint.geometry.validation.icp import COARSE, RefinementParameters
-from sceneprint.geometry.validation.overlap import (
+from sceneprint.geometry.registration.icp import COARSE, RefinementParameters
+from sceneprint.geometry.registration.overlap import (
     AGREES,
     VIOLATES,
     LookupTarget,

@@ -25,17 +25,7 @@ from sceneprint.geometry.pose.rigid import (
     nearest_rotation,
     rotation_angle,
 )
-from sceneprint.geometry.surface.camera import kind_of
-from sceneprint.geometry.validation.acceptance import (
-    AcceptanceParameters,
-    Evidence,
-    Mode,
-    Status,
-    Strength,
-    belief,
-    objection,
-)
-from sceneprint.geometry.validation.alignment import (
+from sceneprint.geometry.registration.alignment import (
     Alignment,
     AlignmentParameters,
     FrameSamples,
@@ -46,27 +36,32 @@ from sceneprint.geometry.validation.alignment import (
     are_scans,
     samples_of,
 )
-from sceneprint.geometry.validation.ambiguity import (
-    AmbiguityParameters,
-    Rival,
-    best_alternative,
-)
-from sceneprint.geometry.validation.gravity import NO_UPS, Ups, contradiction, tilt_of
-from sceneprint.geometry.validation.icp import (
-    FINE,
-    CovarianceParameters,
-    RefinementParameters,
-    pair_covariance,
-    refine,
-)
-from sceneprint.geometry.validation.overlap import (
+from sceneprint.geometry.registration.covariance import CovarianceParameters, pair_covariance
+from sceneprint.geometry.registration.gravity import NO_UPS, Ups, contradiction, tilt_of
+from sceneprint.geometry.registration.icp import FINE, RefinementParameters, refine
+from sceneprint.geometry.registration.overlap import (
     Explained,
     OverlapParameters,
     explained,
     overlap_counts,
     sampled,
 )
-from sceneprint.geometry.validation.sequence_alignment import Matching
+from sceneprint.geometry.registration.sequence_alignment import Matching
+from sceneprint.geometry.surface.camera import kind_of
+from sceneprint.geometry.validation.acceptance import (
+    AcceptanceParameters,
+    Evidence,
+    Mode,
+    Status,
+    Strength,
+    belief,
+    objection,
+)
+from sceneprint.geometry.validation.ambiguity import (
+    AmbiguityParameters,
+    Rival,
+    best_alternative,
+)
 from sceneprint.types import Floats, Geometry, Sphere
 
 #: From which frame to which a transform was searched for.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sceneprint.geometry.pose.average import average_poses
 from sceneprint.geometry.pose.rigid import inverse
+from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.retrieval.distance import (
     Ints64,
     Metric,
@@ -25,7 +26,6 @@ from sceneprint.geometry.retrieval.distance import (
 )
 from sceneprint.geometry.retrieval.dpp import diversify
 from sceneprint.geometry.validation.acceptance import Mode
-from sceneprint.geometry.validation.sequence_alignment import Matching
 from sceneprint.geometry.validation.validation import ValidationParameters, refined_at
 from sceneprint.lab.evaluation.protocol import (
     VIEWS,

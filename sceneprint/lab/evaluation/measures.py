@@ -1,6 +1,6 @@
 """Whether a place is among the first k of a ranking, by any way to rank.
 
-Prepared, Overlaps  --relevant-->  (Q, N)        rankings  --recall-->  figures
+rankings, which are relevant (Q, N)  --recall-->  figures
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def roc(scores: Floats, right: NDArray[np.bool_]) -> Roc | None:
 
 # The rows of the table: how far off the answers are, and whether they are rightly believed.
 #
-# Outcome, ...  --rows, validation, retrieval_of_chance-->  figures
+# Outcome, ...  --rows, validation, oracle_and_random-->  figures
 
 Figures = dict[str, float | int | None]
 

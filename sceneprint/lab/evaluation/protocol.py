@@ -28,7 +28,7 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.pose.rigid import difference, moved
 from sceneprint.geometry.retrieval.distance import Metric
 from sceneprint.geometry.validation.acceptance import Strength
-from sceneprint.geometry.validation.association import preferred
+from sceneprint.geometry.validation.match_ranking import preferred
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, open_signer, prepare

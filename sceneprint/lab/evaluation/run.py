@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import DatasetError
+from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.retrieval.distance import Metric
 from sceneprint.geometry.validation.acceptance import Mode
-from sceneprint.geometry.validation.sequence_alignment import Matching
 from sceneprint.lab.evaluation.baselines.baseline import open_baselines
 from sceneprint.lab.evaluation.baselines.comparison import Compared, compare, registered
 from sceneprint.lab.evaluation.judgement import (

@@ -35,7 +35,7 @@ from sceneprint.types import Floats
 
 # Small things that lie about: each builder returns one object resting on z = 0.
 #
-# rng  --thing-->  Mesh, 5 to 60 cm, yaw left to the caller
+# rng  --small_thing-->  Mesh, 5 to 60 cm, yaw left to the caller
 
 Builder = Callable[[np.random.Generator], SyntheticMesh]
 

@@ -335,7 +335,7 @@ def _every_fourth(
 
 # Rooms that are furnished alike: the same pieces at nearly the same places.
 #
-# rng  --Suite-->  Copies of a room
+# rng, Likeness  --equal_offices | equal_bays-->  rooms
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,10 +14,11 @@ from pathlib import Path
 from sqlalchemy import Connection, Text, cast, delete, func, select, update
 from sqlalchemy.exc import DBAPIError
 
-from sceneprint.engine.upkeep.repair import PRIORITY, collect_blobs, is_known_loss, reason_of_loss
+from sceneprint.engine.upkeep.blob_collection import collect_blobs
+from sceneprint.engine.upkeep.repair import PRIORITY, is_known_loss, reason_of_loss
 from sceneprint.errors import StoreError
 from sceneprint.maintenance.fsck.findings import Finding, Folder, each
-from sceneprint.maintenance.fsck.repair import (
+from sceneprint.maintenance.fsck.repair_actions import (
     GONE,
     quarantine_blob,
     quarantine_bytes,
@@ -29,8 +30,8 @@ from sceneprint.models.table_cache import is_sound_table
 from sceneprint.store.blobs.folder import PART, BlobEntry, Condition
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import refers_to
-from sceneprint.store.model_switch import REENCODE
 from sceneprint.store.queue import cancel_jobs, enqueue, remove_parts
+from sceneprint.store.reencoding_rows import REENCODE
 from sceneprint.store.tables import frames, job_files, jobs, maps, signatures
 from sceneprint_client.api import FrameState, JobState
 

@@ -25,7 +25,7 @@ from sceneprint.maintenance.fsck.blobs import (
     check_tables,
     check_uploads,
 )
-from sceneprint.maintenance.fsck.database import (
+from sceneprint.maintenance.fsck.database_checks import (
     FATAL,
     check_counts,
     check_database,
@@ -35,7 +35,7 @@ from sceneprint.maintenance.fsck.database import (
 )
 from sceneprint.maintenance.fsck.findings import Finding, Folder, Progress, is_of_rows
 from sceneprint.maintenance.fsck.indexes import check_indexes
-from sceneprint.maintenance.fsck.repair import opened_blobs, require_folder
+from sceneprint.maintenance.fsck.repair_actions import opened_blobs, require_folder
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database, Store, open_store
 from sceneprint.store.maps import find_map

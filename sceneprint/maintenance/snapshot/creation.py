@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Literal
 
 from sceneprint.errors import DamagedBlob, SnapshotError, UnusableStore
-from sceneprint.maintenance.fsck.repair import opened_blobs
+from sceneprint.maintenance.fsck.repair_actions import opened_blobs
 from sceneprint.maintenance.snapshot import database_copy
 from sceneprint.maintenance.snapshot.files import check_room, full_disk_explained, put_new, staging
 from sceneprint.maintenance.snapshot.format import (
@@ -48,7 +48,7 @@ from sceneprint.store.blobs.folder import is_digest
 
 # Blobs as a snapshot takes them along: in a row, several at once where each is waited for.
 #
-# digests  --taken-->  Taken | Untaken, in the same order
+# digests  --copied_blobs-->  CopiedBlob | Untaken, in the same order
 
 #: Blobs that are read at once, and bytes above which one is read alone and in parts.
 _AT_ONCE, _LARGE = 8, 8 << 20

@@ -1,6 +1,6 @@
 """The database in one file that nobody writes: made, checked, and asked what it refers to.
 
-database in use  --open_source-->  Source  --copy-->  file  --open_copy-->  Connection of sqlite3
+database in use  --open_source-->  Source  --Source.copy-->  file  --open_copy-->  its connection
 
 Of PostgreSQL it is a SQLite file as well: one format, whatever the store is kept in.
 """
@@ -43,7 +43,7 @@ from sceneprint_client.api import FrameState
 
 # The same rows in both databases: how they are asked for, and how they are compared.
 #
-#     Table  --form_of-->  Form  --of_file | of_server-->  SQL
+#     Form   --of_file | of_server-->  SQL
 #     rows   --Sum-->  how many, and a digest that is the same for the same rows
 #
 # Documents (JSON) travel as the text that they are: nothing is parsed and written anew.

@@ -1,6 +1,6 @@
 """A read replica: queries are answered from it while it is not too far behind.
 
-Replica.near  -->  Near  --asked-->  `Store.queried` within it is the replica, and else the primary
+Replica.near  -->  UsableReplica  --read_through-->  reads go to the replica, or else the primary
 
 How far behind it is, is measured by positions of the log: what the primary had written at a time
 is in every answer of a replica that has replayed as much. So one that nothing is written to is not

@@ -12,7 +12,7 @@ from sceneprint.engine import Engine
 from sceneprint.errors import StoreAway
 from sceneprint.maintenance.fsck.check import FindingOutcome, fsck
 from sceneprint.maintenance.snapshot.creation import take_snapshot
-from sceneprint.maintenance.snapshot.postgres import restore_to_fleet
+from sceneprint.maintenance.snapshot.postgres_restore import restore_to_fleet
 from sceneprint.settings import Settings
 from sceneprint_client.api import JobState
 

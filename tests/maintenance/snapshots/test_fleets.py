@@ -26,7 +26,7 @@ from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.maintenance.snapshot.catalog import SnapshotCatalog
 from sceneprint.maintenance.snapshot.creation import take_snapshot
 from sceneprint.maintenance.snapshot.database_copy import copy_server
-from sceneprint.maintenance.snapshot.postgres import restore_to_fleet
+from sceneprint.maintenance.snapshot.postgres_restore import restore_to_fleet
 from sceneprint.maintenance.snapshot.restoration import restore_snapshot
 from sceneprint.settings import Settings
 from sceneprint.store import open_database

@@ -1,6 +1,6 @@
 """Local features, aggregated: Open3D's FPFH, and VLAD over a vocabulary of the database.
 
-frame  --features-->  (n, 33)  --vlad-->  (64 * 33,)      two of them  --L2-->  distance
+frame  --features-->  (n, 33)  --vlad-->  (64 * 33,)      two of them  -->  L2 distance
 
 Rusu et al., Fast point feature histograms, ICRA 2009; Jegou et al., Aggregating local descriptors,
 CVPR 2010. The vocabulary is learnt on the database that is searched, which favours the baseline:
@@ -14,7 +14,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from sceneprint.errors import UselessFrame
-from sceneprint.libraries import open3d
+from sceneprint.open3d_loader import open3d
 from sceneprint.types import AnyFrame, Cloud, Floats, Floats32
 
 #: Voxel of the points, reach of normals and of features, metres, for a sensor of RANGE metres;

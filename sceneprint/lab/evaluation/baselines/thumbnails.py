@@ -1,6 +1,6 @@
 """The depth image made small: what anyone would try first.
 
-depth (H, W)  --thumbnail-->  (30, 40) inverse depth      two of them  --L1 or ZNCC-->  distance
+depth (H, W)  --thumbnail-->  (30, 40) inverse depth      two of them  -->  L1 or ZNCC
 """
 
 from __future__ import annotations

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import DatasetError
+from sceneprint.geometry.registration.alignment import AlignmentParameters
+from sceneprint.geometry.registration.icp import refined_all
+from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.signature.pair_features import PropertyParameters
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
-from sceneprint.geometry.validation.alignment import AlignmentParameters
-from sceneprint.geometry.validation.icp import refined_all
-from sceneprint.geometry.validation.sequence_alignment import Matching
 from sceneprint.geometry.validation.validation import refined_at
 from sceneprint.lab.evaluation.judgement import (
     Candidate,
@@ -51,8 +51,8 @@ from sceneprint.lab.evaluation.protocol import (
     view_of,
 )
 from sceneprint.lab.evaluation.run import OFF_PLANE, PLANAR, overlaps_of, plane_share
-from sceneprint.libraries import open3d
 from sceneprint.models import Model, ModelParameters
+from sceneprint.open3d_loader import open3d
 from sceneprint.pipeline import Signer, geometry_of
 from sceneprint.signing import see
 from sceneprint.types import AnyFrame, Cloud, DepthFrame, Floats, Geometry

@@ -1,0 +1,510 @@
+"""What one can look at after a query: its points, its ranking, and any match with its evidence.
+
+query id  --Inspection-->  Answer | PLY | Similarities | MatchDetails
+
+A match is validated once more, with the seed and the options of the query: see `Pairs`.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneprint import errors
+from sceneprint.engine.maps.map_frames import FORM, Output, find_indexed, geometry_of, placed
+from sceneprint.engine.results.stored_results import StoredResult, StoredResults
+from sceneprint.engine.search.response import uncertainty_record, validation_record
+from sceneprint.engine.search.up_vectors import known_ups
+from sceneprint.engine.search.verification import thresholds
+from sceneprint.engine.serializers import query_sensor, sensor_of, tag_of, transform
+from sceneprint.engine.signers import Signers
+from sceneprint.engine.upkeep.repair import resign_frames
+from sceneprint.formats.artifact import read_geometry
+from sceneprint.formats.points.ply_export import points_of, write_ply
+from sceneprint.formats.points.web import LIMIT, encode_points, thinned
+from sceneprint.geometry.pose.rigid import inverse, moved
+from sceneprint.geometry.registration.covariance import PAIR_METHOD
+from sceneprint.geometry.registration.gravity import NO_UPS, Ups
+from sceneprint.geometry.registration.overlap import sampled
+from sceneprint.geometry.retrieval.distance import pairwise_distances, similarity
+from sceneprint.geometry.validation.inspection import (
+    AGREES,
+    VIOLATES,
+    Traces,
+    Verdicts,
+    overlay,
+    patches_at,
+    residuals,
+    trace,
+)
+from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
+from sceneprint.pipeline import validate, validate_guided, validate_without_up
+from sceneprint.store import Store
+from sceneprint.store.frames import find_frame, frames_of, refers_to
+from sceneprint.store.maps import find_map, list_maps
+from sceneprint.store.signatures import geometry_blobs, stored_signatures
+from sceneprint.store.tables import MapRow
+from sceneprint.types import Bytes, Floats, Floats32, Geometry
+from sceneprint_client.api import Answer, FrameState
+from sceneprint_client.api import Match as ToldMatch
+from sceneprint_client.api.options import FrameName
+from sceneprint_client.api.results import (
+    MOST_POINTS,
+    CloudFrame,
+    Coincidences,
+    MatchDetails,
+    OverlayColour,
+    OverlayTransform,
+    Points,
+    PointsSide,
+    Similarities,
+    Triple,
+)
+
+# A query that is kept and one of its matches, looked at again.
+#
+# query id, frame id  --Pairs-->  Pair  --opened-->  both geometries  --validated-->  Validation
+#
+# A match is validated once more, with the seed and the options of the query: the same answer. A
+# page asks for several views of one match at once, so the last few validations are remembered.
+
+#: Validations that are remembered: some 1 kB each.
+_REMEMBERED = 64
+
+
+@dataclass(frozen=True, eq=False)
+class StoredPair:
+    """A kept query and one of its matches.
+
+    Parameters
+    ----------
+    kept, match : the answer, and the match of it
+    sensor : what the coordinates of the match are called
+    blob : of the match's geometry artifact
+    row, number : the match's map and number
+    ups : up in the query's and in the match's sensors, as far as it is known
+    """
+
+    kept: StoredResult
+    match: ToldMatch
+    sensor: str
+    blob: str
+    row: MapRow
+    number: int
+    ups: Ups = NO_UPS
+
+
+class Pairs:
+    """Matches of answers that are kept."""
+
+    def __init__(self, store: Store, signers: Signers, kept: StoredResults) -> None:
+        self._store, self._signers, self._kept = store, signers, kept
+        self._remembered = _ValidationCache()
+
+    def find(self, query_id: str, frame_id: str, map_name: str | None = None) -> StoredPair:
+        """A query with one of its matches, while that is still the frame that was matched.
+
+        Raises
+        ------
+        UnknownQuery : it is not kept, or no longer.
+        UnknownMap, UnknownFrame : no match has that id, or it was deleted since.
+        NotIndexed : the query was asked without validation, or the map has changed its model.
+        """
+        kept = self._kept.find(query_id)
+        match = _match_of(kept, frame_id, map_name)
+        check_geometry(kept)
+        with self._store.database.read() as connection:
+            row = find_map(connection, match.map)
+            frame = find_frame(connection, row, match.frame_id)
+            blobs = geometry_blobs(connection, [frame.number], kept.model_id)
+            ups = {} if kept.up is None else known_ups(connection, kept.ranked)
+        if frame.state == FrameState.DELETED or frame.number not in kept.ranked:
+            raise _deleted(match)
+        if frame.number not in blobs:
+            raise errors.NotIndexed(
+                f"Map {match.map!r} has changed its model since the query, and frames of "
+                "different models cannot be compared. Send the query again."
+            )
+        return StoredPair(
+            kept, match, sensor_of(frame), blobs[frame.number], row, frame.number,
+            (kept.up, ups.get(frame.number)),
+        )  # fmt: skip
+
+    def opened(self, pair: StoredPair) -> tuple[Geometry, Geometry]:
+        """The artifacts of the query and of the match.
+
+        Raises
+        ------
+        DamagedBlob, UnreadableGeometry : the match's is damaged; it is made again.
+        UnknownFrame : the match was deleted meanwhile.
+        """
+        query = geometry_of_query(pair.kept)
+        try:
+            return query, read_geometry(self._store.blobs.get(pair.blob))
+        except (errors.DamagedBlob, errors.UnreadableGeometry):
+            with self._store.database.read() as connection:
+                if not refers_to(connection, pair.blob):
+                    raise _deleted(pair.match) from None
+            if pair.row.model_id == pair.kept.model_id:
+                resign_frames(self._store, pair.row, [pair.number], pair.row.model_id)
+            raise
+
+    def parameters(self, pair: StoredPair) -> ValidationParameters:
+        """Those of the model, by which evidence is counted."""
+        return self._signers(pair.kept.model_id).model.parameters.validation
+
+    def validated(self, pair: StoredPair, query: Geometry, match: Geometry) -> PairValidation:
+        """What comes of aligning them, as the query had it."""
+        p = self.parameters(pair)
+        seed, options = pair.kept.query.seed, thresholds(pair.kept.query.validation, p)
+        key = pair.kept.answer.query_id, pair.blob
+
+        def make() -> PairValidation:
+            if pair.match.predicted is not None:
+                T = np.array(pair.match.predicted.matrix)
+                guided = validate_guided(query, match, T, seed, options[0], pair.ups)
+                if guided is not None:
+                    return guided
+            found = validate(query, match, seed, *options, ups=pair.ups)
+            if found.reason != pair.match.validation.reason and pair.kept.up is not None:
+                # nothing was accepted with `up`, and the surfaces were asked without it
+                return validate_without_up(query, match, seed, options[0], pair.ups) or found
+            return found
+
+        return self._remembered.get(key, make)
+
+
+class _ValidationCache:
+    """The last few validations; who asks while one is made waits for it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._made: OrderedDict[tuple[str, str], Future[PairValidation]] = OrderedDict()
+
+    def get(self, key: tuple[str, str], make: Callable[[], PairValidation]) -> PairValidation:
+        with self._lock:
+            found = self._made.get(key)
+            mine = found is None
+            if found is None:
+                found = self._made[key] = Future()
+            self._made.move_to_end(key)
+            while len(self._made) > _REMEMBERED:
+                self._made.popitem(last=False)
+        if mine:
+            try:
+                found.set_result(make())
+            except BaseException as error:
+                with self._lock:
+                    self._made.pop(key, None)
+                found.set_exception(error)
+        return found.result()
+
+
+def check_geometry(kept: StoredResult, needs: str = "the stage") -> bytes:
+    """The bytes of a query's artifact; NotIndexed where it was asked without validation."""
+    if kept.geometry is None:
+        raise errors.NotIndexed(
+            f"Query {kept.answer.query_id} ran without validation, so its points were not "
+            f"stored. Send the query again with {needs} `validate`."
+        )
+    return kept.geometry
+
+
+def geometry_of_query(kept: StoredResult) -> Geometry:
+    """A query's artifact; NotIndexed where it was asked without validation."""
+    return read_geometry(check_geometry(kept))
+
+
+def _deleted(match: ToldMatch) -> errors.UnknownFrame:
+    return errors.UnknownFrame(
+        f"Frame {match.frame_id} of map {match.map!r} was deleted after the query matched it."
+    )
+
+
+def _match_of(kept: StoredResult, frame_id: str, map_name: str | None) -> ToldMatch:
+    for one in kept.answer.matches:
+        if one.frame_id == frame_id and map_name in (None, one.map):
+            return one
+    raise errors.UnknownFrame(
+        f"Query {kept.answer.query_id} has no match "
+        f"{frame_id!r:.80}{'' if map_name is None else f' in map {map_name!r:.80}'}. Its answer "
+        "lists the matches."
+    )
+
+
+class Inspection:
+    """Answers that are kept, and what is behind them."""
+
+    def __init__(self, store: Store, signers: Signers, kept: StoredResults) -> None:
+        self._store, self._signers, self._kept = store, signers, kept
+        self.pairs = Pairs(store, signers, kept)
+
+    def answer(self, query_id: str) -> Answer:
+        """The answer again; UnknownQuery where it is not kept, or no longer."""
+        return self._kept.find(query_id).answer
+
+    def cloud(self, query_id: str) -> bytes:
+        """The query's points and normals as PLY, in the coordinates of its sensor.
+
+        Raises
+        ------
+        UnknownQuery : it is not kept, or no longer.
+        NotIndexed : it was asked without validation, for which alone its points are made.
+        """
+        kept = self._kept.find(query_id)
+        points, normals = points_of(geometry_of_query(kept).surface)
+        comments = [
+            f"frame {_sensor(kept)}", f"points of query {query_id}, metres",
+            f"model {kept.answer.model}",
+        ]  # fmt: skip
+        return write_ply(points, normals, comments=comments)
+
+    def similarities(self, query_id: str, limit: int = 50) -> Similarities:
+        """How alike the query and the first of its ranking are, each to each; UnknownQuery."""
+        kept = self._kept.find(query_id)
+        wanted = kept.ranked[:limit]
+        with self._store.database.read() as connection:
+            rows = frames_of(connection, wanted)
+            vectors = stored_signatures(connection, rows, kept.model_id)
+            names = {row.number: row.name for row in list_maps(connection)}
+        # a frame's number is used once, but its map may be one that the caller cannot know
+        there = [
+            n for n in wanted if n in vectors and names[rows[n].map_number] in kept.answer.maps
+        ]
+        stacked: Bytes = np.stack(
+            [kept.vector, *(np.frombuffer(vectors[n], np.uint8) for n in there)]
+        )
+        model = self._signers(kept.model_id).model
+        shares = similarity(pairwise_distances(stacked, model.metric), model.unrelated_distance)
+        return Similarities(
+            query_id=query_id,
+            model=kept.answer.model,
+            frames=[FrameName(map=names[rows[n].map_number], frame_id=rows[n].id) for n in there],
+            similarity=shares.round(4).tolist(),
+        )
+
+    def match(self, query_id: str, frame_id: str, map_name: str | None = None) -> MatchDetails:
+        """One match, validated once more, with what its figures were counted on.
+
+        Parameters
+        ----------
+        query_id, frame_id : of an answer, and of one of its matches
+        map_name : where matches of several maps have that id; default: the first of them
+
+        Raises
+        ------
+        UnknownQuery : it is not kept, or no longer.
+        UnknownMap, UnknownFrame : no match has that id, or it was deleted since.
+        NotIndexed : there are no points to validate it with: the query was asked without
+            validation, or the map has changed its model since.
+        DamagedBlob, UnreadableGeometry : the match's artifact is damaged; it is made again.
+        """
+        pair = self.pairs.find(query_id, frame_id, map_name)
+        kept, match, p = pair.kept, pair.match, self.pairs.parameters(pair)
+        query, other = self.pairs.opened(pair)
+        v = self.pairs.validated(pair, query, other)
+        names = pair.sensor, _sensor(kept)
+        T, rival = v.T_match_query, v.T_rival
+        traces = None if T is None else trace(query, other, T, p.agreement, p.alignment.consensus)
+        return MatchDetails(
+            query_id=query_id,
+            frame_id=match.frame_id,
+            map=match.map,
+            validation=validation_record(v),
+            transform=None if T is None else transform(T, *names),
+            uncertainty=uncertainty_record(v.covariance, PAIR_METHOD, p.covariance),
+            rival=None if rival is None else transform(rival, *names),
+            patches=None if traces is None else _coincidences(traces, query, other),
+            query=None if traces is None else _points(traces.query, traces.of_query),
+            match=None if traces is None else _points(traces.match, traces.of_match),
+            seed=kept.query.seed,
+        )
+
+    def overlay(
+        self, query_id: str, frame_id: str, map_name: str | None = None,
+        colour: OverlayColour = "source", by: OverlayTransform = "aligned",
+    ) -> bytes:  # fmt: skip
+        """The query's points and a match's as PLY, in the coordinates of the match's sensor; see
+        `match`.
+
+        Parameters
+        ----------
+        query_id, frame_id, map_name : see `match`
+        colour : by where a point is from, by its normal, or by how far it is from the other's
+            surface
+        by : the transform that was found, its best rival, or none: both clouds as they are
+
+        Raises
+        ------
+        UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : see `match`.
+        InvalidRequest : there is no such transform.
+        """
+        pair = self.pairs.find(query_id, frame_id, map_name)
+        query, other = self.pairs.opened(pair)
+        T = np.eye(4)
+        if by != "none":
+            v = self.pairs.validated(pair, query, other)
+            found = v.T_match_query if by == "aligned" else v.T_rival
+            if found is None:
+                what = "no transform" if by == "aligned" else "no rival"
+                raise errors.InvalidRequest(
+                    f"Frame {frame_id} has {what} with query {query_id}: {v.reason}. Use "
+                    "transform=none to see both as they are.",
+                    (("transform", f"there is {what}"),),
+                )
+            T = found
+        p = self.pairs.parameters(pair).agreement
+        points, normals, colours = overlay(query.surface, other.surface, T, colour, p)
+        comments = [
+            f"frame {pair.sensor}",
+            f"query {query_id} and frame {pair.match.frame_id} of map {pair.match.map}, metres",
+            f"transform {by}, colours by {colour}", f"model {pair.kept.answer.model}",
+        ]  # fmt: skip
+        return write_ply(points, normals, colours, comments=comments)
+
+
+def _sensor(kept: StoredResult) -> str:
+    return query_sensor(kept.answer.frame, kept.answer.kind, kept.answer.maps)
+
+
+def _coincidences(traces: Traces, query: Geometry, match: Geometry) -> Coincidences:
+    pairs = traces.pairs[:MOST_POINTS]
+    of_query, of_match = pairs[:, 0], pairs[:, 1]
+    return Coincidences(
+        query=of_query.tolist(),
+        match=of_match.tolist(),
+        query_mean=_triples(query.patches.means[of_query]),
+        query_normal=_triples(query.patches.normals[of_query]),
+        match_mean=_triples(match.patches.means[of_match]),
+        match_normal=_triples(match.patches.normals[of_match]),
+        distance_m=traces.distances[:MOST_POINTS].round(4).tolist(),
+    )
+
+
+def _points(points: Floats32, verdicts: Verdicts) -> Points:
+    return Points(
+        sampled=len(points),
+        inliers=_triples(points[verdicts == AGREES, :3][:MOST_POINTS].astype(float)),
+        violations=_triples(points[verdicts == VIOLATES, :3][:MOST_POINTS].astype(float)),
+    )
+
+
+def _triples(rows: Floats) -> list[Triple]:
+    return [(x, y, z) for x, y, z in rows.round(4).tolist()]
+
+
+# Points of frames, queries and matches as bytes that a page draws; see
+# `sceneprint.formats.points.web`.
+#
+# frame | query | match  --PointClouds-->  Output
+
+
+class PointClouds:
+    """Points to be drawn."""
+
+    def __init__(self, store: Store, pairs: Pairs, kept: StoredResults) -> None:
+        self._store, self._pairs, self._kept = store, pairs, kept
+
+    def frame(
+        self, map_name: str, frame_id: str, within: CloudFrame = "optical", limit: int = LIMIT
+    ) -> Output[bytes]:
+        """Points of a frame, with normals and patches. Parameters and errors as of
+        `FrameFiles.cloud`.
+        """
+        found = find_indexed(self._store, map_name, frame_id)
+        name, matrix = placed(found.frame, within)
+
+        def make() -> bytes:
+            geometry = geometry_of(self._store, found)
+            points, total = _some(geometry, limit)
+            return _encoded(geometry, points, total, np.array(matrix))
+
+        tag = found.tag("points", found.frame.id, found.row.name, name, matrix, limit)
+        return Output(tag, make)
+
+    def query(self, query_id: str, limit: int = LIMIT) -> Output[bytes]:
+        """Points of a kept query in its sensor's frame, with normals and patches.
+
+        Raises
+        ------
+        UnknownQuery : it is not kept, or no longer.
+        NotIndexed : it was asked without validation.
+        """
+        kept = self._kept.find(query_id)
+        check_geometry(kept)
+
+        def make() -> bytes:
+            geometry = geometry_of_query(kept)
+            points, total = _some(geometry, limit)
+            return _encoded(geometry, points, total)
+
+        return Output(tag_of("points of a query", FORM, query_id, limit), make)
+
+    def match(
+        self, query_id: str, frame_id: str, map_name: str | None = None,
+        side: PointsSide = "query", by: OverlayTransform = "aligned", limit: int = LIMIT,
+    ) -> Output[bytes]:  # fmt: skip
+        """Points of a query or of one of its matches, each in its own sensor's frame, with
+        normals, patches, and how far they are from the other's surface; without that where the
+        frames gave no transform.
+
+        Parameters
+        ----------
+        query_id, frame_id, map_name : see `Pairs.find`
+        side : whose points
+        by : under which transform they are compared
+        limit : most points
+
+        Raises
+        ------
+        UnknownQuery, UnknownMap, UnknownFrame, NotIndexed, DamagedBlob, UnreadableGeometry : see
+            `Pairs.find` and `Pairs.opened`.
+        InvalidRequest : there is no rival; raised when it is made.
+        """
+        pair = self._pairs.find(query_id, frame_id, map_name)
+
+        def make() -> bytes:
+            query, match = self._pairs.opened(pair)
+            T: Floats | None = np.eye(4)
+            if by != "none":
+                v = self._pairs.validated(pair, query, match)
+                T = v.T_match_query if by == "aligned" else v.T_rival
+            if by == "rival" and T is None:
+                raise errors.InvalidRequest(
+                    f"Frame {frame_id} has no rival with query {query_id}: {v.reason}. Use "
+                    "transform=aligned.",
+                    (("transform", "there is no rival"),),
+                )
+            mine, other = (query, match) if side == "query" else (match, query)
+            points, total = _some(mine, limit)
+            if T is None:
+                return _encoded(mine, points, total)
+            T = T if side == "query" else inverse(T)
+            p = self._pairs.parameters(pair).agreement
+            apart = residuals(points, other.surface, T, p)
+            return _encoded(mine, points, total, residuals=apart, scale=p.surface_tolerance)
+
+        tag = tag_of("points of a match", FORM, query_id, pair.blob, side, by, limit)
+        return Output(tag, make)
+
+
+def _some(geometry: Geometry, limit: int) -> tuple[Floats32, int]:
+    """Points and normals (N, 6), at most so many, and of how many."""
+    every = sampled(geometry.surface, 1)
+    return np.ascontiguousarray(every[thinned(len(every), limit)]), len(every)
+
+
+def _encoded(
+    geometry: Geometry, points: Floats32, total: int, T: Floats | None = None,
+    residuals: Verdicts | None = None, scale: float = 0.0,
+) -> bytes:  # fmt: skip
+    at, normals = points[:, :3].astype(float), points[:, 3:].astype(float)
+    if T is not None:
+        at, normals = moved(T, at), normals @ T[:3, :3].T
+    patches = patches_at(points, geometry.patches)
+    return encode_points(at, normals, patches, residuals, total=total, scale=scale)

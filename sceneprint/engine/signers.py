@@ -1,0 +1,114 @@
+"""Signers, cached: each model is made ready to sign once a process."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from sceneprint.errors import FrameError
+from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.geometry.registration.overlap import sampled
+from sceneprint.geometry.retrieval.distance import distances, pairwise_distances
+from sceneprint.geometry.validation.inspection import patches_at, residuals
+from sceneprint.index import Tail, search
+from sceneprint.models import Model, parse_model
+from sceneprint.pipeline import Signer, open_signer, prepare, validate
+from sceneprint.store import Database
+from sceneprint.store.maps import model_content
+from sceneprint.types import Cloud, DepthFrame, Intrinsics
+
+
+class Signers:
+    """Signers by the id of their model; the model's file is the one in the database.
+
+    Parameters
+    ----------
+    database : that holds the models
+    cache_dir : of pair tables
+    """
+
+    def __init__(self, database: Database, cache_dir: Path) -> None:
+        self.database, self._cache_dir = database, cache_dir
+        self._lock = threading.Lock()
+        self._open: dict[str, Signer] = {}
+
+    def __call__(self, model_id: str) -> Signer:
+        """The signer of a model that a map refers to.
+
+        Raises
+        ------
+        UnreadableModel : another version of sceneprint stored it.
+        """
+        with self._lock:  # building a table takes seconds: once is enough
+            if model_id not in self._open:
+                with self.database.read() as connection:
+                    content = model_content(connection, model_id)
+                model = parse_model(content, f"model {model_id[:12]}")
+                self._open[model_id] = open_signer(model, self._cache_dir)
+            return self._open[model_id]
+
+    def of(self, model: Model) -> Signer:
+        """The signer of a model that no map may refer to yet."""
+        with self._lock:
+            if model.id not in self._open:
+                self._open[model.id] = open_signer(model, self._cache_dir)
+            return self._open[model.id]
+
+
+# Loading all code and tables before the first request asks for them.
+
+
+def warm(signer: Signer, *, clouds: bool = False) -> bool:
+    """Sign, search and validate a corner of a room, so that kernels are compiled or loaded.
+
+    Parameters
+    ----------
+    signer : whose table is touched
+    clouds : do it with clouds too, with and without a viewpoint: their kernels take longest to
+        compile, and little to load once they are compiled
+
+    Returns
+    -------
+    whole : the corner was recognised, so every stage has run; False where a model of another
+        range sees nothing there
+    """
+    corner, p = _corner(), signer.model.parameters.validation
+    metric = signer.model.metric
+    with suppress(FrameError):
+        signature, seen = prepare(corner, signer)
+        rows = signature.vector[None].copy()
+        search(signature.vector, None, Tail(np.zeros(1, np.int64), rows), 1, metric=metric)
+        pairwise_distances(rows, metric)
+        rows.flags.writeable = False  # as a mapped file is: another compilation
+        distances(signature.vector.copy(), rows, metric)
+        geometry = read_geometry(write_geometry(seen))
+        drawn = sampled(geometry.surface, 1)  # as a page asks for them
+        patches_at(drawn, geometry.patches)
+        residuals(drawn, geometry.surface, np.eye(4), p.agreement)
+        for has_viewpoint in (True, False) if clouds else ():
+            _, points = prepare(_cloud(corner, has_viewpoint=has_viewpoint), signer)
+            validate(geometry, read_geometry(write_geometry(points)), p=p)
+        return validate(geometry, geometry, p=p).status == "accepted"
+    return False
+
+
+def _corner() -> DepthFrame:
+    """A wall, a floor and a box that stands off the middle, two metres away."""
+    camera = Intrinsics(256, 192, 220, 220, 127.5, 95.5)
+    y, x = np.mgrid[0:192, 0:256]
+    right, down = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
+    wall, floor = 2.4 / np.maximum(1 + right, 0.1), 1.2 / np.maximum(down, 0.01)
+    box = np.where((abs(right - 0.1) < 0.2) & (down > 0.1), 1.5, np.inf)
+    return DepthFrame(np.minimum.reduce([wall, floor, box]).astype(np.float32), camera)
+
+
+def _cloud(frame: DepthFrame, *, has_viewpoint: bool) -> Cloud:
+    """What a depth image shows, as points."""
+    k = frame.intrinsics
+    v, u = np.nonzero(frame.depth)
+    z = frame.depth[v, u]
+    points = np.stack([(u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z], axis=1)
+    return Cloud(points.astype(np.float32), has_viewpoint)

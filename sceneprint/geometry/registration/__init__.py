@@ -1,0 +1,1 @@
+"""Two frames to a transform: correspondences, hypotheses, refinement, overlap."""

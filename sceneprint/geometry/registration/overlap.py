@@ -1,0 +1,519 @@
+"""Sec. III-E, evidence: how well two surfaces agree under a transform.
+
+    points of the source, surface of the target, T  --agreements-->  inliers, violations
+
+Points are looked up where the target's camera would see them: no search tree, and what the
+sensor saw *through* counts too. A point that lies before the surface that the target saw
+violates free space: had it been there, the target would have seen it. Where the target has no
+viewpoint, points are looked up by place, and nothing is known of free space.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneprint.geometry.frame_cache import cached_per_frame
+from sceneprint.geometry.kernel import kernel
+from sceneprint.geometry.pose.rigid import inverses
+from sceneprint.geometry.surface.camera import camera_of, depth_at, grown, project
+from sceneprint.geometry.surface.cloud import mixed
+from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches, Sphere, Surface
+
+# Sec. III-E, a surface made ready to be looked up: by its camera, or by place where it has none.
+#
+#     Surface  --target_of-->  Target        Target, point  --nearest_alike-->  index
+#
+# Points in no order are found in a hash of cubes. Of the points in a small cube one is kept, so
+# that a cube holds a bounded number of them, however many a cloud has in one place.
+
+#: Small cubes along the reach; a cube of the hash is two reaches wide.
+FINENESS = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class LookupTarget:
+    """A surface as kernels look it up.
+
+    Parameters
+    ----------
+    points, normals : (h, w, 3); (1, N, 3) of a cloud in no order
+    camera : (7,) of `camera_of`; of a cloud in no order its third number is the reach, and its
+        fourth the secret of the hash
+    heads, chain : of the hash: the first point of each slot, the next of each point, -1 for none
+    """
+
+    points: Floats32
+    normals: Floats32
+    camera: Floats
+    heads: Ints32
+    chain: Ints32
+
+
+@kernel
+def _slot(i: int, j: int, k: int, slots: int, secret: int) -> int:
+    """Of a cube: slots is a power of two."""
+    return mixed((((i << 21) + j) << 21) + k, secret) & (slots - 1)
+
+
+@kernel
+def _fill(points: Floats32, cube: float, secret: int, heads: Ints32, chain: Ints32) -> None:
+    """Every point in the slot of its cube, the last first."""
+    for n in range(len(points)):
+        slot = _slot(
+            int(np.floor(points[n, 0] / cube)), int(np.floor(points[n, 1] / cube)),
+            int(np.floor(points[n, 2] / cube)), len(heads), secret,
+        )  # fmt: skip
+        chain[n] = heads[slot]
+        heads[slot] = n
+
+
+@kernel
+def nearest_alike(
+    points: Floats32, normals: Floats32, camera: Floats, heads: Ints32, chain: Ints32,
+    at: Floats, facing: Floats, least_cosine: float,
+) -> tuple[int, float]:  # fmt: skip
+    """The nearest point within reach whose normal is alike: index, -1 for none, and squared."""
+    reach, secret, slots = camera[2], int(camera[3]), len(heads)
+    cube = 2.0 * reach
+    # the eight cubes that a ball of this reach can touch
+    i0 = int(np.floor(at[0] / cube - 0.5))
+    j0 = int(np.floor(at[1] / cube - 0.5))
+    k0 = int(np.floor(at[2] / cube - 0.5))
+    found, least = -1, reach * reach
+    for i in range(i0, i0 + 2):
+        for j in range(j0, j0 + 2):
+            for k in range(k0, k0 + 2):
+                n = heads[_slot(i, j, k, slots, secret)]
+                while n >= 0:
+                    ex, ey, ez = (
+                        at[0] - points[0, n, 0], at[1] - points[0, n, 1], at[2] - points[0, n, 2]
+                    )  # fmt: skip
+                    square = ex * ex + ey * ey + ez * ez
+                    # of two as near the first, in whatever order slots are walked
+                    if square < least or (square == least and found > n):
+                        cosine = (
+                            facing[0] * normals[0, n, 0]
+                            + facing[1] * normals[0, n, 1]
+                            + facing[2] * normals[0, n, 2]
+                        )
+                        if cosine > least_cosine:
+                            found, least = n, square
+                    n = chain[n]
+    return found, least
+
+
+def one_of_each(points: Floats32, cube: float) -> Ints32:
+    """Indices, rising, of the first point (N, 3) in each occupied cube of this width, metres."""
+    cells = np.floor(points / cube).astype(np.int64)
+    cells -= cells.min(axis=0, initial=0)
+    spans = cells.max(axis=0, initial=0) + 1
+    keys = (cells[:, 0] * spans[1] + cells[:, 1]) * spans[2] + cells[:, 2]
+    _, first = np.unique(keys, return_index=True)
+    return np.sort(first).astype(np.int32)
+
+
+@cached_per_frame
+def target_of(surface: Surface, nearest: float, reach: float) -> LookupTarget:
+    """A surface made ready to be looked up.
+
+    Parameters
+    ----------
+    surface : of any kind
+    nearest : points this near its camera are not looked up, metres of depth
+    reach : how far off a point may be that is in no order, metres
+    """
+    camera, none = camera_of(surface.camera, nearest), np.zeros(0, np.int32)
+    if surface.camera is not None:
+        return LookupTarget(surface.points, surface.normals, camera, none, none)
+    secret = secrets.randbits(52)  # what a float64 holds whole
+    camera[2:4] = reach, secret
+    points, normals = surface.points[surface.valid], surface.normals[surface.valid]
+    kept = one_of_each(points, reach / FINENESS)
+    points, normals = points[kept], normals[kept]
+    slots = 1 << max(int(2 * len(points) - 1).bit_length(), 1)
+    heads, chain = np.full(slots, -1, np.int32), np.full(len(points), -1, np.int32)
+    _fill(points, 2.0 * reach, secret, heads, chain)
+    return LookupTarget(points[None], normals[None], camera, heads, chain)
+
+
+def thinned(surface: Surface, most: int) -> Surface:
+    """At most so many of a surface's points in no order, spread over all that it shows.
+
+    Parameters
+    ----------
+    surface : without a camera
+    most : at least 1
+
+    Returns
+    -------
+    surface : the first point in each cube of a grid, as wide as it must be; the valid points
+        themselves where they are no more than that
+    """
+    points = surface.points[surface.valid]
+    kept = np.arange(len(points), dtype=np.int32)
+    cube = float(np.ptp(points, axis=0).max(initial=0.0)) / 4096 if len(points) > most else 0.0
+    while len(kept) > most:
+        # of n cubes about a surface half are left when they are wider by the root of 2
+        cube *= max((len(kept) / most) ** 0.5, 1.02)
+        kept = one_of_each(points, cube) if cube > 0 else kept[:1]
+    return Surface(
+        points[kept][None],
+        surface.normals[surface.valid][kept][None],
+        np.ones((1, len(kept)), np.bool_),
+        surface.areas[surface.valid][kept][None],
+        None,
+    )
+
+
+#: Of the surface of a depth image: 160 x 120.
+DEPTH_PIXELS = 19_200
+
+
+@dataclass(frozen=True)
+class OverlapParameters:
+    """The numbers of agreement; lengths grow by max(1, (z / `reference_depth`)^`growth`)."""
+
+    surface_tolerance: float = 0.05  #: of a point from the target's plane, metres
+    point_tolerance: float = 0.15  #: of a point from the target's point, metres
+    normal_cosine: float = 0.7  #: of the angle between normals that agree
+    free_space_margin: float = 0.1  #: before the surface, metres
+    reference_depth: float = 5.0**0.5  #: where a depth sensor's noise starts to matter, metres
+    edge_px: int = 2  #: a violation keeps this far from any pixel that agrees, pixels
+    stride: int = 5  #: of the pixels that are looked up
+    growth: int = 2  #: of lengths with depth: 2 as a depth sensor's noise, 1 or 0 as a scanner's
+    nearest: float = 0.1  #: points this near the target's camera are not looked up, metres
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Counts of the source's points."""
+
+    points: int  #: all of them
+    inliers: int  #: that lie on the target's surface, normals alike
+    violations: int | None  #: that lie where the target saw through; None if it has no viewpoint
+
+    @property
+    def violation_share(self) -> float:
+        """Violations as a share of violations and inliers."""
+        violations = self.violations or 0
+        return violations / max(self.inliers + violations, 1)
+
+
+@cached_per_frame
+def sampled(surface: Surface, stride: int) -> Floats32:
+    """Valid pixels of every `stride`-th row and column; of a cloud, about as many points.
+
+    Two frames are to have equal say, whatever saw them: a sphere of more pixels than
+    `DEPTH_PIXELS` is strode through faster. A stride of 1 takes all.
+
+    Returns
+    -------
+    (N, 6) float32, points and normals
+    """
+    if isinstance(surface.camera, Sphere) and stride > 1:
+        more = surface.camera.width * surface.camera.height / DEPTH_PIXELS
+        stride = round(stride * max(more, 1.0) ** 0.5)
+    half = stride // 2
+    rows, columns = slice(half, None, stride), slice(half, None, stride)
+    if surface.camera is None:
+        rows, columns = slice(None), slice(None, None, stride * stride)
+    valid = surface.valid[rows, columns]
+    points = surface.points[rows, columns][valid]
+    normals = surface.normals[rows, columns][valid]
+    return np.ascontiguousarray(np.concatenate([points, normals], axis=1))
+
+
+#: What a target says of a point: nothing, that it lies on its surface, or that it saw through.
+UNKNOWN, AGREES, VIOLATES = 0, 1, 2
+
+
+@kernel
+def _look_up_seen(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
+    tolerances: Floats, said: Bytes,
+) -> None:  # fmt: skip
+    """What the maps of a target with a camera say of the source's points (N, 6) under T, (N,)."""
+    height, width = points.shape[0], points.shape[1]
+    on_surface, on_point, least_cosine = tolerances[0], tolerances[1], tolerances[2]
+    margin, reference, edge = tolerances[3], tolerances[4], int(tolerances[5])
+    for i in range(len(source)):
+        said[i] = UNKNOWN
+        px, py, pz = source[i, 0], source[i, 1], source[i, 2]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        column, line, depth = project(camera, x, y, z)
+        if not (column >= 0 and line >= 0 and column < width and line < height):
+            continue
+        u, v = int(column), int(line)
+        seen = depth_at(camera, points, v, u)
+        if seen <= 0:
+            continue
+        dx, dy, dz = x - points[v, u, 0], y - points[v, u, 1], z - points[v, u, 2]
+        mx, my, mz = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
+        plane = abs(dx * mx + dy * my + dz * mz)
+        grow = grown(depth, reference, tolerances[6])
+        if plane < on_surface * grow:
+            nx, ny, nz = source[i, 3], source[i, 4], source[i, 5]
+            cosine = (
+                (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz) * mx
+                + (T[1, 0] * nx + T[1, 1] * ny + T[1, 2] * nz) * my
+                + (T[2, 0] * nx + T[2, 1] * ny + T[2, 2] * nz) * mz
+            )
+            gate = on_point * grow
+            if cosine > least_cosine and dx * dx + dy * dy + dz * dz < gate * gate:
+                said[i] = AGREES
+                continue
+        if depth - seen < -margin * grow and plane > margin * grow:
+            # at an edge, a pixel near by may show the surface that the point is on
+            nearest = seen
+            for line_ in range(max(v - edge, 0), min(v + edge + 1, height)):
+                for column_ in range(u - edge, u + edge + 1):
+                    beside = column_
+                    if column_ < 0 or column_ >= width:
+                        if camera[0] == 0 or camera[6] == 0:
+                            continue
+                        beside = column_ % width  # around the back of a closed sphere
+                    there = depth_at(camera, points, line_, beside)
+                    if there > 0:
+                        nearest = min(nearest, there)
+            if depth < nearest - margin * grow:
+                said[i] = VIOLATES
+
+
+@kernel
+def _look_up_near(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
+    chain: Ints32, T: Floats, tolerances: Floats, said: Bytes,
+) -> None:  # fmt: skip
+    """The same of a target whose points are in no order."""
+    at, facing = np.empty(3), np.empty(3)
+    for i in range(len(source)):
+        said[i] = UNKNOWN
+        for a in range(3):
+            at[a] = T[a, 3]
+            facing[a] = 0.0
+            for b in range(3):
+                at[a] += T[a, b] * source[i, b]
+                facing[a] += T[a, b] * source[i, 3 + b]
+        n, _ = nearest_alike(points, normals, camera, heads, chain, at, facing, tolerances[2])
+        if n < 0:
+            continue
+        plane = 0.0
+        for a in range(3):
+            plane += (at[a] - points[0, n, a]) * normals[0, n, a]
+        if abs(plane) < tolerances[0]:
+            said[i] = AGREES
+
+
+@kernel
+def _look_up(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
+    chain: Ints32, T: Floats, tolerances: Floats, said: Bytes,
+) -> None:  # fmt: skip
+    """What a target says of each point of the source (N, 6) under T, (N,)."""
+    if camera[0] == 2:
+        _look_up_near(source, points, normals, camera, heads, chain, T, tolerances, said)
+    else:
+        _look_up_seen(source, points, normals, camera, T, tolerances, said)
+
+
+@kernel
+def weigh_overlap(
+    source: Floats32, weights: Floats32, points: Floats32, normals: Floats32, camera: Floats,
+    heads: Ints32, chain: Ints32, T: Floats, tolerances: Floats,
+) -> tuple[float, float]:  # fmt: skip
+    """Weight of inliers and of violations of the source (N, 6) on a target under T."""
+    said = np.empty(len(source), np.uint8)
+    _look_up(source, points, normals, camera, heads, chain, T, tolerances, said)
+    inliers, violations = 0.0, 0.0
+    for i in range(len(source)):
+        if said[i] == AGREES:
+            inliers += weights[i]
+        elif said[i] == VIOLATES:
+            violations += weights[i]
+    return inliers, violations
+
+
+@kernel
+def _weigh_all(
+    source: Floats32, weights: Floats32, points: Floats32, normals: Floats32, camera: Floats,
+    heads: Ints32, chain: Ints32, transforms: Floats, tolerances: Floats, out: Floats,
+) -> None:  # fmt: skip
+    for k in range(len(transforms)):
+        inliers, violations = weigh_overlap(
+            source, weights, points, normals, camera, heads, chain, transforms[k], tolerances
+        )
+        out[k, 0] = inliers
+        out[k, 1] = violations
+
+
+def tolerances(p: OverlapParameters) -> Floats:
+    """The parameters as the kernel takes them."""
+    return np.array(
+        [
+            p.surface_tolerance, p.point_tolerance, p.normal_cosine,
+            p.free_space_margin, p.reference_depth, p.edge_px, p.growth,
+        ]
+    )  # fmt: skip
+
+
+def looked_up(surface: Surface, p: OverlapParameters) -> LookupTarget:
+    """A surface made ready for `weigh_overlap`."""
+    return target_of(surface, p.nearest, p.point_tolerance)
+
+
+def agreements(
+    source: Floats32,
+    target: Surface,
+    transforms: Floats,
+    p: OverlapParameters,
+    weights: Floats32 | None = None,
+) -> Floats:
+    """How a source's points fit what the target saw, under each of some transforms: Sec. III-E.
+
+    Parameters
+    ----------
+    source : (N, 6) float32 of `sampled`
+    target : (h, w) surface, or points in no order, which show no violations
+    transforms : (n, 4, 4) T_target_source
+    p : see AgreementParameters
+    weights : (N,) of the points; default: 1 each
+
+    Returns
+    -------
+    (n, 2) weight of the inliers, and of the violations
+    """
+    out = np.zeros((len(transforms), 2))
+    w = np.ones(len(source), np.float32) if weights is None else weights
+    t = looked_up(target, p)
+    _weigh_all(
+        source, w, t.points, t.normals, t.camera, t.heads, t.chain,
+        np.ascontiguousarray(transforms), tolerances(p), out,
+    )  # fmt: skip
+    return out
+
+
+def look_up(
+    source: Floats32, target: LookupTarget, T_target_source: Floats, tolerances: Floats
+) -> Bytes:
+    """What a target says of each point of a source under one transform.
+
+    Parameters
+    ----------
+    source : (N, 6) float32
+    target : of `looked_up`
+    tolerances : of `tolerances`
+
+    Returns
+    -------
+    (N,) uint8: UNKNOWN, AGREES or VIOLATES
+    """
+    said = np.empty(len(source), np.uint8)
+    _look_up(
+        source, target.points, target.normals, target.camera, target.heads, target.chain,
+        np.ascontiguousarray(T_target_source), tolerances, said,
+    )  # fmt: skip
+    return said
+
+
+def overlap_counts(
+    source: Floats32, target: Surface, T_target_source: Floats, p: OverlapParameters
+) -> Overlap:
+    """How a source's points fit what the target saw under one transform; see `agreements`."""
+    (inliers, violations) = agreements(source, target, T_target_source[None], p)[0].tolist()
+    known = target.camera is not None
+    return Overlap(len(source), round(inliers), round(violations) if known else None)
+
+
+# Sec. III-E, evidence by planes: what agrees, every plane counting as much as another.
+#
+#     Geometry  --plane_view-->  PlaneView        transforms  --explained-->  Explained
+#
+# That a floor lies on a floor says little, wherever on it one stands, and a floor may be half of
+# what a sensor sees. So patches that lie in one plane share one weight.
+
+
+@dataclass(frozen=True)
+class PlaneParameters:
+    """Which patches lie in one plane."""
+
+    coplanar: float = math.radians(15.0)  #: normals this near may be of one plane
+    same_plane: float = 0.06  #: offsets this near are one plane, metres
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneView:
+    """A frame as its planes are weighed.
+
+    Parameters
+    ----------
+    surface, patches : of the frame
+    points : (P, 6) float32, means and normals of the patches
+    weights : (P,) float32, of which those of one plane add up to 1
+    """
+
+    surface: Surface
+    patches: Patches
+    points: Floats32
+    weights: Floats32
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """How far transforms explain two frames, every plane counting the same.
+
+    Parameters
+    ----------
+    share : (n,) of both frames that agrees, 0 to 1
+    violations : (n,) of free space, as a share of what agrees or violates, 0 to 1
+    """
+
+    share: Floats
+    violations: Floats
+
+
+@kernel
+def _count(means: Floats, normals: Floats, cosine: float, apart: float, out: Ints32) -> None:
+    """How many patches lie in the plane of each, itself among them; arrays (3, P)."""
+    x, y, z, nx, ny, nz = means[0], means[1], means[2], normals[0], normals[1], normals[2]
+    for i in range(len(out)):
+        ix, iy, iz, a, b, c = x[i], y[i], z[i], nx[i], ny[i], nz[i]
+        count = 0
+        for j in range(len(out)):
+            offset = (x[j] - ix) * a + (y[j] - iy) * b + (z[j] - iz) * c
+            alike = nx[j] * a + ny[j] * b + nz[j] * c > cosine
+            count += 1 if alike & (abs(offset) < apart) else 0
+        out[i] = max(count, 1)
+
+
+def plane_weights(patches: Patches, p: PlaneParameters) -> Floats32:
+    """Weights of patches: 1 over the number of patches that lie in the plane of each, (P,)."""
+    counts = np.zeros(len(patches), np.int32)
+    means, normals = (np.ascontiguousarray(x.T) for x in (patches.means, patches.normals))
+    _count(means, normals, math.cos(p.coplanar), p.same_plane, counts)
+    weights: Floats32 = (1.0 / counts).astype(np.float32)
+    return weights
+
+
+@cached_per_frame
+def plane_view(geometry: Geometry, p: PlaneParameters) -> PlaneView:
+    """A frame made ready for `explained`."""
+    patches = geometry.patches
+    points = np.concatenate([patches.means, patches.normals], axis=1).astype(np.float32)
+    return PlaneView(geometry.surface, patches, points, plane_weights(patches, p))
+
+
+def explained(
+    query: PlaneView, match: PlaneView, transforms: Floats, p: OverlapParameters
+) -> Explained:
+    """How far each of some transforms (n, 4, 4), T_match_query, explains two frames."""
+    of_query = agreements(query.points, match.surface, transforms, p, query.weights)
+    of_match = agreements(match.points, query.surface, inverses(transforms), p, match.weights)
+    both = of_query + of_match
+    everything = float(query.weights.sum(dtype=float) + match.weights.sum(dtype=float))
+    return Explained(both[:, 0] / everything, both[:, 1] / np.maximum(both.sum(axis=1), 1e-9))

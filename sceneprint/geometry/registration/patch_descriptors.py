@@ -1,0 +1,346 @@
+"""Sec. III-E, descriptors: how all other patches lie about each patch, as histograms.
+
+    Patches (P)  --patch_descriptors-->  (P, D) float32  --compress-->  (P, d) uint8
+
+The properties are of the kind of Eq. (1), and as macro-scale: of every other patch within reach,
+how far off in the plane of the patch it lies, how high over it, and how its normal stands to that
+plane and to the direction it lies in. None of them changes under a rigid motion.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneprint.geometry.kernel import kernel
+from sceneprint.types import Bytes, Floats, Floats32, Ints32, Patches
+
+#: Bins of the two angles, the same at every scale.
+ANGLES = 3
+
+
+@dataclass(frozen=True)
+class PatchDescriptorParameters:
+    """The numbers of the histograms: reach in metres, then bins of distance and of height."""
+
+    near_radius: float = 0.4
+    near_distances: int = 4
+    near_heights: int = 5
+    middle_radius: float = 0.8
+    middle_distances: int = 5
+    middle_heights: int = 7
+    far_radius: float = 1.6
+    far_distances: int = 6
+    far_heights: int = 8
+
+    @property
+    def scales(self) -> Floats:
+        """(3, 3): radius, bins of distance, bins of height of each scale."""
+        return np.array(
+            [
+                (self.near_radius, self.near_distances, self.near_heights),
+                (self.middle_radius, self.middle_distances, self.middle_heights),
+                (self.far_radius, self.far_distances, self.far_heights),
+            ],
+            float,
+        )
+
+    @property
+    def dimension(self) -> int:
+        """D, bins of all scales."""
+        return int((self.scales[:, 1] * self.scales[:, 2]).sum()) * ANGLES * ANGLES
+
+
+@dataclass(frozen=True, eq=False)
+class Compression:
+    """What descriptors keep of histograms: their principal components, learnt once.
+
+    Parameters
+    ----------
+    mean : (D,) float32
+    matrix : (d, D) float32, rows orthonormal
+    """
+
+    mean: Floats32
+    matrix: Floats32
+
+    @property
+    def offset(self) -> Floats32:
+        """The mean's own components, (d,)."""
+        result: Floats32 = (self.matrix.astype(float) @ self.mean).astype(np.float32)
+        return result
+
+
+#: Of 128 components of a unit vector few leave [-RANGE, RANGE]. Those are clipped, so that one
+#: large component, such as that of lying in a floor, does not outweigh all others.
+RANGE = 0.25
+
+
+@kernel
+def _accumulate(
+    means: Floats, normals: Floats, areas: Floats, scales: Floats, angles: int, out: Floats32
+) -> None:
+    """Each pair's area into the sixteen bins about it, at each scale that reaches it."""
+    count = len(means)
+    reach = 0.0
+    for s in range(len(scales)):
+        reach = max(reach, scales[s, 0])
+    for i in range(count):
+        for j in range(count):
+            if i == j:
+                continue
+            dx, dy, dz = (
+                means[j, 0] - means[i, 0], means[j, 1] - means[i, 1], means[j, 2] - means[i, 2]
+            )  # fmt: skip
+            square = dx * dx + dy * dy + dz * dz
+            if square >= reach * reach:
+                continue
+            ax, ay, az = normals[i, 0], normals[i, 1], normals[i, 2]
+            bx, by, bz = normals[j, 0], normals[j, 1], normals[j, 2]
+            height = dx * ax + dy * ay + dz * az
+            cosine = ax * bx + ay * by + az * bz
+            flat = np.sqrt(max(square - height * height, 0.0))
+            radial = 0.0  # of the other normal, along the direction in the plane
+            if flat > 1e-3:
+                radial = (bx * dx + by * dy + bz * dz - height * cosine) / flat
+            e = min(max((cosine + 1.0) * 0.5, 0.0), 1.0) * angles - 0.5
+            g = min(max((radial + 1.0) * 0.5, 0.0), 1.0) * angles - 0.5
+            ie, ig = int(np.floor(e)), int(np.floor(g))
+            fe, fg = e - ie, g - ig
+            e0, e1 = max(ie, 0), min(ie + 1, angles - 1)
+            g0, g1 = max(ig, 0), min(ig + 1, angles - 1)
+            start = 0
+            for s in range(len(scales)):
+                radius, n_flat, n_high = scales[s, 0], int(scales[s, 1]), int(scales[s, 2])
+                if square < radius * radius:
+                    a = flat / radius * n_flat - 0.5
+                    b = (height / radius + 1.0) * 0.5 * n_high - 0.5
+                    ia, ib = int(np.floor(a)), int(np.floor(b))
+                    fa, fb = a - ia, b - ib
+                    for da in range(2):
+                        xa = min(max(ia + da, 0), n_flat - 1)
+                        wa = areas[j] * (fa if da else 1.0 - fa)
+                        for db in range(2):
+                            xb = min(max(ib + db, 0), n_high - 1)
+                            w = wa * (fb if db else 1.0 - fb)
+                            base = start + (xa * n_high + xb) * angles * angles
+                            out[i, base + e0 * angles + g0] += w * (1.0 - fe) * (1.0 - fg)
+                            out[i, base + e0 * angles + g1] += w * (1.0 - fe) * fg
+                            out[i, base + e1 * angles + g0] += w * fe * (1.0 - fg)
+                            out[i, base + e1 * angles + g1] += w * fe * fg
+                start += n_flat * n_high * angles * angles
+
+
+@kernel
+def _normalise(scales: Floats, angles: int, out: Floats32) -> None:
+    """Root of every bin, then length 1 / sqrt(scales) for every scale (Hellinger kernel)."""
+    for i in range(len(out)):
+        start = 0
+        for s in range(len(scales)):
+            end = start + int(scales[s, 1]) * int(scales[s, 2]) * angles * angles
+            total = 0.0
+            for k in range(start, end):
+                total += out[i, k]
+            if total > 0:  # the root's squared length is the sum
+                factor = 1.0 / np.sqrt(total * len(scales))
+                for k in range(start, end):
+                    out[i, k] = np.sqrt(out[i, k]) * factor
+            start = end
+
+
+def patch_descriptors(patches: Patches, p: PatchDescriptorParameters) -> Floats32:
+    """Histograms of the macro-scale surroundings of each patch.
+
+    Parameters
+    ----------
+    patches : P of them
+    p : see PatchDescriptorParameters
+
+    Returns
+    -------
+    (P, D) float32, each row of length 1 where there is a patch within the nearest reach
+    """
+    out = np.zeros((len(patches), p.dimension), np.float32)
+    _accumulate(patches.means, patches.normals, patches.areas, p.scales, ANGLES, out)
+    _normalise(p.scales, ANGLES, out)
+    return out
+
+
+@kernel
+def _project(histograms: Floats32, matrix: Floats32, offset: Floats32, out: Floats32) -> None:
+    """Rows times matrix (D, d), less the offset; most bins of a histogram are empty.
+
+    Four bins at a time, added in their order: a row is read and written a quarter as often.
+    """
+    filled = np.empty(histograms.shape[1], np.int32)
+    for i in range(len(histograms)):
+        histogram, row, count = histograms[i], out[i], 0
+        for b in range(len(histogram)):
+            filled[count] = b
+            count += 1 if histogram[b] > 0 else 0
+        for k in range(len(row)):
+            row[k] = -offset[k]
+        fours = count - count % 4
+        for at in range(0, fours, 4):
+            b0, b1, b2, b3 = filled[at], filled[at + 1], filled[at + 2], filled[at + 3]
+            h0, h1, h2, h3 = histogram[b0], histogram[b1], histogram[b2], histogram[b3]
+            m0, m1, m2, m3 = matrix[b0], matrix[b1], matrix[b2], matrix[b3]
+            for k in range(len(row)):
+                row[k] = (((row[k] + h0 * m0[k]) + h1 * m1[k]) + h2 * m2[k]) + h3 * m3[k]
+        for at in range(fours, count):
+            value, component = histogram[filled[at]], matrix[filled[at]]
+            for k in range(len(row)):
+                row[k] += value * component[k]
+
+
+def compress(histograms: Floats32, by: Compression) -> Bytes:
+    """Histograms to the bytes that are stored and compared.
+
+    Components on the principal axes, brought to length 1; a byte is 1/255 of [-RANGE, RANGE].
+
+    Parameters
+    ----------
+    histograms : (P, D) of `patch_descriptors`
+    by : learnt on the same histograms' layout
+
+    Returns
+    -------
+    (P, d) uint8, 128 for nought
+    """
+    out = np.empty((len(histograms), len(by.matrix)), np.float32)
+    _project(histograms, np.ascontiguousarray(by.matrix.T), by.offset, out)
+    length = np.sqrt((out * out).sum(axis=1, keepdims=True))
+    unit = out / np.maximum(length, 1e-6)
+    stored: Bytes = np.clip(np.rint(unit * (127.0 / RANGE)) + 128, 0, 255).astype(np.uint8)
+    return stored
+
+
+def fit_compression(histograms: Floats32, dimension: int) -> Compression:
+    """The principal components of histograms.
+
+    Parameters
+    ----------
+    histograms : (N, D), N > D
+    dimension : d, components kept
+
+    Raises
+    ------
+    ValueError : fewer histograms than bins, or more components than bins.
+    """
+    count, bins = histograms.shape
+    if count <= bins or not 1 <= dimension <= bins:
+        raise ValueError(f"{dimension} components of {histograms.shape} histograms")
+    mean = histograms.mean(axis=0, dtype=float)
+    covariance = histograms.T.astype(float) @ histograms / count - np.outer(mean, mean)
+    _, vectors = np.linalg.eigh(covariance)
+    rows = vectors.T[::-1][:dimension]
+    signs = np.sign(rows[np.arange(dimension), np.abs(rows).argmax(axis=1)])  # a fixed choice
+    return Compression(mean.astype(np.float32), (rows * signs[:, None]).astype(np.float32))
+
+
+# Sec. III-E, matching: patches of two frames whose surroundings are alike.
+#
+#     descriptors (S, d), (P, d)  --correspondences-->  pairs (M, 2)
+#
+# Reading R10 (docs/paper.md): of the paper's patch matching only the idea is public. A random few
+# of the source's patches are compared with all of the target's, and each keeps its nearest.
+
+
+@dataclass(frozen=True)
+class MatchingParameters:
+    """The numbers of matching."""
+
+    n_sources: int = 100  #: patches drawn from the source
+    n_nearest: int = 3  #: correspondences each keeps
+
+
+@kernel
+def _nearest(
+    source: Bytes, target: Bytes, drawn: Ints32, n_nearest: int, slopes: Floats, onto: Floats,
+    gate: float, pairs: Ints32,
+) -> int:  # fmt: skip
+    """The targets nearest to each source drawn, by squared distance, ties by index; how many."""
+    count, length = target.shape
+    farthest = np.int32(2147483647)
+    squares = np.empty(count, np.int32)
+    found = 0
+    for row in range(len(drawn)):
+        query = source[drawn[row]]
+        for j in range(count):
+            if abs(slopes[drawn[row]] - onto[j]) > gate:
+                squares[j] = farthest
+                continue
+            other = target[j]
+            total = np.int32(0)
+            for k in range(length):
+                gap = np.int32(query[k]) - np.int32(other[k])
+                total += gap * gap
+            squares[j] = total
+        for _ in range(n_nearest):
+            best = 0
+            for j in range(1, count):
+                if squares[j] < squares[best]:
+                    best = j
+            if squares[best] == farthest:  # no other stands at this angle to up
+                break
+            pairs[found, 0] = drawn[row]
+            pairs[found, 1] = best
+            squares[best] = farthest
+            found += 1
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class SlopeGate:
+    """Which patches may correspond where up is known in both frames.
+
+    Parameters
+    ----------
+    source, target : (P,) and (P',) angles of the patches' normals to up, radians
+    most : that two may differ by
+    """
+
+    source: Floats
+    target: Floats
+    most: float
+
+
+def correspondences(
+    source: Bytes,
+    target: Bytes,
+    rng: np.random.Generator,
+    p: MatchingParameters,
+    gate: SlopeGate | None = None,
+) -> Ints32:
+    """Correspondences of a random few of the source's patches: Sec. III-E.
+
+    Parameters
+    ----------
+    source : (P, d) uint8 descriptors
+    target : (P', d) uint8
+    rng : which patches are drawn depends on it alone
+    p : see MatchingParameters
+    gate : only patches at about the same angle to up correspond; None: any
+
+    Returns
+    -------
+    (M, 2) int32, index in source and in target; each drawn patch with its nearest, nearest first
+
+    Raises
+    ------
+    ValueError : the descriptors have different lengths.
+    """
+    if source.shape[1] != target.shape[1]:
+        raise ValueError(f"descriptors of {source.shape[1]} and {target.shape[1]} bytes")
+    drawn = np.sort(rng.choice(len(source), min(p.n_sources, len(source)), replace=False))
+    n_nearest = min(p.n_nearest, len(target))
+    pairs = np.empty((len(drawn) * n_nearest, 2), np.int32)
+    if gate is None:
+        gate = SlopeGate(np.zeros(len(source)), np.zeros(len(target)), math.inf)
+    found = _nearest(
+        source, target, drawn.astype(np.int32), n_nearest, gate.source, gate.target, gate.most,
+        pairs,
+    )  # fmt: skip
+    return pairs[:found]

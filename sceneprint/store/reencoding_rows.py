@@ -1,0 +1,224 @@
+"""Rows of a re-encoding: which frames lack the next model, which are queued, and the switch.
+
+Until the switch every frame keeps the signature that is searched; each gets a second one beside
+it. What was made for a model that a map no longer has, or never came to have, is removed in blocks.
+"""
+
+from __future__ import annotations
+
+import uuid
+from dataclasses import dataclass
+
+from sqlalchemy import ColumnElement, Connection, and_, exists, func, insert, select, update
+
+from sceneprint.store.events import record_event
+from sceneprint.store.frames import set_state
+from sceneprint.store.maps import next_revision
+from sceneprint.store.queue import PENDING, enqueue, read_clock
+from sceneprint.store.tables import MapRow, frames, jobs, maps, signatures
+from sceneprint_client.api import FrameState, JobState
+
+#: Kind of the jobs that sign an indexed frame once more.
+REENCODE = "reencode"
+#: After what robots send, and after what heals.
+PRIORITY = -10
+#: Rows that one transaction handles, so that writers wait for tenths of a second at most.
+QUEUED_AT_ONCE, REMOVED_AT_ONCE = 2000, 50
+
+
+@dataclass(frozen=True)
+class SwitchProgress:
+    """How far a map has come.
+
+    Parameters
+    ----------
+    done : frames that have a signature of the next model
+    left : that wait for one
+    failed : in which the next model finds nothing to sign: rejected at the switch
+    dead : whose jobs broke down in every try: the switch waits for them
+    """
+
+    done: int
+    left: int
+    failed: int
+    dead: int
+
+
+def begin(connection: Connection, row: MapRow, model_id: str) -> None:
+    """Let a map be signed with another model as well, which is kept."""
+    connection.execute(
+        update(maps).where(maps.c.number == row.number).values(next_model_id=model_id)
+    )
+    record_event(connection, "map.reencoding", row.name, model=model_id)
+
+
+def give_up(connection: Connection, row: MapRow) -> None:
+    """Let a map keep the model it has."""
+    connection.execute(update(maps).where(maps.c.number == row.number).values(next_model_id=None))
+    record_event(connection, "map.reencoding_cancelled", row.name, model=row.next_model_id)
+
+
+def switch_progress(connection: Connection, row: MapRow) -> SwitchProgress:
+    """How far a map has come that has a next model."""
+    lacks = and_(_indexed(row), ~_signed(row.next_model_id))
+
+    def count(*conditions: ColumnElement[bool]) -> int:
+        counted = select(func.count()).select_from(frames).where(*conditions)
+        return int(connection.execute(counted).scalar_one())
+
+    def over(state: JobState, *conditions: ColumnElement[bool]) -> int:
+        ended = select(frames.c.number).join(jobs, jobs.c.frame_number == frames.c.number)
+        found = ended.where(jobs.c.state == state, _for_next(row), lacks, *conditions).distinct()
+        return len(connection.execute(found).all())  # few, and found by their state
+
+    every, lacking = count(_indexed(row)), count(lacks)
+    failed = over(JobState.FAILED)
+    dead = over(JobState.DEAD, ~_has_job(row, (*PENDING, JobState.FAILED)))
+    return SwitchProgress(every - lacking, lacking - failed - dead, failed, dead)
+
+
+def is_pending(connection: Connection, row: MapRow) -> bool:
+    """Whether a job for the next model of a map waits or runs; cheap while many do."""
+    found = connection.execute(
+        select(jobs.c.number)
+        .join(frames, frames.c.number == jobs.c.frame_number)
+        .where(_for_next(row), jobs.c.state.in_(PENDING), frames.c.map_number == row.number)
+        .limit(1)
+    )
+    return found.first() is not None
+
+
+def unqueued(connection: Connection, row: MapRow, after: int, *, again: bool = False) -> list[int]:
+    """Numbers of the next frames that lack a signature of the next model, and a job for one.
+
+    Parameters
+    ----------
+    connection : of a transaction
+    row : of the map
+    after : number of a frame
+    again : also those whose jobs broke down in every try
+    """
+    had = (*PENDING, JobState.FAILED, *(() if again else (JobState.DEAD,)))
+    found = connection.execute(
+        select(frames.c.number)
+        .where(_indexed(row), frames.c.number > after, ~_signed(row.next_model_id),
+               ~_has_job(row, had))
+        .order_by(frames.c.number)
+        .limit(QUEUED_AT_ONCE)
+    )  # fmt: skip
+    return list(found.scalars())
+
+
+def enqueue_all(connection: Connection, row: MapRow, numbers: list[int]) -> None:
+    """Queue the signing of frames with the next model of their map."""
+    now = read_clock(connection)
+    values = [
+        {
+            "id": uuid.uuid4().hex, "kind": REENCODE, "frame_number": number,
+            "map_number": row.number,
+            "model_id": row.next_model_id, "state": JobState.QUEUED, "priority": PRIORITY,
+            "attempts": 0, "failures": 0, "token": 0, "run_after": now, "created_at": now,
+        }
+        for number in numbers
+    ]  # fmt: skip
+    if values:
+        connection.execute(insert(jobs), values)
+
+
+def is_complete(connection: Connection, row: MapRow) -> bool:
+    """Whether every frame that can be found is signed by the next model, or cannot be."""
+    lacking = exists().where(
+        _indexed(row), ~_signed(row.next_model_id), ~_has_job(row, (JobState.FAILED,))
+    )
+    return not connection.execute(select(lacking)).scalar_one()
+
+
+def signed_up_to(connection: Connection, row: MapRow, revision: int) -> list[int]:
+    """Numbers of indexed frames, as of a revision, that have a signature of the next model."""
+    found = connection.execute(
+        select(frames.c.number).where(
+            _indexed(row), frames.c.revision <= revision, _signed(row.next_model_id)
+        )
+    )
+    return list(found.scalars())
+
+
+def touch(connection: Connection, row: MapRow, numbers: list[int]) -> None:
+    """Give indexed frames the next revisions of their map, so that an index that lacks them learns
+    of them.
+    """
+    for number in numbers:
+        revision = next_revision(connection, row.number)
+        connection.execute(
+            update(frames).where(frames.c.number == number).values(revision=revision)
+        )
+
+
+def switch_model(connection: Connection, row: MapRow) -> list[str]:
+    """Let the next model be the model of a map whose frames are complete.
+
+    Frames in which it finds nothing to sign are rejected. Those that the former model rejected are
+    to be signed: what it made of them says nothing of the next.
+
+    Returns
+    -------
+    rejected : ids of frames
+    """
+    earlier = connection.execute(
+        select(frames.c.number, frames.c.id).where(
+            frames.c.map_number == row.number, frames.c.state == FrameState.REJECTED
+        )
+    ).all()
+    failed = connection.execute(
+        select(frames.c.number, frames.c.id, jobs.c.id.label("job_id"), jobs.c.error)
+        .join(jobs, jobs.c.frame_number == frames.c.number)
+        .where(_indexed(row), ~_signed(row.next_model_id), _for_next(row),
+               jobs.c.state == JobState.FAILED)
+        .order_by(jobs.c.number)
+    )  # fmt: skip
+    rejected = {one.number: one for one in failed}
+    for number, one in rejected.items():
+        set_state(connection, number, FrameState.REJECTED, one.error)
+        # readers and indexes that hold it, of a time when the map had this model, learn of it
+        touch(connection, row, [number])
+        record_event(connection, "frame.rejected", row.name, one.id, one.job_id)
+    for number, frame_id in earlier:
+        set_state(connection, number, FrameState.RECEIVED)
+        job = enqueue(connection, "sign", number, PRIORITY)
+        record_event(connection, "frame.received", row.name, frame_id, job.id)
+    connection.execute(
+        update(maps)
+        .where(maps.c.number == row.number)
+        .values(model_id=row.next_model_id, next_model_id=None)
+    )
+    record_event(
+        connection, "map.reencoded", row.name, model=row.next_model_id, before=row.model_id
+    )
+    return [one.id for one in rejected.values()]
+
+
+def models_of(row: MapRow) -> tuple[str, ...]:
+    """The models whose signatures a map keeps."""
+    return (row.model_id,) if row.next_model_id is None else (row.model_id, row.next_model_id)
+
+
+def _indexed(row: MapRow) -> ColumnElement[bool]:
+    return and_(frames.c.map_number == row.number, frames.c.state == FrameState.INDEXED)
+
+
+def _signed(model_id: str | None) -> ColumnElement[bool]:
+    return exists().where(
+        signatures.c.frame_number == frames.c.number, signatures.c.model_id == model_id
+    )
+
+
+def _for_next(row: MapRow) -> ColumnElement[bool]:
+    return and_(jobs.c.kind == REENCODE, jobs.c.model_id == row.next_model_id)
+
+
+def _has_job(row: MapRow, states: tuple[JobState, ...]) -> ColumnElement[bool]:
+    own = jobs.alias("own")  # the query around it may speak of jobs too
+    return exists().where(
+        own.c.frame_number == frames.c.number, own.c.kind == REENCODE,
+        own.c.model_id == row.next_model_id, own.c.state.in_(states),
+    )  # fmt: skip

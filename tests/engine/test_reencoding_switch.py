@@ -1,0 +1,453 @@
+"""Queries, workers and indexes at the moment a map switches from model to model."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import select
+
+from sceneprint.engine import Engine
+from sceneprint.engine.jobs import signature_job as working
+from sceneprint.engine.maps import reencoding
+from sceneprint.engine.search import local_index, query
+from sceneprint.engine.search.local_index import index_folder
+from sceneprint.engine.search.retrieval import Deadline
+from sceneprint.errors import Busy, ModelMismatch, UselessFrame
+from sceneprint.geometry.retrieval.distance import distances
+from sceneprint.models import Model, save_model
+from sceneprint.pipeline import Signer, open_signer, prepare
+from sceneprint.store.signatures import StoredSignature, replace_signature
+from sceneprint.store.tables import signatures
+from sceneprint.types import Bytes
+from sceneprint_client.api import FrameState, JobState, Query
+
+Make = Callable[..., Engine]
+WorkOff = Callable[[Engine], list[JobState | None]]
+R = Query(stages=("retrieve",), k=50, exact=True)
+DEPTH = "depth"
+
+
+@pytest.fixture(scope="module")
+def whitened_signer(whitened_model: Model) -> Signer:
+    return open_signer(whitened_model, cached=False)
+
+
+@pytest.fixture(scope="module")
+def small_file(whitened_model: Model, tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("model") / "small.safetensors"
+    save_model(whitened_model, path)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def by_model(
+    uploads: Any, signer: Signer, whitened_signer: Signer
+) -> dict[str, tuple[Signer, Bytes]]:
+    """By the label of each model its signer, and its signatures of all uploads."""
+    return {
+        one.model.label: (one, np.stack([prepare(each.frame, one)[0].vector for each in uploads]))
+        for one in (signer, whitened_signer)
+    }
+
+
+def switch(engine: Engine, model: str | Path, work_off: WorkOff) -> None:
+    """Begin, work off, switch."""
+    engine.reencode("hall", model)
+    work_off(engine)
+    engine.publish_due()
+    assert engine.get_map("hall").reencoding is None
+
+
+def useless(*_: object) -> None:
+    raise UselessFrame("nothing")
+
+
+def found(answer: Any) -> list[tuple[str, int]]:
+    return [(match.frame_id, match.distance) for match in answer.matches]
+
+
+def right(
+    names: list[str], by_model: dict[str, tuple[Signer, Bytes]], label: str, asked: int
+) -> list[tuple[str, int]]:
+    """What a query by upload must find in a map of the model."""
+    vectors = by_model[label][1]
+    apart = distances(vectors[asked].copy(), vectors, "l2")
+    return [(names[i], int(apart[i])) for i in np.argsort(apart, kind="stable")]
+
+
+@pytest.mark.thorough
+def test_no_answer_mixes_models_while_a_map_goes_to_and_fro(
+    full: Engine, make_engine: Make, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
+    by_model: dict[str, tuple[Signer, Bytes]],
+) -> None:  # fmt: skip
+    asking, names = make_engine(full.settings.data_dir), ids(full)
+    wanted = {label: [right(names, by_model, label, i) for i in range(12)] for label in by_model}
+    over, raised, seen = threading.Event(), [], [[], []]
+
+    def ask(mine: list[str], stored: bool) -> None:
+        try:
+            for i in range(10**9):
+                if over.is_set():
+                    return
+                if stored:
+                    answer = asking.query_frame("hall", names[i % 12], R)
+                    expected = [
+                        one for one in wanted[answer.model][i % 12] if one[0] != names[i % 12]
+                    ]
+                else:
+                    one = uploads[i % 12]
+                    answer = asking.query_upload("hall", one.data, one.meta, R)
+                    expected = wanted[answer.model][i % 12]
+                assert found(answer) == expected
+                mine.append(answer.model)
+        except BaseException as error:
+            raised.append(error)
+
+    threads = [
+        threading.Thread(target=ask, args=(mine, stored))
+        for mine, stored in zip(seen, (True, False), strict=True)
+    ]
+    for thread in threads:
+        thread.start()
+    try:
+        for model in (small_file, DEPTH) * 2:
+            switch(full, model, work_off)
+            label, end = full.get_map("hall").model, time.monotonic() + 60
+            while not all(mine and mine[-1] == label for mine in seen) and not raised:
+                assert time.monotonic() < end, (label, [mine[-1:] for mine in seen])
+                over.wait(0.01)
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
+    assert raised == []
+    assert all(set(mine) == set(by_model) for mine in seen)
+
+
+def test_a_query_signed_before_the_switch_is_signed_again(
+    full: Engine, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
+    by_model: dict[str, tuple[Signer, Bytes]], monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """The map switches between the signing of a query and its search, and behind the search."""
+    names, models = ids(full), [small_file, DEPTH, small_file, DEPTH]
+
+    def then_switch(step: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*given: Any, **more: Any) -> Any:
+            made = step(*given, **more)
+            if models:
+                switch(full, models.pop(0), work_off)
+            return made
+
+        return run
+
+    for name in ("prepare_upload", "prepare_stored", "answer"):
+        monkeypatch.setattr(query, name, then_switch(getattr(query, name)))
+    del models[1:]
+    answer = full.query_upload("hall", uploads[4].data, uploads[4].meta, Query())
+    assert answer.model.startswith("small-")
+    assert found(full.query_upload("hall", uploads[4].data, uploads[4].meta, R)) == right(
+        names, by_model, answer.model, 4
+    )
+    models[:] = [DEPTH]
+    answer = full.query_frame("hall", names[4], R)
+    assert answer.model.startswith("depth-")
+    assert found(answer) == right(names, by_model, answer.model, 4)[1:]
+    monkeypatch.undo()
+    monkeypatch.setattr(query, "answer", then_switch(query.answer))
+    models[:] = [small_file]
+    answer = full.query_upload("hall", uploads[4].data, uploads[4].meta, R)
+    assert answer.model.startswith("small-")
+    models[:] = [DEPTH, small_file] * 5
+    with pytest.raises(Busy, match="kept changing its model"):
+        full.query_upload("hall", uploads[4].data, uploads[4].meta, R)
+
+
+def test_signatures_of_two_models_are_not_compared_whatever_their_length(
+    full: Engine, uploads: Any, whitened_model: Model, signer: Signer
+) -> None:
+    row = full._row("hall")
+    asked = query.prepare_upload(uploads[0].data, uploads[0].meta, signer, R)
+    given = ([row], asked, R, Deadline(None))
+    assert full.queries.answer(*given).matches[0].distance == 0
+    with pytest.raises(ModelMismatch, match="two models cannot be compared"):
+        full.queries.answer([row], replace(asked, model_id=whitened_model.id), R, Deadline(None))
+
+
+def test_what_was_being_signed_at_the_switch_is_signed_with_the_new_model(
+    empty: Engine, uploads: Any, work_off: WorkOff, small_file: str, whitened_model: Model,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    for each in uploads[:2]:
+        empty.add_frame("hall", each.data, each.meta)
+    work_off(empty)
+    added, _ = empty.add_frame("hall", uploads[2].data, uploads[2].meta)
+    held = empty.claim("slow")
+    assert held is not None
+    switch(empty, small_file, work_off)  # it is not indexed: nobody waits for it
+    assert empty.run(held) == JobState.QUEUED
+    assert empty.get_frame("hall", added.frame_id).state == FrameState.RECEIVED
+    assert len(list(empty.store.blobs.digests())) == 3 + 2
+    assert work_off(empty) == [JobState.SUCCEEDED]
+    answer = empty.query_upload("hall", uploads[2].data, uploads[2].meta, R)
+    assert (answer.counts.map, found(answer)[0]) == (3, (added.frame_id, 0))
+    # and one in which the former model finds nothing is not rejected for it
+    added, _ = empty.add_frame("hall", uploads[3].data, uploads[3].meta)
+    held = empty.claim("slow")
+    assert held is not None
+    switch(empty, DEPTH, work_off)
+    with monkeypatch.context() as patch:
+        patch.setattr(working, "prepare", useless)
+        assert empty.run(held) == JobState.QUEUED
+    assert work_off(empty) == [JobState.SUCCEEDED]
+    assert empty.get_map("hall").frames == {"indexed": 4}
+
+
+def test_a_frame_indexed_on_the_way_is_signed_with_both(
+    full: Engine, make_upload: Any, uploads: Any, work_off: WorkOff, small_file: str
+) -> None:
+    full.delete_frame("hall", full.list_frames("hall").items[0].frame_id)
+    full.reencode("hall", small_file)
+    full.add_frame("hall", uploads[0].data, uploads[0].meta)
+    assert work_off(full) == [JobState.SUCCEEDED] * 13
+    told = full.get_map("hall").reencoding
+    assert told is not None
+    assert (told.done, told.left) == (12, 0)
+    full.publish_due()
+    assert full.get_map("hall").reencoding is None
+
+
+def test_the_index_of_the_next_model_is_there_at_the_switch(
+    full: Engine, make_engine: Make, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
+    by_model: dict[str, tuple[Signer, Bytes]], monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
+    engine, names = make_engine(full.settings.data_dir, tail_frames=5), ids(full)
+    assert engine.publish_due() == 1
+    before = index_folder(engine.settings.indexes, engine._row("hall"))
+    engine.reencode("hall", small_file)
+    assert set(work_off(engine)) == {JobState.SUCCEEDED}
+    for asked in (engine, full):
+        answer = asked.query_frame("hall", names[1], R)
+        assert (answer.index_generation, answer.model[:6]) == (1, "depth-")
+    engine.publish_due()
+    answer = engine.query_upload("hall", uploads[4].data, uploads[4].meta, R)
+    assert (answer.index_generation, answer.counts.map) == (1, 12)
+    assert found(answer) == right(names, by_model, answer.model, 4)
+    assert not before.exists()
+    after = index_folder(engine.settings.indexes, engine._row("hall"))
+    assert [one for one in engine.settings.indexes.iterdir() if one.is_dir()] == [after]
+    # the next generation is due again after as many frames, and not before
+    assert engine.publish_due() == 0
+
+
+def test_an_index_that_cannot_be_written_does_not_hold_the_switch_up(
+    full: Engine, make_engine: Make, uploads: Any, work_off: WorkOff, small_file: str,
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    (tmp_path / "file").write_text("in the way")
+    nowhere = tmp_path / "file" / "index"
+    engine = make_engine(full.settings.data_dir, tail_frames=5, index_dir=nowhere)
+    switch(engine, small_file, work_off)
+    answer = engine.query_upload("hall", uploads[4].data, uploads[4].meta, R)
+    assert (answer.index_generation, answer.counts.map) == (0, 12)
+
+
+def test_what_an_index_of_the_next_model_lacks_is_found_after_the_switch(
+    full: Engine, make_engine: Make, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
+    whitened_signer: Signer, by_model: dict[str, tuple[Signer, Bytes]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """A frame that could not be signed when the index was published, and was before the switch."""
+    engine, names = make_engine(full.settings.data_dir, tail_frames=5), ids(full)
+    engine.reencode("hall", small_file)
+    blind = engine.claim("w")
+    assert blind is not None
+    with monkeypatch.context() as patch:
+        patch.setattr(working, "prepare", useless)
+        assert engine.run(blind) == JobState.FAILED
+    work_off(engine)
+    with monkeypatch.context() as patch:  # the worker dies between the two
+        patch.setattr(engine._reencoding, "_switch", lambda *_: False)
+        engine.publish_due()
+    assert engine.get_map("hall").reencoding is not None
+    coming = replace(engine._row("hall"), model_id=blind.model_id)
+    assert index_folder(engine.settings.indexes, coming).is_dir()  # and is not cleared away
+    at = names.index(blind.frame.id)
+    signature, _ = prepare(uploads[at].frame, whitened_signer)
+    made = StoredSignature(
+        signature.model_id, signature.vector.tobytes(), engine.store.blobs.put(b"artifact"),
+        signature.n_patches, signature.n_pairs,
+    )  # fmt: skip
+    with engine.store.database.write() as connection:
+        replace_signature(connection, blind.frame, made)
+    engine.publish_due()
+    assert engine.get_map("hall").frames == {"indexed": 12}
+    answer = engine.query_upload("hall", uploads[at].data, uploads[at].meta, R)
+    assert answer.index_generation == 1
+    assert found(answer) == right(names, by_model, answer.model, at)
+
+
+def test_a_rejected_frame_is_gone_for_readers_that_knew_it(
+    full: Engine, make_engine: Make, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
+    by_model: dict[str, tuple[Signer, Bytes]], monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """One that slept while the map went to another model, which rejected a frame, and back."""
+    sleeper, names = make_engine(full.settings.data_dir), ids(full)
+    assert sleeper.query_frame("hall", names[0], R).counts.map == 11
+    full.reencode("hall", small_file)
+    blind = full.claim("w")
+    assert blind is not None
+
+    with monkeypatch.context() as patch:
+        patch.setattr(working, "prepare", useless)
+        full.run(blind)
+    work_off(full)
+    full.publish_due()
+    assert full.get_frame("hall", blind.frame.id).reason == "nothing"
+    switch(full, DEPTH, work_off)
+    at = names.index(blind.frame.id)
+    asked = (at + 1) % 12
+    wanted = right(names, by_model, full.get_map("hall").model, asked)
+    answer = sleeper.query_upload("hall", uploads[asked].data, uploads[asked].meta, R)
+    assert found(answer) == [one for one in wanted if one[0] != blind.frame.id]
+    # what one model rejects another has to look at: it is found again
+    assert full.get_frame("hall", blind.frame.id).state == FrameState.RECEIVED
+    assert work_off(full) == [JobState.SUCCEEDED]
+    answer = sleeper.query_upload("hall", uploads[asked].data, uploads[asked].meta, R)
+    assert found(answer) == wanted
+
+
+#: Works as a worker does, and stands still at a step of which it tells.
+WORKER = """
+import sys, time
+from importlib import import_module
+from pathlib import Path
+from sceneprint.engine import Engine
+from sceneprint.settings import Settings
+
+module, name = import_module(sys.argv[2]), sys.argv[3]
+step, calls = getattr(module, name), 0
+
+def stand_still(*given, **more):
+    global calls
+    calls += 1
+    if calls < int(sys.argv[4]):
+        return step(*given, **more)
+    if sys.argv[5] == "after":
+        step(*given, **more)
+    print(name, flush=True)
+    time.sleep(600)
+
+setattr(module, name, stand_still)
+engine = Engine(Settings(data_dir=Path(sys.argv[1]), lease_s=0.3, tail_frames=5))
+while True:
+    held = engine.claim("doomed")
+    if held is None:
+        engine.publish_due()
+    else:
+        engine.run(held)
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "step", "call", "when", "switched"),
+    [
+        pytest.param(
+            "sceneprint.engine.jobs.signature_job",
+            "replace_signature",
+            5,
+            "after",
+            False,
+            marks=pytest.mark.thorough,
+        ),
+        pytest.param(
+            "sceneprint.engine.upkeep.index_upkeep",
+            "publish",
+            1,
+            "after",
+            False,
+            marks=pytest.mark.thorough,
+        ),
+        ("sceneprint.store.reencoding_rows", "switch_model", 1, "after", False),  # not committed
+        pytest.param(
+            "sceneprint.store.signatures",
+            "remove_signature",
+            4,
+            "after",
+            True,
+            marks=pytest.mark.thorough,
+        ),
+    ],
+)
+def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
+    full: Engine, make_engine: Make, uploads: Any, ids: Any, due_now: Any, work_off: WorkOff,
+    small_file: str, by_model: dict[str, tuple[Signer, Bytes]],
+    module: str, step: str, call: int, when: str, switched: bool,
+) -> None:  # fmt: skip
+    names, folder = ids(full), str(full.settings.data_dir)
+    full.reencode("hall", small_file)
+    arguments = [folder, module, step, str(call), when]
+    with subprocess.Popen(
+        [sys.executable, "-c", WORKER, *arguments], stdout=subprocess.PIPE, text=True
+    ) as worker:
+        late = threading.Timer(90, worker.kill)
+        late.start()
+        try:
+            assert worker.stdout is not None
+            assert worker.stdout.readline() == f"{step}\n"
+        finally:
+            late.cancel()
+            worker.kill()
+    label = full.get_map("hall").model
+    assert label.startswith("small-") == switched
+    answer = full.query_upload("hall", uploads[7].data, uploads[7].meta, R)
+    assert found(answer) == right(names, by_model, label, 7)
+    due_now(full)
+    other = make_engine(full.settings.data_dir, tail_frames=5)
+    work_off(other)
+    for _ in range(2):
+        other.publish_due()
+    assert other.get_map("hall").frames == {"indexed": 12}
+    for i in (2, 7):
+        for asked in (full, other):
+            answer = asked.query_upload("hall", uploads[i].data, uploads[i].meta, R)
+            assert answer.model.startswith("small-")
+            assert found(answer) == right(names, by_model, answer.model, i)
+    with other.store.database.read() as connection:
+        models = connection.execute(select(signatures.c.model_id)).scalars().all()
+    assert models == [other.get_map("hall").model_id] * 12
+    digests = set(other.store.blobs.digests())
+    assert {hashlib.sha256(each.data).hexdigest() for each in uploads} <= digests
+    assert len(digests) >= 24  # an artifact may be left that nothing refers to
+
+
+def test_a_frame_is_signed_again_by_a_model_that_the_map_goes_back_to(
+    full: Engine, ids: Any, work_off: WorkOff, small_file: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the first model made of it is there still, as removing it takes a while."""
+    name = ids(full)[3]
+    with monkeypatch.context() as patch:
+        patch.setattr(reencoding, "_tidy", lambda *_, **__: False)
+        original, first = working.prepare, full.get_map("hall").model
+
+        def refuse(frame: Any, signer: Any) -> Any:
+            if frame.name == name and signer.model.label != first:
+                raise UselessFrame("nothing")
+            return original(frame, signer)
+
+        patch.setattr(working, "prepare", refuse)
+        switch(full, small_file, work_off)
+        assert full.get_frame("hall", name).state == "rejected"
+        switch(full, DEPTH, work_off)
+        work_off(full)
+    assert full.get_frame("hall", name).state == "indexed"

@@ -1,0 +1,236 @@
+"""Up of frames and of maps: stored, learnt, told to the search, and doubted where it is wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.engine.maps.map_lifecycle import edit_frame, edit_map
+from sceneprint.engine.results.stored_results import read, written
+from sceneprint.engine.search.query import localization_of
+from sceneprint.engine.search.up_vectors import known_ups
+from sceneprint.engine.serializers import EDITABLE, frame_tag, map_tag, tag_of
+from sceneprint.errors import FrameConflict, InvalidRequest, MapExists
+from sceneprint.store.frames import find_frame
+from sceneprint.store.maps import find_map
+from sceneprint.types import Floats
+from sceneprint_client.api import Comparison, NamedFrame, NewMap, Query
+from sceneprint_client.api.base import checked
+from sceneprint_client.api.frames import FrameMeta
+
+Ids = Callable[[Engine], list[str]]
+Z = [0.0, 0.0, 1.0]  #: up in the world of synthetic rooms
+
+
+def up_of(upload: Any, tilt: float = 0.0) -> list[float]:
+    """Up in the sensor of an upload, turned by that many degrees about its x axis."""
+    c, s = math.cos(math.radians(tilt)), math.sin(math.radians(tilt))
+    turn = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    told: list[float] = (turn @ upload.pose[:3, :3].T @ Z).tolist()
+    return told
+
+
+def with_up(meta: FrameMeta, up: list[float] | None) -> FrameMeta:
+    return FrameMeta.model_validate(dict(meta) | {"up": up})
+
+
+def row_of(engine: Engine, frame_id: str) -> Any:
+    with engine.store.database.read() as connection:
+        return find_frame(connection, find_map(connection, "hall"), frame_id)
+
+
+def test_a_frame_keeps_its_up(empty: Engine, uploads: Any) -> None:
+    one = uploads[0]
+    near = [0.0, -1.005, 0.0]  # within a hundredth of a unit vector
+    added, _ = empty.add_frame("hall", one.data, with_up(one.meta, near))
+    told = empty.get_frame("hall", added.frame_id)
+    assert told.up is not None
+    assert (told.up.x, told.up.y, told.up.z) == (0.0, -1.0, 0.0)
+    [listed] = empty.list_frames("hall").items
+    assert listed.up == told.up
+    again, new = empty.add_frame("hall", one.data, with_up(one.meta, [0, -1, 0]))
+    assert (again.frame_id, new) == (added.frame_id, False)
+    for other in (None, [0, 0, 1]):
+        with pytest.raises(FrameConflict, match="different up"):
+            empty.add_frame("hall", one.data, with_up(one.meta, other))
+    moved = edit_frame(empty.store, "hall", added.frame_id, {"up": [1, 0, 0]})
+    assert moved.up is not None
+    assert moved.up.x == 1.0
+    assert moved.etag != told.etag
+    bare = edit_frame(empty.store, "hall", added.frame_id, {"up": None})
+    assert bare.up is None
+    row = row_of(empty, added.frame_id)
+    # whoever holds the tag of a frame of before there was an up may still edit it
+    assert bare.etag == frame_tag(row) == tag_of("frame", [getattr(row, n) for n in EDITABLE])
+    empty.delete_frame("hall", added.frame_id)
+    assert row_of(empty, added.frame_id).up is None
+
+
+@pytest.mark.parametrize(
+    ("up", "why"),
+    [
+        ([0, 0, 9.81], "its length is 9.81, not 1"),
+        ([0, 0, 0], "its length is 0, not 1"),
+        ([0, -1], "neither {x, y, z} nor a list of three numbers"),
+        ("up", "neither {x, y, z} nor a list of three numbers"),
+        ({"x": 0, "y": 1}, "Field required"),
+        ([math.nan, 0, 1], "finite number"),
+    ],
+)
+def test_what_is_no_direction_is_refused(up: Any, why: str) -> None:
+    with pytest.raises(InvalidRequest) as raised:
+        checked(FrameMeta, "The frame", up=up)
+    assert why in str(raised.value)
+    assert raised.value.fields[0][0].startswith("up")
+
+
+def test_a_map_has_an_up_that_can_be_changed(empty: Engine) -> None:
+    new = NewMap.model_validate({"name": "level", "up": {"x": 0, "y": 0, "z": 1}})
+    made, _ = empty.create_map(new)
+    assert made.up is not None
+    assert made.up.z == 1.0
+    assert empty.create_map(new)[1] is False
+    with pytest.raises(MapExists, match="another name"):
+        empty.create_map(NewMap.model_validate({"name": "level", "up": [0, 1, 0]}))
+    told = edit_map(empty.store, "level", {"up": [0, -1, 0]}, [str(made.etag)])
+    assert told.up is not None
+    assert told.up.y == -1.0
+    assert told.etag != made.etag
+    assert edit_map(empty.store, "level", {"title": "Level"}).up == told.up
+    assert edit_map(empty.store, "level", {"up": None}).up is None
+    with empty.store.database.read() as connection:
+        row = find_map(connection, "level")
+    assert map_tag(row) == tag_of("map", "level", "Level")
+    with pytest.raises(InvalidRequest, match="length is 2, not 1"):
+        edit_map(empty.store, "level", {"up": [0, 0, 2]})
+
+
+def test_a_map_tells_its_frames_their_up(full: Engine, ids: Ids, uploads: Any) -> None:
+    names = ids(full)
+    numbers = [row_of(full, name).number for name in names]
+
+    def known() -> dict[int, Floats]:
+        with full.store.database.read() as connection:
+            return known_ups(connection, numbers)
+
+    assert known() == {}
+    edit_map(full.store, "hall", {"up": Z})
+    found = known()
+    assert sorted(found) == sorted(numbers)
+    for number, one in zip(numbers, uploads, strict=True):
+        np.testing.assert_allclose(found[number], up_of(one), atol=1e-12)
+    # a frame's own up counts while it agrees, and not where the map knows better
+    edit_frame(full.store, "hall", names[0], {"up": up_of(uploads[0], 3)})
+    edit_frame(full.store, "hall", names[1], {"up": up_of(uploads[1], 30)})
+    found = known()
+    np.testing.assert_allclose(found[numbers[0]], up_of(uploads[0], 3), atol=1e-12)
+    np.testing.assert_allclose(found[numbers[1]], up_of(uploads[1]), atol=1e-12)
+
+
+def test_the_up_of_a_parent_frame_is_learnt_from_three_frames(
+    full: Engine, ids: Ids, uploads: Any
+) -> None:
+    names = ids(full)
+    numbers = [row_of(full, name).number for name in names]
+
+    def known() -> dict[int, Floats]:
+        with full.store.database.read() as connection:
+            return known_ups(connection, numbers)
+
+    for i in (0, 1):
+        edit_frame(full.store, "hall", names[i], {"up": up_of(uploads[i])})
+    assert sorted(known()) == numbers[:2]
+    edit_frame(full.store, "hall", names[2], {"up": up_of(uploads[2], 40)})
+    found = known()  # two of three agree: they outvote the third, and speak for the room
+    assert sorted(found) == numbers[:6]
+    for i in range(6):
+        np.testing.assert_allclose(found[numbers[i]], up_of(uploads[i]), atol=1e-9)
+    edit_frame(full.store, "hall", names[1], {"up": up_of(uploads[1], -40)})
+    found = known()  # no two agree: nothing is learnt, and each has its own
+    assert sorted(found) == numbers[:3]
+    # a frame without a pose has its own
+    edit_frame(full.store, "hall", names[7], {"pose": None, "up": Z})
+    assert known()[numbers[7]].tolist() == Z
+
+
+@pytest.fixture
+def level(full: Engine) -> Engine:
+    """The map `hall` knows which way is up."""
+    edit_map(full.store, "hall", {"up": Z})
+    return full
+
+
+def test_a_query_with_up_is_found_as_without(level: Engine, uploads: Any) -> None:
+    one = uploads[2]
+    query = Query(keep=False, k=3)
+    before = level.query_upload("hall", one.data, one.meta, query)
+    told = level.query_upload("hall", one.data, with_up(one.meta, up_of(one)), query)
+    assert (before.status, told.status) == ("found", "found")
+    assert before.counts.accepted <= told.counts.accepted
+    assert all(match.validation.tilt_deg is None for match in before.matches)
+    accepted = [match for match in told.matches if match.validation.status == "accepted"]
+    assert all((match.validation.tilt_deg or 0.0) < 2.0 for match in accepted)
+    assert accepted[0].validation.tilt_deg is not None
+    assert told.location is not None
+    away = np.array(told.location.pose.matrix)[:3, 3] - one.pose[:3, 3]
+    assert np.linalg.norm(away) < 0.05
+
+
+def test_a_wrong_up_is_told_and_gives_no_pose(level: Engine, uploads: Any) -> None:
+    one = uploads[2]
+    meta = with_up(one.meta, up_of(one, 20))
+    told = level.query_upload("hall", one.data, meta, Query(k=3, explain=True))
+    assert (told.status, told.location, told.counts.accepted) == ("not_found", None, 0)
+    first = told.matches[0].validation
+    assert first.status == "rejected"
+    assert first.strength is None
+    assert first.tilt_deg == pytest.approx(20, abs=1.5)
+    assert "only tilted by" in first.reason
+    assert "check the IMU" in first.reason.replace("Check", "check")
+    assert (told.cause, told.reason) == ("gravity", first.reason)
+    assert localization_of(told).reason == first.reason
+    assert told.matches[0].uncertainty is None
+    # looked at again, it is what it was
+    again = level.inspection.match(told.query_id, told.matches[0].frame_id)
+    assert again.validation == first
+
+
+def test_what_was_found_with_up_is_looked_at_again_with_it(level: Engine, uploads: Any) -> None:
+    one = uploads[2]
+    told = level.query_upload("hall", one.data, with_up(one.meta, up_of(one)), Query(k=3))
+    best = told.matches[0]
+    again = level.inspection.match(told.query_id, best.frame_id)
+    assert again.validation == best.validation
+    kept = level.kept.find(told.query_id)
+    assert kept.up is not None
+    np.testing.assert_allclose(kept.up, up_of(one), atol=1e-12)
+    back = read(written(kept)).up
+    assert back is not None
+    assert back.tolist() == kept.up.tolist()
+    assert read(written(replace(kept, up=None))).up is None
+
+
+def test_a_stored_frame_asks_with_the_up_that_is_known_of_it(level: Engine, ids: Ids) -> None:
+    name = ids(level)[2]
+    told = level.query_frame("hall", name, Query(keep=False))
+    assert told.status == "found"
+    assert told.matches[0].validation.tilt_deg == pytest.approx(0.0, abs=2.0)
+
+
+def test_two_frames_are_compared_with_their_ups(level: Engine, ids: Ids, uploads: Any) -> None:
+    one = uploads[1]
+    stored = NamedFrame(map="hall", frame_id=ids(level)[2])
+    for tilt, status in ((0, "accepted"), (20, "rejected")):
+        sent = one.data, with_up(one.meta, up_of(one, tilt))
+        told = level.queries.compare(sent, stored, Comparison()).validation
+        assert told is not None
+        assert told.status == status
+    alone = level.queries.compare((one.data, one.meta), stored, Comparison()).validation
+    assert alone is not None
+    assert (alone.status, alone.tilt_deg) == ("accepted", None)

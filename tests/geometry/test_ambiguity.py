@@ -1,0 +1,184 @@
+"""Ambiguity: motions that leave a room's planes in themselves, and planes that count the same."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sceneprint.geometry.pose.rigid import difference, inverse, inverses, moved
+from sceneprint.geometry.registration.overlap import (
+    OverlapParameters,
+    explained,
+    plane_view,
+    plane_weights,
+)
+from sceneprint.geometry.validation.ambiguity import (
+    AmbiguityParameters,
+    best_alternative,
+    far_from,
+    symmetries,
+)
+from sceneprint.lab.synth import KINECT, take
+from sceneprint.lab.synth.dataset import room_and_rng
+from sceneprint.lab.synth.trajectories import trajectory
+from sceneprint.models import read_model
+from sceneprint.pipeline import geometry_of
+from sceneprint.signing import see
+from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics, Patches, Surface
+
+P = AmbiguityParameters()
+
+
+def on_planes(*planes: tuple[list[float], float, int, float]) -> Patches:
+    """Patches in planes of these normals, offsets, numbers of patches and area of each."""
+    rng = np.random.default_rng(0)
+    means, normals, areas = [], [], []
+    for normal, offset, n, area in planes:
+        across = np.linalg.svd(np.array([normal]))[2][1:]
+        means.append(offset * np.array(normal) + rng.uniform(-2, 2, (n, 2)) @ across)
+        normals.append(np.tile(normal, (n, 1)))
+        areas.append(np.full(n, area))
+    count = sum(n for _, _, n, _ in planes)
+    return Patches(
+        np.concatenate(means), np.concatenate(normals).astype(float), np.concatenate(areas),
+        np.ones(count, np.int32), np.ones(count),
+    )  # fmt: skip
+
+
+#: A floor 1.4 m below a camera, a wall 3 m ahead, and little of a wall 2 m to the right.
+ROOM = on_planes(
+    ([0, -1, 0], -1.4, 40, 0.05), ([0, 0, -1], -3.0, 25, 0.05), ([-1, 0, 0], -2.0, 3, 0.01)
+)
+
+
+def turns(transforms: Floats) -> Floats:
+    """Those that turn, as vectors of their axis times degrees."""
+    vectors = np.degrees(Rotation.from_matrix(transforms[:, :3, :3]).as_rotvec())
+    return vectors[np.linalg.norm(vectors, axis=1) > 1]
+
+
+def test_symmetries_are_motions_that_leave_a_main_plane_in_itself() -> None:
+    found = symmetries(ROOM, P)
+    floor, wall = ROOM.means[:40], ROOM.means[40:65]
+    for T in found:
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+        of_floor = np.abs(moved(T, floor)[:, 1] - 1.4).max()
+        of_wall = np.abs(moved(T, wall)[:, 2] - 3.0).max()
+        assert min(of_floor, of_wall) < 1e-9
+
+
+def test_quarter_turns_about_the_middle_of_each_plane() -> None:
+    found = symmetries(ROOM, P)
+    sizes = np.linalg.norm(turns(found), axis=1)
+    # of the floor and of the wall, which are the two main directions; of the third none
+    np.testing.assert_allclose(np.sort(sizes), [90, 90, 90, 90, 180, 180], atol=1e-9)
+    axes = np.abs(turns(found)) / sizes[:, None]
+    assert sorted(axes.argmax(axis=1).tolist()) == [1, 1, 1, 2, 2, 2]
+    middle = ROOM.means[:40].mean(axis=0)
+    about_floor = [T for T in found if np.linalg.norm(moved(T, middle[None]) - middle) < 1e-9]
+    assert len(about_floor) == 3
+    # the three of a plane are powers of the first
+    powers = [np.linalg.matrix_power(about_floor[0], k) for k in (1, 2, 3)]
+    for T, power in zip(about_floor, powers, strict=True):
+        np.testing.assert_allclose(T, power, atol=1e-9)
+
+
+def test_planes_and_directions_are_taken_by_area() -> None:
+    one = on_planes(([0, -1, 0], -1.0, 10, 0.1))
+    assert len(turns(symmetries(one, P))) == 3
+    # four steps of a stair, facing up or down: one direction, of which the largest three count
+    stair = on_planes(*(([0, s, 0], 0.3 * k, 10 - k, 0.1) for k, s in enumerate((1, -1, 1, -1))))
+    found = symmetries(stair, P)
+    assert len(turns(found)) == 9
+    for k, start, n, count in ((0, 0, 10, 3), (1, 10, 9, 3), (2, 19, 8, 3), (3, 27, 7, 0)):
+        middle = stair.means[start : start + n].mean(axis=0)
+        assert abs(middle[1]) == pytest.approx(0.3 * k)
+        held = [np.linalg.norm(moved(T, middle[None]) - middle) < 1e-9 for T in found]
+        assert sum(held) == count
+    blank = on_planes(([0, -1, 0], -1.0, 10, 0.0))
+    assert symmetries(blank, P).shape == (0, 4, 4)
+
+
+def test_plane_weights_by_hand() -> None:
+    patches = on_planes(
+        ([0, -1, 0], -1.4, 8, 1.0), ([0, 0, -1], -3.0, 2, 5.0), ([0, -1, 0], -0.7, 1, 1.0)
+    )
+    weights = plane_weights(patches, P.planes)
+    assert weights.dtype == np.float32
+    # a floor of eight, a wall of two, a table top of one, whatever their areas: 1 each
+    np.testing.assert_allclose(weights, [1 / 8] * 8 + [1 / 2] * 2 + [1.0])
+    # two sides of a thin board face apart, and are two planes
+    board = on_planes(([0, 0, -1], -2.0, 4, 1.0), ([0, 0, 1], 2.02, 4, 1.0))
+    np.testing.assert_allclose(plane_weights(board, P.planes), 1 / 4)
+    # 5 cm apart is one plane, 7 cm are two
+    for gap, weight in ((0.05, 0.5), (0.07, 1.0)):
+        two = on_planes(([0, 0, -1], -2.0, 1, 1.0), ([0, 0, -1], -2.0 - gap, 1, 1.0))
+        np.testing.assert_allclose(plane_weights(two, P.planes), weight)
+
+
+def test_plane_view() -> None:
+    nothing = np.zeros((2, 2, 3), np.float32)
+    camera = Intrinsics(2, 2, 1.0, 1.0, 0.5, 0.5)
+    seen = Surface(nothing, nothing, nothing[..., 0] > 0, nothing[..., 0], camera)
+    view = plane_view(Geometry(seen, ROOM, np.zeros((68, 4), np.uint8), "ab" * 32), P.planes)
+    points = view.points
+    np.testing.assert_array_equal(view.weights, plane_weights(ROOM, P.planes))
+    assert (points.shape, points.dtype) == ((68, 6), np.float32)
+    np.testing.assert_array_equal(points[:, :3], ROOM.means.astype(np.float32))
+    np.testing.assert_array_equal(points[:, 3:], ROOM.normals.astype(np.float32))
+
+
+def test_far_from_equals_the_difference() -> None:
+    rng = np.random.default_rng(1)
+    T, others = np.eye(4), np.tile(np.eye(4), (300, 1, 1))
+    T[:3, :3], T[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    turn = Rotation.from_rotvec(rng.normal(0, math.radians(8), (300, 3))).as_matrix()
+    others[:, :3, :3] = turn @ T[:3, :3]
+    others[:, :3, 3] = T[:3, 3] + rng.normal(0, 0.12, (300, 3))
+    apart = [difference(T, other) for other in others]
+    far = [metres > P.rival_m or radians > P.rival_rad for metres, radians in apart]
+    assert 50 < sum(far) < 250
+    np.testing.assert_array_equal(far_from(T, others, P), others[far])
+    assert far_from(T, others[:0], P).shape == (0, 4, 4)
+    assert far_from(T, T[None], P).shape == (0, 4, 4)
+
+
+def test_inverses() -> None:
+    rng = np.random.default_rng(2)
+    transforms = np.tile(np.eye(4), (20, 1, 1))
+    transforms[:, :3, :3] = Rotation.random(20, rng=rng).as_matrix()
+    transforms[:, :3, 3] = rng.normal(size=(20, 3))
+    expected = np.array([inverse(T) for T in transforms])
+    np.testing.assert_allclose(inverses(transforms), expected, atol=1e-12)
+    assert inverses(transforms[:0]).shape == (0, 4, 4)
+    for i, j in product(range(3), range(3)):
+        assert inverses(inverses(transforms))[0, i, j] == transforms[0, i, j]
+
+
+def test_free_space_refutes_no_rival_for_what_it_holds_against_the_transform_too() -> None:
+    model, overlap_p = read_model("depth"), OverlapParameters()
+    room, rng = room_and_rng(11, 0)
+    poses = trajectory(room, 61, rng)[12:36:12]
+    frames = [DepthFrame(take(room, T, KINECT, rng), KINECT) for T in poses]
+    made = [geometry_of(see(frame, model.parameters), model) for frame in frames]
+    views = [plane_view(one, P.planes) for one in made]
+    T = inverse(poses[1]) @ poses[0]
+    # slid by 0.3 m each way along each axis: they agree with what lies along it, and violate
+    shifts = np.tile(np.eye(4), (6, 1, 1))
+    shifts[:, :3, 3] = 0.3 * np.concatenate([np.eye(3), -np.eye(3)])
+    voted = shifts @ T
+    seen = explained(*views, voted, overlap_p)
+    assert (seen.violations > P.refuted).any()
+    none = np.empty((0, 4, 4))
+    told = [
+        best_alternative(*views, T, violations, voted, none, P, overlap_p)[0]
+        for violations in (0.0, 1.0)
+    ]
+    # of a transform that violates everything no rival is refuted: the one that agrees most counts
+    assert told[1] >= seen.share.max()
+    assert told[0] < seen.share.max()

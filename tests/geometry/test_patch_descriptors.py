@@ -1,0 +1,267 @@
+"""Patch descriptors: by hand, against another formula, and what must not change them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import spearmanr
+
+from sceneprint.geometry.registration import patch_descriptors as patch_descriptors_module
+from sceneprint.geometry.registration.patch_descriptors import (
+    ANGLES,
+    RANGE,
+    Compression,
+    PatchDescriptorParameters,
+    compress,
+    fit_compression,
+    patch_descriptors,
+)
+from sceneprint.types import Floats, Floats32, Patches
+
+P = PatchDescriptorParameters()
+
+
+def bin_of(scale: int, distance: int, height: int, cosine: int, radial: int) -> int:
+    """Where in a row the bin of these five numbers is."""
+    counts = P.scales[:, 1:].astype(int)
+    start = int((counts[:scale].prod(axis=1)).sum()) * ANGLES * ANGLES
+    return start + ((distance * counts[scale, 1] + height) * ANGLES + cosine) * ANGLES + radial
+
+
+def two(normal: list[float], place: list[float], area: float = 0.7) -> Patches:
+    """One patch at the origin facing along z, and another."""
+    return Patches(
+        np.array([[0.0, 0, 0], place]),
+        np.array([[0.0, 0, 1], normal]),
+        np.array([0.3, area]),
+        np.ones(2, np.int32),
+        np.ones(2),
+    )
+
+
+def oracle(patches: Patches, p: PatchDescriptorParameters) -> Floats:
+    """The same histograms by hat functions on clipped coordinates, pair after pair."""
+
+    def hats(at: float, count: int) -> Floats:
+        return np.maximum(0.0, 1.0 - np.abs(np.clip(at, 0, count - 1) - np.arange(count)))
+
+    rows = []
+    for i in range(len(patches)):
+        row = []
+        for radius, n_flat, n_high in p.scales:
+            h = np.zeros((int(n_flat), int(n_high), ANGLES, ANGLES))
+            for j in range(len(patches)):
+                off = patches.means[j] - patches.means[i]
+                if i == j or np.linalg.norm(off) >= radius:
+                    continue
+                n, m = patches.normals[i], patches.normals[j]
+                flat = off - (off @ n) * n
+                towards = flat / np.linalg.norm(flat) if np.linalg.norm(flat) > 1e-3 else 0 * flat
+                h += patches.areas[j] * np.einsum(
+                    "a,b,c,d->abcd",
+                    hats(np.linalg.norm(flat) / radius * n_flat - 0.5, int(n_flat)),
+                    hats((off @ n / radius + 1) / 2 * n_high - 0.5, int(n_high)),
+                    hats((m @ n + 1) / 2 * ANGLES - 0.5, ANGLES),
+                    hats((m @ towards + 1) / 2 * ANGLES - 0.5, ANGLES),
+                )
+            root = np.sqrt(h.ravel())
+            row.append(root / max(np.linalg.norm(root), 1e-300) / np.sqrt(len(p.scales)))
+        rows.append(np.concatenate(row))
+    return np.array(rows)
+
+
+def test_sizes() -> None:
+    assert P.dimension == (4 * 5 + 5 * 7 + 6 * 8) * 9
+    none = Patches(
+        np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0, np.int32), np.empty(0)
+    )
+    found = patch_descriptors(none, P)
+    assert (found.shape, found.dtype) == ((0, P.dimension), np.float32)
+
+
+def test_two_patches_by_hand() -> None:
+    # 25 cm off in the plane, level, at right angles, and across the way there: (2, 2, 1, 1) of
+    # the nearest scale, whose bins are 10 cm and 16 cm; one unit of it all in one bin
+    row = patch_descriptors(two([0, 1, 0], [0.25, 0, 0]), P)[0]
+    expected = np.zeros(P.dimension)
+    expected[bin_of(0, 2, 2, 1, 1)] = 1.0
+    # bins of 16 cm, 25 cm is 1.0625 of them past the middle of the first; 7 heights
+    expected[bin_of(1, 1, 3, 1, 1)] = 0.9375
+    expected[bin_of(1, 2, 3, 1, 1)] = 0.0625
+    # bins of 160 / 6 cm, 0.4375 past the first's middle; 8 heights, level is between two of them
+    for height in (3, 4):
+        expected[bin_of(2, 0, height, 1, 1)] = 0.5625 / 2
+        expected[bin_of(2, 1, height, 1, 1)] = 0.4375 / 2
+    np.testing.assert_allclose(row, np.sqrt(expected / 3), atol=1e-6)
+
+
+def test_angles_by_hand() -> None:
+    # straight above, facing the same way: no direction in the plane, so radial 0, the middle bin;
+    # cosine 1 is the middle of no bin: all of it in the last
+    row = patch_descriptors(two([0, 0, 1], [0, 0, 0.16]), P)[0]
+    near = row[: bin_of(1, 0, 0, 0, 0)]
+    assert np.flatnonzero(near).tolist() == [bin_of(0, 0, 3, 2, 1)]
+    # towards the first patch and 60 degrees up: cosine 1/2, 3/4 of the way from bin 1 to 2;
+    # radial -sqrt(3)/2, beyond the middle of bin 0
+    row = patch_descriptors(two([-(3**0.5) / 2, 0, 0.5], [0.25, 0, 0]), P)[0]
+    near = row[: bin_of(1, 0, 0, 0, 0)]
+    assert np.flatnonzero(near).tolist() == [bin_of(0, 2, 2, 1, 0), bin_of(0, 2, 2, 2, 0)]
+    np.testing.assert_allclose(near[near > 0], np.sqrt(np.array([0.25, 0.75]) / 3), atol=1e-6)
+
+
+def test_equals_the_oracle(scenes: ModuleType) -> None:
+    rng = np.random.default_rng(0)
+    for patches in (scenes.random_patches(rng, 40, 0.8), scenes.room(rng, 60)):
+        np.testing.assert_allclose(patch_descriptors(patches, P), oracle(patches, P), atol=2e-6)
+
+
+def test_other_parameters_equal_the_oracle(scenes: ModuleType) -> None:
+    p = PatchDescriptorParameters(0.5, 3, 2, 0.9, 1, 4, 1.1, 2, 1)
+    patches = scenes.random_patches(np.random.default_rng(1), 40, 0.8)
+    np.testing.assert_allclose(patch_descriptors(patches, p), oracle(patches, p), atol=2e-6)
+
+
+def test_rigid_motions_change_nothing(scenes: ModuleType) -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        patches = scenes.room(rng)
+        turned = scenes.moved(patches, Rotation.random(rng=rng), rng.normal(0, 5, 3))
+        # roots make little of much: of 1e-8 in a bin 1e-4
+        before, after = patch_descriptors(patches, P) ** 2, patch_descriptors(turned, P) ** 2
+        np.testing.assert_allclose(after, before, atol=1e-6)
+
+
+def test_a_mirror_image_has_the_same_surroundings(scenes: ModuleType) -> None:
+    # they count lengths and angles, no handedness: a mirrored scene must be told elsewhere
+    patches = scenes.room(np.random.default_rng(3))
+    mirror = np.array([-1.0, 1.0, 1.0])
+    other = replace(patches, means=patches.means * mirror, normals=patches.normals * mirror)
+    np.testing.assert_allclose(
+        patch_descriptors(other, P) ** 2, patch_descriptors(patches, P) ** 2, atol=1e-6
+    )
+
+
+def test_order_and_size_of_patches_do_not_matter(scenes: ModuleType) -> None:
+    rng = np.random.default_rng(4)
+    patches = scenes.room(rng, 50)
+    order = rng.permutation(50)
+    shuffled = Patches(
+        patches.means[order],
+        patches.normals[order],
+        3.0 * patches.areas[order],
+        patches.sizes[order],
+        patches.coherences[order],
+    )
+    np.testing.assert_allclose(
+        patch_descriptors(shuffled, P), patch_descriptors(patches, P)[order], atol=1e-6
+    )
+
+
+def test_every_scale_reached_weighs_the_same() -> None:
+    # 30 cm: all three; 60 cm: two; 1.2 m: one; 2 m: none
+    for distance, scales in ((0.3, 3), (0.6, 2), (1.2, 1), (2.0, 0)):
+        rows = patch_descriptors(two([0, 0, 1], [distance, 0, 0]), P)
+        np.testing.assert_allclose(np.linalg.norm(rows, axis=1) ** 2, scales / 3, atol=1e-6)
+
+
+def random_compression(rng: np.random.Generator, d: int, bins: int) -> Compression:
+    axes = np.linalg.qr(rng.normal(size=(bins, d)))[0].T
+    return Compression(np.full(bins, 0.01, np.float32), axes.astype(np.float32))
+
+
+def test_compression_of_nothing_is_128() -> None:
+    by = random_compression(np.random.default_rng(5), 16, 30)
+    mean = np.repeat(by.mean[None], 2, axis=0)
+    stored = compress(mean, by)
+    assert (stored.shape, stored.dtype) == ((2, 16), np.uint8)
+    # what rounding leaves of it is not blown up
+    assert np.abs(stored.astype(int) - 128).max() <= 2
+
+
+def test_compression_by_hand() -> None:
+    # two of three axes kept; less the mean the row is (3, 4, 9) / 10: (.6, .8), beyond RANGE
+    by = Compression(np.array([0.1, 0.1, 0.1], np.float32), np.eye(3, dtype=np.float32)[:2])
+    assert by.offset.tolist() == pytest.approx([0.1, 0.1])
+    assert RANGE == 0.25
+    (row,) = compress(np.array([[0.4, 0.5, 1.0]], np.float32), by)
+    assert row.tolist() == [255, 255]
+    # (.3, -.4) has length .5; but a histogram has no negative bins
+    by = replace(by, mean=np.array([0.1, 0.9, 0.1], np.float32))
+    (row,) = compress(np.array([[0.4, 0.5, 1.0]], np.float32), by)
+    assert row.tolist() == [255, 0]
+    # 1 of 64 equal components is .125: half of 127
+    by = Compression(np.zeros(64, np.float32), np.eye(64, dtype=np.float32))
+    (row,) = compress(np.ones((1, 64), np.float32), by)
+    assert row.tolist() == [192] * 64
+
+
+def learnt(scenes: ModuleType, rng: np.random.Generator) -> Floats32:
+    rooms = [patch_descriptors(scenes.room(rng), P) for _ in range(12)]
+    return np.concatenate(rooms)
+
+
+def test_bytes_keep_the_order_of_distances(scenes: ModuleType) -> None:
+    rng = np.random.default_rng(6)
+    rows = learnt(scenes, rng)
+    by = fit_compression(rows, 128)
+    exact = (rows.astype(float) - by.mean) @ by.matrix.T.astype(float)
+    exact /= np.linalg.norm(exact, axis=1, keepdims=True)
+    stored = compress(rows, by).astype(int)
+    i, j = rng.integers(0, len(rows), (2, 4000))
+    kept = np.clip(exact, -RANGE, RANGE)
+    of_bytes, of_kept = (
+        np.linalg.norm(x[i] - x[j], axis=1) for x in (stored * (RANGE / 127), kept)
+    )
+    np.testing.assert_allclose(of_bytes, of_kept, atol=0.02)
+    assert spearmanr(of_kept, of_bytes).statistic > 0.9995  # measured: 0.9999
+    # what is beyond the range is meant to be lost, and comes to no more than the range
+    assert np.abs(exact).max() > 2 * RANGE
+    assert stored.min() == 0
+    assert stored.max() == 255
+
+
+def test_principal_components_equal_those_of_the_svd() -> None:
+    rng = np.random.default_rng(7)
+    scales = np.linspace(3, 0.2, 12)
+    rows = (rng.normal(size=(400, 12)) * scales + 0.3).astype(np.float32)
+    by = fit_compression(rows, 5)
+    assert (by.mean.dtype, by.matrix.dtype) == (np.float32, np.float32)
+    np.testing.assert_allclose(by.mean, rows.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(by.matrix @ by.matrix.T, np.eye(5), atol=1e-6)
+    _, _, vt = np.linalg.svd(rows.astype(float) - rows.mean(axis=0, dtype=float))
+    np.testing.assert_allclose(np.abs((by.matrix * vt[:5]).sum(axis=1)), 1.0, atol=1e-5)
+    # of the two signs the one that makes the largest entry positive
+    assert (by.matrix[np.arange(5), np.abs(by.matrix).argmax(axis=1)] > 0).all()
+
+
+def test_components_that_cannot_be_learnt() -> None:
+    rows = np.ones((13, 12), np.float32)
+    for count, dimension in ((12, 3), (13, 0), (13, 13), (0, 1)):
+        with pytest.raises(ValueError, match=f"{dimension} components of"):
+            fit_compression(rows[:count], dimension)
+    assert fit_compression(rows, 12).matrix.shape == (12, 12)
+
+
+@pytest.mark.parametrize("filled", range(10))
+def test_compression_skips_empty_bins_to_the_last_bit(filled: int) -> None:
+    """Any number of filled bins, of which four are taken at a time, against one after the other."""
+    rng = np.random.default_rng(filled)
+    histograms = np.zeros((3, 24), np.float32)
+    for row in histograms:
+        row[rng.choice(24, filled, replace=False)] = rng.random(
+            filled, dtype=np.float32
+        ) + np.float32(0.1)
+    by = Compression(
+        rng.random(24, dtype=np.float32), rng.standard_normal((5, 24)).astype(np.float32)
+    )
+    plain = np.tile(-by.offset, (3, 1))
+    for i, row in enumerate(histograms):
+        for b in np.flatnonzero(row):
+            plain[i] += row[b] * by.matrix[:, b]
+    out = np.empty((3, 5), np.float32)
+    patch_descriptors_module._project(histograms, np.ascontiguousarray(by.matrix.T), by.offset, out)
+    assert np.array_equal(out, plain)

@@ -1,0 +1,51 @@
+"""Which patch a point lies on: against a search one by one, and against a segmentation."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import numpy as np
+
+from sceneprint.geometry.registration.overlap import sampled
+from sceneprint.geometry.signature.segmentation import SegmentationParameters, patches_of, segment
+from sceneprint.geometry.validation.inspection import patches_at
+from sceneprint.types import Floats, Patches
+
+
+def unit(rows: Floats) -> Floats:
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def test_it_is_the_nearest_that_fits() -> None:
+    rng = np.random.default_rng(3)
+    n, m = 40, 200
+    areas = rng.uniform(0.01, 0.05, n)
+    means, normals = rng.uniform(-1, 1, (n, 3)), unit(rng.normal(size=(n, 3)))
+    patches = Patches(means, normals, areas, np.ones(n, np.int32), np.ones(n))
+    at = np.hstack([rng.uniform(-1, 1, (m, 3)), unit(rng.normal(size=(m, 3)))]).astype(np.float32)
+    found = patches_at(at, patches)
+    for row, one in zip(at.astype(float), found.tolist(), strict=True):
+        best, index = np.inf, -1
+        for j in range(n):
+            apart = float(np.linalg.norm(row[:3] - means[j]))
+            alike = float(row[3:] @ normals[j]) > 0.5
+            if alike and apart < best and apart <= 4 * np.sqrt(areas[j] / np.pi):
+                best, index = apart, j
+        assert one == index
+    assert 0 < (found < 0).sum() < m
+
+
+def test_it_is_nearly_the_segmentation(scenes: ModuleType) -> None:
+    seen, _ = scenes.corner()
+    labels = segment(seen, SegmentationParameters())
+    found = patches_at(sampled(seen, 1), patches_of(seen, labels))
+    truth = labels[seen.valid]
+    told = truth >= 0
+    assert told.any()
+    assert (found[told] == truth[told]).mean() > 0.8
+
+
+def test_no_patches_hold_no_points() -> None:
+    none = np.zeros((0, 3))
+    patches = Patches(none, none, np.zeros(0), np.zeros(0, np.int32), np.zeros(0))
+    assert patches_at(np.ones((3, 6), np.float32), patches).tolist() == [-1, -1, -1]

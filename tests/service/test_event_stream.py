@@ -1,0 +1,189 @@
+"""Event streams: one poller, streams that are far behind, silence, and the end."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from sceneprint.errors import Busy
+from sceneprint.store import Database, open_store
+from sceneprint.store.events import EventRow, Wanted, record_event, remove_events
+from service import event_stream as feeds
+from service.event_stream import Feed
+
+Batch = tuple[list[EventRow], int]
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Database:
+    return open_store(f"sqlite:///{tmp_path / 'sceneprint.db'}", tmp_path / "blobs").database
+
+
+@pytest.fixture(autouse=True)
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feeds, "POLL_S", 0.01)
+
+
+def write(database: Database, *names: str) -> None:
+    for name in names:
+        with database.write() as connection:
+            record_event(connection, "frame.received", name, name)
+
+
+def ids(batch: Batch) -> list[int]:
+    return [event.number for event in batch[0]]
+
+
+async def gather(batches: AsyncIterator[Batch], count: int) -> list[int]:
+    """The numbers of so many events, as they come."""
+    found: list[int] = []
+    while len(found) < count:
+        batch = await asyncio.wait_for(anext(batches), 30)
+        assert not batch[0] or batch[1] >= batch[0][-1].number
+        found += ids(batch)
+    return found
+
+
+def always() -> bool:
+    return True
+
+
+def test_streams_far_behind_and_near_are_told_all_once(database, monkeypatch):
+    monkeypatch.setattr(feeds, "HELD", 8)
+    monkeypatch.setattr(feeds, "MOST", 3)
+    write(database, *("hall" for _ in range(20)))
+
+    async def run() -> None:
+        feed = Feed(database, most=9, kept=1000)
+        streams = [(Wanted(), 0), (Wanted(), 13), (Wanted(frozenset(("shop",))), 0)]
+        begun = [feed.batches(wanted, after, always) for wanted, after in streams]
+        for _ in begun:
+            feed.join()
+        assert await gather(begun[0], 20) == list(range(1, 21))
+        write(database, *("hall" if i % 2 else "shop" for i in range(40)))  # 21 to 60
+        assert await gather(begun[1], 47) == list(range(14, 61))  # beyond what is held
+        assert await gather(begun[0], 40) == list(range(21, 61))
+        assert await gather(begun[2], 20) == list(range(21, 61, 2))
+        looks: list[int] = []
+        monkeypatch.setattr(feeds, "next_events", lambda *_: looks.append(1))
+        write(database, "shop", "hall")  # all are near: memory has it
+        for stream in begun[:2]:
+            assert await gather(stream, 2) == [61, 62]
+        assert await gather(begun[2], 1) == [61]
+        assert looks == []
+        for _ in begun:
+            feed.leave()
+
+    asyncio.run(run())
+
+
+def test_from_now_on_means_from_when_it_was_asked(database):
+    write(database, "hall")
+
+    async def run() -> None:
+        feed = Feed(database, most=1, kept=1000)
+        feed.join()
+        stream = feed.batches(Wanted(), None, always)
+        assert await anext(stream) == ([], 1)
+        write(database, "hall", "shop")
+        assert await gather(stream, 2) == [2, 3]
+        feed.leave()
+        feed.join()  # a new poller for who comes after the last one left
+        assert await gather(feed.batches(Wanted(), 1, always), 2) == [2, 3]
+        feed.leave()
+
+    asyncio.run(run())
+
+
+def test_what_is_gone_is_said_to_be(database):
+    """And what is left of it is told."""
+    write(database, *("hall" for _ in range(12)))
+    with database.write() as connection:
+        remove_events(connection, [1, 3])
+
+    async def run() -> None:
+        feed = Feed(database, most=9, kept=9)
+        for after, place in ((1, 1), (99, 12)):
+            stream = feed.batches(Wanted(), after, always)
+            first, told = await anext(stream)
+            assert [(one.number, one.kind) for one in first] == [(place, "events.missed")]
+            assert told == place
+            if place < 12:
+                assert await gather(stream, 10) == [2, *range(4, 13)]
+        assert await anext(feed.batches(Wanted(), 3, always)) == ([], 3)
+
+    asyncio.run(run())
+
+
+def test_silence_is_broken_and_a_key_that_opens_nothing_ends_it(database, monkeypatch):
+    monkeypatch.setattr(feeds, "ALIVE_S", 0.05)
+    write(database, "hall")
+    asked: list[int] = []
+
+    def twice() -> bool:
+        asked.append(1)
+        return len(asked) < 3
+
+    async def run() -> list[Batch]:
+        feed = Feed(database, most=1, kept=9)
+        return [batch async for batch in feed.batches(Wanted(), None, twice)]
+
+    assert asyncio.run(run()) == [([], 1)] * 3
+    assert len(asked) == 3
+
+
+def test_events_of_others_are_no_reason_to_go_on(database, monkeypatch):
+    """Neither to keep silent, nor to keep a stream whose key opens nothing any more."""
+    monkeypatch.setattr(feeds, "ALIVE_S", 0.2)
+    asked: list[int] = []
+
+    def twice() -> bool:
+        asked.append(1)
+        return len(asked) < 3
+
+    async def run(wanted: Wanted) -> list[Batch]:
+        feed, found = Feed(database, most=1, kept=1000), []
+        asked.clear()
+
+        async def busy() -> None:
+            while True:
+                write(database, "hall")
+                await asyncio.sleep(0.02)
+
+        others = asyncio.create_task(busy())
+        async with asyncio.timeout(30):
+            found = [batch async for batch in feed.batches(wanted, None, twice)]
+        others.cancel()
+        return found
+
+    write(database, "shop")
+    for shop in (Wanted(frozenset(("shop",))), Wanted(frozenset(("shop",)), ("map.",))):
+        assert asyncio.run(run(shop)) == [([], 1)] * 3  # nor are they seen in what is told
+    told = [one for batch in asyncio.run(run(Wanted())) for one in ids(batch)]
+    assert told == list(range(told[0], told[-1] + 1))
+
+
+def test_there_are_so_many_places_and_all_end_together(database):
+    async def run() -> None:
+        feed = Feed(database, most=2, kept=9)
+        for _ in range(2):
+            feed.join()
+        with pytest.raises(Busy, match="limit of open event streams"):
+            feed.join()
+        streams = [feed.batches(Wanted(), None, always) for _ in range(2)]
+        waiting = []
+        for stream in streams:
+            await anext(stream)
+            waiting.append(asyncio.ensure_future(anext(stream, None)))
+        await asyncio.sleep(0.05)
+        feed.close()
+        assert await asyncio.wait_for(asyncio.gather(*waiting), 5) == [None, None]
+        feed.leave()
+        with pytest.raises(Busy):  # a service that stops takes none
+            feed.join()
+        feed.leave()
+
+    asyncio.run(run())

@@ -1,0 +1,31 @@
+"""Idempotency keys: whether a repeated request is the same one."""
+
+from __future__ import annotations
+
+from sceneprint_client.api.base import Given
+from service.auth import Caller
+from service.bodies import guarded
+
+
+class Before(Given):
+    """A record of one version."""
+
+    robot: str | None = None
+
+
+class After(Before):
+    """The same in the next, which can say more."""
+
+    gripper: str | None = "none"
+
+
+def print_of(part: Given) -> str:
+    once = guarded(Caller("fleet", {}), "k", "route", part)
+    assert once is not None
+    return once.fingerprint
+
+
+def test_a_request_of_before_an_upgrade_is_the_same_after_it() -> None:
+    assert print_of(After(robot="spot")) == print_of(Before(robot="spot"))
+    assert print_of(After()) != print_of(After(gripper=None))
+    assert print_of(After()) != print_of(After(robot="spot"))

@@ -1,0 +1,151 @@
+"""Rerun of a stored query: with the same options or others, without uploading the file again."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+
+@pytest.fixture(scope="module")
+def asked(served, make_map, shots) -> dict[str, Any]:
+    """Three views of a room in a map, and the answer to an upload with a base and a session."""
+    path = make_map(served, "again")
+    for i in (0, 1, 3):
+        sent = served.client.post(
+            f"{path}/frames",
+            **shots[i].form(session="s", captured_at=f"2026-11-16T09:30:0{i}Z"),
+            headers={"Prefer": "wait=60"},
+        )
+        assert sent.json()["state"] == "indexed"
+    base = {"base_frame": "base_link", "matrix": np.eye(4).tolist()}
+    form = shots[0].form(
+        session="s", robot="r", captured_at="2026-11-16T09:30:00Z", T_base_sensor=base
+    )
+    form["data"] |= {"seed": "3", "validation": '{"residual_m": 0.05}'}
+    answer: dict[str, Any] = served.client.post(f"{path}/queries", **form).json()
+    assert answer["status"] == "found"
+    return answer
+
+
+def again(served, query_id: str, **options: Any) -> dict[str, Any]:
+    reply = served.client.post(f"/v1/queries/{query_id}/again", json=options)
+    assert reply.status_code == 200, reply.text
+    told: dict[str, Any] = reply.json()
+    return told
+
+
+def same(answer: dict[str, Any]) -> dict[str, Any]:
+    """What of an answer must not change when it is asked again."""
+    return {
+        name: value for name, value in answer.items() if name not in ("query_id", "milliseconds")
+    }
+
+
+def test_an_upload_is_asked_again_without_its_file(served, asked):
+    told = again(served, asked["query_id"])
+    assert told["query_id"] != asked["query_id"]
+    assert same(told) == same(asked)
+    assert same(served.client.get(f"/v1/queries/{told['query_id']}").json()) == same(asked)
+    # what is given changes, what is not stays, and null is the default again
+    fewer = again(served, told["query_id"], k=1, candidates=2)
+    assert (fewer["counts"]["selected"], fewer["seed"]) == (2, 3)
+    assert again(served, fewer["query_id"], k=None, candidates=None)["counts"] == asked["counts"]
+    # the session and the time that came with the upload are known still
+    apart = again(served, asked["query_id"], filter={"not_within_s": 2.0})
+    assert apart["counts"]["passed"] == 1
+    # asked without validation, its points go on with the answer
+    bare = again(served, asked["query_id"], stages="retrieve")
+    assert bare["status"] == "unvalidated"
+    whole = again(served, bare["query_id"], stages=None)
+    assert same(whole) == same(asked)
+
+
+def test_the_question_is_told(served, asked):
+    question = served.client.get(f"/v1/queries/{asked['query_id']}/question").json()
+    assert question.pop("asked_at").endswith("+00:00")
+    assert question == {
+        "query_id": asked["query_id"], "maps": ["again"], "frame": None, "kind": "depth",
+        "robot": "r", "session": "s", "validates": True, "model": asked["model"],
+        "options": {"seed": 3, "validation": {"residual_m": 0.05}},
+    }  # fmt: skip
+
+
+def test_a_stored_frame_is_asked_again_of_other_maps(served, asked, make_map, shots):
+    path = make_map(served, "again-too")
+    served.client.post(f"{path}/frames", **shots[2].form(), headers={"Prefer": "wait=60"})
+    frame_id = asked["matches"][0]["frame_id"]
+    first = served.client.post(
+        "/v1/maps/again/queries", json={"frame_id": frame_id, "stages": "retrieve"}
+    ).json()
+    told = again(served, first["query_id"], stages=None, maps=["again", "again-too"])
+    assert told["frame"] == {"map": "again", "frame_id": frame_id}
+    assert told["maps"] == ["again", "again-too"]
+    assert (told["counts"]["map"], told["counts"]["validated"]) == (3, 3)  # not itself
+
+
+def test_another_frame_of_the_same_id_is_not_asked_in_its_place(served, make_map, shots, refused):
+    path = make_map(served, "again-other")
+
+    def put(i: int) -> None:
+        reply = served.client.put(
+            f"{path}/frames/door", **shots[i].form(), headers={"Prefer": "wait=60"}
+        )
+        assert reply.json()["state"] == "indexed", reply.text
+
+    put(0)
+    asked = {"frame_id": "door", "stages": "retrieve"}
+    query_id = served.client.post(f"{path}/queries", json=asked).json()["query_id"]
+    for i, status in ((0, 200), (2, 404)):  # the same frame once more, and another
+        assert served.client.delete(f"{path}/frames/door").status_code == 204
+        put(i)
+        reply = served.client.post(f"/v1/queries/{query_id}/again", json={})
+        assert reply.status_code == status, reply.text
+    refused(reply, 404, "unknown-frame", "a new frame has its id")
+
+
+def test_the_query_is_drawn_as_the_frame_is(served, asked):
+    """The first match is the same view: what the query saw is drawn to the pixel as the frame."""
+    path, best = f"/v1/queries/{asked['query_id']}/preview.png", asked["matches"][0]["frame_id"]
+    for view in ("depth", "normals"):
+        reply = served.client.get(path, params={"view": view, "width": 160})
+        assert (reply.status_code, reply.headers["content-type"]) == (200, "image/png")
+        of_frame = served.client.get(
+            f"/v1/maps/again/frames/{best}/preview.png", params={"view": view, "width": 160}
+        )
+        drawn, expected = (
+            np.asarray(Image.open(io.BytesIO(one.content))) for one in (reply, of_frame)
+        )
+        assert (drawn == expected).all()
+
+
+def test_what_cannot_be_asked_again(served, asked, shots, refused):
+    path = f"/v1/queries/{asked['query_id']}"
+    reply = served.client.get(f"{path}/preview.png?view=patches")
+    refused(reply, 422, "invalid-request", "not stored")
+    for wrong in ({"kk": 2}, {"k": 0}, {"frame": {"map": "again", "frame_id": "x"}}, {"maps": []}):
+        refused(served.client.post(f"{path}/again", json=wrong), 422, "invalid-request", "")
+    refused(served.client.post(f"{path}/again", json=[1]), 400, "malformed-body", "object")
+    reply = served.client.post(
+        f"{path}/again", content=b"{}", headers={"Content-Type": "text/plain"}
+    )
+    refused(reply, 415, "unsupported-type", "application/json")
+    reply = served.client.post(f"{path}/again", json={"maps": ["nowhere"]})
+    refused(reply, 404, "unknown-map", "nowhere")
+    reply = served.client.post(f"/v1/queries/{'0' * 32}/again", json={})
+    refused(reply, 404, "unknown-query", "expired")
+    # without validation no points were made: they cannot be validated, or drawn
+    form = shots[0].form()
+    form["data"]["stages"] = "retrieve"
+    bare = served.client.post("/v1/maps/again/queries", **form).json()["query_id"]
+    refused(served.client.get(f"/v1/queries/{bare}/preview.png"), 409, "not-indexed", "validate")
+    assert not served.client.get(f"/v1/queries/{bare}/question").json()["validates"]
+    reply = served.client.post(f"/v1/queries/{bare}/again", json={"stages": None})
+    refused(reply, 409, "not-indexed", "with the frame")
+    # and a map of another model cannot be asked with this signature
+    served.client.post("/v1/maps", json={"name": "again-paper", "model": "paper"})
+    reply = served.client.post(f"{path}/again", json={"maps": ["again-paper"]})
+    refused(reply, 409, "not-indexed", "a different model")

@@ -1,0 +1,348 @@
+"""Security of the service: headers, origins, proxies, rate limits, and keys."""
+
+from __future__ import annotations
+
+import os
+import socket
+from contextlib import ExitStack
+from datetime import UTC, datetime, timedelta
+
+import httpx
+import pytest
+
+from sceneprint.errors import InvalidRequest
+from sceneprint.settings import Settings
+from service.browser_security import origins_of
+
+FLEET = "https://fleet.example"
+NOTHING = "default-src 'none'; frame-ancestors 'none'"
+
+
+@pytest.fixture(scope="module")
+def held(wall):
+    """A server that soon has enough of a caller, and lets the pages of one origin ask."""
+    return wall(
+        {"robot": {"hall": "write"}}, "--workers", "0", "--host", "127.0.0.1", require_keys=True,
+        requests_per_s=0.02, failed_keys_per_minute=2, cors_origins=FLEET,
+    )  # fmt: skip
+
+
+def guarded(answer: httpx.Response) -> None:
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert answer.headers["x-frame-options"] == "DENY"
+    assert answer.headers["referrer-policy"] == "no-referrer"
+    assert answer.headers["cache-control"] == "no-store"
+    assert answer.headers["content-security-policy"] == NOTHING
+
+
+def test_every_answer_is_guarded(served):
+    for answer in (
+        served.client.get("/healthz"),
+        served.client.get("/v1/maps"),
+        served.client.get("/v1/maps/nowhere"),
+        served.client.get("/nothing"),
+        served.client.put("/v1/maps"),
+        served.client.get("/v1/maps", headers={"Host": "evil.example"}),
+        served.client.post("/v1/maps", content=b"{", headers={"Content-Type": "application/json"}),
+    ):
+        guarded(answer)
+
+
+@pytest.mark.parametrize("path", ["/healthz", "/readyz"])
+def test_a_balancer_may_ask_for_the_head_alone(served, path):
+    answer = served.client.head(path)
+    assert (answer.status_code, answer.content) == (200, b"")
+    assert int(answer.headers["content-length"]) > 0
+
+
+def test_only_the_pages_of_the_documentation_may_load_anything(served):
+    for path in ("/docs", "/redoc"):
+        answer = served.client.get(path)
+        assert answer.status_code == 200
+        policy = answer.headers["content-security-policy"]
+        assert "script-src https://cdn.jsdelivr.net" in policy
+        assert "frame-ancestors 'none'" in policy
+        for source in ("https://cdn.jsdelivr.net/npm/", "https://fastapi.tiangolo.com/img/"):
+            assert source in answer.text  # what the policy is written for
+
+
+# origins
+
+
+@pytest.mark.parametrize("path", ["/v1/maps", "/v1/maps/nowhere", "/healthz"])
+def test_a_page_of_an_allowed_origin_may_ask_and_read(served, path):
+    answer = served.client.get(path, headers={"Origin": FLEET})
+    assert answer.status_code == (404 if "nowhere" in path else 200)
+    assert answer.headers["access-control-allow-origin"] == FLEET
+    assert answer.headers["vary"] == "Origin"
+    exposed = {one.strip() for one in answer.headers["access-control-expose-headers"].split(",")}
+    assert {"ETag", "Idempotent-Replayed", "Location", "Retry-After", "X-Request-Id"} <= exposed
+    assert "access-control-allow-credentials" not in answer.headers
+
+
+@pytest.mark.parametrize("origin", ["https://evil.example", "null", f"{FLEET}.evil.example",
+                                    "http://fleet.example", f"{FLEET}:444"])  # fmt: skip
+def test_a_page_of_another_origin_may_not(served, held, refused, origin):
+    answer = served.client.get("/v1/maps", headers={"Origin": origin})
+    refused(answer, 403, "foreign-origin", "SCENEPRINT_CORS_ORIGINS")
+    assert "access-control-allow-origin" not in answer.headers
+    answer = held.server.client.get("/healthz", headers={"Origin": origin})
+    assert (answer.status_code, "access-control-allow-origin" in answer.headers) == (200, False)
+
+
+def asked_before(origin: str) -> dict[str, str]:
+    return {
+        "Origin": origin, "Access-Control-Request-Method": "PUT",
+        "Access-Control-Request-Headers": "authorization",
+    }  # fmt: skip
+
+
+def test_a_browser_asks_beforehand_and_needs_no_key_for_it(held, served):
+    for server in (held.server, served):
+        answer = server.client.options("/v1/maps/hall/frames/f", headers=asked_before(FLEET))
+        assert (answer.status_code, answer.content) == (204, b"")
+        assert answer.headers["access-control-allow-origin"] == FLEET
+        methods = answer.headers["access-control-allow-methods"].split(", ")
+        assert {"GET", "POST", "PUT", "PATCH", "DELETE"} == set(methods)
+        headers = answer.headers["access-control-allow-headers"].lower().split(", ")
+        assert {"authorization", "content-type", "if-match", "idempotency-key"} <= set(headers)
+
+
+def test_a_browser_that_asks_for_another_page_hears_nothing_of_it(held):
+    answer = held.server.client.options("/v1/maps", headers=asked_before("https://evil.example"))
+    assert answer.status_code == 405
+    assert not [name for name in answer.headers if name.startswith("access-control")]
+
+
+def test_also_a_refusal_can_be_read_by_the_page(held, refused):
+    answer = held.server.client.get("/v1/maps", headers={"Origin": FLEET})
+    refused(answer, 401, "key-required")
+    assert answer.headers["access-control-allow-origin"] == FLEET
+    guarded(answer)
+
+
+def test_all_pages_are_not_let_in_where_no_key_is_asked_for(tmp_path):
+    with pytest.raises(InvalidRequest, match="every web page"):
+        origins_of(Settings(data_dir=tmp_path, cors_origins="*"))
+    for asking in ({"host": "0.0.0.0"}, {"require_keys": True}):
+        wide = origins_of(Settings(data_dir=tmp_path, cors_origins="*", **asking))
+        assert (b"access-control-allow-origin", b"https://a.b") in wide.headers(b"https://a.b")
+
+
+@pytest.mark.parametrize("given", ["fleet.example", "https://fleet.example/", "ftp://a", "a b"])
+def test_an_origin_is_written_as_browsers_write_it(given):
+    with pytest.raises(ValueError, match="is not an origin"):
+        Settings(cors_origins=given)
+
+
+# proxies
+
+
+@pytest.mark.parametrize("header", ["X-Forwarded-For", "Forwarded", "X-Real-IP", "Via",
+                                    "X-Forwarded-Proto", "CF-Connecting-IP"])  # fmt: skip
+def test_what_comes_through_a_proxy_needs_a_key(served, refused, header):
+    given = {header: "127.0.0.1"}
+    for path in ("/v1/maps", "/v1/jobs", "/metrics"):
+        answer = served.client.get(path, headers=given)
+        refused(answer, 401, "key-required", f"it has the header {header.title()}")
+    ready = served.client.get("/readyz", headers=given)
+    assert (ready.status_code, ready.json()["frames"]) == (200, None)
+
+
+def test_with_its_key_a_caller_behind_a_proxy_has_what_the_key_may(served, refused):
+    client = served.client
+    made = client.post("/v1/keys", json={"name": "far", "grants": {"hall": "read"}})
+    given = {"X-Forwarded-For": "1.2.3.4", "Authorization": f"Bearer {made.json()['secret']}"}
+    assert client.get("/v1/maps", headers=given).status_code == 200
+    me = client.get("/v1/keys/me", headers=given).json()
+    assert (me["name"], me["grants"]) == ("far", {"hall": "read"})
+    refused(client.get("/v1/keys", headers=given), 403, "forbidden", "'admin' for all maps")
+    assert client.get("/v1/keys/me").json()["name"] is None  # here, without the proxy
+
+
+# rates: one request, and then one each 50 s; two wrong keys, and then one each 30 s
+
+
+def test_who_asks_too_often_is_asked_to_wait(held, refused):
+    answers = [held.ask("robot", "GET", "/v1/keys/me") for _ in range(3)]
+    assert [answer.status_code for answer in answers] == [200, 429, 429]
+    assert answers[0].headers["ratelimit-policy"] == '"requests";q=1;w=50'
+    assert answers[0].headers["ratelimit"].startswith('"requests";r=0;t=')
+    refused(answers[2], 429, "rate-limited", "Too many requests: 1 at once")
+    assert answers[2].headers["ratelimit"].startswith('"requests";r=0;t=')
+    assert 1 <= int(answers[2].headers["retry-after"]) <= 50
+    assert answers[2].headers["ratelimit"].endswith(f"t={answers[2].headers['retry-after']}")
+
+
+def test_no_body_is_waited_for_of_who_asks_too_often(held):
+    url = httpx.URL(held.server.url)
+    head = (
+        "POST /v1/maps/hall/frames HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n"
+        "Content-Type: multipart/form-data; boundary=x\r\n"
+        f"Authorization: Bearer {held.secrets['robot']}\r\n\r\n"
+    ).encode()
+    for _ in range(2):  # the second comes too soon, whatever came before
+        with socket.create_connection((url.host, url.port), timeout=60) as wire:
+            wire.sendall(head)
+            if wire.recv(12) == b"HTTP/1.1 429":
+                return
+    raise AssertionError("it was let in twice")
+
+
+def test_one_key_does_not_take_every_place(walled, refused, until):
+    """It holds back the bodies of as many queries as it may have in hand."""
+    defaults = Settings(concurrency=max(os.cpu_count() or 1, 2))
+    most = 3 * (defaults.concurrency + defaults.waiting) // 4
+    url = httpx.URL(walled.server.url)
+    head = (
+        "POST /v1/maps/alpha/queries HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n"
+        "Content-Type: multipart/form-data; boundary=x\r\n"
+        f"Authorization: Bearer {walled.secrets['reader']}\r\n\r\n"
+    ).encode()
+    with ExitStack() as held:
+        for _ in range(most):
+            wire = held.enter_context(socket.create_connection((url.host, url.port), timeout=60))
+            wire.sendall(head)
+        until(lambda: walled.ask("reader", "GET", "/v1/keys/me").status_code == 429)
+        answer = walled.ask("reader", "GET", "/v1/keys/me", headers={"X-Request-Id": "late"})
+        refused(answer, 429, "rate-limited", f"{most} requests with this key are in progress")
+        other = walled.ask("keeper", "POST", "/v1/maps/bravo/queries", json={"frame_id": "none"})
+        assert other.status_code == 404
+    until(lambda: walled.ask("reader", "GET", "/v1/keys/me").status_code == 200)
+
+
+def test_wrong_keys_are_counted_and_right_ones_are_not_kept_out_by_them(held, refused):
+    def try_key(secret: str) -> httpx.Response:
+        return held.server.client.get("/v1/maps", headers={"Authorization": f"Bearer {secret}"})
+
+    answers = [try_key(f"sp_wrong{number}") for number in range(4)]
+    assert [answer.status_code for answer in answers] == [401, 401, 429, 429]
+    refused(answers[3], 429, "rate-limited", "Too many wrong keys: 2 at once")
+    assert try_key(held.secrets["robot"]).status_code in (200, 429)
+    told = try_key(held.secrets["robot"]).headers["ratelimit-policy"]
+    assert told.startswith('"requests"')  # its own limit, not that of the wrong ones
+
+
+# keys over HTTP, and the audit log
+
+
+def test_a_key_is_made_shown_once_used_and_revoked(walled, refused):
+    until = datetime.now(UTC) + timedelta(days=1)
+    new = {"name": "robot/7 é", "grants": {"hall": "write"}, "expires_at": until.isoformat()}
+    answer = walled.ask("boss", "POST", "/v1/keys", json=new)
+    assert answer.status_code == 201
+    assert answer.headers["location"] == "/v1/keys/robot%2F7%20%C3%A9"
+    made = answer.json()
+    assert made["secret"].startswith("sp_")
+    assert datetime.fromisoformat(made["expires_at"]) == until
+    walled.secrets["new"] = made["secret"]
+    me = walled.ask("new", "GET", "/v1/keys/me").json()
+    assert (me["name"], me["grants"]) == ("robot/7 é", {"hall": "write"})
+    listed = walled.ask("boss", "GET", "/v1/keys?limit=3").json()
+    assert [key["name"] for key in listed["items"]] == ["admin", "boss", "keeper"]
+    rest = walled.ask("boss", "GET", f"/v1/keys?cursor={listed['next_cursor']}").json()
+    assert [key["name"] for key in rest["items"]] == ["reader", "robot/7 é", "watcher", "writer"]
+    assert made["secret"] not in str(listed) + str(rest)
+    again = walled.ask("boss", "POST", "/v1/keys", json=new)
+    refused(again, 409, "conflict", "There is a key named")
+    gone = walled.ask("boss", "DELETE", answer.headers["location"])
+    assert gone.status_code == 204
+    refused(walled.ask("new", "GET", "/v1/keys/me"), 401, "key-required")
+    refused(walled.ask("boss", "DELETE", answer.headers["location"]), 404, "unknown-key")
+
+
+def test_a_key_that_has_expired_says_so(walled, refused):
+    past = (datetime.now(UTC) - timedelta(seconds=1)).isoformat()
+    new = {"name": "late", "grants": {"*": "admin"}, "expires_at": past}
+    walled.secrets["late"] = walled.ask("boss", "POST", "/v1/keys", json=new).json()["secret"]
+    refused(walled.ask("late", "GET", "/v1/maps"), 401, "key-required", "has expired")
+
+
+@pytest.mark.parametrize(
+    ("new", "field"),
+    [
+        ({}, "name"),
+        ({"name": "a"}, "grants"),
+        ({"name": "a", "grants": {}}, "grants"),
+        ({"name": "a", "grants": {"hall": "own"}}, "grants.hall"),
+        ({"name": "a", "grants": {"No Map": "read"}}, "grants.No Map.[key]"),
+        ({"name": "", "grants": {"*": "read"}}, "name"),
+        ({"name": "command", "grants": {"*": "read"}}, "name"),
+        ({"name": "a", "grants": {"*": "read"}, "expires_at": "2030-01-01T00:00:00"}, "expires_at"),
+        # as a date of UTC it would be of the year 10000, and no list of keys could tell it
+        (
+            {"name": "a", "grants": {"*": "read"}, "expires_at": "9999-12-31T23:59:59.999999Z"},
+            "expires_at",
+        ),
+        (
+            {"name": "a", "grants": {"*": "read"}, "expires_at": "0001-01-01T00:00:00+12:00"},
+            "expires_at",
+        ),
+        ({"name": "a", "grants": {"*": "read"}, "secret": "sp_mine"}, "secret"),
+    ],
+)
+def test_a_key_that_cannot_be_made_names_the_field(walled, refused, new, field):
+    problem = refused(walled.ask("boss", "POST", "/v1/keys", json=new), 422, "invalid-request")
+    assert [one["field"] for one in problem["errors"]] == [field] or field in str(problem["errors"])
+    assert "a" not in [key["name"] for key in walled.ask("boss", "GET", "/v1/keys").json()["items"]]
+
+
+def test_only_admins_of_all_have_to_do_with_keys(walled, refused):
+    what = (("GET", "keys"), ("POST", "keys"), ("DELETE", "keys/boss"), ("GET", "audit"))
+    for method, path in what:
+        refused(walled.ask("watcher", method, f"/v1/{path}"), 403, "forbidden", "'watcher'")
+    assert walled.ask("boss", "GET", "/v1/keys/me").status_code == 200
+
+
+def test_figures_are_for_who_may_read_all(walled, refused):
+    client = walled.server.client
+    refused(client.get("/metrics"), 401, "key-required")
+    assert walled.ask("watcher", "GET", "/metrics").status_code == 200
+    bare = client.get("/readyz").json()
+    assert (bare["status"], bare["frames"], bare["jobs"]) == ("ready", None, None)
+    assert walled.ask("watcher", "GET", "/readyz").json()["frames"] is not None
+    wrong = client.get("/readyz", headers={"Authorization": "Bearer sp_wrong"})
+    refused(wrong, 401, "key-required")
+
+
+def test_changes_are_noted_and_found(walled):
+    for number in range(3):
+        made = walled.ask("boss", "POST", "/v1/maps", json={"name": f"m{number}"})
+        assert made.status_code == 201
+    given = {"X-Request-Id": "delete-1"}
+    assert walled.ask("boss", "DELETE", "/v1/maps/m1", headers=given).status_code == 204
+    assert walled.ask("boss", "DELETE", "/v1/maps/m1").status_code == 404
+    assert walled.ask("watcher", "DELETE", "/v1/maps/m2").status_code == 403
+    lines = walled.ask("boss", "GET", "/v1/audit?map=m1").json()["items"]
+    assert [line["action"] for line in lines] == ["delete_map", "create_map"]
+    assert [line["actor"] for line in lines] == ["boss", "boss"]
+    assert (lines[0]["request_id"], lines[0]["data"]["status"]) == ("delete-1", 204)
+    assert lines[0]["at"] >= lines[1]["at"]
+    assert walled.ask("boss", "GET", "/v1/audit?actor=watcher").json()["items"] == []
+    page = walled.ask("boss", "GET", "/v1/audit?limit=1&map=m1").json()
+    rest = walled.ask("boss", "GET", f"/v1/audit?map=m1&cursor={page['next_cursor']}").json()
+    assert [page["items"] + rest["items"], rest["next_cursor"]] == [lines, None]
+
+
+def test_keys_may_be_asked_for_on_this_machine_too(held, refused):
+    """Whatever the proxy before it makes of the headers."""
+    for given in ({}, {"Host": "maps.example"}, {"Origin": "https://maps.example"}):
+        refused(held.server.client.get("/v1/maps", headers=given), 401, "key-required")
+        assert held.server.client.get("/healthz", headers=given).status_code == 200
+
+
+def test_the_address_is_that_of_the_connection(walled):
+    asked = {"X-Forwarded-For": "203.0.113.9", "Content-Type": "application/json"}
+    made = walled.ask("boss", "POST", "/v1/maps", json={"name": "seen"}, headers=asked)
+    assert made.status_code == 201
+    (line,) = walled.ask("boss", "GET", "/v1/audit?map=seen").json()["items"]
+    assert (line["address"], line["actor"]) == ("127.0.0.1", "boss")
+
+
+def test_what_was_refused_is_in_the_log(walled, until):
+    given = {"X-Request-Id": "refused-1"}
+    walled.ask("watcher", "DELETE", "/v1/maps/m2", headers=given)
+    (line,) = until(
+        lambda: [one for one in walled.server.log("refused") if one["request_id"] == "refused-1"]
+    )
+    assert (line["level"], line["key"], line["status"]) == ("warning", "watcher", 403)

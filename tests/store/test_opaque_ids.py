@@ -1,0 +1,50 @@
+"""Opaque ids: only the store that made one can read it, and it reveals nothing."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from sceneprint.store import Store, open_store
+from sceneprint.store.opaque_ids import START
+
+
+def opened(folder: Path) -> Store:
+    return open_store(f"sqlite:///{folder / 'sceneprint.db'}", folder / "blobs")
+
+
+def test_a_seal_is_read_by_its_store_in_every_process(tmp_path):
+    (tmp_path / "other").mkdir()
+    mine, again = opened(tmp_path).seals, opened(tmp_path).seals
+    other = opened(tmp_path / "other").seals
+    for number in (1, 2, 255, 256, 2**31, 2**63 - 1):
+        seal = mine.seal("event", number)
+        assert again.seal("event", number) == seal
+        assert again.open("event", seal) == number
+        assert mine.open("job", seal) is None
+        assert other.open("event", seal) is None
+        assert other.seal("event", number) != seal
+        assert mine.seal("job", number) != seal
+    assert mine.seal("event", 0) == START
+    assert mine.open("event", START) == 0
+
+
+def test_what_was_not_given_out_is_none(tmp_path):
+    seals = opened(tmp_path).seals
+    seal = seals.seal("frame", 7)
+    for place in range(48):  # whichever digit is another
+        altered = f"{seal[:place]}{'0' if seal[place] != '0' else '1'}{seal[place + 1 :]}"
+        assert seals.open("frame", altered) is None
+    for wrong in ("", "7", "00", "x" * 32, seal.upper() + "a", seal + "0", seal[:-1], "0" * 48):
+        assert seals.open("frame", wrong) is None
+
+
+@pytest.mark.parametrize("part", [slice(16), slice(16, 32), slice(32, 48)])
+def test_neighbours_have_nothing_in_common(tmp_path, part):
+    """Half of 64 bits differ, six deviations of the mean of 500 allowed: else gaps would show."""
+    seals = opened(tmp_path).seals
+    found = [int(seals.seal("event", number)[part], 16) for number in range(1, 502)]
+    differing = [(a ^ b).bit_count() for a, b in pairwise(found)]
+    assert abs(sum(differing) / 500 - 32) < 6 * 4 / 500**0.5
