@@ -28,7 +28,7 @@ from sceneprint_client.api import (
     ValidationOptions,
 )
 from sceneprint_client.api.admin import NewKey, NewModel
-from sceneprint_client.api.listing import FrameEdit, MapEdit
+from sceneprint_client.api.listing import FrameEdit, MapEdit, SessionEdit
 from sceneprint_client.api.reconstructions import NewReconstruction
 from sceneprint_client.api.sessions import NewAssociation
 from service import dashboard, problems
@@ -64,6 +64,7 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
             [
                 (FrameMeta, "validation"),
                 (FrameEdit, "validation"),
+                (SessionEdit, "validation"),
                 (MapEdit, "validation"),
                 (Filter, "validation"),
                 (NamedFrame, "validation"),

@@ -14,7 +14,7 @@
         - ModelMismatch         signatures or artifacts of two models were compared
       x UnreadableGeometry      a geometry artifact that is missing, damaged or of another schema
       x NotFound                there is no such map, frame or job
-        - UnknownMap, UnknownFrame, UnknownJob, UnknownQuery, UnknownSnapshot
+        - UnknownMap, UnknownFrame, UnknownSession, UnknownJob, UnknownQuery, UnknownSnapshot
         - UnknownKey            there is no key of that name
       x Conflict                the request contradicts what is there
         - MapExists             a map of that name, made otherwise
@@ -139,6 +139,10 @@ class UnknownMap(NotFound):
 
 class UnknownFrame(NotFound):
     """There is no frame of that id in the map."""
+
+
+class UnknownSession(NotFound):
+    """The map has no frame of that session."""
 
 
 class UnknownJob(NotFound):

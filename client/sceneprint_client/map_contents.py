@@ -10,7 +10,7 @@ from pydantic_core import to_json
 
 from sceneprint_client.api import Frame, FrameState, Map, NewMap, Page
 from sceneprint_client.api.base import checked
-from sceneprint_client.api.listing import FrameListing, Run, Session, Trajectory
+from sceneprint_client.api.listing import FrameListing, Run, Session, SessionChange, Trajectory
 from sceneprint_client.api.maps import By, Growth, GrowthOf
 from sceneprint_client.api.results import (
     CLOUD_FRAMES,
@@ -24,7 +24,7 @@ from sceneprint_client.api.results import (
 )
 from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.http import ServiceConnection
-from sceneprint_client.requests import frame_path, map_path
+from sceneprint_client.requests import frame_path, given, map_path
 
 
 class MapMethods(ServiceConnection):
@@ -206,6 +206,59 @@ class MapMethods(ServiceConnection):
         UnknownMap : no such map.
         """
         return self._items(Page[Session], f"{map_path(map_name)}/sessions")
+
+    def delete_session(self, map_name: str, session: str, robot: str | None = None) -> int:
+        """Delete all frames of a session for good; how many.
+
+        Parameters
+        ----------
+        map_name, session : of the frames
+        robot : only those that it took; default: of all robots
+
+        Raises
+        ------
+        UnknownMap, UnknownSession : there is none.
+        """
+        path, deleted = f"{map_path(map_name)}/sessions", 0
+        while True:
+            parameters = given(session=session, robot=robot)
+            change = self._ask(SessionChange, "DELETE", path, params=parameters)
+            deleted += change.frames
+            if not change.remaining:
+                return deleted
+
+    def edit_session(
+        self, map_name: str, session: str, *, rename: str | None = None,
+        rename_robot: str | None = None, add_tags: Sequence[str] = (),
+        remove_tags: Sequence[str] = (), robot: str | None = None,
+    ) -> int:  # fmt: skip
+        """Rename a session or its robot, and add or remove tags, on all its frames; how many.
+
+        Parameters
+        ----------
+        map_name, session : of the frames
+        rename : new name; one that another session has joins the two
+        rename_robot : who took the frames
+        add_tags, remove_tags : of all frames
+        robot : only the frames that it took; default: of all robots
+
+        Raises
+        ------
+        UnknownMap, UnknownSession : there is none.
+        InvalidRequest : nothing is to be changed, or a frame would have too many tags.
+        """
+        path, edited, after = f"{map_path(map_name)}/sessions", 0, None
+        changes = {
+            "session": rename, "robot": rename_robot, "add_tags": list(add_tags),
+            "remove_tags": list(remove_tags),
+        }  # fmt: skip
+        body = {name: value for name, value in changes.items() if value}
+        while True:
+            parameters = given(session=session, robot=robot, after=after)
+            change = self._ask(SessionChange, "PATCH", path, json=body, params=parameters)
+            edited, after = edited + change.frames, change.last_frame_id
+            if not change.remaining:
+                return edited
 
     def trajectory(
         self, map_name: str, session: str, *, robot: str | None = None,

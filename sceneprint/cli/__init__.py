@@ -30,6 +30,7 @@ COMMANDS = {
     "similarity": "query",
     "associate": "sessions",
     "frames": "inventory",
+    "sessions": "sessions",
     "reconstruct": "sessions",
     "jobs": "inventory",
     "events": "inventory",

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from sceneprint_client import Client
     from sceneprint_client.api import Frame, Job, Map
     from sceneprint_client.api.admin import Event
-    from sceneprint_client.api.listing import Session
 
 #: Options that take a file for something of one frame.
 _FILES = ("cloud", "preview", "patches", "signature", "upload")
@@ -42,14 +41,14 @@ def add_frames(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "frames",
-        help="list frames and sessions of a map, download their files, edit metadata",
-        description="List the frames of a map in order of upload, or its sessions, or write the "
-        "trajectory of a session. With FRAME: show that frame, download its files, or edit its "
+        help="list frames of a map, download their files, edit metadata",
+        description="List the frames of a map in order of upload, or write the trajectory of a "
+        "session. With FRAME: show that frame, download its files, or edit its "
         "metadata.",
     )
     command.add_argument("map", metavar="MAP")
     command.add_argument("frame_id", nargs="?", metavar="FRAME", help="id of one frame")
-    _add_listing(command.add_argument_group("select frames, sessions or poses"))
+    _add_listing(command.add_argument_group("select frames or poses"))
     _add_files(command.add_argument_group("actions on one frame"))
     command.add_argument("--json", action="store_true", help="print JSON")
     add_service_options(command)
@@ -73,7 +72,6 @@ def _add_listing(group: Any) -> None:
     )
     group.add_argument("--newest", action="store_true", help="newest first")
     group.add_argument("--limit", type=positive, metavar="N", help="maximum number to list")
-    group.add_argument("--sessions", action="store_true", help="list sessions instead")
     group.add_argument(
         "--trajectory",
         type=Path,
@@ -117,8 +115,6 @@ def run_frames(options: argparse.Namespace) -> int:
             _one(client, options)
         elif options.trajectory is not None:
             _trajectory(client, options)
-        elif options.sessions:
-            _sessions(client.sessions(options.map), as_json=options.json)
         else:
             found = client.frames(
                 options.map, None if options.state is None else FrameState(options.state),
@@ -181,29 +177,6 @@ def _print_frames(frames: Iterable[Frame], *, as_json: bool) -> None:
         print(f"{one.frame_id:32}  {one.state:9}  {at:19}  {pose:4}  {who}  {tags}".rstrip())
     if not any_yet and not as_json:
         print("no frames match")
-
-
-def _sessions(sessions: Iterable[Session], *, as_json: bool) -> None:
-    any_yet = False
-    for one in sessions:
-        if as_json:
-            print(one.model_dump_json())
-            continue
-        if not any_yet:
-            print("frames  indexed  poses  first captured       last captured        robot/session")
-            any_yet = True
-        first, last = (
-            "" if at is None else f"{at:%Y-%m-%d %H:%M:%S}"
-            for at in (one.first_captured_at, one.last_captured_at)
-        )
-        who = one_line(f"{one.robot or '-'}/{one.session or '-'}")
-        n = sum(one.frames.values())
-        print(
-            f"{n:6}  {one.frames.get('indexed', 0):7}  {one.with_pose:5}  {first:19}  {last:19}  "
-            f"{who}"
-        )
-    if not any_yet and not as_json:
-        print("no sessions yet")
 
 
 def _time(text: str) -> datetime:

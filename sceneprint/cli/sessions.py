@@ -1,9 +1,10 @@
-"""`sceneprint associate`: join two sessions of a map, or close the loops of one."""
+"""`sceneprint sessions`, `associate` and `reconstruct`: runs of a map, and what is made of them."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,11 +27,103 @@ from sceneprint_client.api import JobState
 if TYPE_CHECKING:
     from sceneprint_client import Client
     from sceneprint_client.api import Answer
+    from sceneprint_client.api.listing import Session
     from sceneprint_client.api.reconstructions import Coverage, Reconstruction
     from sceneprint_client.api.sessions import Association, GraphFormat, Join
 
 #: What a file is by its name's end.
 _FORMATS: dict[str, GraphFormat] = {".g2o": "g2o", ".txt": "tum", ".tum": "tum", ".json": "json"}
+
+
+def add_sessions(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "sessions",
+        help="list, rename, tag or delete the sessions of a map",
+        description="List the sessions of a map. With SESSION: rename it, change the tags of its "
+        "frames, or delete it with all its frames.",
+    )
+    command.add_argument("map", metavar="MAP")
+    command.add_argument("session", nargs="?", metavar="SESSION", help="name of one session")
+    command.add_argument("--robot", metavar="NAME", help="only the frames of this robot")
+    command.add_argument("--rename", metavar="NAME", help="rename the session")
+    command.add_argument("--rename-robot", metavar="NAME", help="rename the robot of its frames")
+    for option, what in (("--tag", "add a tag to"), ("--untag", "remove a tag from")):
+        command.add_argument(
+            option,
+            action="append",
+            default=[],
+            metavar="TAG",
+            help=f"{what} its frames; repeatable",
+        )
+    command.add_argument("--delete", action="store_true", help="delete it with all its frames")
+    command.add_argument("--yes", action="store_true", help="confirm a deletion")
+    command.add_argument("--json", action="store_true", help="print JSON")
+    add_service_options(command)
+    command.set_defaults(run=run_sessions)
+
+
+def run_sessions(options: argparse.Namespace) -> int:
+    """List, edit or delete."""
+    edits = {
+        "rename": options.rename, "rename_robot": options.rename_robot, "add_tags": options.tag,
+        "remove_tags": options.untag,
+    }  # fmt: skip
+    edits = {name: value for name, value in edits.items() if value}
+    if options.session is None and (edits or options.delete):
+        raise InvalidRequest("Name the session after the map, to edit or delete it.")
+    if options.delete and edits:
+        raise InvalidRequest("--delete removes the session. Leave the other changes out.")
+    with open_client(options) as client:
+        if options.delete:
+            _delete_session(client, options)
+        elif edits:
+            edited = client.edit_session(options.map, options.session, robot=options.robot, **edits)
+            print(f"edited {edited} frames of session {one_line(options.session)}")
+        else:
+            found = client.sessions(options.map)
+            names = {"session": options.session, "robot": options.robot}
+            wanted = {name: value for name, value in names.items() if value is not None}
+            chosen = (s for s in found if all(getattr(s, n) == v for n, v in wanted.items()))
+            _sessions(chosen, as_json=options.json)
+    return 0
+
+
+def _delete_session(client: Client, options: argparse.Namespace) -> None:
+    name = one_line(options.session)
+    if not options.yes:
+        of = [one for one in client.sessions(options.map) if one.session == options.session]
+        of = [one for one in of if options.robot in (None, one.robot)]
+        n_frames = sum(sum(one.frames.values()) for one in of)
+        raise InvalidRequest(
+            f"This would permanently delete session {name} and its {n_frames} frames. Add --yes "
+            "to go ahead."
+        )
+    deleted = client.delete_session(options.map, options.session, options.robot)
+    print(f"deleted session {name} and its {deleted} frames")
+
+
+def _sessions(sessions: Iterable[Session], *, as_json: bool) -> None:
+    any_yet = False
+    for one in sessions:
+        if as_json:
+            print(one.model_dump_json())
+            continue
+        if not any_yet:
+            print("frames  indexed  poses  first captured       last captured        robot/session")
+            any_yet = True
+        first, last = (
+            "" if at is None else f"{at:%Y-%m-%d %H:%M:%S}"
+            for at in (one.first_captured_at, one.last_captured_at)
+        )
+        who = one_line(f"{one.robot or '-'}/{one.session or '-'}")
+        n = sum(one.frames.values())
+        print(
+            f"{n:6}  {one.frames.get('indexed', 0):7}  {one.with_pose:5}  {first:19}  {last:19}  "
+            f"{who}"
+        )
+    if not any_yet and not as_json:
+        print("no sessions yet")
 
 
 def add_associate(commands: Any) -> None:

@@ -334,6 +334,34 @@ def _of_session(map_number: int, run: Run) -> list[ColumnElement[bool]]:
     return [*of_map, *_common_conditions(run)]
 
 
+def session_frames(
+    connection: Connection, map_number: int, session: str, robot: str | None, after: int, limit: int
+) -> list[int]:
+    """Numbers of frames of a session above one of them, in whatever state but deleted."""
+    found = connection.execute(
+        select(frames.c.number)
+        .where(*_of_name(map_number, session, robot), frames.c.number > after)
+        .order_by(frames.c.number)
+        .limit(limit)
+    )
+    return list(found.scalars())
+
+
+def count_session(
+    connection: Connection, map_number: int, session: str, robot: str | None, after: int = 0
+) -> int:
+    """How many there are of `session_frames`."""
+    where = (*_of_name(map_number, session, robot), frames.c.number > after)
+    return connection.execute(select(func.count()).select_from(frames).where(*where)).scalar_one()
+
+
+def _of_name(map_number: int, session: str, robot: str | None) -> list[ColumnElement[bool]]:
+    own = [frames.c.map_number == map_number, frames.c.session == session]
+    return [
+        *own, frames.c.state.in_(_LIVING), *([] if robot is None else [frames.c.robot == robot])
+    ]  # fmt: skip
+
+
 # Frames of sessions in the order in which they were taken, for jobs that associate them.
 
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from functools import partial
+from typing import Annotated, Any, TypeVar
 
 from anyio import to_thread
 from fastapi import Depends, Query, Request, Response
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from sceneprint.engine.maps.map_frames import growth, list_sessions, trajectory, trajectory_file
 from sceneprint.engine.sessions.associations import MEDIA_TYPES
+from sceneprint.engine.sessions.session_edits import delete_session, edit_session
 from sceneprint.errors import InvalidRequest, UnsupportedType
 from sceneprint_client.api import Page
-from sceneprint_client.api.listing import Run, Session, Trajectory
+from sceneprint_client.api.base import Label
+from sceneprint_client.api.listing import Run, Session, SessionChange, SessionEdit, Trajectory
 from sceneprint_client.api.maps import Growth, GrowthOf
 from sceneprint_client.api.sessions import Association, Edge, Graph, GraphFormat, NewAssociation
 from service.auth import may_read, may_write, v1_router
@@ -23,6 +26,7 @@ from service.responses import preferred_media_type
 
 router = v1_router("/maps/{map_name}", "sessions", may_read)
 
+_Record = TypeVar("_Record", bound=BaseModel)
 _PLAIN, _JSON = "text/plain", "application/json"
 _TRAJECTORY: dict[int | str, dict[str, Any]] = {
     200: {
@@ -47,6 +51,80 @@ def get_sessions(
     Frames that name neither are one run, and the first.
     """
     return list_sessions(here.engine.store, map_name, cursor, limit)
+
+
+# Names of sessions may hold anything, such as slashes, and so are no parts of a path.
+_SessionName = Annotated[Label, Query(description="Name of the session.")]
+_Robot = Annotated[Label | None, Query(description="Only frames of this robot; default: of all.")]
+
+
+@router.delete("/sessions", responses=declared(404, 422), dependencies=[Depends(may_write)])
+async def delete_session_frames(
+    map_name: str, session: _SessionName, request: Request, here: Here, robot: _Robot = None
+) -> SessionChange:
+    """Delete all frames of a session for good.
+
+    A call ends after ten seconds: repeat it while `remaining` is not 0.
+    """
+    request.state.audited = {"session": session, "robot": robot}
+    async with here.gate.place():
+        return await here.gate.run(
+            partial(delete_session, here.engine.store, map_name, session, robot)
+        )
+
+
+@router.patch(
+    "/sessions",
+    responses=declared(400, 404, 413, 415, 422),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {_JSON: {"schema": {"$ref": "#/components/schemas/SessionEdit"}}},
+        }
+    },
+    dependencies=[Depends(may_write)],
+)
+async def patch_session(
+    map_name: str,
+    session: _SessionName,
+    request: Request,
+    here: Here,
+    robot: _Robot = None,
+    after: Annotated[
+        str | None, Query(description="`last_frame_id` of the call before, to go on from there.")
+    ] = None,
+) -> SessionChange:
+    """Rename a session or its robot, and add or remove tags, on all its frames.
+
+    A call ends after ten seconds: repeat it with `after` while `remaining` is not 0.
+    """
+    edit = _record_of(SessionEdit, await _read_document(request), "The edit of the session")
+    request.state.audited = {"session": session, "robot": robot} | edit.model_dump(
+        exclude_defaults=True
+    )
+    async with here.gate.place():
+        return await here.gate.run(
+            partial(edit_session, here.engine.store, map_name, session, edit, robot, after)
+        )
+
+
+async def _read_document(request: Request) -> object:
+    if media_type(request) != _JSON:
+        raise UnsupportedType(
+            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as {_JSON}."
+        )
+    return await read_json(request)
+
+
+def _record_of(kind: type[_Record], document: object, what: str) -> _Record:
+    if not isinstance(document, dict):
+        raise InvalidRequest(
+            f"{what} is not a JSON object. See /docs for its fields.", (("", "not an object"),)
+        )
+    try:
+        return kind.model_validate(document)
+    except ValidationError as error:
+        raise invalid(error, what) from error
 
 
 @router.get("/trajectory", response_class=Response, responses=_TRAJECTORY)
@@ -114,12 +192,7 @@ async def begin_association(
     accepts is an edge. Edges near each other must agree with how the robots moved between their
     frames, and those that are left vote on how the sessions' parent frames lie to each other.
     """
-    if media_type(request) != "application/json":
-        raise UnsupportedType(
-            f"The body is {media_type(request) or 'of no type'!r:.80}. Send JSON as "
-            "application/json."
-        )
-    asked = _association_from_json(await read_json(request))
+    asked = _record_of(NewAssociation, await _read_document(request), "The association")
     begun = await to_thread.run_sync(here.engine.associations.begin, map_name, asked)
     response.headers["Location"] = f"/v1/maps/{map_name}/associations/{begun.association_id}"
     return begun
@@ -214,15 +287,3 @@ async def get_graph(
         )
     name = f'attachment; filename="{job_id}.{wanted}"'
     return Response(text, media_type=MEDIA_TYPES[wanted], headers={"Content-Disposition": name})
-
-
-def _association_from_json(given: object) -> NewAssociation:
-    if not isinstance(given, dict):
-        raise InvalidRequest(
-            "The association is not a JSON object. See /docs for its fields.",
-            (("", "not an object"),),
-        )
-    try:
-        return NewAssociation.model_validate(given)
-    except ValidationError as error:
-        raise invalid(error, "The association") from error

@@ -56,9 +56,9 @@ def test_lists_files_and_edits(
     said = sceneprint("frames", name, "--session", "s", "--trajectory", tum)
     assert said.stdout == f"wrote {tum}: 2 poses\n"
     assert len(read_trajectory(tum).stamps) == 2
-    sessions = sceneprint("frames", name, "--sessions").stdout.splitlines()
+    sessions = sceneprint("sessions", name).stdout.splitlines()
     assert [line.split()[-1] for line in sessions[1:]] == ["r1/room-0/seq-01", "r1/s"]
-    told = sceneprint("frames", name, "--sessions", "--json").stdout.splitlines()
+    told = sceneprint("sessions", name, "--json").stdout.splitlines()
     assert [json.loads(line)["frames"] for line in told] == [{"indexed": 1}, {"indexed": 2}]
 
 
@@ -78,3 +78,32 @@ def test_what_cannot_be_is_one_line(
     said = sceneprint("frames", name, *arguments, expect=2)
     assert text in said.stderr
     assert said.stderr.count("\n") == 1
+
+
+def test_a_session_is_renamed_tagged_and_deleted(
+    sceneprint: Callable[..., object], rooms: Path, name: str
+) -> None:
+    name = f"{name}-sessions"
+    sceneprint("upload", name, rooms / "room-0", "--model", "depth", "--robot", "r1")
+    (own,) = [json.loads(one) for one in sceneprint("sessions", name, "--json").stdout.splitlines()]
+    old, new = own["session"], "Monday / first floor"
+    said = sceneprint("sessions", name, old, "--rename", new, "--tag", "door").stdout
+    assert said == f"edited 3 frames of session {old}\n"
+    listed = sceneprint("sessions", name, new, "--robot", "r1").stdout.splitlines()
+    assert listed[1].endswith(f"r1/{new}")
+    assert sceneprint("sessions", name, old).stdout == "no sessions yet\n"
+    assert len(sceneprint("frames", name, "--tag", "door", "--json").stdout.splitlines()) == 3
+
+    refused = sceneprint("sessions", name, new, "--delete", expect=2).stderr
+    assert refused == (
+        f"sceneprint sessions: This would permanently delete session {new} and its 3 frames. Add "
+        "--yes to go ahead.\n"
+    )
+    both = sceneprint("sessions", name, new, "--delete", "--tag", "a", expect=2).stderr
+    assert both.endswith(": --delete removes the session. Leave the other changes out.\n")
+    nameless = sceneprint("sessions", name, "--delete", expect=2).stderr
+    assert nameless.endswith(": Name the session after the map, to edit or delete it.\n")
+    said = sceneprint("sessions", name, new, "--delete", "--yes").stdout
+    assert said == f"deleted session {new} and its 3 frames\n"
+    gone = sceneprint("sessions", name, new, "--delete", "--yes", expect=2).stderr
+    assert f"has no frame of session '{new}'" in gone

@@ -62,6 +62,10 @@ OF_A_MAP = {
     "GET /v1/maps/{map_name}/frames/{frame_id}/upload": Case(),
     "GET /v1/maps/{map_name}/frames/{frame_id}/points": Case(),
     "GET /v1/maps/{map_name}/sessions": Case(),
+    "PATCH /v1/maps/{map_name}/sessions": Case(
+        "write", body={"add_tags": ["x"]}, query={"session": "{session}"}
+    ),
+    "DELETE /v1/maps/{map_name}/sessions": Case("write", query={"session": "{session}"}),
     "GET /v1/maps/{map_name}/trajectory": Case(query={"session": "{session}"}),
     "GET /v1/maps/{map_name}/growth": Case(query={"by": "hour"}),
     "POST /v1/maps/{map_name}/queries": Case(body={"frame_id": "{frame}"}),
@@ -428,7 +432,8 @@ def test_what_is_not_noted_is_said(operations):
     assert names >= UNNOTED
     assert names - UNNOTED == {
         "create_key", "revoke_key", "create_map", "patch_map", "delete_map", "patch_frame",
-        "delete_frame", "cancel_job", "retry_job", "reencode", "cancel_reencoding",
+        "delete_frame", "patch_session", "delete_session_frames", "cancel_job", "retry_job",
+        "reencode", "cancel_reencoding",
         "begin_association", "delete_association", "reconstruct", "delete_reconstruction",
         "add_import", "take_snapshot", "delete_snapshot",
     }  # fmt: skip

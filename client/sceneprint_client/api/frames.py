@@ -27,6 +27,8 @@ from sceneprint_client.errors import (
     kebab_case,
 )
 
+#: Tags of a frame.
+MOST_TAGS = 32
 #: A frame's priority is a whole number from minus this to this.
 MOST_PRIORITY = 10
 
@@ -145,7 +147,7 @@ class FrameMeta(Given):
         "y down, z forward. A camera held level has (0, -1, 0). Transforms that tilt a query "
         "against a frame are impossible then.",
     )
-    tags: list[Label] = Field(default=[], max_length=32)
+    tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
 
     @field_validator("captured_at")
     @classmethod
@@ -302,7 +304,7 @@ class ImportOptions(Given):
     session: Label | None = Field(
         default=None, description="In which run; default: the name of each sequence."
     )
-    tags: list[Label] = Field(default=[], max_length=32)
+    tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
     parent_frame: Label | None = Field(
         default=None,
         description="What all poses lead to; default: the scene's name, after ROBOT/ if given.",

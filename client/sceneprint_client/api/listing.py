@@ -5,11 +5,18 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import AwareDatetime, BeforeValidator, Field, ValidationInfo, field_validator
+from pydantic import (
+    AwareDatetime,
+    BeforeValidator,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import from_json
 
 from sceneprint_client.api.base import ApiRecord, FrameState, Given, Label, Note, Up
-from sceneprint_client.api.frames import GivenBase, GivenPose, GivenVector
+from sceneprint_client.api.frames import MOST_TAGS, GivenBase, GivenPose, GivenVector
 from sceneprint_client.api.maps import Days, Quota
 
 
@@ -181,7 +188,7 @@ class Filter(Given):
     session: Names | None = Field(default=None, description="Taken in this one, or one of these.")
     captured_after: AwareDatetime | None = Field(default=None, description="Then, or later.")
     captured_before: AwareDatetime | None = Field(default=None, description="Then, or earlier.")
-    tags: list[Label] = Field(default=[], max_length=32, description="It has all of them.")
+    tags: list[Label] = Field(default=[], max_length=MOST_TAGS, description="It has all of them.")
     not_within_s: float | None = Field(
         default=None,
         gt=0,
@@ -219,7 +226,7 @@ class FrameEdit(Given):
         description="In which run. The parent frame of a pose that was named after it stays.",
     )
     captured_at: AwareDatetime | None = Field(default=None, description="When, with its zone.")
-    tags: Annotated[list[Label], Field(max_length=32)] | None = Field(
+    tags: Annotated[list[Label], Field(max_length=MOST_TAGS)] | None = Field(
         default=None, description="All of them: they are replaced together."
     )
     pose: GivenPose | None = Field(
@@ -231,6 +238,40 @@ class FrameEdit(Given):
         default=None, description="Where the sensor sits on the robot; parts of it as of `pose`."
     )
     up: Up | None = Field(default=None, description="Up in the sensor's axes.")
+
+
+class SessionEdit(Given):
+    """What to change on all frames of a session: what is left out stays."""
+
+    session: Label | None = Field(
+        default=None,
+        description="Its new name; one that another session has joins the two. The parent frame "
+        "of poses that was named after it stays.",
+    )
+    robot: Label | None = Field(default=None, description="Who took the frames.")
+    add_tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
+    remove_tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
+
+    @model_validator(mode="after")
+    def _changes_something(self) -> SessionEdit:
+        if not (self.session or self.robot or self.add_tags or self.remove_tags):
+            raise ValueError("name session, robot, add_tags or remove_tags")
+        return self
+
+
+class SessionChange(ApiRecord):
+    """What became of a session."""
+
+    map: str
+    session: str = Field(description="Its name now.")
+    robot: str | None = Field(description="Where the frames of one robot were asked for.")
+    frames: int = Field(description="How many this call deleted or edited.")
+    remaining: int = Field(
+        default=0, description="How many are left as time was over: repeat the call for these."
+    )
+    last_frame_id: str | None = Field(
+        default=None, description="Of an edit with frames remaining: send it as `after`."
+    )
 
 
 class MapEdit(Given):

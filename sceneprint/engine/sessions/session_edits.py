@@ -1,0 +1,143 @@
+"""A session as a whole: renamed, tagged, or deleted with all its frames.
+
+map, session  --delete_session | edit_session-->  SessionChange
+
+Frames are written some at a time, each block in a transaction of its own, as writers wait
+meanwhile. What is interrupted can be called again and goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import time
+
+from sqlalchemy import Connection
+
+from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
+from sceneprint.errors import InvalidRequest, UnknownSession
+from sceneprint.store import Store
+from sceneprint.store.deletion import delete_frames
+from sceneprint.store.frame_queries import count_session, session_frames
+from sceneprint.store.frames import find_frame, frame_of, write_frame
+from sceneprint.store.maps import find_map
+from sceneprint.store.tables import FrameRow, MapRow
+from sceneprint_client.api.frames import MOST_TAGS
+from sceneprint_client.api.listing import SessionChange, SessionEdit
+
+#: Frames written in one transaction: other writers wait for some 20 ms.
+AT_ONCE = 100
+#: Seconds after which a call ends with what is left.
+CALL_S = 10.0
+
+
+def delete_session(
+    store: Store, map_name: str, session: str, robot: str | None = None, seconds: float = CALL_S
+) -> SessionChange:
+    """Delete frames of a session, in whatever state, until none is left or the time is over.
+
+    Parameters
+    ----------
+    store : see Store
+    map_name, session : of the frames
+    robot : only those that it took; None for those of all robots
+    seconds : after which no further block is begun
+
+    Raises
+    ------
+    UnknownMap, UnknownSession : there is none.
+    """
+    until, deleted = time.monotonic() + seconds, 0
+    while True:
+        with store.database.write() as connection:
+            row = find_map(connection, map_name)
+            numbers = session_frames(connection, row.number, session, robot, 0, AT_ONCE)
+            blobs = delete_frames(connection, row, numbers)
+            left = count_session(connection, row.number, session, robot)
+        collect_deleted_blobs(store, blobs)
+        deleted += len(numbers)
+        if not left or time.monotonic() >= until:
+            break
+    _require_frames(deleted, row, session, robot)
+    return SessionChange(map=row.name, session=session, robot=robot, frames=deleted, remaining=left)
+
+
+def edit_session(
+    store: Store, map_name: str, session: str, edit: SessionEdit, robot: str | None = None,
+    after: str | None = None, seconds: float = CALL_S,
+) -> SessionChange:  # fmt: skip
+    """Rename a session or its robot, and add or remove tags, on all its frames.
+
+    A name that another session has joins the two. Poses and their parent frames stay.
+
+    Parameters
+    ----------
+    store, map_name, session, robot, seconds : see `delete_session`
+    edit : what to change
+    after : id of the last frame of an earlier call, to go on from there
+
+    Returns
+    -------
+    change : with the names afterwards, and how many frames were gone through
+
+    Raises
+    ------
+    UnknownMap, UnknownSession, UnknownFrame : there is none.
+    InvalidRequest : a frame would have more tags than it may have. The frames before it are
+        changed.
+    """
+    until, done, at = time.monotonic() + seconds, 0, after
+    while True:
+        with store.database.write() as connection:
+            row = find_map(connection, map_name)
+            last = 0 if at is None else find_frame(connection, row, at).number
+            numbers = session_frames(connection, row.number, session, robot, last, AT_ONCE)
+            if numbers:
+                at = _edit_frames(connection, row, numbers, edit)
+                last = numbers[-1]
+            left = count_session(connection, row.number, session, robot, last)
+        done += len(numbers)
+        if not left or time.monotonic() >= until:
+            break
+    if after is None:
+        _require_frames(done, row, session, robot)
+    return SessionChange(
+        map=row.name, session=edit.session or session, robot=edit.robot or robot, frames=done,
+        remaining=left, last_frame_id=at if left else None,
+    )  # fmt: skip
+
+
+def _edit_frames(connection: Connection, row: MapRow, numbers: list[int], edit: SessionEdit) -> str:
+    """Edit some frames; the id of the last."""
+    for number in numbers:
+        frame = frame_of(connection, number)
+        write_frame(connection, row, frame, _values(frame, edit))
+    return frame.id
+
+
+def _values(frame: FrameRow, edit: SessionEdit) -> dict[str, object]:
+    """Columns of a frame that an edit asks for."""
+    values: dict[str, object] = {}
+    if edit.session is not None:
+        values["session"] = edit.session
+    if edit.robot is not None:
+        values["robot"] = edit.robot
+    if edit.add_tags or edit.remove_tags:
+        gone = set(edit.remove_tags)
+        tags = [tag for tag in frame.tags if tag not in gone]
+        tags += [tag for tag in dict.fromkeys(edit.add_tags) if tag not in tags]
+        if len(tags) > MOST_TAGS:
+            raise InvalidRequest(
+                f"Frame {frame.id} would have {len(tags)} tags, and a frame has at most "
+                f"{MOST_TAGS}. Remove some with `remove_tags`.",
+                (("add_tags", "too many"),),
+            )
+        values["tags"] = tags
+    return values
+
+
+def _require_frames(count: int, row: MapRow, session: str, robot: str | None) -> None:
+    if not count:
+        by = "" if robot is None else f" by robot {robot!r:.140}"
+        raise UnknownSession(
+            f"Map {row.name!r} has no frame of session {session!r:.140}{by}. "
+            f"`sceneprint sessions {row.name}` lists them."
+        )

@@ -1,0 +1,109 @@
+"""Sessions as a whole: renamed, tagged and deleted block by block, and nothing else with them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from sceneprint.engine import Engine
+from sceneprint.engine.sessions import session_edits
+from sceneprint.engine.sessions.session_edits import delete_session, edit_session
+from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap, UnknownSession
+from sceneprint_client.api import Frame, FrameMeta
+from sceneprint_client.api.listing import FrameListing, SessionEdit
+
+#: Session and robot of each of twelve uploads.
+TAKEN = [("a", "r1")] * 5 + [("a", "r2")] * 3 + [("a/..", "r1")] * 2 + [(None, "r1")] * 2
+
+
+@pytest.fixture(autouse=True)
+def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session_edits, "AT_ONCE", 2)
+
+
+@pytest.fixture
+def ids(empty: Engine, uploads: Any) -> list[str]:
+    """Twelve frames that nobody signs: states do not matter."""
+    made = []
+    for upload, (session, robot) in zip(uploads, TAKEN, strict=True):
+        known = upload.meta.model_dump() | {"session": session, "robot": robot, "tags": ["old"]}
+        made.append(empty.add_frame("hall", upload.data, FrameMeta.model_validate(known))[0])
+    return [one.frame_id for one in made]
+
+
+def frames(engine: Engine) -> dict[str, Frame]:
+    return {one.frame_id: one for one in engine.list_frames("hall", None, 100).items}
+
+
+def test_a_session_is_deleted_with_its_frames_and_blobs(empty: Engine, ids: list[str]) -> None:
+    before = frames(empty)
+    change = delete_session(empty.store, "hall", "a", "r1")
+    assert (change.session, change.robot, change.frames, change.remaining) == ("a", "r1", 5, 0)
+    assert frames(empty) == {one: before[one] for one in ids[5:]}
+    assert len(list(empty.store.blobs.digests())) == 7
+    assert empty.get_map("hall").used_frames == 7
+    assert delete_session(empty.store, "hall", "a").frames == 3
+    assert delete_session(empty.store, "hall", "a/..").frames == 2
+    assert list(frames(empty)) == ids[10:]
+    for name, robot in (("a", None), ("", None), ("a", "r1")):
+        with pytest.raises(UnknownSession, match="has no frame of session"):
+            delete_session(empty.store, "hall", name, robot)
+    with pytest.raises(UnknownMap):
+        delete_session(empty.store, "hall-2", "a")
+
+
+def test_a_call_that_runs_out_of_time_says_what_is_left(empty: Engine, ids: list[str]) -> None:
+    told = [delete_session(empty.store, "hall", "a", seconds=0.0) for _ in range(4)]
+    assert [(one.frames, one.remaining) for one in told] == [(2, 6), (2, 4), (2, 2), (2, 0)]
+    assert list(frames(empty)) == ids[8:]
+
+
+def test_a_session_is_renamed_and_joins_another(empty: Engine, ids: list[str]) -> None:
+    before = frames(empty)
+    edit = SessionEdit(session="a", robot="r2")
+    assert edit_session(empty.store, "hall", "a/..", edit).frames == 2
+    after = frames(empty)
+    for place, one in enumerate(ids):
+        wanted = {"session": "a", "robot": "r2"} if place in (8, 9) else {}
+        free = {"etag": "", "revision": 0}
+        now = after[one].model_copy(update=free)
+        assert now == before[one].model_copy(update={**wanted, **free})
+    assert delete_session(empty.store, "hall", "a", "r2").frames == 3 + 2
+
+
+def test_tags_are_added_once_and_removed(empty: Engine, ids: list[str]) -> None:
+    edit = SessionEdit(add_tags=["new", "old", "new"], remove_tags=["other"])
+    change = edit_session(empty.store, "hall", "a", edit, "r1")
+    assert (change.frames, change.session, change.robot) == (5, "a", "r1")
+    tags = [one.tags for one in frames(empty).values()]
+    assert tags == [["old", "new"]] * 5 + [["old"]] * 7
+    edit_session(empty.store, "hall", "a", SessionEdit(remove_tags=["old"]))
+    found = empty.list_frames("hall", None, 100, wanted=FrameListing(tag=["old"])).items
+    assert [one.frame_id for one in found] == ids[8:]
+
+
+def test_an_edit_goes_on_after_the_last_frame(empty: Engine, ids: list[str]) -> None:
+    edit, after, told = SessionEdit(add_tags=["new"]), None, []
+    while not told or told[-1].remaining:
+        told.append(edit_session(empty.store, "hall", "a", edit, after=after, seconds=0.0))
+        after = told[-1].last_frame_id
+    assert [(one.frames, one.remaining) for one in told] == [(2, 6), (2, 4), (2, 2), (2, 0)]
+    assert [one.last_frame_id for one in told] == [ids[1], ids[3], ids[5], None]
+    assert sum("new" in one.tags for one in frames(empty).values()) == 8
+    with pytest.raises(UnknownFrame):
+        edit_session(empty.store, "hall", "a", edit, after="0" * 32)
+
+
+def test_a_frame_keeps_within_its_tags(empty: Engine, ids: list[str]) -> None:
+    many = [f"t{i}" for i in range(32)]
+    with pytest.raises(InvalidRequest, match="would have 33 tags, and a frame has at most 32"):
+        edit_session(empty.store, "hall", "a", SessionEdit(add_tags=many))
+    assert all(one.tags == ["old"] for one in frames(empty).values())
+    edit = SessionEdit(add_tags=many, remove_tags=["old"])
+    assert edit_session(empty.store, "hall", "a", edit).frames == 8
+
+
+def test_an_edit_that_changes_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="name session, robot, add_tags or remove_tags"):
+        SessionEdit()
