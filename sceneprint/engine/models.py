@@ -13,12 +13,13 @@ from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.retrieval.distance import distances, pairwise_distances
 from sceneprint.geometry.validation.inspection import patches_at, residuals
 from sceneprint.geometry.validation.overlap import sampled
+from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.index import Tail, search
 from sceneprint.models import Model, parse_model
 from sceneprint.pipeline import Signer, open_signer, prepare, validate
 from sceneprint.store import Database
 from sceneprint.store.maps import model_content
-from sceneprint.types import Cloud, DepthFrame, Intrinsics
+from sceneprint.types import Cloud, DepthFrame, Geometry, Intrinsics
 
 
 class Signers:
@@ -67,32 +68,48 @@ def warm(signer: Signer, *, clouds: bool = False) -> bool:
     Parameters
     ----------
     signer : whose table is touched
-    clouds : do it with clouds too, with and without a viewpoint: their kernels take longest to
-        compile, and little to load once they are compiled
+    clouds : do it with clouds too, with and without a viewpoint: their kernels take long to
+        compile, and not every service meets a cloud
 
     Returns
     -------
     whole : the corner was recognised, so every stage has run; False where a model of another
         range sees nothing there
     """
-    corner, p = _corner(), signer.model.parameters.validation
-    metric = signer.model.metric
+    p = signer.model.parameters.validation
     with suppress(FrameError):
-        signature, seen = prepare(corner, signer)
-        rows = signature.vector[None].copy()
-        search(signature.vector, None, Tail(np.zeros(1, np.int64), rows), 1, metric=metric)
-        pairwise_distances(rows, metric)
-        rows.flags.writeable = False  # as a mapped file is: another compilation
-        distances(signature.vector.copy(), rows, metric)
-        geometry = read_geometry(write_geometry(seen))
-        drawn = sampled(geometry.surface, 1)  # as a page asks for them
-        patches_at(drawn, geometry.patches)
-        residuals(drawn, geometry.surface, np.eye(4), p.agreement)
-        for has_viewpoint in (True, False) if clouds else ():
-            _, points = prepare(_cloud(corner, has_viewpoint=has_viewpoint), signer)
-            validate(geometry, read_geometry(write_geometry(points)), p=p)
-        return validate(geometry, geometry, p=p).status == "accepted"
+        geometry = read_geometry(warm_signing(signer))
+        if clouds:
+            warm_clouds(signer, geometry)
+        return warm_validation(geometry, p)
     return False
+
+
+def warm_signing(signer: Signer) -> bytes:
+    """Sign and search the corner; returns its artifact."""
+    signature, seen = prepare(_corner(), signer)
+    metric, rows = signer.model.metric, signature.vector[None].copy()
+    search(signature.vector, None, Tail(np.zeros(1, np.int64), rows), 1, metric=metric)
+    pairwise_distances(rows, metric)
+    rows.flags.writeable = False  # as a mapped file is: another compilation
+    distances(signature.vector.copy(), rows, metric)
+    return write_geometry(seen)
+
+
+def warm_validation(geometry: Geometry, p: ValidationParameters) -> bool:
+    """Validate a corner against itself, and draw it; returns whether it was accepted."""
+    drawn = sampled(geometry.surface, 1)  # as a page asks for them
+    patches_at(drawn, geometry.patches)
+    residuals(drawn, geometry.surface, np.eye(4), p.agreement)
+    return validate(geometry, geometry, p=p).status == "accepted"
+
+
+def warm_clouds(signer: Signer, geometry: Geometry) -> None:
+    """Sign and validate the corner as points, with and without a viewpoint."""
+    p = signer.model.parameters.validation
+    for has_viewpoint in (True, False):
+        _, points = prepare(_cloud(_corner(), has_viewpoint=has_viewpoint), signer)
+        validate(geometry, read_geometry(write_geometry(points)), p=p)
 
 
 def _corner() -> DepthFrame:

@@ -1,0 +1,75 @@
+"""What pyproject.toml cannot say: wheels that carry compiled kernels.
+
+    SCENEPRINT_COMPILE=1 pip wheel --no-deps --no-build-isolation .
+
+builds one for this version of Python and for processors from x86-64-v3 on (2013 and later); it
+needs the dependencies installed, as it runs each kernel once. Without the variable the wheel has
+no machine code and fits every machine, which then compiles on first use.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from setuptools import setup
+from setuptools.command.bdist_wheel import bdist_wheel
+from setuptools.command.build_py import build_py
+
+COMPILE = os.environ.get("SCENEPRINT_COMPILE", "") not in ("", "0")
+HERE = Path(__file__).resolve().parent
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from sceneprint.engine.compilation import ALL, compile_kernels
+compile_kernels(Path(sys.argv[1]), ALL)
+"""
+
+
+class BuildWithKernels(build_py):
+    """Copies the packages, and compiles their kernels where they lie then."""
+
+    def run(self) -> None:
+        """Build."""
+        super().run()
+        if COMPILE and not self.editable_mode:
+            compile_in(Path(self.build_lib).resolve())
+
+
+class WheelWithKernels(bdist_wheel):
+    """A wheel of this version of Python and this kind of machine, as machine code is."""
+
+    def finalize_options(self) -> None:
+        """Take the options."""
+        super().finalize_options()
+        if COMPILE:
+            self.root_is_pure = False
+
+
+def compile_in(folder: Path) -> None:
+    """Compile the kernels of packages in a folder, for every processor of our kind."""
+    sys.path.insert(0, str(HERE))
+    from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES
+
+    for old in [*folder.rglob("__pycache__")]:
+        shutil.rmtree(old)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join((str(folder), str(HERE / "client"))),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "NUMBA_CPU_NAME": TARGET,
+        "NUMBA_CPU_FEATURES": TARGET_FEATURES,
+    }
+    environment.pop("NUMBA_CACHE_DIR", None)
+    with tempfile.TemporaryDirectory() as elsewhere:  # the tables, and no checkout beside it
+        subprocess.run(
+            [sys.executable, "-c", PROGRAM, elsewhere], cwd=elsewhere, env=environment, check=True
+        )
+
+
+setup(cmdclass={"build_py": BuildWithKernels, "bdist_wheel": WheelWithKernels})
