@@ -12,11 +12,11 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
 
-from sceneprint.errors import SceneprintError
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.geometry.kernel import cached_at
 from sceneprint.geometry.signature import pair_table
@@ -32,12 +32,10 @@ _LAST = {
 }
 #: What a service for depth images needs, and what it needs for clouds as well.
 DEPTH, ALL = ("signing", "validation"), ("signing", "validation", "clouds")
+#: Seconds between two looks whether they are compiled.
+_LOOK_S = 0.05
 #: Those who need kernels wait for whoever compiles them.
 _compiling = threading.Lock()
-
-
-class Uncompiled(SceneprintError):
-    """Kernels could not be compiled ahead: they are when they are first used."""
 
 
 def missing(parts: Sequence[str] = DEPTH) -> tuple[str, ...]:
@@ -45,40 +43,63 @@ def missing(parts: Sequence[str] = DEPTH) -> tuple[str, ...]:
     return tuple(part for part in parts if not cached_at(_LAST[part])[1])
 
 
-def compile_kernels(cache_dir: Path, parts: Sequence[str] = DEPTH) -> None:
+def compile_kernels(
+    cache_dir: Path, parts: Sequence[str] = DEPTH, say: Callable[[str], None] | None = None,
+    stop: threading.Event | None = None,
+) -> None:  # fmt: skip
     """Compile parts that are missing, in a process each, and wait for them.
+
+    Where a process fails, kernels are compiled when they are first used.
 
     Parameters
     ----------
     cache_dir : of pair tables: the one that signing needs is built on the way
     parts : of `ALL`
-
-    Raises
-    ------
-    Uncompiled : one of the processes failed.
+    say : what tells that it takes a while, and how long it took
+    stop : once it is set, nothing more is compiled
     """
     with _compiling:
         wanted = missing(parts)
+        if not wanted:
+            return
+        tell, begun = say or (lambda _: None), time.monotonic()
+        tell(f"first use after installation: compiling kernels for {' and '.join(wanted)}, once")
         # clouds are validated with the kernels of the other parts: compiled twice, if beside them
-        first = [part for part in wanted if part != "clouds"]
-        for group in (first, [part for part in wanted if part == "clouds"]):
-            begun = [(part, _begin(part, cache_dir)) for part in group]
-            ended = [(part, process.communicate()[1], process) for part, process in begun]
-            for part, said, process in ended:
-                if process.returncode:
-                    last = said.strip().splitlines()[-1:] or ["it said nothing"]
-                    raise Uncompiled(
-                        f"Compiling kernels for {part} failed ({last[0]:.200}). They are compiled "
-                        "on first use instead."
-                    )
+        for group in ([one for one in wanted if one != "clouds"], ["clouds"]):
+            if _run([one for one in group if one in wanted], cache_dir, tell, stop):
+                return
+        tell(f"compilation finished in {time.monotonic() - begun:.0f} s")
 
 
-def _begin(part: str, cache_dir: Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "sceneprint.engine.compilation", part, str(cache_dir)]
-    return subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-        text=True, errors="replace",
-    )  # fmt: skip
+def _run(
+    parts: Sequence[str], cache_dir: Path, tell: Callable[[str], None],
+    stop: threading.Event | None,
+) -> bool:  # fmt: skip
+    """Compile parts beside each other; returns whether it was told to stop."""
+    running: dict[str, subprocess.Popen[bytes]] = {}
+    try:
+        for part in parts:
+            running[part] = subprocess.Popen(
+                [sys.executable, "-m", "sceneprint.engine.compilation", part, str(cache_dir)],
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+        while running:
+            if stop is not None and stop.is_set():
+                return True
+            for part, process in [*running.items()]:
+                if process.poll() is not None:
+                    del running[part]
+                    if process.returncode:
+                        tell(
+                            f"compiling kernels for {part} failed (exit code {process.returncode})"
+                            ": they are compiled on first use"
+                        )
+            time.sleep(_LOOK_S)
+    finally:
+        for process in running.values():
+            process.terminate()
+            process.wait()
+    return False
 
 
 def _compile(part: str, cache_dir: Path) -> None:

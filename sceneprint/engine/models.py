@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprint.errors import FrameError
+from sceneprint.errors import Busy, FrameError
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.retrieval.distance import distances, pairwise_distances
 from sceneprint.geometry.validation.inspection import patches_at, residuals
@@ -20,6 +20,9 @@ from sceneprint.pipeline import Signer, open_signer, prepare, validate
 from sceneprint.store import Database
 from sceneprint.store.maps import model_content
 from sceneprint.types import Cloud, DepthFrame, Geometry, Intrinsics
+
+#: Seconds that a request waits for kernels that are being compiled.
+KERNELS_S = 20.0
 
 
 class Signers:
@@ -35,6 +38,29 @@ class Signers:
         self.database, self._cache_dir = database, cache_dir
         self._lock = threading.Lock()
         self._open: dict[str, Signer] = {}
+        self._compiled = threading.Event()
+        self._compiled.set()
+
+    def hold(self) -> None:
+        """Have those who sign or validate wait: kernels are compiled elsewhere meanwhile."""
+        self._compiled.clear()
+
+    def release(self) -> None:
+        """Let them go on."""
+        self._compiled.set()
+
+    def require_kernels(self, wait_s: float = KERNELS_S) -> None:
+        """See that nobody has to compile.
+
+        Raises
+        ------
+        Busy : kernels are still being compiled after these seconds.
+        """
+        if not self._compiled.wait(wait_s):
+            raise Busy(
+                "The service is waiting for its kernels, which the first start after an "
+                "installation compiles for about half a minute. Retry in a few seconds."
+            )
 
     def __call__(self, model_id: str) -> Signer:
         """The signer of a model that a map refers to.
@@ -42,7 +68,9 @@ class Signers:
         Raises
         ------
         UnreadableModel : another version of sceneprint stored it.
+        Busy : kernels are still being compiled.
         """
+        self.require_kernels()
         with self._lock:  # building a table takes seconds: once is enough
             if model_id not in self._open:
                 with self.database.read() as connection:
@@ -52,7 +80,8 @@ class Signers:
             return self._open[model_id]
 
     def of(self, model: Model) -> Signer:
-        """The signer of a model that no map may refer to yet."""
+        """The signer of a model that no map may refer to yet; see `__call__`."""
+        self.require_kernels()
         with self._lock:
             if model.id not in self._open:
                 self._open[model.id] = open_signer(model, self._cache_dir)
