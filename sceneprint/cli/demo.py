@@ -310,7 +310,7 @@ def run_queries(client: Client, choice: Choice) -> list[DemoQuery]:
             tqdm.write(f"skipped: {one.reference.name}: {error}")
             continue
         asked.append(DemoQuery(one, ranked, diverse, time.perf_counter() - start))
-    print(f"queries: {2 * len(asked)} sent in {time.perf_counter() - begun:.1f} s")
+    print(f"asked: {2 * len(asked)} queries over HTTP in {time.perf_counter() - begun:.1f} s")
     return asked
 
 

@@ -49,14 +49,14 @@ class Signers:
         """Let them go on."""
         self._compiled.set()
 
-    def require_kernels(self, wait_s: float = KERNELS_S) -> None:
+    def require_kernels(self, wait_s: float | None = None) -> None:
         """See that nobody has to compile.
 
         Raises
         ------
-        Busy : kernels are still being compiled after these seconds.
+        Busy : kernels are still being compiled after these seconds (default: KERNELS_S).
         """
-        if not self._compiled.wait(wait_s):
+        if not self._compiled.wait(KERNELS_S if wait_s is None else wait_s):
             raise Busy(
                 "The service is waiting for its kernels, which the first start after an "
                 "installation compiles for about half a minute. Retry in a few seconds."

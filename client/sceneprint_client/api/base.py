@@ -45,12 +45,13 @@ Note = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00]*$")]
 class Given(BaseModel):
     """A record that a caller sends: unknown fields are errors, as they would have no effect."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class ApiRecord(BaseModel):
     """A record that the service answers with; a client may meet fields it does not know yet."""
 
+    # the many records that answers are made of, built when one is first made: a start is quicker
     model_config = ConfigDict(frozen=True, defer_build=True)
 
 
