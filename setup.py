@@ -27,7 +27,7 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from sceneprint.engine.compilation import ALL, compile_kernels
-compile_kernels(Path(sys.argv[1]), ALL)
+compile_kernels(Path(sys.argv[1]), ALL, print, portable=True)
 """
 
 
@@ -53,17 +53,12 @@ class WheelWithKernels(bdist_wheel):
 
 def compile_in(folder: Path) -> None:
     """Compile the kernels of packages in a folder, for every processor of our kind."""
-    sys.path.insert(0, str(HERE))
-    from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES
-
     for old in [*folder.rglob("__pycache__")]:
         shutil.rmtree(old)
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join((str(folder), str(HERE / "client"))),
         "PYTHONDONTWRITEBYTECODE": "1",
-        "NUMBA_CPU_NAME": TARGET,
-        "NUMBA_CPU_FEATURES": TARGET_FEATURES,
     }
     environment.pop("NUMBA_CACHE_DIR", None)
     with tempfile.TemporaryDirectory() as elsewhere:  # the tables, and no checkout beside it

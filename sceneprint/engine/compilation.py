@@ -9,16 +9,17 @@ needs the other's. Kernels of clouds are compiled when the first cloud comes.
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 
 from sceneprint.formats.artifact import read_geometry
-from sceneprint.geometry.kernel import cached_at
+from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES, cached_at, runs_here
 from sceneprint.geometry.signature import pair_table
 from sceneprint.geometry.surface import cloud
 from sceneprint.geometry.validation import icp
@@ -45,7 +46,7 @@ def missing(parts: Sequence[str] = DEPTH) -> tuple[str, ...]:
 
 def compile_kernels(
     cache_dir: Path, parts: Sequence[str] = DEPTH, say: Callable[[str], None] | None = None,
-    stop: threading.Event | None = None,
+    stop: threading.Event | None = None, *, portable: bool = False,
 ) -> None:  # fmt: skip
     """Compile parts that are missing, in a process each, and wait for them.
 
@@ -57,6 +58,8 @@ def compile_kernels(
     parts : of `ALL`
     say : what tells that it takes a while, and how long it took
     stop : once it is set, nothing more is compiled
+    portable : for every processor from x86-64-v3 on, as for an image or a wheel; elsewhere, as
+        for arm64, for processors like this one
     """
     with _compiling:
         wanted = missing(parts)
@@ -64,23 +67,28 @@ def compile_kernels(
             return
         tell, begun = say or (lambda _: None), time.monotonic()
         tell(f"first use after installation: compiling kernels for {' and '.join(wanted)}, once")
+        environment = dict(os.environ)
+        if portable and runs_here():
+            environment |= {"NUMBA_CPU_NAME": TARGET, "NUMBA_CPU_FEATURES": TARGET_FEATURES}
         # clouds are validated with the kernels of the other parts: compiled twice, if beside them
         for group in ([one for one in wanted if one != "clouds"], ["clouds"]):
-            if _run([one for one in group if one in wanted], cache_dir, tell, stop):
+            commands = {part: (part, str(cache_dir)) for part in group if part in wanted}
+            if _run(commands, environment, tell, stop):
                 return
         tell(f"compilation finished in {time.monotonic() - begun:.0f} s")
 
 
 def _run(
-    parts: Sequence[str], cache_dir: Path, tell: Callable[[str], None],
-    stop: threading.Event | None,
+    commands: Mapping[str, Sequence[str]], environment: Mapping[str, str],
+    tell: Callable[[str], None], stop: threading.Event | None,
 ) -> bool:  # fmt: skip
     """Compile parts beside each other; returns whether it was told to stop."""
     running: dict[str, subprocess.Popen[bytes]] = {}
     try:
-        for part in parts:
+        for part, arguments in commands.items():
             running[part] = subprocess.Popen(
-                [sys.executable, "-m", "sceneprint.engine.compilation", part, str(cache_dir)],
+                [sys.executable, "-m", "sceneprint.engine.compilation", *arguments],
+                env=environment,
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             )  # fmt: skip
         while running:

@@ -112,6 +112,15 @@ def cached_at(function: Any) -> tuple[str, bool]:
     return found
 
 
+def runs_here() -> bool:
+    """Whether code for `TARGET` runs where we compile for."""
+    from numba.core.registry import cpu_target
+
+    from sceneprint.geometry.kernel_cache import runs_on
+
+    return runs_on(cpu_target.target_context.codegen().magic_tuple()[2])
+
+
 def _made_of(function: Callable[..., Any], known: dict[str, Any]) -> str:
     """What a kernel's code on disk must have been made of, but for its own file.
 

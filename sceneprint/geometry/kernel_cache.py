@@ -1,8 +1,9 @@
 """Where kernels' machine code is kept: numba's folders, and what a wheel or an image brought.
 
 numba keeps code by the processor that it was compiled on. What comes with an installation was
-compiled for any processor of a kind (`TARGET`), and is found beside the sources, whether that
-folder may be written to or not. Loaded apart from the kernels: it imports numba, which takes long.
+compiled for any processor of a kind (`TARGET`). It is found in numba's folder and beside the
+sources, whether that folder may be written to or not. Loaded apart from the kernels: it imports
+numba, which takes long.
 """
 
 from __future__ import annotations
@@ -62,8 +63,9 @@ class KernelCache(FunctionCache):
         """Folder of valid code for this processor and whether there is any."""
         target = cpu_target.target_context.codegen().magic_tuple()
         brought = self._brought_for(target)
-        if any(one[1] == brought for one in self._brought._load_index()):
-            return self._brought._cache_path, True
+        for file in (self._brought, self._cache_file):
+            if brought is not None and any(one[1] == brought for one in file._load_index()):
+                return file._cache_path, True
         found = any(one[1] == target for one in self._cache_file._load_index())
         return "" if self._read_only else self._cache_path, found
 
@@ -76,8 +78,8 @@ class KernelCache(FunctionCache):
         """Code that was brought, or that was compiled here; None where it is yet to be."""
         signature, target, code = self._index_key(sig, target_context.codegen())
         brought = self._brought_for(target)
-        if brought is not None:
-            data = self._brought.load((signature, brought, code))
+        for file in (self._brought, self._cache_file) if brought is not None else ():
+            data = file.load((signature, brought, code))
             if data is not None:
                 return self._impl.rebuild(target_context, data)
         return super()._load_overload(sig, target_context)
