@@ -16,8 +16,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from setuptools import setup
-from setuptools.command.bdist_wheel import bdist_wheel
+from setuptools import Distribution, setup
 from setuptools.command.build_py import build_py
 
 COMPILE = os.environ.get("SCENEPRINT_COMPILE", "") not in ("", "0")
@@ -41,14 +40,12 @@ class BuildWithKernels(build_py):
             compile_in(Path(self.build_lib).resolve())
 
 
-class WheelWithKernels(bdist_wheel):
-    """A wheel of this version of Python and this kind of machine, as machine code is."""
+class Package(Distribution):
+    """With kernels it is of this version of Python and this kind of machine, as machine code is."""
 
-    def finalize_options(self) -> None:
-        """Take the options."""
-        super().finalize_options()
-        if COMPILE:
-            self.root_is_pure = False
+    def has_ext_modules(self) -> bool:
+        """Whether it fits no other."""
+        return COMPILE
 
 
 def compile_in(folder: Path) -> None:
@@ -67,4 +64,4 @@ def compile_in(folder: Path) -> None:
         )
 
 
-setup(cmdclass={"build_py": BuildWithKernels, "bdist_wheel": WheelWithKernels})
+setup(distclass=Package, cmdclass={"build_py": BuildWithKernels})

@@ -48,7 +48,7 @@ from sceneprint_client.api import Added, Answer, JobState
 SEED = 11
 #: Frames of a walk, 3 to 8 cm apart. Of every ten, those of the map and those that are looked up,
 #: which are 10 to 30 cm away from any of the map.
-WALK, TEN, MAP, QUERIES = 100, 10, (0, 2, 4), (7, 8)
+WALK, TEN, MAP, QUERIES = 100, 10, (0, 2, 4), (7,)
 DEPTH_SCALE = 1000.0
 
 
