@@ -42,18 +42,19 @@ import gc, json, sys
 from pathlib import Path
 import numpy as np
 from sceneprint import Client
-from sceneprint.types import DepthFrame, Intrinsics
+from sceneprint_client.api import FrameMeta
 import sceneprint
 from sceneprint.engine.models import _corner
 corner = _corner()
 lens = {n: getattr(corner.intrinsics, n) for n in ("width", "height", "fx", "fy", "cx", "cy")}
+meta = FrameMeta.model_validate({"intrinsics": lens})
 path = Path(sys.argv[1]) / "frame.npy"
 np.save(path, corner.depth)
 with Client.embedded(Path(sys.argv[1]) / "data") as client:
     client.create_map("hall")
-    added = client.upload("hall", path, {"intrinsics": lens})
+    added = client.upload("hall", path, meta)
     client.wait([added.job_id])
-    answer = client.query("hall", path, {"intrinsics": lens})
+    answer = client.query("hall", path, meta)
 from numba.core.dispatcher import Dispatcher
 ours = [one for one in gc.get_objects() if isinstance(one, Dispatcher)
         and one.py_func.__module__.startswith("sceneprint.")]
