@@ -178,7 +178,7 @@ def add_demo(commands: Any) -> None:
         metavar="N",
         help="number of worker processes",
     )
-    command.add_argument("--rooms", type=positive, default=4, help=argparse.SUPPRESS)
+    command.add_argument("--rooms", type=positive, default=3, help=argparse.SUPPRESS)
     command.set_defaults(run=run_demo)
 
 
