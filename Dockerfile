@@ -73,17 +73,17 @@ USER 10001:10001
 
 # Compile the kernels and build the pair tables now, as the user who runs them: numba uses a cache
 # folder only where it may write, so one that root made would be passed over, and every process
-# would compile for itself. On another kind of processor than this one the first use compiles
-# once more, into the same folder.
+# would compile for itself. The code is for every processor from x86-64-v3 on (2013 and later); on
+# an older one the first use compiles once more, into the same folder.
 RUN python -c "from sceneprint.cli.options import prepare_presets; \
     from sceneprint.settings import Settings; \
-    prepare_presets(Settings())"
+    prepare_presets(Settings(), clouds=True, portable=True)"
 
 VOLUME ["/data"]
 EXPOSE 8008
 STOPSIGNAL SIGTERM
 
-# Of the service; docker-compose.yml has another for workers. The start may have to compile.
+# Of the service; docker-compose.yml has another for workers. It answers before kernels are loaded.
 HEALTHCHECK --interval=15s --timeout=5s --start-period=120s --retries=3 \
     CMD ["python", "-c", "import http.client, os, sys; c = http.client.HTTPConnection('127.0.0.1', int(os.environ['SCENEPRINT_PORT']), timeout=3); c.request('GET', '/healthz'); sys.exit(c.getresponse().status != 200)"]
 

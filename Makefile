@@ -53,7 +53,7 @@ lint: $(STAMP)
 # Compiled once here, and not by each process of the tests for itself.
 kernels: $(STAMP)
 	@$(BIN)/python -c 'from sceneprint.cli.options import prepare_presets; \
-		from sceneprint.settings import Settings; prepare_presets(Settings())'
+		from sceneprint.settings import Settings; prepare_presets(Settings(), clouds=True)'
 
 # The linters run beside the kernels and the first tests; where one fails, the target fails too.
 test: $(STAMP)

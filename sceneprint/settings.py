@@ -12,6 +12,7 @@ import platformdirs
 from pydantic import Field, SecretStr, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
+from sceneprint.errors import UnusableStore
 from sceneprint.models import default_cache_dir
 from sceneprint_client.addresses import is_loopback
 
@@ -159,6 +160,21 @@ class Settings(BaseSettings):
         """Where uploads and geometry artifacts are kept: a folder, or a URL."""
         given = "" if self.blob_url is None else self.blob_url.get_secret_value()
         return given if given and not given.startswith("file:") else self.blob_dir
+
+    @property
+    def served_blobs(self) -> Path | str:
+        """As `blobs`, for a service whose workers are other processes.
+
+        Raises
+        ------
+        UnusableStore : they would be kept inside one process.
+        """
+        if str(self.blobs).startswith("memory:"):
+            raise UnusableStore(
+                "SCENEPRINT_BLOB_URL=memory:/// keeps blobs inside one process, so the workers of "
+                "a service cannot read them. Use file:///folder, or `Client.embedded`."
+            )
+        return self.blobs
 
     @property
     def blob_dir(self) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext
 from typing import Any
@@ -15,6 +16,7 @@ from pydantic.json_schema import models_json_schema
 
 from sceneprint import __version__
 from sceneprint.engine import Engine
+from sceneprint.engine.compilation import compile_kernels
 from sceneprint.errors import SceneprintError
 from sceneprint.settings import Settings
 from sceneprint_client.api import (
@@ -115,15 +117,24 @@ their sensor. Refusals are problem documents (RFC 9457) that say what happened, 
 
 @asynccontextmanager
 async def warming(engine: Engine) -> AsyncIterator[None]:
-    """Load kernels and tables in the background, so that the service answers at once."""
-    task = asyncio.create_task(to_thread.run_sync(_warm, engine))
+    """Compile or load kernels and tables in the background, so that the service answers at once."""
+    stop = threading.Event()
+    engine.signers.hold()
+    task = asyncio.create_task(to_thread.run_sync(_warm, engine, stop))
     try:
         yield
     finally:
+        stop.set()
         await task  # the engine must outlast it
 
 
-def _warm(engine: Engine) -> None:
+def _warm(engine: Engine, stop: threading.Event) -> None:
+    try:
+        compile_kernels(engine.settings.cache_dir, say=log.info, stop=stop)
+    finally:
+        engine.signers.release()
+    if stop.is_set():
+        return
     try:
         engine.warm()
     except SceneprintError as error:  # the first requests load what they need, or say the same

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
+import gc
 import logging
 import resource
+import signal
 import socket
 import struct
 import sys
@@ -13,17 +15,21 @@ import termios
 import time
 import uuid
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from sceneprint.engine.engine import open_engine
 from sceneprint.errors import UnusableStore
 from sceneprint.process_limits import raise_descriptors
 from sceneprint.settings import Settings
-from service.app import create_app
-from service.problems import problem
+from sceneprint.store import open_store
+from sceneprint.store.patience import open_patiently
+from service.front import Front
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 # Connections: none is kept by who neither speaks nor listens.
 #
@@ -111,6 +117,8 @@ class Connection(H11Protocol):
 
     def send_400_response(self, msg: str) -> None:
         """Refuse what is no HTTP in the form of all refusals."""
+        from service.problems import problem
+
         if self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE):
             self.transport.abort()  # in the middle of an answer
             return
@@ -222,20 +230,16 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     ------
     UnusableStore, NewerSchema : the store cannot be opened, or the address not listened on.
     """
-    # uvicorn would make a traceback of what cannot be opened
-    with open_engine(settings) as engine:
-        read_only = engine.store.database.read_only
+    read_only = _require_store(settings)
     if read_only:
         log.warning(
             "the store is read-only: queries work, but nothing is stored or signed",
             extra={"data": str(settings.data_dir)},
         )
-    # a thread that computes gives way to the event loop after this long, not after 5 ms
-    sys.setswitchinterval(0.001)
     listening = listen(settings)
     host, port = listening.getsockname()[:2]
     url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
-    app = create_app(settings)
+    app = Front(settings, lambda: _load(settings), lambda: server.handle_exit(signal.SIGTERM, None))
     config = uvicorn.Config(
         app,
         log_config=None,  # ours is JSON
@@ -251,9 +255,40 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     raise_descriptors()
     sys.setswitchinterval(SWITCH_S)
     make_room()
-    _Server(config, lambda: ready(url, read_only), lambda: app.state.context.feed.close()).run(
-        sockets=[listening]
-    )
+    server = _Server(config, lambda: ready(url, read_only), lambda: _close_feed(app))
+    try:
+        server.run(sockets=[listening])
+    finally:
+        gc.enable()
+    if app.error is not None:
+        raise app.error
+
+
+def _require_store(settings: Settings) -> bool:
+    """See that the store can be opened, before anything is answered; whether it is read-only.
+
+    The application opens it once more: uvicorn would make a traceback of what cannot be opened.
+    """
+    store = open_patiently(lambda: open_store(settings.database, settings.served_blobs))
+    try:
+        return store.database.read_only
+    finally:
+        store.close()
+
+
+def _load(settings: Settings) -> FastAPI:
+    """The application; all that is imported stays, and need not be looked through ever again."""
+    from service.app import create_app
+
+    app = create_app(settings)
+    gc.freeze()
+    gc.enable()
+    return app
+
+
+def _close_feed(front: Front) -> None:
+    if front.app is not None:
+        front.app.state.context.feed.close()
 
 
 class _Server(uvicorn.Server):

@@ -443,12 +443,12 @@ def _sqlite_version() -> Check:
 def _kernels() -> Check:
     from sceneprint.geometry.signature.pair_table import compiled_at
 
-    folder, pattern = compiled_at()
-    if folder and any(Path(folder).glob(pattern)):
+    folder, compiled = compiled_at()
+    if compiled:
         return Check("ok", "kernels", f"compiled, in {folder}")
     if folder and _may_write(Path(folder)):
         return Check(
-            "note", "kernels", ("not compiled yet; the first use compiles for about a minute")
+            "note", "kernels", "not compiled yet; the first use compiles for about half a minute"
         )
     text = (
         f"{folder or 'no folder'} is not writable, so every process compiles for about a minute. "

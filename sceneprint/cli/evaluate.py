@@ -12,13 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
-from sceneprint.cli.options import (
-    add_judging_options,
-    add_model_options,
-    open_for,
-    positive,
-    whole_number,
-)
+from sceneprint.cli.numbers import positive, whole_number
+from sceneprint.cli.options import add_judging_options, add_model_options, open_for
 from sceneprint.errors import DatasetError
 from sceneprint.settings import Settings
 

@@ -13,14 +13,8 @@ from typing import TYPE_CHECKING, Any
 from pydantic_core import from_json
 
 from sceneprint.atomic_files import write_whole
-from sceneprint.cli.options import (
-    add_service_options,
-    one_line,
-    open_client,
-    positive,
-    up_of,
-    whole_number,
-)
+from sceneprint.cli.numbers import positive, whole_number
+from sceneprint.cli.options import add_service_options, one_line, open_client, up_of
 from sceneprint.errors import CannotRetry, InvalidRequest
 from sceneprint.models import PRESETS
 from sceneprint_client.api.base import FrameState, JobState

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import signal
 import sys
-import time
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
+from sceneprint.cli.numbers import positive, whole_number
+from sceneprint.engine.compilation import ALL, DEPTH, compile_kernels
 from sceneprint.errors import FrameError, InvalidRequest, UnusableStore
-from sceneprint.geometry.signature.pair_table import compiled_at
 from sceneprint.models import PRESETS, Model, read_model
 from sceneprint.pipeline import Signer, open_signer, sign
 from sceneprint.settings import Settings
@@ -132,40 +132,6 @@ def add_judging_options(command: argparse.ArgumentParser) -> None:
         help="find correspondences by histograms, or by aligned sequences of neighbours as in "
         "the paper, which is slower (default: histograms)",
     )
-
-
-# Numbers on the command line, checked where they are read.
-
-
-def whole_number(text: str) -> int:
-    """A whole number from 0 up."""
-    return _at_least(text, 0)
-
-
-def positive(text: str) -> int:
-    """A whole number from 1 up."""
-    return _at_least(text, 1)
-
-
-def _at_least(text: str, least: int) -> int:
-    try:
-        number = int(text)
-    except ValueError:
-        number = least - 1
-    if number < least:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {least}")
-    return number
-
-
-def metres(text: str) -> float:
-    """A positive distance."""
-    try:
-        distance = float(text)
-    except ValueError:
-        distance = math.nan
-    if not 0 < distance <= 1e4:  # false for NaN as well
-        raise argparse.ArgumentTypeError(f"{text!r} is not a distance of up to 10000 m")
-    return distance
 
 
 # What options of `sceneprint upload` say, read from text.
@@ -482,8 +448,7 @@ def open_for(options: argparse.Namespace, settings: Settings, *, psi: bool = Fal
     ------
     UnreadableModel : no such model.
     """
-    if _is_new():
-        _print("first use after installation: compiling, once, for about half a minute")
+    compile_kernels(settings.cache_dir, ("signing",), _print)
     chosen = options.model or options.preset or ("paper" if psi else PRESETS[0])
     model = read_model(chosen)
     signer = _open_signer(model.of_psi if psi else model, str(chosen), settings)
@@ -492,7 +457,10 @@ def open_for(options: argparse.Namespace, settings: Settings, *, psi: bool = Fal
     return signer
 
 
-def prepare_presets(settings: Settings, say: Callable[[str], None] | None = None) -> None:
+def prepare_presets(
+    settings: Settings, say: Callable[[str], None] | None = None, *, clouds: bool = False,
+    portable: bool = False, stop: threading.Event | None = None,
+) -> None:  # fmt: skip
     """See that code is compiled and the presets' tables are built, once an installation.
 
     So that a service's first frame does not wait for what a person can watch now.
@@ -501,26 +469,15 @@ def prepare_presets(settings: Settings, say: Callable[[str], None] | None = None
     ----------
     settings : see Settings
     say : what tells of each step, as it takes a while (default: lines on standard error)
+    clouds : compile what clouds need as well; else the first cloud waits for that
+    portable : compile for other processors too; see `compile_kernels`
+    stop : once it is set, nothing more is compiled or built
     """
-    from sceneprint.engine.signers import warm
-
-    if _is_new():
-        tell, begun = say or _print, time.monotonic()
-        tell("first use after installation: compiling for depth images (about 40 seconds)")
-        signer = _open_signer(read_model(PRESETS[0]), PRESETS[0], settings)
-        warm(signer)
-        spent = time.monotonic() - begun
-        tell(f"compiled for depth images in {spent:.0f} s; now for clouds (about 15 seconds)")
-        warm(signer, clouds=True)
-        tell(f"compilation finished in {time.monotonic() - begun:.0f} s")
+    parts = ALL if clouds else DEPTH
+    compile_kernels(settings.cache_dir, parts, say or _print, stop, portable=portable)
     for preset in PRESETS:
-        _open_signer(read_model(preset), preset, settings)
-
-
-def _is_new() -> bool:
-    """Whether the code is yet to be compiled."""
-    folder, pattern = compiled_at()
-    return not any(Path(folder).glob(pattern))
+        if stop is None or not stop.is_set():
+            _open_signer(read_model(preset), preset, settings)
 
 
 def _print(text: str) -> None:

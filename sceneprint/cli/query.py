@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.atomic_files import check_writable, write_whole
+from sceneprint.cli.numbers import whole_number
 from sceneprint.cli.options import (
     add_asking_options,
     add_prior_option,
@@ -23,7 +24,6 @@ from sceneprint.cli.options import (
     options_of,
     setting,
     settings_of,
-    whole_number,
 )
 from sceneprint.errors import DatasetError, FrameError, MissingDependency, TooLarge, UnknownFrame
 from sceneprint.formats.dataset import FrameReference, find_sequences

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import logging
 import signal
 import threading
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from sceneprint.cli.options import whole_number
-from sceneprint.settings import Settings
+from sceneprint.cli.numbers import whole_number
+
+if TYPE_CHECKING:
+    from sceneprint.settings import Settings
 
 
 def add_serve(commands: Any) -> None:
@@ -67,6 +70,7 @@ def settings_of(options: argparse.Namespace) -> Settings:
     from pydantic import ValidationError
 
     from sceneprint.errors import InvalidRequest
+    from sceneprint.settings import Settings
 
     names = {"data": "data_dir", "host": "host", "port": "port", "workers": "workers"}
     given = {
@@ -90,20 +94,23 @@ def settings_of(options: argparse.Namespace) -> Settings:
 
 def run_serve(options: argparse.Namespace) -> int:
     """Serve until told to stop."""
-    from sceneprint.cli.options import prepare_presets
+    gc.disable()  # until all is imported: a twelfth of the start would go to it
     from sceneprint.logs import log_as_json
     from service.server import run as serve
-    from worker.supervisor import Supervisor
 
     settings = settings_of(options)
     log_as_json()  # from the first line on
-    supervisor, stop = Supervisor(settings), threading.Event()
+    stop = threading.Event()
     failures: list[Exception] = []
 
     def work(read_only: bool) -> None:
         try:
-            prepare_presets(settings, logging.getLogger(__name__).info)
+            from sceneprint.cli.options import prepare_presets
+            from worker.supervisor import Supervisor
+
+            prepare_presets(settings, logging.getLogger(__name__).info, stop=stop)
             if not (read_only or stop.is_set()):  # there would be nothing for workers to do
+                supervisor = Supervisor(settings)
                 supervisor.start()
                 supervisor.watch(stop)
         except Exception as error:  # a service without its workers must not go on

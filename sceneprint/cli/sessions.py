@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
+from sceneprint.cli.numbers import positive, whole_number
 from sceneprint.cli.options import (
     add_filter_options,
     add_service_options,
     filter_of,
     one_line,
     open_client,
-    positive,
-    whole_number,
 )
 from sceneprint.errors import DatasetError, InvalidRequest
 from sceneprint.formats.dataset import FrameReference, find_sequences

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from sceneprint.cli.numbers import positive
 from sceneprint.cli.options import (
     add_service_options,
     add_up_option,
     base_of,
     one_line,
     open_client,
-    positive,
     priority_of,
     share_of,
 )

@@ -35,7 +35,7 @@ from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
 from sceneprint.engine.upkeep.purge import Purging
 from sceneprint.engine.upkeep.retention import Retention
-from sceneprint.errors import ModelError, StoreAway, UnusableStore
+from sceneprint.errors import ModelError
 from sceneprint.geometry.cores import Cores
 from sceneprint.models import Model
 from sceneprint.settings import Settings
@@ -44,6 +44,7 @@ from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import open_store, queue
 from sceneprint.store.deletion import remove_map
+from sceneprint.store.patience import PATIENCE_S, open_patiently
 from sceneprint.store.reencoding_rows import models_of
 from sceneprint.store.tables import MapRow
 from sceneprint.store.wakeup import Notices, Wakeup
@@ -351,14 +352,6 @@ class Engine:
         return self._upkeep.rebuild(self._row(map_name)).number
 
 
-# Opening a store whose server may be away: what is started beside it may be there before it.
-
-#: Seconds that who is started waits for a server before it gives up, and says why.
-PATIENCE_S = 60.0
-#: Seconds between two tries.
-AGAIN_S = 1.0
-
-
 def open_engine(
     settings: Settings, patience_s: float = PATIENCE_S,
     may_go_on: Callable[[float], bool] | None = None,
@@ -375,22 +368,5 @@ def open_engine(
     ------
     UnusableStore, NewerSchema : see Engine. Of a server that is away, once it was waited for.
     """
-    if str(settings.blobs).startswith("memory:"):
-        raise UnusableStore(
-            "SCENEPRINT_BLOB_URL=memory:/// keeps blobs inside one process, so the workers of a "
-            "service cannot read them. Use file:///folder, or `Client.embedded`."
-        )
-    until, said = time.monotonic() + patience_s, False
-    while True:
-        try:
-            return Engine(settings)
-        except StoreAway as error:
-            if time.monotonic() + AGAIN_S > until:
-                raise
-            if not said:
-                log.warning("waiting for the database", extra={"error": str(error)})
-                said = True
-            if may_go_on is None:
-                time.sleep(AGAIN_S)
-            elif not may_go_on(AGAIN_S):
-                raise
+    _ = settings.served_blobs
+    return open_patiently(lambda: Engine(settings), patience_s, may_go_on)

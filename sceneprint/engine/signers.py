@@ -8,17 +8,21 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprint.errors import FrameError
+from sceneprint.errors import Busy, FrameError
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.geometry.retrieval.distance import distances, pairwise_distances
 from sceneprint.geometry.validation.inspection import patches_at, residuals
+from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.index import Tail, search
 from sceneprint.models import Model, parse_model
 from sceneprint.pipeline import Signer, open_signer, prepare, validate
 from sceneprint.store import Database
 from sceneprint.store.maps import model_content
-from sceneprint.types import Cloud, DepthFrame, Intrinsics
+from sceneprint.types import Cloud, DepthFrame, Geometry, Intrinsics
+
+#: Seconds that a request waits for kernels that are being compiled.
+KERNELS_S = 20.0
 
 
 class Signers:
@@ -34,6 +38,29 @@ class Signers:
         self.database, self._cache_dir = database, cache_dir
         self._lock = threading.Lock()
         self._open: dict[str, Signer] = {}
+        self._compiled = threading.Event()
+        self._compiled.set()
+
+    def hold(self) -> None:
+        """Have those who sign or validate wait: kernels are compiled elsewhere meanwhile."""
+        self._compiled.clear()
+
+    def release(self) -> None:
+        """Let them go on."""
+        self._compiled.set()
+
+    def require_kernels(self, wait_s: float | None = None) -> None:
+        """See that nobody has to compile.
+
+        Raises
+        ------
+        Busy : kernels are still being compiled after these seconds (default: KERNELS_S).
+        """
+        if not self._compiled.wait(KERNELS_S if wait_s is None else wait_s):
+            raise Busy(
+                "The service is waiting for its kernels, which the first start after an "
+                "installation compiles for about half a minute. Retry in a few seconds."
+            )
 
     def __call__(self, model_id: str) -> Signer:
         """The signer of a model that a map refers to.
@@ -41,7 +68,9 @@ class Signers:
         Raises
         ------
         UnreadableModel : another version of sceneprint stored it.
+        Busy : kernels are still being compiled.
         """
+        self.require_kernels()
         with self._lock:  # building a table takes seconds: once is enough
             if model_id not in self._open:
                 with self.database.read() as connection:
@@ -51,7 +80,8 @@ class Signers:
             return self._open[model_id]
 
     def of(self, model: Model) -> Signer:
-        """The signer of a model that no map may refer to yet."""
+        """The signer of a model that no map may refer to yet; see `__call__`."""
+        self.require_kernels()
         with self._lock:
             if model.id not in self._open:
                 self._open[model.id] = open_signer(model, self._cache_dir)
@@ -67,32 +97,48 @@ def warm(signer: Signer, *, clouds: bool = False) -> bool:
     Parameters
     ----------
     signer : whose table is touched
-    clouds : do it with clouds too, with and without a viewpoint: their kernels take longest to
-        compile, and little to load once they are compiled
+    clouds : do it with clouds too, with and without a viewpoint: their kernels take long to
+        compile, and not every service meets a cloud
 
     Returns
     -------
     whole : the corner was recognised, so every stage has run; False where a model of another
         range sees nothing there
     """
-    corner, p = _corner(), signer.model.parameters.validation
-    metric = signer.model.metric
+    p = signer.model.parameters.validation
     with suppress(FrameError):
-        signature, seen = prepare(corner, signer)
-        rows = signature.vector[None].copy()
-        search(signature.vector, None, Tail(np.zeros(1, np.int64), rows), 1, metric=metric)
-        pairwise_distances(rows, metric)
-        rows.flags.writeable = False  # as a mapped file is: another compilation
-        distances(signature.vector.copy(), rows, metric)
-        geometry = read_geometry(write_geometry(seen))
-        drawn = sampled(geometry.surface, 1)  # as a page asks for them
-        patches_at(drawn, geometry.patches)
-        residuals(drawn, geometry.surface, np.eye(4), p.agreement)
-        for has_viewpoint in (True, False) if clouds else ():
-            _, points = prepare(_cloud(corner, has_viewpoint=has_viewpoint), signer)
-            validate(geometry, read_geometry(write_geometry(points)), p=p)
-        return validate(geometry, geometry, p=p).status == "accepted"
+        geometry = read_geometry(warm_signing(signer))
+        if clouds:
+            warm_clouds(signer, geometry)
+        return warm_validation(geometry, p)
     return False
+
+
+def warm_signing(signer: Signer) -> bytes:
+    """Sign and search the corner; returns its artifact."""
+    signature, seen = prepare(_corner(), signer)
+    metric, rows = signer.model.metric, signature.vector[None].copy()
+    search(signature.vector, None, Tail(np.zeros(1, np.int64), rows), 1, metric=metric)
+    pairwise_distances(rows, metric)
+    rows.flags.writeable = False  # as a mapped file is: another compilation
+    distances(signature.vector.copy(), rows, metric)
+    return write_geometry(seen)
+
+
+def warm_validation(geometry: Geometry, p: ValidationParameters) -> bool:
+    """Validate a corner against itself, and draw it; returns whether it was accepted."""
+    drawn = sampled(geometry.surface, 1)  # as a page asks for them
+    patches_at(drawn, geometry.patches)
+    residuals(drawn, geometry.surface, np.eye(4), p.agreement)
+    return validate(geometry, geometry, p=p).status == "accepted"
+
+
+def warm_clouds(signer: Signer, geometry: Geometry) -> None:
+    """Sign and validate the corner as points, with and without a viewpoint."""
+    p = signer.model.parameters.validation
+    for has_viewpoint in (True, False):
+        _, points = prepare(_cloud(_corner(), has_viewpoint=has_viewpoint), signer)
+        validate(geometry, read_geometry(write_geometry(points)), p=p)
 
 
 def _corner() -> DepthFrame:

@@ -9,44 +9,120 @@ divisors themselves. For the same reason inner loops write one array each.
 
 A kernel's code holds that of the kernels it calls, and numbers of other files, so what is on
 disk is valid for these too, and not for its own file alone, which is all that numba looks at:
-see `_stamp`.
+see `_made_of`.
 """
 
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections.abc import Callable
+from functools import update_wrapper
 from types import CodeType, ModuleType
 from typing import Any, ParamSpec, TypeVar, cast
 
-import numba
 import numpy as np
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
+#: The processor that wheels and images carry machine code for, in LLVM's words. All of its
+#: features, so that code for it runs on whichever processor has these: x86-64 of 2013 and later.
+TARGET = "x86-64-v3"
+TARGET_FEATURES = (
+    "+avx,+avx2,+bmi,+bmi2,+cx16,+f16c,+fma,+lzcnt,+movbe,+popcnt,+sahf,+sse3,+sse4.1,+sse4.2,"
+    "+ssse3"
+)
+
+#: One thread at a time makes compilers of kernels; making one makes those that it calls.
+_making = threading.RLock()
+
+
+class Kernel:
+    """A loop over arrays that is compiled, or loaded, when it is first called.
+
+    numba is imported then and not before: a service answers without it.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        update_wrapper(self, function)
+        self.function = function
+        self._known = dict(cast(dict[str, Any], getattr(function, "__globals__", {})))
+        self._compiler: Any = None
+        self._stamp = ""
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the machine code."""
+        compiler = self._compiler
+        return (self.compiler if compiler is None else compiler)(*arguments)
+
+    def __reduce__(self) -> str:
+        """By its name, as a function is pickled."""
+        return self.function.__qualname__
+
+    def __getattr__(self, name: str) -> Any:
+        """What numba's compiler of it has: signatures, statistics, assembly."""
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self.compiler, name)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """As numba sees a kernel that another kernel calls."""
+        return self.compiler._numba_type_
+
+    @property
+    def compiler(self) -> Any:
+        """What compiles it: numba's, with our rules of what on disk is valid."""
+        if self._compiler is None:
+            with _making:
+                if self._compiler is None:
+                    self._compiler = self._make()
+        return self._compiler
+
+    @property
+    def stamp(self) -> str:
+        """What its code on disk must have been made of; "" where there is none."""
+        _ = self.compiler
+        return self._stamp
+
+    def _make(self) -> Any:
+        import numba
+
+        from sceneprint.geometry.kernel_cache import KernelCache
+
+        compiler: Any = numba.njit(nogil=True, error_model="numpy")(self.function)
+        if compiler is not self.function:  # as it is under NUMBA_DISABLE_JIT, to be debugged
+            cache = KernelCache(self.function)
+            self._stamp = repr(cache.stamp(_made_of(self.function, self._known)))
+            compiler._cache = cache
+        self._known = {}
+        return compiler
+
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a loop over arrays to machine code on its first call; cached on disk."""
-    compiled: Any
-    try:
-        compiled = numba.njit(nogil=True, cache=True, error_model="numpy")(function)
-        if compiled is not function:  # as it is under NUMBA_DISABLE_JIT, to be debugged
-            files = compiled._cache._cache_file
-            files._source_stamp = _stamp(function, files._source_stamp)
-    except RuntimeError:  # no folder to keep the code in: compile in every process instead
-        compiled = numba.njit(nogil=True, error_model="numpy")(function)
-    return cast(Callable[P, R], compiled)
+    return cast(Callable[P, R], Kernel(function))
 
 
-def cached_at(function: Any) -> tuple[str, str]:
-    """Folder and name pattern of a kernel's machine code, there once it has been compiled."""
-    folder = getattr(function.stats, "cache_path", None) or ""
-    return folder, f"*.{function.__name__}-*.nbi"
+def cached_at(function: Any) -> tuple[str, bool]:
+    """Folder of a kernel's machine code, and whether it is there for this processor."""
+    cache = getattr(function, "_cache", None)
+    found: tuple[str, bool] = ("", False) if cache is None else cache.place()
+    return found
 
 
-def _stamp(function: Callable[..., Any], own: object) -> tuple[object, str]:
-    """What a kernel's code on disk must have been made of.
+def runs_here() -> bool:
+    """Whether code for `TARGET` runs where we compile for."""
+    from numba.core.registry import cpu_target
+
+    from sceneprint.geometry.kernel_cache import runs_on
+
+    return runs_on(cpu_target.target_context.codegen().magic_tuple()[2])
+
+
+def _made_of(function: Callable[..., Any], known: dict[str, Any]) -> str:
+    """What a kernel's code on disk must have been made of, but for its own file.
 
     Modules import what they use before they define anything. So all that may be built into a
     kernel is known when it is decorated, but for what stands in its own file.
@@ -54,19 +130,19 @@ def _stamp(function: Callable[..., Any], own: object) -> tuple[object, str]:
     Parameters
     ----------
     function : the kernel
-    own : what stands for its own file
+    known : names of its module and their values when it was decorated
     """
-    known = cast(dict[str, Any], getattr(function, "__globals__", {}))
-    told = _TOLD.setdefault(function.__module__, {})
+    told = []
     for name, value in known.items():
-        if (name, id(value)) not in told:
-            told[name, id(value)] = _named(name, value, function.__module__)
-    text = ";".join(sorted(each for each in told.values() if each))
-    return own, hashlib.sha256(text.encode()).hexdigest()
+        key = (function.__module__, name, id(value))
+        if key not in _TOLD:
+            _TOLD[key] = _named(name, value, function.__module__)
+        told.append(_TOLD[key])
+    return hashlib.sha256(";".join(sorted(filter(None, told))).encode()).hexdigest()
 
 
-#: By module, and in it by name and value: what a kernel of it may be made of, told once.
-_TOLD: dict[str, dict[tuple[str, int], str]] = {}
+#: By module, name and value: what a kernel of the module may be made of, told once.
+_TOLD: dict[tuple[str, str, int], str] = {}
 
 
 def _named(name: str, value: object, module: str) -> str:
@@ -95,9 +171,8 @@ def _constant_text(value: Any, module: str) -> str:
         return f"{value.dtype.str} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
     if getattr(value, "__module__", module) == module:
         return ""
-    cache = getattr(getattr(value, "_cache", None), "_cache_file", None)
-    if cache is not None:  # a kernel
-        return repr(cache._source_stamp)
+    if isinstance(value, Kernel):
+        return value.stamp
     made = getattr(value, "_defn", None)  # an intrinsic
     return "" if made is None else _code(made.__code__)
 

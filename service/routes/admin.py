@@ -40,6 +40,9 @@ from service.responses import files, send_file
 
 router = APIRouter(tags=["operations"])
 
+#: Seconds that `/readyz` waits to learn whether kernels have to be compiled.
+LOOK_S = 1.0
+
 
 class Health(BaseModel):
     """The service lives."""
@@ -71,9 +74,10 @@ async def healthz() -> Health:
 @router.head("/readyz", include_in_schema=False)
 @router.get("/readyz", responses=declared(), response_model_exclude_defaults=True)
 def readyz(here: Here, asking: Guest) -> Readiness:
-    """Answers while the database and the object store do; 503 while one does not. No key is asked
-    for.
+    """Answers while the database and the object store do; 503 while one does not, and while
+    kernels are being compiled. No key is asked for.
     """
+    here.engine.signers.require_kernels(LOOK_S)
     frames = jobs = None
     here.engine.store.blobs.check()
     if asking is not None and asking.reads_every:

@@ -14,9 +14,10 @@ import pytest
 from pydantic import SecretStr
 
 from sceneprint import __version__
-from sceneprint.cli import doctor, options
+from sceneprint.cli import doctor
 from sceneprint.cli.doctor import Check
 from sceneprint.cli.options import prepare_presets
+from sceneprint.engine import compilation
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.geometry.signature import pair_table
 from sceneprint.settings import Settings
@@ -53,7 +54,7 @@ def test_a_machine_where_nothing_was_used_yet(
     monkeypatch.delenv("SCENEPRINT_URL")
     monkeypatch.setattr(doctor, "DEFAULT_URL", "http://127.0.0.1:1")
     monkeypatch.setenv("SCENEPRINT_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(pair_table, "compiled_at", lambda: (str(tmp_path / "numba"), "*.nbi"))
+    monkeypatch.setattr(pair_table, "compiled_at", lambda: (str(tmp_path / "numba"), False))
     done = sceneprint("doctor", "--data", tmp_path / "new" / "data")
     found = verdicts(done.stdout)
     for made_later in ("kernels", "table depth", "table paper", "service"):
@@ -231,9 +232,11 @@ def test_the_first_use_says_what_it_waits_for(
     said.clear()  # of a checkout in which nothing was compiled
     prepare_presets(Settings(data_dir=tmp_path), said.append)
     assert said == []
-    monkeypatch.setattr(options, "compiled_at", lambda: (str(tmp_path / "numba"), "*.nbi"))
+    waits: list[bool] = []
+    monkeypatch.setattr(compilation, "missing", lambda _: ("signing", "validation"))
+    monkeypatch.setattr(compilation, "_run", lambda *_: waits.append(True))  # not told to stop
     prepare_presets(Settings(data_dir=tmp_path), said.append)
-    first, second, last = said
-    assert first.endswith("compiling for depth images (about 40 seconds)")
-    assert re.fullmatch(r"compiled for depth images in \d+ s; now for clouds \(.+\)", second)
+    first, last = said
+    assert first.endswith("compiling kernels for signing and validation, once")
     assert re.fullmatch(r"compilation finished in \d+ s", last)
+    assert waits == [True, True]

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from numba.core.registry import cpu_target
+
+from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES
+from sceneprint.geometry.kernel_cache import runs_on
+from sceneprint.geometry.signature.pair_table import _count
+
+#: What numba compiles for: its words for the system, the processor and its features.
+HOST = cpu_target.target_context.codegen().magic_tuple()
 
 INNER = """
 from sceneprint.geometry.kernel import kernel
@@ -74,22 +83,86 @@ def test_a_caller_is_built_anew_with_what_it_is_made_of(
 #: Marks of all kernels that a process has loaded with the library.
 MARKS = """
 import gc, sceneprint.pipeline
-from numba.core.dispatcher import Dispatcher
-found = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]
-marks = {f"{one.py_func.__module__}.{one.py_func.__qualname__}": one._cache for one in found}
-marks = {name: cache._cache_file for name, cache in marks.items() if hasattr(cache, "_cache_file")}
-print(len(marks), sorted((name, files._source_stamp) for name, files in marks.items()))
+from sceneprint.geometry.kernel import Kernel
+marks = {f"{one.__module__}.{one.__qualname__}": one.stamp
+         for one in gc.get_objects() if isinstance(one, Kernel)}
+print(len(marks), sorted(marks.items()))
 """
 
 
 def test_the_marks_are_the_same_in_every_process() -> None:
-    """Or each would compile for itself: no address and no order of a set may be in them."""
+    """Or each would compile for itself: no address and no order may be in them.
+
+    Neither that of a set nor that in which kernels are first used.
+    """
     said = [
         subprocess.run(
-            [sys.executable, "-c", MARKS], env={**os.environ, "PYTHONHASHSEED": seed},
+            [sys.executable, "-c", MARKS.replace("gc.get_objects()", order)],
+            env={**os.environ, "PYTHONHASHSEED": seed},
             capture_output=True, text=True, check=True,
         ).stdout
-        for seed in ("1", "2")
+        for seed, order in (("1", "gc.get_objects()"), ("2", "gc.get_objects()[::-1]"))
     ]  # fmt: skip
     assert int(said[0].split()[0]) > 80
     assert said[0] == said[1]
+
+
+ALONE = """
+from sceneprint.geometry.kernel import cached_at, kernel
+
+@kernel
+def thrice(x):
+    return x * 3
+
+before = cached_at(thrice)[1]
+value = thrice(5.0)
+folder, there = cached_at(thrice)
+print(value, sum(thrice.stats.cache_hits.values()), before, there, folder)
+"""
+
+
+def called(folder: Path, **environment: str) -> tuple[float, int, bool, bool, str]:
+    """What `ALONE` gives, how often it was loaded, if its code was there before, after; where."""
+    done = subprocess.run(
+        [sys.executable, "-c", "import alone"],
+        cwd=folder, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **environment},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    value, hits, before, there, place = done.stdout.split()
+    return float(value), int(hits), before == "True", there == "True", place
+
+
+@pytest.mark.skipif(not runs_on(HOST[2]), reason="an older processor, or none of x86")
+def test_code_that_was_brought_is_found_wherever_own_code_is_kept(tmp_path: Path) -> None:
+    """As that of a wheel: compiled for any processor of a kind, in a folder that nobody writes."""
+    (tmp_path / "alone.py").write_text(ALONE)
+    own, brought = str(tmp_path / "own"), str(tmp_path / "__pycache__")
+    kind = {"NUMBA_CPU_NAME": TARGET, "NUMBA_CPU_FEATURES": TARGET_FEATURES, "NUMBA_CACHE_DIR": ""}
+    assert called(tmp_path, **kind) == (15.0, 0, False, True, brought)
+    here = {"NUMBA_CACHE_DIR": own}
+    assert called(tmp_path, **here) == (15.0, 1, True, True, brought)
+    assert not [*Path(own).rglob("*.nb?")]
+    # code for another processor is what was asked for, and is kept apart
+    other = {**here, "NUMBA_CPU_NAME": "generic"}
+    hits = [called(tmp_path, **other)[1] for _ in range(2)]
+    assert hits == [0, 1]
+    # code of something else is not taken
+    (tmp_path / "alone.py").write_text(ALONE.replace("x * 3", "x * 4"))
+    assert called(tmp_path, **here)[:3] == (20.0, 0, False)
+
+
+def test_what_a_processor_needs_for_code_that_was_brought() -> None:
+    assert runs_on(TARGET_FEATURES)
+    assert runs_on(f"+adx,{TARGET_FEATURES},-avx512bw")
+    assert not runs_on(TARGET_FEATURES.replace("+avx2", "-avx2"))
+    assert not runs_on("")
+
+
+def test_kernels_import_numba_when_they_are_called() -> None:
+    code = "import sys, sceneprint.pipeline; print({'numba', 'llvmlite'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
+
+
+def test_a_kernel_is_pickled_by_its_name() -> None:
+    assert pickle.loads(pickle.dumps(_count)) is _count

@@ -14,15 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.geometry.retrieval.distance import (
-    QUERIES,
-    SCANNERS,
-    Ints64,
-    frozen,
-    scan,
-    widths,
-    widths_of,
-)
+from sceneprint.geometry.retrieval.distance import Ints64, frozen, scan
+from sceneprint.geometry.retrieval.scanners import QUERIES, SCANNERS, widths, widths_of
 from sceneprint.types import Bytes
 
 WIDTHS = (64, 32, 16, 0)
@@ -144,7 +137,7 @@ def test_what_a_processor_can_do() -> None:
 #: Run by a process that compiles for another processor than that it runs on.
 FOREIGN = """
 import numpy as np
-from sceneprint.geometry.retrieval.distance import widths
+from sceneprint.geometry.retrieval.scanners import widths
 from sceneprint.geometry.retrieval.distance import scan
 x = np.arange(7000, dtype=np.uint64).reshape(7, 1000).astype(np.uint8)
 right = np.abs(x.astype(int)[:, None] - x.astype(int)).sum(axis=2)

@@ -185,7 +185,7 @@ from sceneprint import cli
 from sceneprint.cli import options
 from sceneprint.errors import UnusableStore
 
-def fail(*_):
+def fail(*_, **__):
     raise UnusableStore("no room for tables")
 
 options.prepare_presets = fail

@@ -51,7 +51,8 @@ class Given(BaseModel):
 class ApiRecord(BaseModel):
     """A record that the service answers with; a client may meet fields it does not know yet."""
 
-    model_config = ConfigDict(frozen=True)
+    # the many records that answers are made of, built when one is first made: a start is quicker
+    model_config = ConfigDict(frozen=True, defer_build=True)
 
 
 class Page(ApiRecord, Generic[T]):

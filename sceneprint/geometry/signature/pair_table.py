@@ -402,6 +402,6 @@ def count_pairs(
     return PairCounts(counts, n_pairs, total)
 
 
-def compiled_at() -> tuple[str, str]:
-    """Folder and name pattern of a file that is there once this code has been compiled."""
+def compiled_at() -> tuple[str, bool]:
+    """Folder of this code's machine code, and whether it is there."""
     return cached_at(_count)

@@ -1,0 +1,133 @@
+"""Compiling kernels before anyone waits for them, in processes of their own beside each other.
+
+A process that compiles answers nobody meanwhile. So kernels are compiled by others, which leave
+the machine code on disk: those of signing by one, those of validation by another, as neither
+needs the other's. Kernels of clouds are compiled when the first cloud comes.
+
+    python -m sceneprint.engine.compilation signing|validation|clouds FOLDER_OF_TABLES
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+
+from sceneprint.formats.artifact import read_geometry
+from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES, cached_at, runs_here
+from sceneprint.geometry.registration import icp
+from sceneprint.geometry.signature import pair_table
+from sceneprint.geometry.surface import cloud
+from sceneprint.models import PRESETS, read_model
+
+#: A kernel of each part that is among the last to be compiled: where it is, so are the others.
+_LAST = {
+    "signing": pair_table._count,
+    "validation": icp.refine_in_place,
+    "clouds": cloud._gather,
+}
+#: What a service for depth images needs, and what it needs for clouds as well.
+DEPTH, ALL = ("signing", "validation"), ("signing", "validation", "clouds")
+#: Seconds between two looks whether they are compiled.
+_LOOK_S = 0.05
+#: Those who need kernels wait for whoever compiles them.
+_compiling = threading.Lock()
+
+
+def missing(parts: Sequence[str] = DEPTH) -> tuple[str, ...]:
+    """Which of the parts are yet to be compiled for this processor, or for this version."""
+    return tuple(part for part in parts if not cached_at(_LAST[part])[1])
+
+
+def compile_kernels(
+    cache_dir: Path, parts: Sequence[str] = DEPTH, say: Callable[[str], None] | None = None,
+    stop: threading.Event | None = None, *, portable: bool = False,
+) -> None:  # fmt: skip
+    """Compile parts that are missing, in a process each, and wait for them.
+
+    Where a process fails, kernels are compiled when they are first used.
+
+    Parameters
+    ----------
+    cache_dir : of pair tables: the one that signing needs is built on the way
+    parts : of `ALL`
+    say : what tells that it takes a while, and how long it took
+    stop : once it is set, nothing more is compiled
+    portable : for every processor from x86-64-v3 on, as for an image or a wheel; elsewhere, as
+        for arm64, for processors like this one
+    """
+    with _compiling:
+        wanted = missing(parts)
+        if not wanted:
+            return
+        tell, begun = say or (lambda _: None), time.monotonic()
+        tell(f"first use after installation: compiling kernels for {' and '.join(wanted)}, once")
+        environment = dict(os.environ)
+        if portable and runs_here():
+            environment |= {"NUMBA_CPU_NAME": TARGET, "NUMBA_CPU_FEATURES": TARGET_FEATURES}
+        # clouds are validated with the kernels of the other parts: compiled twice, if beside them
+        for group in ([one for one in wanted if one != "clouds"], ["clouds"]):
+            commands = {part: (part, str(cache_dir)) for part in group if part in wanted}
+            if _run(commands, environment, tell, stop):
+                return
+        tell(f"compilation finished in {time.monotonic() - begun:.0f} s")
+
+
+def _run(
+    commands: Mapping[str, Sequence[str]], environment: Mapping[str, str],
+    tell: Callable[[str], None], stop: threading.Event | None,
+) -> bool:  # fmt: skip
+    """Compile parts beside each other; returns whether it was told to stop."""
+    running: dict[str, subprocess.Popen[bytes]] = {}
+    try:
+        for part, arguments in commands.items():
+            running[part] = subprocess.Popen(
+                [sys.executable, "-m", "sceneprint.engine.compilation", *arguments],
+                env=environment,
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+        while running:
+            if stop is not None and stop.is_set():
+                return True
+            for part, process in [*running.items()]:
+                if process.poll() is not None:
+                    del running[part]
+                    if process.returncode:
+                        tell(
+                            f"compiling kernels for {part} failed (exit code {process.returncode})"
+                            ": they are compiled on first use"
+                        )
+            time.sleep(_LOOK_S)
+    finally:
+        for process in running.values():
+            process.terminate()
+            process.wait()
+    return False
+
+
+def _compile(part: str, cache_dir: Path) -> None:
+    """Use every kernel of a part once."""
+    from sceneprint.engine.signers import warm_clouds, warm_signing, warm_validation
+    from sceneprint.pipeline import open_signer
+
+    model = read_model(PRESETS[0])
+    p = model.parameters.validation
+    # the corner as signing left it, so that validation need not wait for that
+    corner = read_geometry(files("sceneprint.engine").joinpath("corner.artifact").read_bytes())
+    if part == "validation":
+        warm_validation(corner, p)
+        return
+    signer = open_signer(model, cache_dir)
+    if part == "signing":
+        warm_signing(signer)
+    else:
+        warm_clouds(signer, corner)
+
+
+if __name__ == "__main__":
+    _compile(sys.argv[1], Path(sys.argv[2]))

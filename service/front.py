@@ -1,0 +1,101 @@
+"""The door of the service: it answers `/healthz` at once, while the application is loaded.
+
+uvicorn  -->  Front  -->  the application, as soon as it is there
+
+All other requests wait for it, a second or so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import uuid
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from sceneprint import __version__
+from sceneprint.settings import Settings
+from service.browser_security import Headers, security_headers, stranger
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+    from starlette.types import Receive, Scope, Send
+
+
+class Front:
+    """An ASGI application that loads another.
+
+    Parameters
+    ----------
+    settings : see Settings
+    load : makes the application, in a thread
+    failed : called where it could not be made or begun; `error` says why
+    """
+
+    def __init__(
+        self, settings: Settings, load: Callable[[], FastAPI], failed: Callable[[], None]
+    ) -> None:
+        self._load, self._failed = load, failed
+        self._alone = not settings.asks_for_keys
+        self._loaded, self._stop = asyncio.Event(), asyncio.Event()
+        #: The application, once it answers; and why there is none.
+        self.app: FastAPI | None = None
+        self.error: Exception | None = None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """The life of the service, or one request."""
+        if scope["type"] == "lifespan":
+            await self._live(receive, send)
+            return
+        if self.app is None:
+            if self._is_harmless(scope):
+                await _answer(scope, send)
+                return
+            await self._loaded.wait()
+        if self.app is None:
+            raise RuntimeError("the service could not start") from self.error
+        await self.app(scope, receive, send)
+
+    def _is_harmless(self, scope: Scope) -> bool:
+        """Whether a request asks for `/healthz`, and not from a page of others."""
+        asks = scope["path"] == "/healthz" and scope["method"] in ("GET", "HEAD")
+        headers = scope["headers"]
+        if not asks or any(name == b"origin" for name, _ in headers):
+            return False
+        return not self._alone or stranger(headers, lambda _: False) is None
+
+    async def _live(self, receive: Receive, send: Send) -> None:
+        """Run the application until told to stop."""
+        await receive()
+        running = asyncio.create_task(self._run())
+        await send({"type": "lifespan.startup.complete"})
+        await receive()
+        self._stop.set()
+        await running
+        await send({"type": "lifespan.shutdown.complete"})
+
+    async def _run(self) -> None:
+        try:
+            app = await asyncio.to_thread(self._load)
+            async with app.router.lifespan_context(app):
+                self.app = app
+                self._loaded.set()
+                await self._stop.wait()
+        except Exception as error:
+            self.error = error
+            self._failed()
+        finally:
+            self._loaded.set()
+
+
+async def _answer(scope: Scope, send: Send) -> None:
+    """What the application answers to `/healthz`."""
+    body = json.dumps({"status": "ok", "version": __version__}, separators=(",", ":")).encode()
+    headers: Headers = [
+        (b"content-length", str(len(body)).encode()),
+        (b"content-type", b"application/json"),
+        (b"x-request-id", uuid.uuid4().hex.encode()),
+    ]
+    headers += security_headers("/healthz", headers)
+    await send({"type": "http.response.start", "status": 200, "headers": headers})
+    await send({"type": "http.response.body", "body": body if scope["method"] == "GET" else b""})

@@ -1,0 +1,67 @@
+"""What pyproject.toml cannot say: wheels that carry compiled kernels.
+
+    SCENEPRINT_COMPILE=1 pip wheel --no-deps --no-build-isolation .
+
+builds one for this version of Python and for processors from x86-64-v3 on (2013 and later); it
+needs the dependencies installed, as it runs each kernel once. Without the variable the wheel has
+no machine code and fits every machine, which then compiles on first use.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from setuptools import Distribution, setup
+from setuptools.command.build_py import build_py
+
+COMPILE = os.environ.get("SCENEPRINT_COMPILE", "") not in ("", "0")
+HERE = Path(__file__).resolve().parent
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from sceneprint.engine.compilation import ALL, compile_kernels
+compile_kernels(Path(sys.argv[1]), ALL, print, portable=True)
+"""
+
+
+class BuildWithKernels(build_py):
+    """Copies the packages, and compiles their kernels where they lie then."""
+
+    def run(self) -> None:
+        """Build."""
+        super().run()
+        if COMPILE and not self.editable_mode:
+            compile_in(Path(self.build_lib).resolve())
+
+
+class Package(Distribution):
+    """With kernels it is of this version of Python and this kind of machine, as machine code is."""
+
+    def has_ext_modules(self) -> bool:
+        """Whether it fits no other."""
+        return COMPILE
+
+
+def compile_in(folder: Path) -> None:
+    """Compile the kernels of packages in a folder, for every processor of our kind."""
+    for old in [*folder.rglob("__pycache__")]:
+        shutil.rmtree(old)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join((str(folder), str(HERE / "client"))),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    environment.pop("NUMBA_CACHE_DIR", None)
+    with tempfile.TemporaryDirectory() as elsewhere:  # the tables, and no checkout beside it
+        subprocess.run(
+            [sys.executable, "-c", PROGRAM, elsewhere], cwd=elsewhere, env=environment, check=True
+        )
+
+
+setup(distclass=Package, cmdclass={"build_py": BuildWithKernels})

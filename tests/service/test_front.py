@@ -1,0 +1,115 @@
+"""While the application is loaded: what is answered at once, and what waits."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from sceneprint import __version__
+from sceneprint.errors import UnusableStore
+from sceneprint.settings import Settings
+from service.app import create_app
+from service.front import Front
+
+
+async def _lived(front: Front, test: Callable[[httpx.AsyncClient], Awaitable[Any]]) -> Any:
+    """Run a test between a front's start and its end."""
+    told: asyncio.Queue[dict[str, str]] = asyncio.Queue()
+    said: asyncio.Queue[Any] = asyncio.Queue()
+    life = asyncio.create_task(front({"type": "lifespan"}, told.get, said.put))
+    await told.put({"type": "lifespan.startup"})
+    assert (await said.get())["type"] == "lifespan.startup.complete"
+    async with httpx.AsyncClient(
+        transport=httpx.ASGITransport(front), base_url="http://127.0.0.1"
+    ) as client:
+        result = await test(client)
+    await told.put({"type": "lifespan.shutdown"})
+    assert (await said.get())["type"] == "lifespan.shutdown.complete"
+    await life
+    return result
+
+
+@pytest.fixture
+def slow(tmp_path: Path) -> tuple[Front, threading.Event]:
+    """A front whose application comes once the event is set."""
+    settings, go = Settings(data_dir=tmp_path), threading.Event()
+
+    def load() -> FastAPI:
+        assert go.wait(60)
+        return create_app(settings)
+
+    return Front(settings, load, lambda: None), go
+
+
+def test_healthz_is_answered_before_there_is_an_application_and_as_by_it(
+    slow: tuple[Front, threading.Event],
+) -> None:
+    front, go = slow
+
+    async def test(client: httpx.AsyncClient) -> None:
+        early, head = await client.get("/healthz"), await client.head("/healthz")
+        assert front.app is None
+        assert (early.status_code, early.json()) == (200, {"status": "ok", "version": __version__})
+        assert (head.status_code, head.content) == (200, b"")
+        others = [
+            client.get("/readyz"),
+            client.get("/healthz", headers={"Host": "rebound.example"}),
+            client.get("/healthz", headers={"Origin": "http://elsewhere.example"}),
+        ]
+        waiting = [asyncio.create_task(one) for one in others]
+        done, _ = await asyncio.wait(waiting, timeout=0.3)
+        assert done == set()
+        go.set()
+        assert [(await one).status_code for one in waiting] == [200, 421, 403]
+        late = await client.get("/healthz")
+        assert (late.status_code, late.content) == (200, early.content)
+        unlike = {"x-request-id"}
+        assert {k: v for k, v in late.headers.items() if k not in unlike} == {
+            k: v for k, v in early.headers.items() if k not in unlike
+        }
+        assert len(early.headers["x-request-id"]) == len(late.headers["x-request-id"])
+
+    asyncio.run(_lived(front, test))
+
+
+def test_an_application_that_cannot_be_made_ends_the_service(tmp_path: Path) -> None:
+    ended = threading.Event()
+
+    def load() -> FastAPI:
+        raise UnusableStore("the disk is gone")
+
+    front = Front(Settings(data_dir=tmp_path), load, ended.set)
+
+    async def test(client: httpx.AsyncClient) -> None:
+        with pytest.raises(RuntimeError, match="the service could not start"):
+            await client.get("/readyz")
+        assert ended.is_set()
+
+    asyncio.run(_lived(front, test))
+    assert str(front.error) == "the disk is gone"
+
+
+def test_while_kernels_are_compiled_readyz_says_so_and_who_needs_them_waits(
+    open_house: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.routes.admin.LOOK_S", 0.05)
+    monkeypatch.setattr("sceneprint.engine.models.KERNELS_S", 0.05)
+    with open_house(tmp_path, None, {"robot": {"*": "write"}}) as house:
+        house.engine.signers.require_kernels(60)  # those of this machine are there
+        ready = house.ask("robot", "GET", "/readyz")
+        assert (ready.status_code, ready.json()["status"]) == (200, "ready")
+        house.engine.signers.hold()
+        waits = house.ask("robot", "GET", "/readyz")
+        assert (waits.status_code, waits.headers["retry-after"]) == (503, "1")
+        assert waits.json()["detail"].startswith("The service is waiting for its kernels, which")
+        assert house.ask("robot", "GET", "/healthz").status_code == 200
+        assert house.ask("robot", "GET", "/v1/maps").status_code == 200
+        house.engine.signers.release()
+        assert house.ask("robot", "GET", "/readyz").status_code == 200

@@ -1,0 +1,178 @@
+"""A wheel that carries compiled kernels: whoever installs it compiles nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from sceneprint.geometry.kernel import runs_here
+
+ROOT = Path(__file__).parents[1]
+
+pytestmark = [
+    pytest.mark.thorough,
+    pytest.mark.skipif(not runs_here(), reason="machine code is for x86-64-v3"),
+]
+
+#: Signs, searches and validates, then says how many kernels of ours were compiled and loaded.
+COUNT = """
+import gc, sys
+from pathlib import Path
+from sceneprint.engine.models import warm
+from sceneprint.signing import open_signer
+assert warm(open_signer("depth", Path(sys.argv[1])), clouds=sys.argv[2] == "clouds")
+from numba.core.dispatcher import Dispatcher
+ours = [one for one in gc.get_objects() if isinstance(one, Dispatcher)
+        and one.py_func.__module__.startswith("sceneprint.")]
+print(sum(sum(one._cache_misses.values()) for one in ours),
+      sum(sum(one._cache_hits.values()) for one in ours))
+"""
+
+#: Uploads a frame and asks for it, in this process; says what was compiled and found.
+USE = """
+import gc, json, sys
+from pathlib import Path
+import numpy as np
+from sceneprint import Client
+from sceneprint_client.api import FrameMeta
+import sceneprint
+from sceneprint.engine.models import _corner
+corner = _corner()
+lens = {n: getattr(corner.intrinsics, n) for n in ("width", "height", "fx", "fy", "cx", "cy")}
+meta = FrameMeta.model_validate({"intrinsics": lens})
+path = Path(sys.argv[1]) / "frame.npy"
+np.save(path, corner.depth)
+with Client.embedded(Path(sys.argv[1]) / "data") as client:
+    client.create_map("hall")
+    added = client.upload("hall", path, meta)
+    client.wait([added.job_id])
+    answer = client.query("hall", path, meta)
+from numba.core.dispatcher import Dispatcher
+ours = [one for one in gc.get_objects() if isinstance(one, Dispatcher)
+        and one.py_func.__module__.startswith("sceneprint.")]
+print(json.dumps({
+    "compiled": [one.py_func.__name__ for one in ours if sum(one._cache_misses.values())],
+    "loaded": sum(sum(one._cache_hits.values()) for one in ours),
+    "from": sceneprint.__file__,
+    "matches": [one.frame_id for one in answer.matches], "frame": added.frame_id,
+}))
+"""
+
+#: The bytes of a signature and of an artifact.
+BYTES = """
+import hashlib, sys
+from pathlib import Path
+from sceneprint.engine.models import _corner, warm_signing
+from sceneprint.pipeline import prepare
+from sceneprint.signing import open_signer
+signer = open_signer("depth", Path(sys.argv[1]))
+print(hashlib.sha256(prepare(_corner(), signer)[0].vector.tobytes()).hexdigest(),
+      hashlib.sha256(warm_signing(signer)).hexdigest())
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from what git knows of this checkout."""
+    folder = tmp_path_factory.mktemp("wheel")
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    wanted = ("sceneprint/", "service/", "worker/", "migrations/", "client/", "setup.py",
+              "pyproject.toml", "README.md", "LICENSE")  # fmt: skip
+    for name in listed.stdout.split("\0"):
+        if name.startswith(wanted) and (ROOT / name).is_file():
+            to = folder / "source" / name
+            to.parent.mkdir(parents=True, exist_ok=True)
+            to.write_bytes((ROOT / name).read_bytes())
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps",
+               "--no-build-isolation", "--wheel-dir", str(folder / "wheels"), "."]  # fmt: skip
+    env = {**os.environ, "SCENEPRINT_COMPILE": "1"}
+    done = subprocess.run(
+        command, cwd=folder / "source", env=env, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    (found,) = (folder / "wheels").glob("sceneprint-*.whl")
+    return found
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its files, in a folder that nobody may write to but root."""
+    folder = tmp_path_factory.mktemp("installed")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder)
+    for path in folder.rglob("*"):
+        if path.is_dir():
+            path.chmod(0o555)
+    return folder
+
+
+def run(program: str, installed: Path, folder: Path, *arguments: str, **env: str) -> str:
+    """What a program of an installation prints, with cache folders of its own."""
+    given = {
+        **os.environ, "PYTHONPATH": os.pathsep.join((str(installed), str(ROOT / "client"))),
+        "NUMBA_CACHE_DIR": str(folder / "numba"), "SCENEPRINT_CACHE_DIR": str(folder / "tables"),
+        **env,
+    }  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(folder), *arguments], cwd=folder, env=given,
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()[-1]
+
+
+def test_it_says_for_whom_it_is_and_brings_code_for_every_kernel(wheel: Path) -> None:
+    python = f"cp{sys.version_info.major}{sys.version_info.minor}"
+    system = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    assert wheel.stem.endswith(f"-{python}-{python}-{system}")
+    assert system.endswith(platform.machine())
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+    lists = [name for name in names if name.endswith(".nbi")]
+    codes = [name for name in names if name.endswith(".nbc")]
+    assert len(lists) > 70
+    assert len(codes) >= len(lists)
+    assert all("/__pycache__/" in name for name in lists + codes)
+    assert [name for name in names if name.endswith(".pyc")] == []
+    assert "sceneprint/engine/corner.artifact" in names
+
+
+@pytest.mark.parametrize("what", ["depth", "clouds"])
+def test_a_first_use_compiles_nothing(installed: Path, tmp_path: Path, what: str) -> None:
+    compiled, loaded = map(int, run(COUNT, installed, tmp_path, what).split())
+    assert compiled == 0
+    assert loaded > 25
+    assert [*(tmp_path / "numba").rglob("*.nb?")] == []
+
+
+def test_a_first_upload_and_query_compile_nothing(installed: Path, tmp_path: Path) -> None:
+    told = json.loads(run(USE, installed, tmp_path))
+    assert Path(told["from"]).is_relative_to(installed)
+    assert told["matches"] == [told["frame"]]
+    assert told["compiled"] == []
+    assert told["loaded"] > 25
+
+
+def test_signatures_are_those_of_code_for_this_processor(installed: Path, tmp_path: Path) -> None:
+    brought = run(BYTES, installed, tmp_path)
+    assert run(BYTES, ROOT, tmp_path, NUMBA_CACHE_DIR="") == brought
+
+
+def test_another_processor_gets_code_of_its_own(installed: Path, tmp_path: Path) -> None:
+    program = (
+        "import sys; from sceneprint.geometry.pose.loops import *; import sceneprint;"
+        "from sceneprint.geometry.signature.pair_table import compiled_at; print(compiled_at()[1])"
+    )
+    assert run(program, installed, tmp_path) == "True"
+    assert run(program, installed, tmp_path, NUMBA_CPU_NAME="generic") == "False"
