@@ -6,13 +6,16 @@ signature, database --retrieve--> R --diversify--> C --associate--> C_vld --loca
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from sceneprint.errors import ModelMismatch
 from sceneprint.geometry.cores import both
 from sceneprint.geometry.registration.gravity import NO_UPS, Ups
+from sceneprint.geometry.registration.overlap import thinned
 from sceneprint.geometry.registration.patch_descriptors import compress, patch_descriptors
 from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.retrieval.distance import (
@@ -25,7 +28,8 @@ from sceneprint.geometry.retrieval.distance import (
 )
 from sceneprint.geometry.retrieval.dpp import DiversityParameters, Selection
 from sceneprint.geometry.retrieval.dpp import diversify as select
-from sceneprint.geometry.surface.range_image import range_image
+from sceneprint.geometry.surface.cloud import CloudParameters
+from sceneprint.geometry.surface.range_image import SPREAD_POINTS, range_image, spread_points
 from sceneprint.geometry.surface.voxels import Voxels
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
@@ -42,7 +46,7 @@ from sceneprint.signing import (
     patches_for_validation,
     see,
 )
-from sceneprint.types import AnyFrame, Bytes, Floats, Geometry, Surface
+from sceneprint.types import AnyFrame, Bytes, Cloud, Floats, Geometry, Sphere, Surface
 
 __all__ = [
     "Signature",
@@ -103,10 +107,21 @@ def geometry_of(seen: Surface, model: Model) -> Geometry:
     _NUMBERS[model.id] = p.validation
     shown = seen
     if isinstance(seen, Voxels):
-        shown = range_image(seen.cloud, p.cloud) if seen.cloud.has_viewpoint else seen.plain
+        shown = _scan(seen.cloud, p.cloud) if seen.cloud.has_viewpoint else seen.plain
     patches = patches_for_validation(seen, p)
     histograms = patch_descriptors(patches, p.surroundings)
     return Geometry(shown, patches, compress(histograms, model.compression), model.id)
+
+
+def _scan(cloud: Cloud, p: CloudParameters) -> Surface:
+    """The range image of a cloud; where it sees all around, with points spread over it."""
+    shown = range_image(cloud, p)
+    if not (isinstance(shown.camera, Sphere) and shown.camera.sees_around):
+        return shown
+    points = spread_points(cloud, shown, p)
+    # far surface is seen thinly, so that cubes are far narrower than if points lay evenly
+    even = math.sqrt(float(points.areas.sum(dtype=float)) / SPREAD_POINTS)
+    return replace(shown, spread=thinned(points, SPREAD_POINTS, even / 12))
 
 
 def distance(a: Signature, b: Signature) -> int:

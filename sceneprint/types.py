@@ -7,7 +7,7 @@ in the name. Camera frames are optical: x right, y down, z forward.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,6 +159,8 @@ class Surface:
     valid : (h, w) bool
     areas : (h, w) float32, square metres of surface seen by each pixel; 0 where not valid
     camera : of this (reduced) map; None for points in no order
+    spread : of a scan, points in no order as well, spread evenly over what it shows: of
+        `range_image.spread_points`; else None
     """
 
     points: Floats32
@@ -166,6 +168,12 @@ class Surface:
     valid: NDArray[np.bool_]
     areas: Floats32
     camera: Camera | None
+    spread: Surface | None = field(default=None, kw_only=True)
+
+    @property
+    def fitted(self) -> Surface:
+        """What another frame is laid on finely: the points of a scan, else the map itself."""
+        return self if self.spread is None else self.spread
 
 
 @dataclass(frozen=True, eq=False)

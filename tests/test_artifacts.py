@@ -199,12 +199,12 @@ def test_every_damaged_byte_is_noticed(data: bytes) -> None:
 
 
 def test_what_is_no_artifact(data: bytes) -> None:
-    other_schema = data[:5] + struct.pack("<H", 3) + data[7:]
+    other_schema = data[:5] + struct.pack("<H", 4) + data[7:]
     cases = {
         "bytes are no geometry artifact": [
             b"", b"SPGEO", b"x" * 500, data[: HEAD + BODY - 1], b"spgeo" + data[5:],
         ],
-        "has schema 3, and this version reads 1 and 2": [other_schema],
+        "has schema 4, and this version reads 1 to 3": [other_schema],
         "is damaged": [data[:-1], data + b"\0", data[: HEAD + BODY], data[: len(data) // 2]],
     }  # fmt: skip
     for message, files in cases.items():

@@ -6,6 +6,7 @@ import math
 import struct
 import tracemalloc
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,6 +57,17 @@ def scan(camera: Sphere = SPHERE, nearest: float = 0.5, farthest: float = 80.0) 
     return holding(directions(camera) * r[..., None], rng.random(shape) < 0.8, camera)
 
 
+def spinning(count: int = 200) -> Geometry:
+    """A scan that keeps points spread over what it shows as well."""
+    was = scan()
+    shown = was.surface
+    some = np.random.default_rng(7).choice(np.flatnonzero(shown.valid.ravel()), count, False)
+    points, normals = (x.reshape(-1, 3)[some][None] for x in (shown.points, shown.normals))
+    one = np.ones((1, count), np.bool_)
+    spread = Surface(points, normals, one, one.astype(np.float32), None)
+    return replace(was, surface=replace(shown, spread=spread))
+
+
 def fused(count: int, span: float = 20.0, far: float = 0.0) -> Geometry:
     points = np.random.default_rng(3).uniform(-span / 2, span / 2, (1, count, 3)) + far
     return holding(points, np.ones((1, count), np.bool_), None)
@@ -96,6 +108,70 @@ def test_a_scan_comes_back(pole: int) -> None:
     assert write_geometry(read) == data
 
 
+def test_a_scan_comes_back_with_its_points() -> None:
+    was = spinning()
+    data = write_geometry(was)
+    assert data[5:7] == b"\3\0"
+    # 4 bytes a pixel, 8 a point, 34 for their number, corner and step
+    assert len(data) == HEAD + BODY + 34 + 4 * 90 * 40 + 8 * 200 + 3 * (36 + 16)
+    read = read_geometry(data)
+    assert write_geometry(read) == data
+    assert read.surface.fitted is read.surface.spread
+    np.testing.assert_array_equal(read.surface.valid, was.surface.valid)
+    assert read.surface.spread is not None
+    assert was.surface.spread is not None
+    for got, had in ((read.surface, was.surface), (read.surface.spread, was.surface.spread)):
+        # 160 m in 65535 steps of a power of two: 1/256 m
+        assert np.abs(got.points - had.points).max() <= 1 / 512 + 1e-5
+        turn = np.linalg.norm(got.normals - had.normals, axis=2)
+        assert np.degrees(turn.max()) < 1.0
+    assert read.surface.spread.camera is None
+    # without its points it is what it was before
+    plain = write_geometry(replace(was, surface=replace(was.surface, spread=None)))
+    assert plain == write_geometry(scan())
+    assert plain[5:7] == b"\2\0"
+    old = read_geometry(plain).surface
+    assert old.spread is None
+    assert old.fitted is old
+
+
+def test_normals_on_the_edge_of_the_octahedron_pack_alike() -> None:
+    was = spinning(6)
+    assert was.surface.spread is not None
+    axes = np.concatenate([np.eye(3), -np.eye(3)])[None].astype(np.float32)
+    was.surface.spread.normals[:] = axes
+    data = write_geometry(was)
+    read = read_geometry(data)
+    assert write_geometry(read) == data
+    assert read.surface.spread is not None
+    turned = (read.surface.spread.normals * axes).sum(axis=2)
+    assert np.degrees(np.arccos(np.minimum(turned, 1.0))).max() < 0.5
+
+
+def test_points_that_no_scan_has() -> None:
+    data, at = write_geometry(spinning()), BODY
+    nan, endless = math.nan, math.inf
+    for field, values in ((0, (nan, endless, 1e7)), (2, (nan, -endless)), (3, (nan, 0.0, 17.0))):
+        for value in values:
+            with pytest.raises(UnreadableGeometry, match=r"no scan has|step of offset"):
+                read_geometry(sealed(data, at + 2 + 8 * field, struct.pack("<d", value)))
+    for count in (0, 199, 65535):
+        with pytest.raises(UnreadableGeometry, match="is damaged"):
+            read_geometry(sealed(data, at, struct.pack("<H", count)))
+    many = spinning(2000)
+    assert many.surface.spread is not None
+    points = np.repeat(many.surface.spread.points, 5, axis=1)
+    one = np.ones((1, 10_000), np.bool_)
+    spread = Surface(points, np.repeat(many.surface.spread.normals, 5, axis=1), one,
+                     one.astype(np.float32), None)  # fmt: skip
+    more = write_geometry(replace(many, surface=replace(many.surface, spread=spread)))
+    with pytest.raises(UnreadableGeometry, match="no scan has"):
+        read_geometry(more)
+    # one of points in no order has none beside it
+    with pytest.raises(UnreadableGeometry):
+        read_geometry(sealed(data, 8, bytes([2, 0])))
+
+
 def test_areas_of_a_scan() -> None:
     """Of a sphere seen from its middle they add up to its own, but for the caps left out."""
     camera = Sphere(180, 89, math.radians(2.0), 0.0, math.radians(88.0))
@@ -131,7 +207,7 @@ def test_no_more_points_than_pixels_are_kept() -> None:
 
 def test_every_damaged_byte_is_noticed() -> None:
     rng = np.random.default_rng(5)
-    for data in (write_geometry(scan()), write_geometry(fused(300))):
+    for data in (write_geometry(one) for one in (scan(), fused(300), spinning())):
         some = rng.integers(HEAD + BODY, len(data), 40).tolist()
         for at in [*range(HEAD + BODY), *some, len(data) - 1]:
             damaged = bytearray(data)
@@ -169,7 +245,7 @@ def test_numbers_that_no_cloud_has() -> None:
 
 
 def test_sizes_that_the_bytes_do_not_hold() -> None:
-    for data in (write_geometry(scan()), write_geometry(fused(300))):
+    for data in (write_geometry(one) for one in (scan(), fused(300), spinning())):
         tracemalloc.start()
         try:
             for at, size in ((0, 0), (0, 65535), (2, 65535), (4, 65535), (6, 0), (6, 65535)):
@@ -186,7 +262,7 @@ def test_any_numbers_make_finite_points() -> None:
     """What is read, whatever its bytes, can be validated with."""
     rng = np.random.default_rng(6)
     read = 0
-    for data in (write_geometry(scan()), write_geometry(fused(300))):
+    for data in (write_geometry(one) for one in (scan(), fused(300), spinning())):
         for _ in range(150):
             at = int(rng.integers(8, BODY - 32))
             field = rng.integers(0, 256, int(rng.integers(1, 9)), np.uint8).tobytes()

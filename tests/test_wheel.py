@@ -26,7 +26,7 @@ pytestmark = [
 COUNT = """
 import gc, sys
 from pathlib import Path
-from sceneprint.engine.models import warm
+from sceneprint.engine.signers import warm
 from sceneprint.signing import open_signer
 assert warm(open_signer("depth", Path(sys.argv[1])), clouds=sys.argv[2] == "clouds")
 from numba.core.dispatcher import Dispatcher
@@ -44,7 +44,7 @@ import numpy as np
 from sceneprint import Client
 from sceneprint_client.api import FrameMeta
 import sceneprint
-from sceneprint.engine.models import _corner
+from sceneprint.engine.signers import _corner
 corner = _corner()
 lens = {n: getattr(corner.intrinsics, n) for n in ("width", "height", "fx", "fy", "cx", "cy")}
 meta = FrameMeta.model_validate({"intrinsics": lens})
@@ -70,7 +70,7 @@ print(json.dumps({
 BYTES = """
 import hashlib, sys
 from pathlib import Path
-from sceneprint.engine.models import _corner, warm_signing
+from sceneprint.engine.signers import _corner, warm_signing
 from sceneprint.pipeline import prepare
 from sceneprint.signing import open_signer
 signer = open_signer("depth", Path(sys.argv[1]))

@@ -4,15 +4,17 @@
     uint16  --unpack_image | unpack_points-->  Surface
 
 A pinhole's pixels are inverse depths (its steps are far below a sensor's noise), a sphere's are
-ranges, points in no order are offsets in a cube. A normal is 2 x 16 bits on an octahedron. Steps
-of range and offset are powers of two, so that to pack again what was unpacked changes nothing.
+ranges, points in no order are offsets in a cube. A normal is 2 x 16 bits on an octahedron; 2 x 8
+of a scan with spread points. Steps of range and offset are powers of two, so that to pack again
+what was unpacked changes nothing.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from typing import NoReturn
+from dataclasses import replace
+from typing import Any, NoReturn
 
 import numpy as np
 from isal.isal_zlib import crc32
@@ -22,7 +24,7 @@ from sceneprint.errors import InvalidIntrinsics, UnreadableGeometry
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.registration.overlap import thinned
 from sceneprint.geometry.surface.camera import camera_of
-from sceneprint.geometry.surface.range_image import directions
+from sceneprint.geometry.surface.range_image import SPREAD_POINTS, directions
 from sceneprint.types import Bytes, Floats, Floats32, Geometry, Intrinsics, Patches, Sphere, Surface
 
 Packed = NDArray[np.uint16]
@@ -32,7 +34,7 @@ _TOLD = 2.0**-22
 
 
 @kernel
-def _to_octahedron(nx: float, ny: float, nz: float) -> tuple[int, int]:
+def _to_octahedron(nx: float, ny: float, nz: float, most: float) -> tuple[int, int]:
     total = abs(nx) + abs(ny) + abs(nz)
     u, v = nx / total, ny / total
     if nz > 0:  # normals face a depth sensor, -z: that half is the middle of the square
@@ -40,12 +42,19 @@ def _to_octahedron(nx: float, ny: float, nz: float) -> tuple[int, int]:
             (1.0 - abs(v)) * (1.0 if u >= 0 else -1.0),
             (1.0 - abs(u)) * (1.0 if v >= 0 else -1.0),
         )
-    return round((u * 0.5 + 0.5) * 65535.0), round((v * 0.5 + 0.5) * 65535.0)
+    a, b = round((u * 0.5 + 0.5) * most), round((v * 0.5 + 0.5) * most)
+    # of the two places on the edge of the square that are one direction, one
+    a_on_edge, b_on_edge = a == 0 or a == most, b == 0 or b == most
+    if a_on_edge:
+        b = max(b, int(most) - b)
+    if b_on_edge:
+        a = max(a, int(most) - a)
+    return a, b
 
 
 @kernel
-def _of_octahedron(a: int, b: int) -> tuple[float, float, float]:
-    u, v = a / 65535.0 * 2.0 - 1.0, b / 65535.0 * 2.0 - 1.0
+def _of_octahedron(a: int, b: int, most: float) -> tuple[float, float, float]:
+    u, v = a / most * 2.0 - 1.0, b / most * 2.0 - 1.0
     nz = -(1.0 - abs(u) - abs(v))
     if nz > 0:
         u, v = (
@@ -58,7 +67,7 @@ def _of_octahedron(a: int, b: int) -> tuple[float, float, float]:
 
 @kernel
 def _pack_image(
-    points: Floats32, normals: Floats32, pinhole: bool, scale: float, out: Packed
+    points: Floats32, normals: Floats32, pinhole: bool, scale: float, most: float, out: Packed
 ) -> None:
     """Inverse depth or range, and normal, of every pixel; 0 where not valid: out (h, w, 3)."""
     height, width = points.shape[0], points.shape[1]
@@ -76,7 +85,7 @@ def _pack_image(
                     continue
                 out[y, x, 0] = np.uint16(min(max(round(away / scale), 1.0), 65535.0))
             u, v = _to_octahedron(
-                float(normals[y, x, 0]), float(normals[y, x, 1]), float(normals[y, x, 2])
+                float(normals[y, x, 0]), float(normals[y, x, 1]), float(normals[y, x, 2]), most
             )
             out[y, x, 1] = np.uint16(u)
             out[y, x, 2] = np.uint16(v)
@@ -96,7 +105,7 @@ def _unpack_pinhole(
                 continue
             xn = (x - cx) / fx
             z = 1.0 / (packed[y, x, 0] * scale)
-            u, v, nz = _of_octahedron(packed[y, x, 1], packed[y, x, 2])
+            u, v, nz = _of_octahedron(packed[y, x, 1], packed[y, x, 2], 65535.0)
             points[y, x, 0], points[y, x, 1], points[y, x, 2] = xn * z, yn * z, z
             normals[y, x, 0], normals[y, x, 1], normals[y, x, 2] = u, v, nz
             ray = np.sqrt(xn * xn + yn * yn + 1.0)
@@ -107,7 +116,7 @@ def _unpack_pinhole(
 
 @kernel
 def _unpack_sphere(
-    packed: Packed, scale: float, rays: Floats, solid: Floats, points: Floats32,
+    packed: Packed, scale: float, most: float, rays: Floats, solid: Floats, points: Floats32,
     normals: Floats32, areas: Floats32, valid: NDArray[np.bool_],
 ) -> None:  # fmt: skip
     height, width = packed.shape[0], packed.shape[1]
@@ -117,7 +126,7 @@ def _unpack_sphere(
                 continue
             away = packed[y, x, 0] * scale
             a, b, c = rays[y, x, 0], rays[y, x, 1], rays[y, x, 2]
-            nx, ny, nz = _of_octahedron(packed[y, x, 1], packed[y, x, 2])
+            nx, ny, nz = _of_octahedron(packed[y, x, 1], packed[y, x, 2], most)
             points[y, x, 0], points[y, x, 1], points[y, x, 2] = a * away, b * away, c * away
             normals[y, x, 0], normals[y, x, 1], normals[y, x, 2] = nx, ny, nz
             cosine = -(a * nx + b * ny + c * nz)
@@ -126,17 +135,19 @@ def _unpack_sphere(
 
 
 @kernel
-def _pack_normals(normals: Floats32, out: Packed) -> None:
+def _pack_normals(normals: Floats32, most: float, out: Packed) -> None:
     for n in range(len(normals)):
-        u, v = _to_octahedron(float(normals[n, 0]), float(normals[n, 1]), float(normals[n, 2]))
+        u, v = _to_octahedron(
+            float(normals[n, 0]), float(normals[n, 1]), float(normals[n, 2]), most
+        )
         out[n, 0] = np.uint16(u)
         out[n, 1] = np.uint16(v)
 
 
 @kernel
-def _unpack_normals(packed: Packed, out: Floats32) -> None:
+def _unpack_normals(packed: Packed, most: float, out: Floats32) -> None:
     for n in range(len(packed)):
-        nx, ny, nz = _of_octahedron(packed[n, 0], packed[n, 1])
+        nx, ny, nz = _of_octahedron(packed[n, 0], packed[n, 1], most)
         out[n, 0], out[n, 1], out[n, 2] = nx, ny, nz
 
 
@@ -145,9 +156,9 @@ def _step(span: float) -> float:
     return 2.0 ** math.ceil(math.log2(span / MOST) - 1e-4) if span > 0 else 1.0
 
 
-def pack_image(surface: Surface) -> tuple[Packed, float]:
+def pack_image(surface: Surface, most: int = MOST) -> tuple[Packed, float]:
     """Pixels (h, w, 3) of a surface that a camera saw; and the inverse depth of 1 (of a pinhole),
-    or the range of 1 (of a sphere).
+    or the range of 1 (of a sphere). Numbers of normals are 0 to `most`.
     """
     pinhole = isinstance(surface.camera, Intrinsics)
     if pinhole:
@@ -157,11 +168,13 @@ def pack_image(surface: Surface) -> tuple[Packed, float]:
         seen = surface.points[surface.valid].astype(float)
         scale = _step(float(np.linalg.norm(seen, axis=1).max(initial=0.0)))
     packed = np.zeros((*surface.valid.shape, 3), np.uint16)
-    _pack_image(surface.points, surface.normals, pinhole, scale, packed)
+    _pack_image(surface.points, surface.normals, pinhole, scale, float(most), packed)
     return packed, scale
 
 
-def unpack_image(packed: Packed, scale: float, camera: Intrinsics | Sphere) -> Surface:
+def unpack_image(
+    packed: Packed, scale: float, camera: Intrinsics | Sphere, most: int = MOST
+) -> Surface:
     """The surface of `pack_image`."""
     shape = (camera.height, camera.width)
     points, normals = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
@@ -172,11 +185,12 @@ def unpack_image(packed: Packed, scale: float, camera: Intrinsics | Sphere) -> S
     else:
         elevation = camera.top - camera.step * np.arange(camera.height)
         solid = camera.step**2 * np.maximum(np.cos(elevation), 0.0)
-        _unpack_sphere(packed, scale, directions(camera), solid, points, normals, areas, valid)
+        rays = directions(camera)
+        _unpack_sphere(packed, scale, float(most), rays, solid, points, normals, areas, valid)
     return Surface(points, normals, valid, areas, camera)
 
 
-def pack_points(surface: Surface) -> tuple[Packed, Floats, float]:
+def pack_points(surface: Surface, most: int = MOST) -> tuple[Packed, Floats, float]:
     """Points in no order as (N, 5): offsets and normal; the corner they are from, and a step."""
     points, normals = surface.points[surface.valid], surface.normals[surface.valid]
     packed = np.zeros((len(points), 5), np.uint16)
@@ -187,15 +201,15 @@ def pack_points(surface: Surface) -> tuple[Packed, Floats, float]:
     step = _step(max(span, float(np.abs(points).max()) * _TOLD * MOST))
     offsets = np.rint((points - corner) / step)
     packed[:, :3] = np.clip(offsets, 0, MOST).astype(np.uint16)
-    _pack_normals(normals, packed[:, 3:])
+    _pack_normals(normals, float(most), packed[:, 3:])
     return packed, corner, step
 
 
-def unpack_points(packed: Packed, corner: Floats, step: float) -> Surface:
+def unpack_points(packed: Packed, corner: Floats, step: float, most: int = MOST) -> Surface:
     """The surface of `pack_points`, a map of one row without areas."""
     points = (packed[:, :3] * step + corner).astype(np.float32)
     normals = np.zeros((len(packed), 3), np.float32)
-    _unpack_normals(packed[:, 3:], normals)
+    _unpack_normals(packed[:, 3:], float(most), normals)
     shape = (1, len(packed))
     return Surface(
         points[None], normals[None], np.ones(shape, np.bool_), np.zeros(shape, np.float32), None
@@ -208,12 +222,12 @@ def unpack_points(packed: Packed, corner: Floats, step: float) -> Surface:
 #
 # Little-endian, in this order: magic, schema, CRC-32 of all that follows, sizes and camera, id of
 # the model, then the arrays; those of the surface are as above. Depth images have schema 1,
-# clouds 2.
+# clouds 2, scans with spread points 3: of these offset and ranges come first, then all normals.
 
 MAGIC = b"SPGEO"
-#: Of the bytes and of what they mean, for depth images and for clouds. Raise it when either
-#: changes.
-SCHEMA_VERSION, CLOUD_SCHEMA = 1, 2
+#: Of the bytes and of what they mean, for depth images, for clouds, and for scans with spread
+#: points. Raise it when either changes.
+SCHEMA_VERSION, CLOUD_SCHEMA, SCAN_SCHEMA = 1, 2, 3
 #: magic, schema, checksum
 _HEAD = struct.Struct("<5sHI")
 #: Of a depth image: width, height, patches, bytes of a descriptor, fx, fy, cx, cy, inverse depth
@@ -223,6 +237,10 @@ _DEPTH = struct.Struct("<HHHH5d32s")
 #: of a sphere or the corner of points in no order, then the step of 1, model
 _CLOUD = struct.Struct("<HHHHBB4d32s")
 _SPHERE, _POINTS = 1, 2
+#: Of a scan, after what is told of a cloud: spread points, their corner and their step of 1
+_SPREAD = struct.Struct("<H4d")
+#: Greatest number of a normal of a scan with spread points: half a degree off, at most.
+_COARSE = 255
 #: Most points in no order that are kept: as many as pixels of a depth image.
 MAXIMUM_POINTS = 20_000
 #: Most patches and longest descriptor that are believed: validation compares all patches with all,
@@ -251,32 +269,48 @@ def write_geometry(geometry: Geometry) -> bytes:
     geometry : see Geometry; its model id is 64 hexadecimal digits. Of points in no order at most
         MAXIMUM_POINTS are kept
     """
-    patches, camera = geometry.patches, geometry.surface.camera
+    patches, camera, spread = geometry.patches, geometry.surface.camera, geometry.surface.spread
+    schema = SCHEMA_VERSION if isinstance(camera, Intrinsics) else CLOUD_SCHEMA
     model, sizes = bytes.fromhex(geometry.model_id), (len(patches), geometry.descriptors.shape[1])
     if camera is None:
         packed, corner, step = pack_points(thinned(geometry.surface, MAXIMUM_POINTS))
         head = _CLOUD.pack(len(packed), 1, *sizes, _POINTS, 0, *corner, step, model)
+        body = packed.astype("<u2").tobytes()
     else:
-        packed, scale = pack_image(geometry.surface)
+        packed, scale = pack_image(geometry.surface, MOST if spread is None else _COARSE)
         size = camera.width, camera.height, *sizes
         if isinstance(camera, Intrinsics):
             head = _DEPTH.pack(*size, camera.fx, camera.fy, camera.cx, camera.cy, scale, model)
         else:
             turn = camera.step, camera.left, camera.top
             head = _CLOUD.pack(*size, _SPHERE, camera.pole, *turn, scale, model)
+        body = packed.astype("<u2").tobytes()
+        if isinstance(camera, Sphere) and spread is not None:
+            schema = SCAN_SCHEMA
+            points, corner, step = pack_points(spread, _COARSE)
+            head += _SPREAD.pack(len(points), *corner, step)
+            body = _split(packed, 1) + _split(points, 3)
     rows = np.zeros(len(patches), _PATCH)
     rows["mean"], rows["normal"], rows["area"] = patches.means, patches.normals, patches.areas
     rows["coherence"], rows["size"] = patches.coherences, patches.sizes
-    body = b"".join(
-        [
-            head,
-            packed.astype("<u2").tobytes(),
-            rows.tobytes(),
-            np.ascontiguousarray(geometry.descriptors).tobytes(),
-        ]
-    )
-    schema = SCHEMA_VERSION if isinstance(camera, Intrinsics) else CLOUD_SCHEMA
+    descriptors = np.ascontiguousarray(geometry.descriptors).tobytes()
+    body = b"".join([head, body, rows.tobytes(), descriptors])
     return _HEAD.pack(MAGIC, schema, crc32(body)) + body
+
+
+def _split(packed: Packed, places: int) -> bytes:
+    """The first numbers of each row as 16 bits, then those of the normals as 8."""
+    return (
+        packed[..., :places].astype("<u2").tobytes() + packed[..., places:].astype("u1").tobytes()
+    )
+
+
+def _joined(data: memoryview, shape: tuple[int, ...], places: int) -> Packed:
+    """Of `_split`, (*shape, places + 2)."""
+    end = 2 * places * math.prod(shape)
+    first = np.frombuffer(data[:end], "<u2").reshape(*shape, places)
+    normals = np.frombuffer(data[end:], np.uint8).reshape(*shape, 2)
+    return np.concatenate([first, normals.astype(np.uint16)], axis=-1)
 
 
 def read_geometry(data: bytes) -> Geometry:
@@ -295,33 +329,43 @@ def read_geometry(data: bytes) -> Geometry:
     if len(data) < _HEAD.size or data[: len(MAGIC)] != MAGIC:
         _refuse(nothing)
     _, schema, checksum = _HEAD.unpack_from(data)
-    if schema not in (SCHEMA_VERSION, CLOUD_SCHEMA):
+    if schema not in (SCHEMA_VERSION, CLOUD_SCHEMA, SCAN_SCHEMA):
         _refuse(
             f"The geometry artifact has schema {schema}, and this version reads "
-            f"{SCHEMA_VERSION} and {CLOUD_SCHEMA}."
+            f"{SCHEMA_VERSION} to {SCAN_SCHEMA}."
         )
     body = memoryview(data)[_HEAD.size :]
     layout = _DEPTH if schema == SCHEMA_VERSION else _CLOUD
-    if len(body) < layout.size:
+    is_scan = schema == SCAN_SCHEMA
+    start = layout.size + _SPREAD.size * is_scan
+    if len(body) < start:
         _refuse(nothing)
     width, height, count, length, *told, model = layout.unpack_from(body)
-    numbers = 5 if schema == CLOUD_SCHEMA and told[0] == _POINTS else 3
-    arrays = [width * height * 2 * numbers, count * _PATCH.itemsize, count * length]
-    ends = np.cumsum([layout.size, *arrays])
+    spread = _SPREAD.unpack_from(body, layout.size) if is_scan else None
+    pixel = 4 if is_scan else 10 if schema == CLOUD_SCHEMA and told[0] == _POINTS else 6
+    points = 8 * spread[0] if spread else 0
+    arrays = [width * height * pixel, points, count * _PATCH.itemsize, count * length]
+    ends = np.cumsum([start, *arrays])
     if len(body) != ends[-1] or crc32(body) != checksum:
         _refuse("The geometry artifact is damaged: its checksum does not fit.")
-    packed = np.frombuffer(body[ends[0] : ends[1]], "<u2").reshape(height, width, numbers)
+    drawn = body[ends[0] : ends[1]]
     try:
-        surface = _depth(packed, *told) if schema == SCHEMA_VERSION else _cloud(packed, *told)
+        if spread:
+            surface = _scan(
+                _joined(drawn, (height, width), 1), body[ends[1] : ends[2]], told, spread
+            )
+        else:
+            packed = np.frombuffer(drawn, "<u2").reshape(height, width, pixel // 2)
+            surface = _depth(packed, *told) if schema == SCHEMA_VERSION else _cloud(packed, *told)
     except InvalidIntrinsics as error:
         raise UnreadableGeometry(f"The geometry artifact has no camera: {error}") from error
-    patches = _patches(np.frombuffer(body[ends[1] : ends[2]], _PATCH))
+    patches = _patches(np.frombuffer(body[ends[2] : ends[3]], _PATCH))
     if count > MAXIMUM_PATCHES or length > MAXIMUM_DESCRIPTOR or not _sound(patches):
         _refuse(
             f"The geometry artifact's {count} patches with descriptors of {length} bytes are none "
             "that a model makes."
         )
-    descriptors: Bytes = np.frombuffer(body[ends[2] :], np.uint8).reshape(count, length)
+    descriptors: Bytes = np.frombuffer(body[ends[3] :], np.uint8).reshape(count, length)
     return Geometry(surface, patches, descriptors, model.hex())
 
 
@@ -339,14 +383,28 @@ def _depth(
     return unpack_image(packed, scale, camera)
 
 
+def _scan(packed: Packed, points: memoryview, told: list[Any], spread: tuple[Any, ...]) -> Surface:
+    """A range image, and points in no order that are spread over what it shows."""
+    count, *corner, step = spread
+    near = all(abs(one) <= NEAREST[1] for one in corner)  # false for NaN
+    if not (told[0] == _SPHERE and 0 < count <= SPREAD_POINTS and near):
+        _refuse("The geometry artifact has points that no scan has.")
+    if not STEPS[0] <= step <= STEPS[1]:
+        _refuse(f"The geometry artifact has {step} for its step of offset.")
+    shown = _cloud(packed, *told, most=_COARSE)
+    of_all = unpack_points(_joined(points, (count,), 3), np.array(corner), step, _COARSE)
+    return replace(shown, spread=of_all)
+
+
 def _cloud(
-    packed: NDArray[np.uint16], kind: int, pole: int, a: float, b: float, c: float, step: float
-) -> Surface:
+    packed: NDArray[np.uint16], kind: int, pole: int, a: float, b: float, c: float, step: float,
+    *, most: int = MOST,
+) -> Surface:  # fmt: skip
     if not STEPS[0] <= step <= STEPS[1]:
         _refuse(f"The geometry artifact has {step} for its step of range.")
     height, width = packed.shape[:2]
     if kind == _SPHERE:
-        return unpack_image(packed, step, Sphere(width, height, a, b, c, pole))
+        return unpack_image(packed, step, Sphere(width, height, a, b, c, pole), most)
     near = all(abs(one) <= NEAREST[1] for one in (a, b, c))  # false for NaN
     if kind != _POINTS or pole or height != 1 or width > MAXIMUM_POINTS or not near:
         _refuse("The geometry artifact has points that no cloud has.")

@@ -11,10 +11,10 @@ from importlib.resources import files
 from pathlib import Path
 
 import pytest
-from sceneprint.engine.models import warm_signing, warm_validation
 
 from sceneprint.engine import compilation
 from sceneprint.engine.compilation import ALL, DEPTH, compile_kernels
+from sceneprint.engine.signers import warm_signing, warm_validation
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.models import read_model
 from sceneprint.settings import Settings
@@ -77,7 +77,7 @@ def test_the_corner_is_what_signing_leaves_of_it() -> None:
 COUNT = """
 import gc, sys
 from pathlib import Path
-from sceneprint.engine.models import warm
+from sceneprint.engine.signers import warm
 from sceneprint.signing import open_signer
 assert warm(open_signer("depth", Path(sys.argv[1])), clouds=sys.argv[2] == "clouds")
 from numba.core.dispatcher import Dispatcher

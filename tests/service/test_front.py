@@ -100,7 +100,7 @@ def test_while_kernels_are_compiled_readyz_says_so_and_who_needs_them_waits(
     open_house: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("service.routes.admin.LOOK_S", 0.05)
-    monkeypatch.setattr("sceneprint.engine.models.KERNELS_S", 0.05)
+    monkeypatch.setattr("sceneprint.engine.signers.KERNELS_S", 0.05)
     with open_house(tmp_path, None, {"robot": {"*": "write"}}) as house:
         house.engine.signers.require_kernels(60)  # those of this machine are there
         ready = house.ask("robot", "GET", "/readyz")

@@ -231,8 +231,8 @@ def align_scans(
         return None
     order = _ranked(query, match, transforms, p, overlap_p)
     transforms, is_planned = transforms[order], is_planned[order]
-    finely = replace(p.fine, stride=p.fine_stride)
-    fine, index = refined_with_index(a.surface, b.surface, transforms[: p.n_fine], finely)
+    onto, numbers = b.surface.fitted, replace(p.fine, stride=p.fine_stride)
+    fine, index = refined_with_index(a.surface, onto, transforms[: p.n_fine], numbers)
     transforms[index] = fine
     order = _ranked(query, match, transforms, p, overlap_p)
     T, others = transforms[order[0]], transforms[order[1:]]
@@ -293,7 +293,8 @@ def _finished(
     search: Search,
 ) -> Alignment:  # fmt: skip
     """One transform refined to the end."""
-    surface, onto = source.geometry.surface, target.geometry.surface
+    surface = source.geometry.surface
+    onto = target.geometry.surface.fitted
     fine = refine(sampled(surface, p.fine.stride), onto, T, p.fine, kind_of(surface.camera))
     if fine is None:
         return Alignment(T, others, 0.0, None, search)

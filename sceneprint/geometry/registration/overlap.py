@@ -140,13 +140,14 @@ def target_of(surface: Surface, nearest: float, reach: float) -> LookupTarget:
     return LookupTarget(points[None], normals[None], camera, heads, chain)
 
 
-def thinned(surface: Surface, most: int) -> Surface:
+def thinned(surface: Surface, most: int, cube: float = 0.0) -> Surface:
     """At most so many of a surface's points in no order, spread over all that it shows.
 
     Parameters
     ----------
     surface : without a camera
     most : at least 1
+    cube : width of the first grid that is tried, metres; default: a 4096th of all that it shows
 
     Returns
     -------
@@ -155,7 +156,7 @@ def thinned(surface: Surface, most: int) -> Surface:
     """
     points = surface.points[surface.valid]
     kept = np.arange(len(points), dtype=np.int32)
-    cube = float(np.ptp(points, axis=0).max(initial=0.0)) / 4096 if len(points) > most else 0.0
+    cube = cube or float(np.ptp(points, axis=0).max(initial=0.0)) / 4096
     while len(kept) > most:
         # of n cubes about a surface half are left when they are wider by the root of 2
         cube *= max((len(kept) / most) ** 0.5, 1.02)
@@ -208,12 +209,18 @@ def sampled(surface: Surface, stride: int) -> Floats32:
     """Valid pixels of every `stride`-th row and column; of a cloud, about as many points.
 
     Two frames are to have equal say, whatever saw them: a sphere of more pixels than
-    `DEPTH_PIXELS` is strode through faster. A stride of 1 takes all.
+    `DEPTH_PIXELS` is strode through faster, and of the points of a scan about as many are taken.
+    A stride of 1 takes all of the map.
 
     Returns
     -------
     (N, 6) float32, points and normals
     """
+    if surface.spread is not None and stride > 1:
+        points, normals = surface.spread.points[0], surface.spread.normals[0]
+        each = max(round(stride * stride * len(points) / DEPTH_PIXELS), 1)
+        both = np.concatenate([points, normals], axis=1)
+        return np.ascontiguousarray(both[each // 2 :: each])
     if isinstance(surface.camera, Sphere) and stride > 1:
         more = surface.camera.width * surface.camera.height / DEPTH_PIXELS
         stride = round(stride * max(more, 1.0) ** 0.5)

@@ -143,9 +143,10 @@ def plan_of(
     axis : (3,) near which up is looked for; default: the axis that the scanner turns about
     up : (3,) unit vector in the scanner's coordinates, where it is known; it is taken as it is
     """
-    points = surface.points[surface.valid]
+    shown = surface.fitted
+    points = shown.points[shown.valid]
     kept = one_of_each(points, p.voxel)
-    where, facing = points[kept].astype(float), surface.normals[surface.valid][kept].astype(float)
+    where, facing = points[kept].astype(float), shown.normals[shown.valid][kept].astype(float)
     if up is None:
         up = up_of(facing, axis_of(surface) if axis is None else axis, p.tilt)
     level = np.zeros(3)

@@ -10,6 +10,7 @@ always facing the viewpoint, as `depth_image.py` does in the image of a depth se
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +87,11 @@ def framed(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
         step *= max(math.sqrt(width * height / p.maximum_pixels), 1.01)
 
 
+#: How much finer the pixels are that the points of a scan are taken from.
+FINER = 2
+#: Points of a scan that are kept, at most; how many: docs/clouds.md.
+SPREAD_POINTS = 8192
+
 #: Steps of a number from 0 to 1 in sums: those of 5 million points stay below 2^63.
 _STEPS = 2.0**38
 #: A window is at most so much wider than high.
@@ -137,6 +143,36 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
     ):
         _close(view, target, ray, shown, p.gap_px, gates, p.gap_cosine)
     return _lifted(closed, rays, camera, p)
+
+
+def spread_points(cloud: Cloud, image: Surface, p: CloudParameters) -> Surface:
+    """Points in no order of a scan, finer than its range image: what fine refinement works on.
+
+    A range image has a pixel each 0.9 degrees or so, which 30 m away is half a metre of wall and
+    several metres of ground. Where finer pixels fix no plane, as between rings far apart, the
+    points of the image itself are taken.
+
+    Parameters
+    ----------
+    cloud, p : of the image
+    image : of `range_image`
+
+    Returns
+    -------
+    surface : (1, N) without a camera, finer pixels first
+    """
+    finer = replace(
+        p,
+        image_angle=p.image_angle / FINER,
+        maximum_pixels=p.maximum_pixels * FINER**2,
+        gap_px=p.gap_px * FINER,
+    )
+    both = range_image(cloud, finer), image
+    points, normals, areas = (
+        np.concatenate([getattr(one, name)[one.valid] for one in both])[None]
+        for name in ("points", "normals", "areas")
+    )
+    return Surface(points, normals, np.ones(areas.shape, np.bool_), areas, None)
 
 
 def _turned(maps: Floats) -> Floats:

@@ -188,8 +188,8 @@ def refined_at(
     """
     p = p or FINE
     a, b = query.surface, match.surface
-    there = refine(sampled(a, p.stride), b, T_match_query, p, kind_of(a.camera))
-    back = refine(sampled(b, p.stride), a, inverse(T_match_query), p, kind_of(b.camera))
+    there = refine(sampled(a, p.stride), b.fitted, T_match_query, p, kind_of(a.camera))
+    back = refine(sampled(b, p.stride), a.fitted, inverse(T_match_query), p, kind_of(b.camera))
     if there is None or back is None:
         return None
     return middle(there.T, inverse(back.T))

@@ -1,0 +1,134 @@
+"""Points spread over what a scan shows: which are kept, and what works on them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneprint.geometry.registration.overlap import sampled, thinned
+from sceneprint.geometry.registration.plan_search import PlanParameters, plan_of
+from sceneprint.geometry.surface.cloud import CloudParameters
+from sceneprint.geometry.surface.range_image import SPREAD_POINTS, range_image, spread_points
+from sceneprint.geometry.validation.validation import refined_at
+from sceneprint.models import Model, read_model
+from sceneprint.pipeline import geometry_of
+from sceneprint.signing import see
+from sceneprint.types import Cloud, Floats32, Geometry
+
+
+def hall(at: tuple[float, float, float], turn: float = 0.0, half: float = math.pi) -> Cloud:
+    """A hall of 30 x 20 x 6 m with three pillars, scanned from a place in it, without noise."""
+    azimuth = np.linspace(-half, half, 900, endpoint=False)
+    elevation = np.radians(np.linspace(-30, 30, 48))
+    a, e = (x.ravel() for x in np.meshgrid(azimuth, elevation))
+    rays = np.stack([np.cos(e) * np.cos(a + turn), np.cos(e) * np.sin(a + turn), np.sin(e)], axis=1)
+    low, high = np.array([-15.0, -10.0, 0.0]), np.array([15.0, 10.0, 6.0])
+    origin = np.array(at)
+    with np.errstate(divide="ignore"):
+        ranges = np.maximum((low - origin) / rays, (high - origin) / rays).min(axis=1)
+    for x, y in ((-6.0, 3.0), (2.0, -4.0), (8.0, 5.0)):  # of a square plan
+        with np.errstate(divide="ignore"):
+            sides = (np.array([[x - 0.6, y - 0.6], [x + 0.6, y + 0.6]]) - origin[:2])[
+                :, None
+            ] / rays[:, :2]
+        enter, leave = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
+        hit = (enter < leave) & (enter > 0)
+        ranges = np.where(hit, np.minimum(ranges, enter), ranges)
+    away = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1)
+    points: Floats32 = (away * ranges[:, None]).astype(np.float32)
+    return Cloud(points)
+
+
+@pytest.fixture(scope="module")
+def lidar() -> Model:
+    return read_model("lidar")
+
+
+def geometry(cloud: Cloud, model: Model) -> Geometry:
+    return geometry_of(see(cloud, model.parameters), model)
+
+
+def test_points_lie_on_what_is_shown_and_evenly(lidar: Model) -> None:
+    surface = geometry(hall((1.0, 0.5, 1.5)), lidar).surface
+    spread = surface.spread
+    assert spread is not None
+    assert SPREAD_POINTS * 0.8 < spread.points.shape[1] <= SPREAD_POINTS
+    assert spread.valid.all()
+    assert spread.camera is None
+    points = spread.points[0] + np.array([1.0, 0.5, 1.5])
+    # on floor, ceiling or a wall, or a pillar's side
+    off = np.minimum(np.abs(points[:, 2]), np.abs(points[:, 2] - 6.0))
+    off = np.minimum(off, np.abs(np.abs(points[:, 0]) - 15.0))
+    off = np.minimum(off, np.abs(np.abs(points[:, 1]) - 10.0))
+    for x, y in ((-6.0, 3.0), (2.0, -4.0), (8.0, 5.0)):
+        beside = np.abs(np.maximum(np.abs(points[:, 0] - x), np.abs(points[:, 1] - y)) - 0.6)
+        off = np.minimum(off, beside)
+    assert np.quantile(off, 0.9) < 0.04  # of the others, planes were fitted across a corner
+    # the far wall has a share of the points that a range image does not give it
+    far = (points[:, 0] < -14.9).mean()
+    shown = surface.points[surface.valid] + np.array([1.0, 0.5, 1.5])
+    assert far > 1.5 * (shown[:, 0] < -14.9).mean()
+
+
+def test_the_order_of_a_cloud_changes_nothing(lidar: Model) -> None:
+    cloud = hall((1.0, 0.5, 1.5))
+    shuffled = replace(cloud, points=np.random.default_rng(0).permutation(cloud.points))
+    one, other = (geometry(c, lidar).surface.spread for c in (cloud, shuffled))
+    assert one is not None
+    assert other is not None
+    assert one.points.tobytes() == other.points.tobytes()
+    assert one.normals.tobytes() == other.normals.tobytes()
+
+
+def test_a_scan_that_sees_a_part_keeps_its_image_alone(lidar: Model) -> None:
+    surface = geometry(hall((1.0, 0.5, 1.5), half=1.0), lidar).surface
+    assert surface.spread is None
+    assert surface.fitted is surface
+
+
+def test_where_finer_pixels_fix_no_plane_the_image_helps() -> None:
+    p = CloudParameters(image_angle=0.025, maximum_range=60.0, gap_px=0)
+    rings = np.radians(np.arange(-15, 16, 1.5))
+    cloud = hall((1.0, 0.5, 1.5))
+    elevation = np.arctan2(cloud.points[:, 2], np.hypot(cloud.points[:, 0], cloud.points[:, 1]))
+    near = np.abs(elevation[:, None] - rings).min(axis=1) < 0.011
+    sparse = replace(cloud, points=cloud.points[near])
+    image = range_image(sparse, p)
+    assert spread_points(sparse, image, p).points.shape[1] >= int(image.valid.sum())
+
+
+def test_as_many_are_counted_as_of_a_depth_image(lidar: Model) -> None:
+    surface = geometry(hall((1.0, 0.5, 1.5)), lidar).surface
+    assert surface.spread is not None
+    n = surface.spread.points.shape[1]
+    assert len(sampled(surface, 5)) == pytest.approx(n / round(25 * n / 19_200), abs=1)
+    assert len(sampled(surface, 2)) == pytest.approx(n / 2, abs=1)
+    assert len(sampled(surface, 1)) == int(surface.valid.sum())
+    assert len(thinned(surface.spread, 100, 1.0).points[0]) <= 100
+
+
+def test_plans_are_of_the_points(lidar: Model) -> None:
+    surface = geometry(hall((1.0, 0.5, 1.5)), lidar).surface
+    plan = plan_of(surface, PlanParameters(cell=0.5, voxel=0.4))
+    assert surface.spread is not None
+    alone = plan_of(surface.spread, PlanParameters(cell=0.5, voxel=0.4))
+    np.testing.assert_array_equal(plan.points, alone.points)
+
+
+def test_refinement_works_on_the_points(lidar: Model) -> None:
+    """From the truth, 14 m apart, where the image alone is 2 cm off or more."""
+    places = (-7.0, -3.0, 1.5), (6.0, 2.0, 1.5)
+    a, b = (geometry(hall(at), lidar) for at in places)
+    T = np.eye(4)
+    T[:3, 3] = np.array(places[0]) - np.array(places[1])
+    fine = lidar.parameters.validation.alignment.fine
+    found = refined_at(a, b, T, fine)
+    assert found is not None
+    assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < 0.02
+    plain = [replace(one, surface=replace(one.surface, spread=None)) for one in (a, b)]
+    coarse = refined_at(plain[0], plain[1], T, fine)
+    off = math.inf if coarse is None else float(np.linalg.norm(coarse[:3, 3] - T[:3, 3]))
+    assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < off
