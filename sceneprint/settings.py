@@ -60,8 +60,8 @@ class Settings(BaseSettings):
     host: str = "127.0.0.1"
     #: Port of the service; 0 for a free one.
     port: int = Field(default=8008, ge=0, le=65535)
-    #: Worker processes that sign frames.
-    workers: int = Field(default_factory=lambda: max((os.cpu_count() or 1) - 1, 1), ge=0, le=256)
+    #: Worker processes that sign frames; they give way to requests.
+    workers: int = Field(default_factory=lambda: os.cpu_count() or 1, ge=0, le=256)
     #: Uploads and queries that are worked on at once; more wait.
     concurrency: int = Field(default_factory=lambda: max(os.cpu_count() or 1, 2), ge=1, le=256)
     #: Cores that the queries of a service process share; one that finds a core free is faster.

@@ -56,7 +56,7 @@ def add_workers_option(command: argparse.ArgumentParser) -> None:
         "--workers",
         type=whole_number,
         metavar="N",
-        help="number of worker processes (default: processors - 1)",
+        help="number of worker processes (default: processors)",
     )
 
 
