@@ -230,13 +230,17 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     ------
     UnusableStore, NewerSchema : the store cannot be opened, or the address not listened on.
     """
-    read_only = _require_store(settings)
+    listening = listen(settings)  # first: where it is refused, no data folder is made
+    try:
+        read_only = _require_store(settings)
+    except BaseException:
+        listening.close()
+        raise
     if read_only:
         log.warning(
             "the store is read-only: queries work, but nothing is stored or signed",
             extra={"data": str(settings.data_dir)},
         )
-    listening = listen(settings)
     host, port = listening.getsockname()[:2]
     url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
     app = Front(settings, lambda: _load(settings), lambda: server.handle_exit(signal.SIGTERM, None))

@@ -144,9 +144,10 @@ def test_what_cannot_be_set_is_refused_in_one_line(begin, arguments, text):
     assert text in refusal(begin, *arguments)
 
 
-def test_a_port_that_is_taken_is_refused_in_one_line(begin, served):
+def test_a_port_that_is_taken_is_refused_in_one_line(begin, served, tmp_path):
     port = served.url.rpartition(":")[2]
-    line = refusal(begin, "--port", port)
+    line = refusal(begin, "--port", port, folder=tmp_path / "new")
+    assert not (tmp_path / "new").exists()
     assert line == (
         f"sceneprint serve: 127.0.0.1:{port} is not available (Address already in use). "
         "Choose another --port, 0 for a free one, or stop the process that uses it."
