@@ -73,6 +73,7 @@ class Tracker:
         self._client, self._map, self._camera = client, map_name, camera
         self._core = TrackerCore(parameters)
         self._lock = RLock()
+        self.epoch = 0  #: how often it was reset
         self._log = log
         self._write({"parameters": asdict(self._core.parameters)})
 
@@ -97,29 +98,47 @@ class Tracker:
             error: the state goes on by odometry.
         """
         stamp = time.time() if stamp is None else stamp
-        observation = self.ask(frame, odom_pose, up, meta=meta)
-        return self.take(stamp, odom_pose, observation)
+        return self.answer(frame, odom_pose, up, stamp, meta, self.epoch)
 
     def move(self, odom_pose: NDArray[Any], stamp: float | None = None) -> State:
         """The state by odometry alone, between frames."""
         stamp = time.time() if stamp is None else stamp
         with self._lock:
+            state = self._core.move(stamp, np.asarray(odom_pose, np.float64))
             self._write({"stamp": stamp, "odometry": _listed(odom_pose)})
-            return self._core.move(stamp, np.asarray(odom_pose, np.float64))
+            return state
 
     def reset(self, reason: str = "it was reset") -> State:
-        """Forget the place: after a lift or a ride, which odometry does not see."""
+        """Forget the place: after a lift or a ride, which odometry does not see. Clock and odometry
+        may begin anew; answers to frames from before are not used.
+        """
         with self._lock:
+            self.epoch += 1
             self._write({"reset": reason})
             return self._core.reset(reason)
 
-    def ask(
-        self, frame: FrameInput, odom_pose: NDArray[Any], up: Sequence[float] | None = None,
-        *, meta: MetaInput | None = None,
-    ) -> Observation:  # fmt: skip
-        """What the service says of a frame, which `take` brings into the state."""
+    def answer(
+        self, frame: FrameInput, odom_pose: NDArray[Any], up: Sequence[float] | None,
+        stamp: float, meta: MetaInput | None, epoch: int,
+    ) -> State:  # fmt: skip
+        """As `update`; an answer to a frame of an `epoch` before the last reset is not used."""
+        T_odom_sensor = np.asarray(odom_pose, np.float64)
         with self._lock:
-            prior = self._core.prior(np.asarray(odom_pose, np.float64))
+            prior = self._core.prior(T_odom_sensor)
+        observation = self._observe(frame, up, meta, prior)
+        with self._lock:
+            if epoch != self.epoch:
+                return self._core.state()
+            state = self._core.update(stamp, T_odom_sensor, observation)
+            line = {"stamp": stamp, "odometry": _listed(odom_pose)}
+            self._write({**line, "observation": _observation_json(observation)})
+            return state
+
+    def _observe(
+        self, frame: FrameInput, up: Sequence[float] | None, meta: MetaInput | None,
+        prior: PoseEvidence | None,
+    ) -> Observation:  # fmt: skip
+        """What the service says of a frame."""
         try:
             answer = self._client.localize(
                 self._map, frame, self._camera if meta is None else meta, up=up, keep=False,
@@ -134,13 +153,6 @@ class Tracker:
                 raise
             return Observation("unanswered", reason=f"no answer: {error}")
         return observation_of(answer)
-
-    def take(self, stamp: float, odom_pose: NDArray[Any], observation: Observation) -> State:
-        """The state after what `ask` gave, in the order of the frames."""
-        with self._lock:
-            line = {"stamp": stamp, "odometry": _listed(odom_pose)}
-            self._write({**line, "observation": _observation_json(observation)})
-            return self._core.update(stamp, np.asarray(odom_pose, np.float64), observation)
 
     def _write(self, line: dict[str, Any]) -> None:
         if self._log is not None:
@@ -179,6 +191,7 @@ class AsyncTracker:
         SceneprintError : an earlier frame, or the map, cannot be used.
         """
         stamp = time.time() if stamp is None else stamp
+        epoch = self._tracker.epoch
         state = self._tracker.move(odom_pose, stamp)
         with self._changed:
             if self._error is not None:
@@ -187,6 +200,7 @@ class AsyncTracker:
             self.dropped += self._waiting is not None
             self._waiting = {
                 "frame": frame, "odom_pose": odom_pose, "up": up, "stamp": stamp, "meta": meta,
+                "epoch": epoch,
             }  # fmt: skip
             self._changed.notify_all()
         return state
@@ -224,7 +238,7 @@ class AsyncTracker:
                     return
                 asked, self._waiting, self._busy = self._waiting, None, True
             try:
-                self._tracker.update(**asked)
+                self._tracker.answer(**asked)
             except Exception as error:
                 with self._changed:
                     self._error = error

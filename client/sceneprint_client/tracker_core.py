@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint_client.api import Localization
+from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.sidecars import rigid_transform
 
 Array = NDArray[np.float64]
@@ -215,6 +216,7 @@ class TrackerCore:
         self._belief: _Belief | None = None
         self._against: list[tuple[int, _Mark, float]] = []
         self._answers = 0
+        self._stamp = 0.0
         self._verdict: tuple[TrackerStatus, str] = ("lost", "nothing was seen yet")
 
     def move(self, stamp: float, T_odom_sensor: Array) -> State:
@@ -222,7 +224,7 @@ class TrackerCore:
         mark = self._mark(stamp, rigid_transform(T_odom_sensor))
         if self._belief is not None:
             self._verdict = self._tracked(mark)
-        return self._state()
+        return self.state()
 
     def update(self, stamp: float, T_odom_sensor: Array, observation: Observation) -> State:
         """The state after an answer.
@@ -236,12 +238,17 @@ class TrackerCore:
         Returns
         -------
         state : of the latest odometry
+
+        Raises
+        ------
+        InvalidPose : the odometry is no rigid transform.
+        InvalidRequest : stamps do not rise.
         """
         mark = self._mark(stamp, rigid_transform(T_odom_sensor))
         if observation.status == "unanswered":
             status, reason = self._verdict[0], observation.reason
             self._verdict = self._tracked(self._marks[-1]) if self._belief else (status, reason)
-            return self._state()
+            return self.state()
         self._answers += 1
         self._vote(mark, observation)
         if self._belief is None:
@@ -249,14 +256,30 @@ class TrackerCore:
         else:
             self._compare(mark, observation)
             self._verdict = self._tracked(self._marks[-1])
-        return self._state()
+        return self.state()
 
     def reset(self, reason: str = "it was reset") -> State:
-        """Forget the place: after a lift, or when the robot was carried and knows it."""
+        """Forget the place: after a lift, or when the robot was carried and knows it; clock and
+        odometry may begin anew. An answer to a frame from before is not to be given any more.
+        """
         self._forget()
         self._votes.clear()
+        self._stamp = self.state().stamp
+        self._marks.clear()
         self._verdict = ("lost", reason)
-        return self._state()
+        return self.state()
+
+    def state(self) -> State:
+        """The state as it is."""
+        status, reason = self._verdict
+        stamp = self._marks[-1].stamp if self._marks else self._stamp
+        belief = self._belief
+        if belief is None:
+            return State(status, stamp, None, None, None, None, None, reason)
+        T, P = self._predicted(self._marks[-1])
+        T_map_odom = rigid_transform(belief.T_map_sensor @ inverse(belief.mark.T_odom_sensor))
+        age = stamp - belief.confirmed
+        return State(status, stamp, belief.parent_frame, T_map_odom, T, P, age, reason)
 
     def prior(self, T_odom_sensor: Array) -> PoseEvidence | None:
         """What the next question should say of the pose; None where it is to be asked alone."""
@@ -272,7 +295,14 @@ class TrackerCore:
         """The place of a frame; the way to it is measured where it is new."""
         if self._marks and stamp <= self._marks[-1].stamp:
             at = bisect_right([one.stamp for one in self._marks], stamp) - 1
-            return replace(self._marks[max(at, 0)], stamp=stamp, T_odom_sensor=T)
+            known = self._marks[max(at, 0)]
+            if known.stamp != stamp or not np.allclose(known.T_odom_sensor, T, atol=1e-6):
+                raise InvalidRequest(
+                    f"The stamp {stamp} is not after {self._marks[-1].stamp}, that of the last "
+                    "odometry. Give stamps that rise; reset the tracker where the clock jumped.",
+                    (("stamp", "not after the last"),),
+                )
+            return known
         mark = replace(self._ahead(T), stamp=stamp)
         self._marks.append(mark)
         return mark
@@ -318,13 +348,12 @@ class TrackerCore:
         """Forget the other votes."""
         if all(map(wanted, self._votes)):
             return
-        places = {old: old for old, vote in enumerate(self._votes) if wanted(vote)}
-        places = {old: new for new, old in enumerate(places)}
+        kept = [old for old, vote in enumerate(self._votes) if wanted(vote)]
+        place = {old: new for new, old in enumerate(kept)}
         self._votes = [
-            replace(self._votes[old], friends={places[f] for f in self._votes[old].friends
-                                               if f in places})
-            for old in places
-        ]  # fmt: skip
+            replace(one, friends={place[friend] for friend in one.friends if friend in place})
+            for one in map(self._votes.__getitem__, kept)
+        ]
 
     def _agree(self, older: _Vote, newer: _Vote) -> bool:
         """Whether two votes are one place: the older one carried to the newer by odometry."""
@@ -416,9 +445,8 @@ class TrackerCore:
             return False
         step, turn = difference(T, pose.T_map_sensor)
         gate = self.parameters.gate_m + 2 * _deviation(P[:3, :3])
-        return step <= gate and turn <= math.radians(self.parameters.gate_deg) + 2 * _deviation(
-            P[3:, 3:]
-        )
+        gate_rad = math.radians(self.parameters.gate_deg) + 2 * _deviation(P[3:, 3:])
+        return step <= gate and turn <= gate_rad
 
     def _compare(self, mark: _Mark, observation: Observation) -> None:
         """Correct the belief by an answer that agrees; note one that does not."""
@@ -508,17 +536,6 @@ class TrackerCore:
         self._belief = None
         self._against.clear()
 
-    def _state(self) -> State:
-        status, reason = self._verdict
-        stamp = self._marks[-1].stamp if self._marks else 0.0
-        belief = self._belief
-        if belief is None:
-            return State(status, stamp, None, None, None, None, None, reason)
-        T, P = self._predicted(self._marks[-1])
-        T_map_odom = rigid_transform(belief.T_map_sensor @ inverse(belief.mark.T_odom_sensor))
-        age = stamp - belief.confirmed
-        return State(status, stamp, belief.parent_frame, T_map_odom, T, P, age, reason)
-
 
 # Rigid transforms.
 
@@ -556,9 +573,9 @@ def rotation_matrix(vector: Array) -> Array:
     x, y, z = vector
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = float(np.linalg.norm(vector))
-    if angle < 1e-9:
-        return np.eye(3) + K
-    sine, cosine = math.sin(angle) / angle, (1 - math.cos(angle)) / angle**2
+    sine, cosine = 1.0, 0.5
+    if angle > 1e-9:
+        sine, cosine = math.sin(angle) / angle, (1 - math.cos(angle)) / angle**2
     return np.asarray(np.eye(3) + sine * K + cosine * K @ K, np.float64)
 
 

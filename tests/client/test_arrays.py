@@ -12,9 +12,9 @@ from sceneprint.errors import InvalidIntrinsics, InvalidRequest, UnreadableCloud
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.types import DepthFrame
 from sceneprint_client import Client
-from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose
+from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, Prior
 from sceneprint_client.api.base import checked
-from sceneprint_client.frame_files import sendable
+from sceneprint_client.frame_files import camera_of, sendable
 
 QUARTER = 0.5**0.5
 CAMERA = CameraIntrinsics(width=4, height=3, fx=5, fy=6, cx=1.5, cy=1)
@@ -113,6 +113,34 @@ def test_a_path_string_and_arrays_are_one_frame(
     assert compared.similarity == 1.0
 
 
+def test_the_pose_of_the_base_is_stored_as_that_of_the_sensor(
+    client: Client, map_name: str, room_frames: tuple[DepthFrame, ...]
+) -> None:
+    """The base stands at (1, 2, 0), turned by 90 degrees; the camera sits 0.2 m ahead, 0.5 m up."""
+    k = room_frames[0].intrinsics
+    camera = camera_of((k.fx, k.fy, k.cx, k.cy), (k.width, k.height))
+    turn = {"x": 0, "y": 0, "z": QUARTER, "w": QUARTER}
+    still = {"x": 0, "y": 0, "z": 0, "w": 1}
+    told = {
+        "intrinsics": camera.model_dump(),
+        "pose": {"position": {"x": 1, "y": 2, "z": 0}, "orientation": turn, "of": "base",
+                 "parent_frame": "odom"},
+        "T_base_sensor": {"translation": {"x": 0.2, "y": 0, "z": 0.5}, "rotation": still},
+    }  # fmt: skip
+    client.create_map(map_name, "base")
+    meta = FrameMeta.model_validate(told)
+    added = client.upload(map_name, room_frames[0].depth, meta, wait_s=30)
+    pose = client.frame(map_name, added.frame_id).pose
+    assert pose is not None
+    np.testing.assert_allclose(np.array(pose.matrix)[:3, 3], [1, 2.2, 0.5], atol=1e-12)
+    with pytest.raises(InvalidRequest, match="give T_base_sensor"):
+        checked(FrameMeta, "The frame", **{**told, "T_base_sensor": None})
+    with pytest.raises(InvalidRequest, match="pose of the sensor"):
+        checked(Prior, "The prior", pose=told["pose"])
+    with pytest.raises(InvalidRequest, match="that of the base"):
+        client.edit_frame(map_name, added.frame_id, {"pose": {"of": "base"}})
+
+
 def test_poses_as_ros_names_them() -> None:
     told = {"position": {"x": 1, "y": 2, "z": 3},
             "orientation": {"x": 0, "y": 0, "z": QUARTER, "w": QUARTER}}  # fmt: skip
@@ -120,7 +148,7 @@ def test_poses_as_ros_names_them() -> None:
     assert pose.translation is not None
     assert pose.rotation is not None
     assert (pose.translation.y, pose.rotation.w) == (2, QUARTER)
-    assert set(pose.model_dump(exclude_none=True)) == {"translation", "rotation", "parent_frame"}
+    assert set(pose.model_dump(exclude_defaults=True)) == {"translation", "rotation", "parent_frame"}
     for twice in ({**told, "translation": told["position"]}, {"position": told["position"]}):
         with pytest.raises(InvalidRequest):
             checked(GivenPose, "The pose", **twice)

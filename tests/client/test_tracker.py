@@ -8,12 +8,14 @@ import io
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from threading import Event
 from typing import Any
 
 import numpy as np
 import pytest
 
+from sceneprint.formats.dataset import find_sequences
 from sceneprint.lab.synth import corridor, render, synthesise_lookalike, synthesise_room
 from sceneprint.lab.synth.trajectories import pose as camera_pose
 from sceneprint.types import DepthFrame, Floats
@@ -168,6 +170,22 @@ def test_a_thread_asks_for_the_latest_frame_alone() -> None:
     assert equal(list(replay(log.getvalue().splitlines()))[-2], state)
 
 
+def test_an_answer_to_a_frame_from_before_a_reset_is_not_used() -> None:
+    client = fake(answer("found", 5.0))
+    client.may_answer.clear()
+    inner = Tracker(client, "m", camera=K)
+    with AsyncTracker(inner) as tracker:
+        tracker.submit("0", ahead(0), stamp=0.0)
+        assert client.begun.wait(60)
+        tracker.submit("1", ahead(1), stamp=1.0)
+        assert inner.reset("a lift").reason == "a lift"
+        client.may_answer.set()
+        assert tracker.wait(60)
+        assert tracker.submit("2", ahead(0), stamp=0.5).status == "lost"  # the clock began anew
+        assert tracker.wait(60)
+        assert tracker.submit("3", ahead(0), stamp=0.6).status == "tracking"
+
+
 def test_what_the_thread_meets_is_raised_by_the_next_submit() -> None:
     with AsyncTracker(Tracker(fake(errors.UnknownMap("no map")), "m", camera=K)) as tracker:
         tracker.submit(DEPTH, ahead(0), stamp=0.0)
@@ -288,10 +306,31 @@ def test_it_tracks_and_is_found_again_after_a_kidnapping(
 def test_it_tracks_through_a_building(
     building: Callable[[DepthFrame], Building], seed: int
 ) -> None:
-    rooms = [walked(seed, index, 120) for index in range(3)]
+    rooms = [walked(seed, index, 60) for index in range(3)]
     site = building(synthesise_room(seed, 0, 1).frames[0])
     site.fill([view for seen, _ in rooms for view in seen])
     check_kidnapping(site, [run for _, run in rooms])
+
+
+@pytest.mark.thorough
+def test_it_tracks_through_a_kitchen_that_was_recorded(
+    client: Client, map_name: str, data_root: Path
+) -> None:
+    frames = find_sequences(data_root / "7scenes" / "redkitchen")[0].frames
+    client.create_map(map_name, "a kitchen", model="depth")
+    client.wait([client.upload(map_name, one).job_id for one in frames[0:600:4]])
+    run = frames[650:1000:5]
+    truth = [one.pose for one in run if one.pose is not None]
+    assert len(truth) == len(run) == 70
+    tracker = Tracker(client, map_name)
+    right = []
+    for i, (frame, T) in enumerate(zip(run, drifted(truth, 0), strict=True)):
+        state = tracker.update(frame, T, stamp=i / 6)
+        if state.status == "tracking":
+            assert state.T_map_sensor is not None
+            assert difference(state.T_map_sensor, truth[i])[0] < 0.1
+        right.append(state.status == "tracking")
+    assert np.mean(right[right.index(True) :]) >= 0.99
 
 
 @pytest.mark.thorough

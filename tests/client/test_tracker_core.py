@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from sceneprint_client.errors import InvalidPose, InvalidRequest
 from sceneprint_client.tracker_core import (
     Observation,
     PoseEvidence,
@@ -254,6 +255,19 @@ def test_a_late_answer_counts_where_its_frame_was_taken() -> None:
     state = core.update(2, at(2), found(at(10, 22, 0, 90)))
     assert (state.stamp, state.age) == (4, 2)
     np.testing.assert_allclose(state.T_map_sensor, at(10, 24, 0, 90), atol=1e-12)
+
+
+def test_stamps_that_do_not_rise_are_refused() -> None:
+    core = tracking()
+    core.move(1.0, at(1))
+    core.move(1.0, at(1))  # the same once more
+    for stamp, T in ((1.0, at(2)), (0.5, at(1)), (-1.0, at(0))):
+        with pytest.raises(InvalidRequest, match=r"not after 1\.0"):
+            core.update(stamp, T, NOTHING)
+    with pytest.raises(InvalidPose):
+        core.move(2.0, at(math.nan))
+    assert core.reset("the clock jumped").stamp == 1.0
+    assert core.update(0.5, at(7), found(at(10, 27, 0, 90))).status == "tracking"
 
 
 def walk() -> list[tuple[float, np.ndarray, Observation]]:

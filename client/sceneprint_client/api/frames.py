@@ -104,6 +104,11 @@ class GivenPose(GivenTransform):
         default=None,
         description="Poses are combined within one parent frame; default: ROBOT/SESSION.",
     )
+    of: Literal["sensor", "base"] = Field(
+        default="sensor",
+        description="`base`, of an upload with `T_base_sensor`: the pose is T_parent_base, and is "
+        "stored as that of the sensor.",
+    )
 
 
 class GivenBase(GivenTransform):
@@ -177,6 +182,8 @@ class FrameMeta(Given):
     def _named_parent(self) -> FrameMeta:
         if self.pose is not None and self.pose.parent_frame is None and self.session is None:
             raise ValueError("pose: name its parent_frame, or the session it belongs to")
+        if self.pose is not None and self.pose.of == "base" and self.T_base_sensor is None:
+            raise ValueError("pose: of the base; give T_base_sensor, where the sensor sits on it")
         return self
 
 

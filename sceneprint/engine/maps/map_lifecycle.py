@@ -140,6 +140,11 @@ def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
     InvalidRequest, InvalidPose : see `edit_frame`.
     """
     meta = _merged(frame, patch)
+    if meta.pose is not None and meta.pose.of != "sensor":
+        raise errors.InvalidRequest(
+            "The edited pose is that of the base. Give that of the sensor, and leave `of` out.",
+            (("pose.of", "an edited pose is that of the sensor"),),
+        )
     pose = None if meta.pose is None else serializers.pose_matrix(meta.pose)
     known = columns(meta, pose, base_of(meta.T_base_sensor, viewpoint_of(frame)))
     found = {name: known[name] for field in patch for name in _COLUMNS[field]}
