@@ -297,7 +297,8 @@ FRAME_BODY: dict[str, Any] = {
                         "type": "string",
                         "format": "binary",
                         "description": "A depth image: 16-bit greyscale PNG in stored units (0 and "
-                        "65535 where missing), or a two-dimensional float NPY in metres. Or a "
+                        "65535 where missing), or a two-dimensional NPY: float in metres, or "
+                        "uint16 in stored units. Or a "
                         "point cloud: PLY, PCD, LAS, LAZ, NPY of shape (N, 3), or KITTI's .bin.",
                     },
                     "meta": {"$ref": "#/components/schemas/FrameMeta"},

@@ -39,6 +39,25 @@ def test_the_robot_maps_a_room_and_finds_itself(tmp_path: Path) -> None:
     assert (tmp_path / "robot" / "sceneprint.db").is_file()
 
 
+def test_a_robot_tracks_itself_and_notices_that_it_was_carried() -> None:
+    ran = subprocess.run(
+        [sys.executable, ROOT / "examples" / "tracked_drive.py"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    first, _, second = ran.stdout.partition("in room 1\n")
+    assert "  tracking: room-0" in first
+    statuses = [line.split(":")[0].strip() for line in second.splitlines()]
+    assert statuses[0] == "tracking"  # one answer never moves it
+    lost = statuses.index("lost")
+    assert lost <= 4  # 2 s at most
+    after = second.splitlines()[lost + 1 :]
+    assert all(line.startswith("  tracking: room-1") for line in after)
+    off = [int(one) for one in re.findall(r"(\d+) cm from the truth", first + "".join(after))]
+    assert len(off) > 8
+    assert max(off) < 10
+
+
 def test_every_example_is_listed() -> None:
     listed = (ROOT / "examples" / "README.md").read_text()
     for path in (ROOT / "examples").glob("*.py"):

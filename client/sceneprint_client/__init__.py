@@ -16,14 +16,27 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sceneprint_client.client import Client, Status
     from sceneprint_client.frame_files import FrameFile, meta_of
+    from sceneprint_client.tracker import AsyncTracker, State, Tracker
 
 __version__ = "0.2.0"
-__all__ = ["Client", "FrameFile", "Status", "__version__", "meta_of"]
+__all__ = [
+    "AsyncTracker",
+    "Client",
+    "FrameFile",
+    "State",
+    "Status",
+    "Tracker",
+    "__version__",
+    "meta_of",
+]
 
 _HOME = {
+    "AsyncTracker": "tracker",
     "Client": "client",
     "FrameFile": "frame_files",
+    "State": "tracker",
     "Status": "client",
+    "Tracker": "tracker",
     "meta_of": "frame_files",
 }
 

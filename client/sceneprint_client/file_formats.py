@@ -11,7 +11,7 @@ import re
 import struct
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -28,20 +28,23 @@ HEAD = 10_016
 
 NPY_SIGNATURE = b"\x93NUMPY"
 _MAXIMUM_HEADER = 10_000  #: bytes, as in numpy; a literal that long can still be parsed safely
-_TYPES = ("<f4", "<f8", "<f2", ">f4", ">f8", ">f2")
+_FLOATING = ("<f4", "<f8", "<f2", ">f4", ">f8", ">f2")
+_WHOLE = ("<u2", ">u2")
 
 
 @dataclass(frozen=True)
 class NpyHeader:
-    """What an NPY file says of itself: an array of two dimensions, floating."""
+    """What an NPY file says of itself: an array of two dimensions, floating or uint16."""
 
-    dtype: np.dtype[np.floating]
+    dtype: np.dtype[Any]
     shape: tuple[int, int]
     order: Literal["C", "F"]
     start: int  #: of its numbers, bytes
 
 
-def npy_header(data: bytes, error: type[FrameError], advice: str, shapes: str) -> NpyHeader:
+def npy_header(
+    data: bytes, error: type[FrameError], advice: str, shapes: str, *, whole: bool = False
+) -> NpyHeader:
     """The header of an NPY file of floating numbers in rows and columns.
 
     Parameters
@@ -50,13 +53,14 @@ def npy_header(data: bytes, error: type[FrameError], advice: str, shapes: str) -
     error : to raise
     advice : what to write instead of an array of another type; a sentence
     shapes : what to write instead of one of another shape; two sentences
+    whole : take uint16 too
 
     Raises
     ------
     error : it cannot be read, or is of another type or shape.
     """
     fields, start = _fields(data, error)
-    dtype = _dtype(fields["descr"], error, advice)
+    dtype = _dtype(fields["descr"], error, advice, _FLOATING + _WHOLE if whole else _FLOATING)
     shape = fields["shape"]
     if (
         not isinstance(shape, tuple)
@@ -91,14 +95,16 @@ def _fields(data: bytes, error: type[FrameError]) -> tuple[dict[str, object], in
     return header, start
 
 
-def _dtype(described: object, error: type[FrameError], advice: str) -> np.dtype[np.floating]:
+def _dtype(
+    described: object, error: type[FrameError], advice: str, types: tuple[str, ...]
+) -> np.dtype[Any]:
     if described == "|O":
         raise error(
             "The NPY file holds pickled Python objects, which could run code. "
             "Write a plain float32 array in metres."
         )
     # compared, not parsed: np.dtype would take almost anything
-    if not isinstance(described, str) or described not in _TYPES:
+    if not isinstance(described, str) or described not in types:
         raise error(
             f"The NPY file holds {described if isinstance(described, str) else 'records'!r:.40}, "
             f"and {advice}"

@@ -1,24 +1,32 @@
-"""A frame in a file: what it is, what is known of it, and what is sent of it.
+"""A frame in a file or in an array: what it is, what is known of it, and what is sent of it.
 
 Path  --find_frame_file-->  FrameFile  --meta_of-->  FrameMeta
-bytes | Path | FrameFile  --sendable-->  bytes, FrameMeta
+bytes | path | FrameFile | array  --sendable-->  bytes, FrameMeta
+array, camera  --array_sendable-->  bytes (NPY), FrameMeta
 """
 
 from __future__ import annotations
 
+import io
+import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint_client.api.base import GivenDirection, checked
 from sceneprint_client.api.frames import CameraIntrinsics, FrameMeta, GivenBase, GivenPose
-from sceneprint_client.errors import DatasetError, UnreadableCloud, UnreadableFrame
+from sceneprint_client.errors import (
+    DatasetError,
+    InvalidIntrinsics,
+    UnreadableCloud,
+    UnreadableFrame,
+)
 from sceneprint_client.file_formats import (
     HEAD,
     MAXIMUM_CLOUD_BYTES,
@@ -37,6 +45,9 @@ from sceneprint_client.sidecars import (
     find_cloud_source,
     read_pose,
 )
+
+if TYPE_CHECKING:
+    from sceneprint_client.requests import FrameInput, MetaInput
 
 #: A depth image of the 7-Scenes layout, whose pose lies beside it.
 SEVEN_SCENES = re.compile(r"frame-\d+\.depth\.png", re.ASCII)
@@ -227,7 +238,7 @@ def _of_cloud(reference: FrameFile) -> dict[str, Any]:
 
 
 def sendable(
-    frame: bytes | Path | FrameFile, meta: FrameMeta | None, *, with_pose: bool,
+    frame: FrameInput, meta: MetaInput | None, *, with_pose: bool,
     up: Sequence[float] | None = None,
 ) -> tuple[bytes, FrameMeta]:  # fmt: skip
     """Bytes of a frame and what is known of it; a path's camera is looked for beside it.
@@ -236,25 +247,142 @@ def sendable(
 
     Raises
     ------
-    UnreadableFrame, UnreadableCloud : the file cannot be read.
+    UnreadableFrame, UnreadableCloud : the file cannot be read, or the array is neither depth nor
+        points.
     DatasetError : there is no intrinsics.json beside a depth image or above, or it is a folder.
-    InvalidIntrinsics, InvalidPose : what is beside it is none.
-    TypeError : bytes without metadata, and of no point cloud.
+    InvalidIntrinsics, InvalidPose : what is given or lies beside it is none.
+    TypeError : bytes without metadata, and of no point cloud; or no frame at all.
     """
-    if meta is not None and up is not None:
-        meta = meta.model_copy(update={"up": _direction(up)})
+    if isinstance(frame, np.ndarray):
+        return array_sendable(frame, meta, up=up)
+    known = _meta_without_array(meta)
+    if known is not None and up is not None:
+        known = known.model_copy(update={"up": _direction(up)})
     if isinstance(frame, bytes):
-        if meta is None and format_of(frame) is None:
+        if known is None and format_of(frame) is None:
             raise TypeError("the bytes of a depth image need its `meta`, at least the intrinsics")
-        return frame, meta or FrameMeta(up=_direction(up))
+        return frame, known or FrameMeta(up=_direction(up))
     if isinstance(frame, FrameFile):
         found = frame
-    elif meta is not None:
-        return _read(frame, is_cloud=meta.intrinsics is None), meta
+    elif not isinstance(frame, str | os.PathLike):
+        raise TypeError(
+            f"a frame is a path, the bytes of a file, a FrameFile or a numpy array, not "
+            f"{type(frame).__name__}"
+        )
+    elif known is not None:
+        return _read(Path(frame), is_cloud=known.intrinsics is None), known
     else:
-        found = _named(frame)
+        found = _named(Path(frame))
     data = _read(found.path, is_cloud=found.kind == "cloud")
-    return data, meta_of(found, with_pose=with_pose, up=up) if meta is None else meta
+    return data, meta_of(found, with_pose=with_pose, up=up) if known is None else known
+
+
+def _meta_without_array(meta: MetaInput | None) -> FrameMeta | None:
+    """What is known of a frame whose size no array tells; TypeError for four numbers alone."""
+    if meta is None or isinstance(meta, FrameMeta):
+        return meta
+    if isinstance(meta, CameraIntrinsics):
+        return FrameMeta(intrinsics=meta)
+    raise TypeError(
+        "a camera matrix does not say how large the image of a file is; give CameraIntrinsics or "
+        "FrameMeta"
+    )
+
+
+def array_sendable(
+    array: NDArray[Any], meta: MetaInput | None, *, up: Sequence[float] | None = None
+) -> tuple[bytes, FrameMeta]:
+    """An array as NPY, and what is known of it: with a camera it is depth, else points.
+
+    Parameters
+    ----------
+    array : (H, W) depth, uint16 in stored units (`depth_scale` to a metre, 1000 unless `meta` says
+        otherwise) or floating in metres; without a camera (N, 3) or (N, 4) floating points
+    meta : FrameMeta, or the camera: CameraIntrinsics, (3, 3) matrix, or (fx, fy, cx, cy), pixels
+    up : as for `sendable`
+
+    Raises
+    ------
+    UnreadableFrame, UnreadableCloud : another shape or type.
+    InvalidIntrinsics : no camera.
+    """
+    size = (array.shape[1], array.shape[0]) if array.ndim == 2 else None
+    if meta is None or isinstance(meta, FrameMeta):
+        known = meta or FrameMeta()
+    else:
+        known = FrameMeta(intrinsics=camera_of(meta, size or (1, 1)))
+    if up is not None:
+        known = known.model_copy(update={"up": _direction(up)})
+    if known.intrinsics is None:
+        return _npy(_checked_points(array)), known
+    if size is None or not array.size or array.dtype.kind + str(array.dtype.itemsize) not in _DEPTH:
+        raise UnreadableFrame(
+            f"The array has shape {array.shape} and type {array.dtype}, and depth is (H, W), "
+            "uint16 in stored units or float32 in metres. Convert it."
+        )
+    return _npy(array), known
+
+
+#: Types of depth images: kind and bytes.
+_DEPTH = ("u2", "f2", "f4", "f8")
+
+
+def _checked_points(array: NDArray[Any]) -> NDArray[Any]:
+    """An array of points; UnreadableFrame for what is depth without its camera."""
+    if array.ndim == 2 and array.shape[1] in (3, 4) and array.dtype.kind == "f":
+        if array.dtype.itemsize in (2, 4, 8):
+            return array
+    elif array.ndim == 2 and array.shape[1] not in (3, 4):
+        raise UnreadableFrame(
+            f"The array has shape {array.shape} and no camera. If it is a depth image, give its "
+            "camera: CameraIntrinsics, a 3 x 3 matrix, or (fx, fy, cx, cy). Points are (N, 3)."
+        )
+    raise UnreadableCloud(
+        f"The array has shape {array.shape} and type {array.dtype}, and points are (N, 3), "
+        "float32 or float64 in metres. Convert it."
+    )
+
+
+def camera_of(
+    camera: CameraIntrinsics | Sequence[float] | NDArray[Any], size: tuple[int, int]
+) -> CameraIntrinsics:
+    """The camera of an image of a size (width, height).
+
+    Parameters
+    ----------
+    camera : CameraIntrinsics as it is, a (3, 3) matrix without skew, or (fx, fy, cx, cy), pixels
+    size : width and height, pixels
+
+    Raises
+    ------
+    InvalidIntrinsics : none of these.
+    """
+    if isinstance(camera, CameraIntrinsics):
+        return camera
+    try:
+        K = np.asarray(camera, np.float64)
+    except (TypeError, ValueError):
+        K = np.zeros(0)
+    if K.shape == (3, 3) and np.array_equal(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], (0, 0, 0, 0, 1)):
+        K = K[[0, 1, 0, 1], [0, 1, 2, 2]]
+    if K.shape != (4,) or not np.isfinite(K).all() or not (K[:2] > 0).all():
+        raise InvalidIntrinsics(
+            "The camera is none. Give CameraIntrinsics, a matrix [[fx, 0, cx], [0, fy, cy], "
+            "[0, 0, 1]], or (fx, fy, cx, cy), in pixels."
+        )
+    fx, fy, cx, cy = K.tolist()
+    width, height = size
+    return checked(
+        CameraIntrinsics, "The camera", width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy
+    )
+
+
+def _npy(array: NDArray[Any]) -> bytes:
+    """An NPY file. It is not compressed: to compress takes longer than to send."""
+    file = io.BytesIO()
+    compact = array.astype(np.float32) if array.dtype.itemsize == 8 else array
+    np.save(file, np.ascontiguousarray(compact), allow_pickle=False)
+    return file.getvalue()
 
 
 def _named(path: Path) -> FrameFile:

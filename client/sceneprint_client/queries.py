@@ -5,13 +5,11 @@ their answers rest on.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint_client.api import (
     Answer,
     Comparison,
-    FrameMeta,
     Localization,
     NamedFrame,
     Query,
@@ -50,7 +48,7 @@ from sceneprint_client.requests import (
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from sceneprint_client.frame_files import FrameFile
+    from sceneprint_client.requests import FrameInput, MetaInput
 
 #: Most frames of a ranking that are compared with each other.
 _MOST_ALIKE = 200
@@ -60,8 +58,8 @@ class QueryMethods(ServiceConnection):
     """Queries, and what can be looked at after one."""
 
     def query(
-        self, map_name: str | None = None, frame: bytes | Path | FrameFile | None = None,
-        meta: FrameMeta | None = None, *, frame_id: str | None = None,
+        self, map_name: str | None = None, frame: FrameInput | None = None,
+        meta: MetaInput | None = None, *, frame_id: str | None = None,
         maps: str | Iterable[str] | None = None, up: Sequence[float] | None = None,
         **how: Unpack[QueryOptions],
     ) -> Answer:  # fmt: skip
@@ -105,8 +103,8 @@ class QueryMethods(ServiceConnection):
         return self._ask(Answer, "POST", "/v1/queries", **request)
 
     def localize(
-        self, map_name: str, frame: bytes | Path | FrameFile | None = None,
-        meta: FrameMeta | None = None, *, frame_id: str | None = None,
+        self, map_name: str, frame: FrameInput | None = None,
+        meta: MetaInput | None = None, *, frame_id: str | None = None,
         up: Sequence[float] | None = None, **how: Unpack[QueryOptions],
     ) -> Localization:  # fmt: skip
         """Where in a map was this frame taken? One status and one pose; see `query`."""
@@ -115,8 +113,8 @@ class QueryMethods(ServiceConnection):
         return self._ask(Localization, "POST", f"{map_path(name)}/localize", **request)
 
     def localize_sequence(
-        self, map_name: str, frames: Sequence[bytes | Path | FrameFile],
-        metas: Sequence[FrameMeta] | None = None, **how: Unpack[QueryOptions],
+        self, map_name: str, frames: Sequence[FrameInput],
+        metas: Sequence[MetaInput] | None = None, **how: Unpack[QueryOptions],
     ) -> Localization:  # fmt: skip
         """Where in a map was the last of these frames taken? The earlier ones vote for it too.
 
@@ -143,9 +141,9 @@ class QueryMethods(ServiceConnection):
         return self._ask(Localization, "POST", f"{map_path(map_name)}/localize/sequence", **request)
 
     def similarity(
-        self, a: bytes | Path | FrameFile | NamedFrame | tuple[str, str],
-        b: bytes | Path | FrameFile | NamedFrame | tuple[str, str],
-        meta_a: FrameMeta | None = None, meta_b: FrameMeta | None = None, *, validate: bool = True,
+        self, a: FrameInput | NamedFrame | tuple[str, str],
+        b: FrameInput | NamedFrame | tuple[str, str],
+        meta_a: MetaInput | None = None, meta_b: MetaInput | None = None, *, validate: bool = True,
         validation: ValidationOptions | dict[str, Any] | None = None, seed: int = 0,
         model: str | None = None,
     ) -> Similarity:  # fmt: skip

@@ -9,10 +9,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Sequence
-from pathlib import Path
+from os import PathLike
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from sceneprint_client.api import (
+    CameraIntrinsics,
     Diversity,
     Filter,
     FrameMeta,
@@ -33,7 +34,17 @@ from sceneprint_client.errors import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from sceneprint_client.frame_files import FrameFile
+
+    #: A frame at hand: the content of a file, a path, a frame of `find_sequences`, or an array:
+    #: (H, W) depth, uint16 in stored units or floating in metres; (N, 3) floating points.
+    FrameInput = bytes | str | PathLike[str] | FrameFile | NDArray[np.generic]
+    #: What is known of a frame; or its camera alone, of an array also as (3, 3) matrix or as
+    #: (fx, fy, cx, cy), pixels.
+    MetaInput = FrameMeta | CameraIntrinsics | Sequence[float] | NDArray[np.generic]
 
 #: A frame that is stored, or one at hand: its bytes and what is known of it.
 QueryFrame = NamedFrame | tuple[bytes, FrameMeta]
@@ -45,7 +56,7 @@ def given(**parameters: Any) -> dict[str, Any]:
 
 
 def frame_bytes(
-    frame: bytes | Path | FrameFile, meta: FrameMeta | None, *, with_pose: bool,
+    frame: FrameInput, meta: MetaInput | None, *, with_pose: bool,
     up: Sequence[float] | None = None,
 ) -> tuple[bytes, FrameMeta]:  # fmt: skip
     """Bytes of a frame and what is known of it; see `frame_files.sendable`."""
@@ -62,9 +73,7 @@ def frame_form(data: bytes, meta: FrameMeta) -> dict[str, Any]:
     }
 
 
-def frames_form(
-    frames: Sequence[bytes | Path | FrameFile], metas: Sequence[FrameMeta | None]
-) -> dict[str, Any]:
+def frames_form(frames: Sequence[FrameInput], metas: Sequence[MetaInput | None]) -> dict[str, Any]:
     """Arguments of a request that sends several frames with their poses; see `frame_bytes`."""
     sent = [frame_bytes(*one, with_pose=True) for one in zip(frames, metas, strict=True)]
     return {
@@ -158,7 +167,7 @@ def query_of(kind: type[Any], how: QueryOptions, **more: Any) -> Any:
 
 
 def named_or_sent(
-    map_name: str | None, frame: bytes | Path | FrameFile | None, meta: FrameMeta | None,
+    map_name: str | None, frame: FrameInput | None, meta: MetaInput | None,
     frame_id: str | None, up: Sequence[float] | None = None,
 ) -> tuple[str, QueryFrame]:  # fmt: skip
     """The frame that is asked for, of the map that it is asked of."""
@@ -174,7 +183,7 @@ def named_or_sent(
 
 
 def compared_frame(
-    frame: bytes | Path | FrameFile | NamedFrame | tuple[str, str], meta: FrameMeta | None
+    frame: FrameInput | NamedFrame | tuple[str, str], meta: MetaInput | None
 ) -> QueryFrame:
     """One of two frames to compare."""
     if isinstance(frame, tuple):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sceneprint_client.api import Added, Frame, FrameMeta, FrameState
@@ -22,7 +21,7 @@ from sceneprint_client.jobs import growing_pauses
 from sceneprint_client.requests import frame_bytes, frame_form, frame_path, frames_form, map_path
 
 if TYPE_CHECKING:
-    from sceneprint_client.frame_files import FrameFile
+    from sceneprint_client.requests import FrameInput, MetaInput
 
 #: Longest time the service is asked to wait for a worker, seconds.
 _LONGEST_WAIT_S = 60
@@ -32,7 +31,7 @@ class UploadMethods(ServiceConnection):
     """How frames come into a map."""
 
     def upload(
-        self, map_name: str, frame: bytes | Path | FrameFile, meta: FrameMeta | None = None,
+        self, map_name: str, frame: FrameInput, meta: MetaInput | None = None,
         *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> Added:  # fmt: skip
@@ -41,8 +40,11 @@ class UploadMethods(ServiceConnection):
         Parameters
         ----------
         map_name : of the map
-        frame : content of a PNG or NPY file or of a cloud, the file, or a frame of `find_sequences`
-        meta : what is known of it; default: what `meta_of` finds
+        frame : a path, the content of a PNG or NPY file or of a cloud, a frame of
+            `find_sequences`, or an array: (H, W) depth, uint16 in stored units or floating in
+            metres, or (N, 3) points
+        meta : what is known of it; default: what `meta_of` finds. Or its camera alone:
+            CameraIntrinsics, and of an array a (3, 3) matrix or (fx, fy, cx, cy)
         wait_s : seconds to wait until it is signed; default: none
         priority : from -10 to 10; frames of a greater one are signed first
         if_novel : keep it only if the map lacks the place: if its nearest frame is farther than
@@ -68,7 +70,7 @@ class UploadMethods(ServiceConnection):
         return self._settled(map_name, added, until)
 
     def add(
-        self, map_name: str, frame: bytes | Path | FrameFile, meta: FrameMeta | None = None,
+        self, map_name: str, frame: FrameInput, meta: MetaInput | None = None,
         *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> tuple[Added, bool]:  # fmt: skip
@@ -82,8 +84,8 @@ class UploadMethods(ServiceConnection):
         )  # fmt: skip
 
     def put_frame(
-        self, map_name: str, frame_id: str, frame: bytes | Path | FrameFile,
-        meta: FrameMeta | None = None, *, wait_s: float | None = None, priority: int = 0,
+        self, map_name: str, frame_id: str, frame: FrameInput,
+        meta: MetaInput | None = None, *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> Added:  # fmt: skip
         """Take a frame into a map under an id of your own; sent again, it is the one there.
@@ -110,8 +112,8 @@ class UploadMethods(ServiceConnection):
         return self._settled(map_name, added, until)
 
     def upload_batch(
-        self, map_name: str, frames: Sequence[bytes | Path | FrameFile],
-        metas: Sequence[FrameMeta] | FrameMeta | None = None, *, priority: int = 0,
+        self, map_name: str, frames: Sequence[FrameInput],
+        metas: Sequence[MetaInput] | FrameMeta | None = None, *, priority: int = 0,
         if_novel: float | bool | None = None,
     ) -> list[BatchItem]:  # fmt: skip
         """Take up to 64 frames into a map in one commit; what is wrong with one costs no other.
@@ -146,7 +148,7 @@ class UploadMethods(ServiceConnection):
         return self._ask(Batch, "POST", f"{map_path(map_name)}/frames/batch", **request).items
 
     def _upload(
-        self, method: str, path: str, frame: bytes | Path | FrameFile, meta: FrameMeta | None,
+        self, method: str, path: str, frame: FrameInput, meta: MetaInput | None,
         wait_s: float, fields: dict[str, str], up: Sequence[float] | None,
     ) -> tuple[Added, bool]:  # fmt: skip
         """Send a frame; the service does not wait for one it had already."""

@@ -43,6 +43,17 @@ def test_npy(order: str, dtype: str) -> None:
     decoded[:] = 0  # and one's own
 
 
+@pytest.mark.parametrize("dtype", ["<u2", ">u2"])
+def test_npy_of_stored_units_is_read_as_a_png(dtype: str) -> None:
+    array = np.array([[0, 1500, 65535], [2000, 1, 4]], dtype)
+    decoded = decode_npy(npy(array))
+    assert decoded.dtype == np.uint16
+    decoded[:] = decoded  # one's own
+    camera = Intrinsics(3, 2, 5.0, 5.0, 1.0, 0.5)
+    depth = make_frame(decoded, camera, depth_scale=1000.0).depth
+    np.testing.assert_allclose(depth, [[0, 1.5, 0], [2, 0.001, 0.004]], rtol=1e-6)
+
+
 def test_npy_of_later_versions() -> None:
     data = np.array([[1, 2]], "<f4").tobytes()
     header = "{'descr': '<f4', 'fortran_order': False, 'shape': (1, 2), }\n"
@@ -61,7 +72,8 @@ BAD_NPY = {
     "endless header": (
         b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + b" " * 99_999, "announces 4294967295",
     ),
-    "whole numbers": (npy(np.ones((3, 4), np.uint16)), "'<u2'.* 16-bit PNG"),
+    "signed numbers": (npy(np.ones((3, 4), np.int16)), "'<i2'.* uint16 in stored units"),
+    "bytes": (npy(np.ones((3, 4), np.uint8)), "uint16 in stored units"),
     "complex": (npy(np.ones((3, 4), complex)), "'<c16'"),
     "long double": (npy(np.ones((3, 4), np.longdouble)), "Convert it"),
     "text": (npy(np.array([["a", "b"]])), "'<U1'"),

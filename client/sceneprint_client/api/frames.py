@@ -68,12 +68,28 @@ class GivenQuaternion(GivenVector):
     w: float
 
 
+#: What ROS calls the parts of a pose, and what we do.
+ROS_NAMES = {"position": "translation", "orientation": "rotation"}
+
+
 class GivenTransform(Given):
     """A rigid transform, as `translation` and `rotation` or as `matrix`."""
 
-    translation: GivenVector | None = None
-    rotation: GivenQuaternion | None = None
+    translation: GivenVector | None = Field(
+        default=None, description="`position`, as ROS calls it, is taken too."
+    )
+    rotation: GivenQuaternion | None = Field(
+        default=None, description="`orientation`, as ROS calls it, is taken too."
+    )
     matrix: Annotated[list[Row4], Field(min_length=4, max_length=4)] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_ros_calls_it(cls, given: object) -> object:
+        if not isinstance(given, dict):
+            return given
+        ours = {name: own for name, own in ROS_NAMES.items() if name in given and own not in given}
+        return {ours.get(name, name): value for name, value in given.items()}
 
     @model_validator(mode="after")
     def _one_way(self) -> GivenTransform:
@@ -89,6 +105,11 @@ class GivenPose(GivenTransform):
     parent_frame: Label | None = Field(
         default=None,
         description="Poses are combined within one parent frame; default: ROBOT/SESSION.",
+    )
+    of: Literal["sensor", "base"] = Field(
+        default="sensor",
+        description="`base`, of an upload with `T_base_sensor`: the pose is T_parent_base, and is "
+        "stored as that of the sensor.",
     )
 
 
@@ -109,7 +130,7 @@ class FrameMeta(Given):
     depth_scale: float = Field(
         default=1000.0,
         gt=0,
-        description="Stored units per metre; NPY files are metres whatever it is.",
+        description="Stored units per metre; floating NPY files are metres whatever it is.",
     )
     depth_along_ray: bool = Field(
         default=False, description="Samples are ranges along the pixel's ray."
@@ -163,6 +184,8 @@ class FrameMeta(Given):
     def _named_parent(self) -> FrameMeta:
         if self.pose is not None and self.pose.parent_frame is None and self.session is None:
             raise ValueError("pose: name its parent_frame, or the session it belongs to")
+        if self.pose is not None and self.pose.of == "base" and self.T_base_sensor is None:
+            raise ValueError("pose: of the base; give T_base_sensor, where the sensor sits on it")
         return self
 
 

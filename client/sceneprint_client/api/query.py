@@ -72,6 +72,8 @@ class Prior(Given):
     def _in_a_parent_frame(self) -> Prior:
         if self.pose.parent_frame is None:
             raise ValueError("a prior needs pose.parent_frame: the one of the map's poses")
+        if self.pose.of != "sensor":
+            raise ValueError("a prior is the pose of the sensor: leave `of` out")
         return self
 
 

@@ -60,6 +60,8 @@ def read_upload(data: bytes, meta: FrameMeta) -> Read:
     """
     pose = None if meta.pose is None else pose_matrix(meta.pose)
     base = None if meta.T_base_sensor is None else base_of(meta.T_base_sensor, None)
+    if pose is not None and base is not None and meta.pose is not None and meta.pose.of == "base":
+        pose = pose @ base[1]
     if _is_cloud(data, meta):
         return _read_cloud(data, meta, pose)
     _refuse(meta, "depth image", {"viewpoint": "file", "units_per_metre": 1.0, "format": None})

@@ -18,6 +18,7 @@ from sceneprint.store.frames import find_frame, write_frame, write_map
 from sceneprint.store.maps import add_map, find_map, keep_model, list_maps
 from sceneprint.store.tables import FrameRow
 from sceneprint_client.api import Frame, FrameMeta, FrameState, Map, NewMap
+from sceneprint_client.api.frames import ROS_NAMES
 from sceneprint_client.api.listing import FrameEdit, MapEdit
 
 #: Fields of a new map that say what it may hold, and for how long.
@@ -73,7 +74,7 @@ _CONTENT = (
     "intrinsics", "depth_scale", "depth_along_ray", "viewpoint", "units_per_metre", "format",
 )  # fmt: skip
 #: Ways to give a transform.
-_WAYS = ("translation", "rotation", "matrix")
+_WAYS = ("translation", "rotation", "matrix", *ROS_NAMES)
 
 
 def edit_frame(
@@ -139,6 +140,11 @@ def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
     InvalidRequest, InvalidPose : see `edit_frame`.
     """
     meta = _merged(frame, patch)
+    if meta.pose is not None and meta.pose.of != "sensor":
+        raise errors.InvalidRequest(
+            "The edited pose is that of the base. Give that of the sensor, and leave `of` out.",
+            (("pose.of", "an edited pose is that of the sensor"),),
+        )
     pose = None if meta.pose is None else serializers.pose_matrix(meta.pose)
     known = columns(meta, pose, base_of(meta.T_base_sensor, viewpoint_of(frame)))
     found = {name: known[name] for field in patch for name in _COLUMNS[field]}
@@ -178,6 +184,7 @@ def _relative_transform(
 
 def _with(now: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str, Any]:
     """A transform after a patch; it is given in one way, so the other one goes."""
+    given = {ROS_NAMES.get(name, name): value for name, value in given.items()}
     kept = dict(now or {})
     if "matrix" in kept and ("translation" in given or "rotation" in given):
         T = serializers.transform(np.array(kept.pop("matrix")), "", "")

@@ -188,13 +188,13 @@ def _samples(header: bytes, rows: bytes) -> NDArray[np.uint16]:
     return np.array(samples, dtype=np.uint16)  # some versions of Pillow give int32
 
 
-# NPY files of float metres, read without trusting their header.
+# NPY files of float metres or of stored units, read without trusting their header.
 #
-# bytes  --decode_npy-->  samples (H, W) float32
+# bytes  --decode_npy-->  samples (H, W) float32 or uint16
 
 _TYPES = (
-    "depth is float32 in metres (float64 and float16 are taken too). Convert it, or send whole "
-    "numbers as a 16-bit PNG."
+    "depth is float32 in metres (float64 and float16 are taken too) or uint16 in stored units. "
+    "Convert it."
 )
 _SHAPES = (
     "The shape of the NPY array is not that of an image, which has two dimensions. "
@@ -202,16 +202,16 @@ _SHAPES = (
 )
 
 
-def decode_npy(data: bytes) -> Floats32:
-    """Return the samples of an NPY file, in metres.
+def decode_npy(data: bytes) -> NDArray[np.uint16] | Floats32:
+    """Return the samples of an NPY file: floating ones in metres, uint16 in stored units.
 
     Parameters
     ----------
-    data : the whole file: one two-dimensional array of float32, float64 or float16
+    data : the whole file: one two-dimensional array of float32, float64, float16 or uint16
 
     Returns
     -------
-    samples : (H, W) float32, with whatever NaN and infinities the file holds
+    samples : (H, W) float32, with whatever NaN and infinities the file holds; or uint16
 
     Raises
     ------
@@ -238,6 +238,8 @@ def decode_npy(data: bytes) -> Floats32:
         )
     numbers = np.frombuffer(data, header.dtype, offset=header.start)
     samples = numbers.reshape(header.shape, order=header.order)
+    if header.dtype.kind == "u":
+        return np.array(samples, dtype=np.uint16, order="C")
     with np.errstate(all="ignore"):  # a float64 beyond float32 becomes inf: missing
         return np.array(samples, dtype=np.float32, order="C")
 
@@ -249,7 +251,7 @@ def image_size(head: bytes) -> tuple[int, int]:
 
 
 def _header(data: bytes) -> NpyHeader:
-    header = npy_header(data, UnreadableFrame, _TYPES, _SHAPES)
+    header = npy_header(data, UnreadableFrame, _TYPES, _SHAPES, whole=True)
     height, width = header.shape
     if not 1 <= height * width <= MAXIMUM_SAMPLES:
         raise UnreadableFrame(
@@ -390,7 +392,7 @@ def _decode(data: bytes) -> NDArray[np.uint16] | Floats32:
         return decode_npy(data)
     raise UnreadableFrame(
         "This is neither PNG nor NPY. Write the depth as a 16-bit greyscale PNG, or as a "
-        "float32 array in metres with numpy.save."
+        "float32 array in metres or a uint16 array in stored units with numpy.save."
     )
 
 

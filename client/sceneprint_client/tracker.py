@@ -1,0 +1,312 @@
+"""Continuous localisation of a robot: answers of a service over time, joined with odometry.
+
+    tracker = Tracker(client, "warehouse", camera=(525, 525, 319.5, 239.5))
+    state = tracker.update(depth, T_odom_sensor, stamp=stamp)
+    if state.status == "tracking":
+        drive(state.T_map_odom)
+
+frame, odometry  --Tracker.update-->  State
+frame, odometry  --AsyncTracker.submit-->  State, at once
+log  --replay-->  the same states
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+from threading import Condition, RLock, Thread
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint_client import errors
+from sceneprint_client.api import GivenPose, Prior
+from sceneprint_client.tracker_core import (
+    Observation,
+    PoseEvidence,
+    State,
+    TrackerCore,
+    TrackerParameters,
+    observation_of,
+)
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from sceneprint_client.queries import QueryMethods
+    from sceneprint_client.requests import FrameInput, MetaInput
+
+__all__ = ["AsyncTracker", "Observation", "State", "Tracker", "TrackerParameters", "replay"]
+
+#: Why no answer came, and may come the next time.
+_AWAY = (errors.Unreachable, errors.Busy, errors.RateLimited, errors.StoreAway, errors.StoreLocked)
+#: Statuses of HTTP from here on are faults of the service, or of what stands before it.
+_FIRST_FAULT = 500
+
+
+class Tracker:
+    """Where a robot is in a map: `lost`, `ambiguous` or `tracking`, with T_map_odom.
+
+    Each update asks the service once, and waits for the answer: see AsyncTracker.
+
+    Parameters
+    ----------
+    client : of the service, or `Client.embedded`
+    map_name : of the map, whose frames have poses
+    camera : of frames that are arrays or bytes: as `meta` of `Client.localize`
+    parameters : default: TrackerParameters()
+    log : a text file that is written, a line a call; `replay` reads it
+
+    Raises
+    ------
+    UnknownMap, FrameError and the like come from `update`, where asking again would not help.
+    """
+
+    def __init__(
+        self, client: QueryMethods, map_name: str, *, camera: MetaInput | None = None,
+        parameters: TrackerParameters | None = None, log: TextIO | None = None,
+    ) -> None:  # fmt: skip
+        self._client, self._map, self._camera = client, map_name, camera
+        self._core = TrackerCore(parameters)
+        self._lock = RLock()
+        self.epoch = 0  #: how often it was reset
+        self._log = log
+        self._write({"parameters": asdict(self._core.parameters)})
+
+    def update(
+        self, frame: FrameInput, odom_pose: NDArray[Any], up: Sequence[float] | None = None,
+        stamp: float | None = None, *, meta: MetaInput | None = None,
+    ) -> State:  # fmt: skip
+        """Ask where a frame was taken; the state after the answer.
+
+        Parameters
+        ----------
+        frame : as for `Client.localize`
+        odom_pose : (4, 4) T_odom_sensor when the frame was taken; of a robot that knows the pose
+            of its base, T_odom_base @ T_base_sensor
+        up : unit vector in the sensor's axes, of an IMU
+        stamp : when the frame was taken, seconds; default: now
+        meta : default: `camera`
+
+        Raises
+        ------
+        SceneprintError : the frame or the map cannot be used. A service that does not answer is no
+            error: the state goes on by odometry.
+        """
+        stamp = time.time() if stamp is None else stamp
+        return self.answer(frame, odom_pose, up, stamp, meta, self.epoch)
+
+    def move(self, odom_pose: NDArray[Any], stamp: float | None = None) -> State:
+        """The state by odometry alone, between frames."""
+        stamp = time.time() if stamp is None else stamp
+        with self._lock:
+            state = self._core.move(stamp, np.asarray(odom_pose, np.float64))
+            self._write({"stamp": stamp, "odometry": _listed(odom_pose)})
+            return state
+
+    def reset(self, reason: str = "it was reset") -> State:
+        """Forget the place: after a lift or a ride, which odometry does not see. Clock and odometry
+        may begin anew; answers to frames from before are not used.
+        """
+        with self._lock:
+            self.epoch += 1
+            self._write({"reset": reason})
+            return self._core.reset(reason)
+
+    def answer(
+        self, frame: FrameInput, odom_pose: NDArray[Any], up: Sequence[float] | None,
+        stamp: float, meta: MetaInput | None, epoch: int,
+    ) -> State:  # fmt: skip
+        """As `update`; an answer to a frame of an `epoch` before the last reset is not used."""
+        T_odom_sensor = np.asarray(odom_pose, np.float64)
+        with self._lock:
+            prior = self._core.prior(T_odom_sensor)
+        observation = self._observe(frame, up, meta, prior)
+        with self._lock:
+            if epoch != self.epoch:
+                return self._core.state()
+            state = self._core.update(stamp, T_odom_sensor, observation)
+            line = {"stamp": stamp, "odometry": _listed(odom_pose)}
+            self._write({**line, "observation": _observation_json(observation)})
+            return state
+
+    def _observe(
+        self, frame: FrameInput, up: Sequence[float] | None, meta: MetaInput | None,
+        prior: PoseEvidence | None,
+    ) -> Observation:  # fmt: skip
+        """What the service says of a frame."""
+        try:
+            answer = self._client.localize(
+                self._map, frame, self._camera if meta is None else meta, up=up, keep=False,
+                prior=None if prior is None else _given_prior(prior),
+            )  # fmt: skip
+        except errors.UselessFrame as error:
+            return Observation("not_found", reason=str(error))
+        except _AWAY as error:
+            return Observation("unanswered", reason=f"no answer: {error}")
+        except errors.Refused as error:
+            if error.status < _FIRST_FAULT:
+                raise
+            return Observation("unanswered", reason=f"no answer: {error}")
+        return observation_of(answer)
+
+    def _write(self, line: dict[str, Any]) -> None:
+        if self._log is not None:
+            self._log.write(json.dumps(line) + "\n")
+
+
+class AsyncTracker:
+    """A tracker whose questions a thread asks: `submit` returns at once.
+
+    While a question is under way the latest frame alone waits; older ones are dropped, their
+    odometry counts. To be closed, or used in `with`.
+
+    Parameters
+    ----------
+    tracker : which nobody else updates
+    """
+
+    def __init__(self, tracker: Tracker) -> None:
+        self.dropped = 0  #: frames that a later one superseded
+        self._tracker = tracker
+        self._waiting: dict[str, Any] | None = None
+        self._busy = self._closed = False
+        self._error: Exception | None = None
+        self._changed = Condition()
+        self._thread = Thread(target=self._work, name="sceneprint-tracker", daemon=True)
+        self._thread.start()
+
+    def submit(
+        self, frame: FrameInput, odom_pose: NDArray[Any], up: Sequence[float] | None = None,
+        stamp: float | None = None, *, meta: MetaInput | None = None,
+    ) -> State:  # fmt: skip
+        """Leave a frame to the thread; the state by what is known so far. See `Tracker.update`.
+
+        Raises
+        ------
+        SceneprintError : an earlier frame, or the map, cannot be used.
+        """
+        stamp = time.time() if stamp is None else stamp
+        epoch = self._tracker.epoch
+        state = self._tracker.move(odom_pose, stamp)
+        with self._changed:
+            if self._error is not None:
+                error, self._error = self._error, None
+                raise error
+            self.dropped += self._waiting is not None
+            self._waiting = {
+                "frame": frame, "odom_pose": odom_pose, "up": up, "stamp": stamp, "meta": meta,
+                "epoch": epoch,
+            }  # fmt: skip
+            self._changed.notify_all()
+        return state
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Until no frame waits; False where that takes longer."""
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: self._waiting is None and not self._busy, timeout_s
+            )
+
+    def close(self) -> None:
+        """Ask no more; a question that is under way is waited for."""
+        with self._changed:
+            self._closed, self._waiting = True, None
+            self._changed.notify_all()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:  # fmt: skip
+        self.close()
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: self._waiting is not None or self._closed)
+                if self._waiting is None:
+                    return
+                asked, self._waiting, self._busy = self._waiting, None, True
+            try:
+                self._tracker.answer(**asked)
+            except Exception as error:
+                with self._changed:
+                    self._error = error
+
+
+# A log of what came in, from which the states can be computed again.
+
+
+def replay(lines: Iterable[str], parameters: TrackerParameters | None = None) -> Iterator[State]:
+    """The states of a log that a tracker wrote, one for each call.
+
+    Parameters
+    ----------
+    lines : of the log
+    parameters : others than those of the log, to see what they would have changed
+    """
+    core = TrackerCore(parameters)
+    for text in lines:
+        line = json.loads(text)
+        if "parameters" in line:
+            core = TrackerCore(parameters or TrackerParameters(**line["parameters"]))
+        elif "reset" in line:
+            yield core.reset(line["reset"])
+        elif "observation" in line:
+            yield core.update(
+                line["stamp"], _matrix(line["odometry"]), _observation_from(line["observation"])
+            )
+        else:
+            yield core.move(line["stamp"], _matrix(line["odometry"]))
+
+
+def _listed(matrix: NDArray[Any]) -> list[float]:
+    return [float(value) for value in np.asarray(matrix, np.float64).ravel()]
+
+
+def _matrix(listed: list[float], size: int = 4) -> NDArray[np.float64]:
+    return np.array(listed).reshape(size, size)
+
+
+def _observation_json(observation: Observation) -> dict[str, Any]:
+    poses = [
+        {
+            "parent_frame": one.parent_frame,
+            "matrix": _listed(one.T_map_sensor),
+            "weight": one.weight,
+            "covariance": None if one.covariance is None else _listed(one.covariance),
+        }
+        for one in observation.poses
+    ]
+    return {
+        "status": observation.status, "poses": poses, "strong": observation.strong,
+        "by_prior": observation.by_prior, "reason": observation.reason,
+    }  # fmt: skip
+
+
+def _observation_from(line: dict[str, Any]) -> Observation:
+    poses = tuple(
+        PoseEvidence(
+            one["parent_frame"], _matrix(one["matrix"]), one["weight"],
+            None if one["covariance"] is None else _matrix(one["covariance"], 6),
+        )
+        for one in line["poses"]
+    )  # fmt: skip
+    return Observation(line["status"], poses, line["strong"], line["by_prior"], line["reason"])
+
+
+def _given_prior(pose: PoseEvidence) -> Prior:
+    if pose.covariance is None:
+        raise AssertionError("the tracker knows how sure it is")
+    given = GivenPose(parent_frame=pose.parent_frame, matrix=pose.T_map_sensor.tolist())
+    return Prior(pose=given, covariance=_listed(pose.covariance))

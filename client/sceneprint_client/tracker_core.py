@@ -1,0 +1,595 @@
+"""Where a robot is, from answers over time and odometry: arithmetic alone, without a service.
+
+answer of the service  --observation_of-->  Observation
+odometry, Observation  --TrackerCore.update-->  State: lost, ambiguous or tracking; T_map_odom
+
+Each answer is a vote for T_map_odom = T_map_sensor @ inv(T_odom_sensor). Equal calls give equal
+states, so a log of them can be replayed.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint_client.api import Localization
+from sceneprint_client.errors import InvalidRequest
+from sceneprint_client.sidecars import rigid_transform
+
+Array = NDArray[np.float64]
+TrackerStatus = Literal["lost", "ambiguous", "tracking"]
+
+#: Deviations that the filter never falls below, and that any answer is off by at least.
+_LEAST_M, _LEAST_RAD = 0.01, math.radians(0.3)
+_ANSWER_M, _ANSWER_RAD = 0.03, math.radians(1.0)
+#: How much of a further answer that came by the prior is believed: its deviation times this.
+_PRIOR_FACTOR = 2.0
+#: Moves of odometry whose distance is remembered: answers come late by fewer.
+_MOST_MARKS = 4096
+
+
+@dataclass(frozen=True)
+class TrackerParameters:
+    """What the tracker takes for granted.
+
+    Parameters
+    ----------
+    drift : of odometry, as a share of the distance travelled
+    turn_drift : of odometry, as a share of the angle turned
+    heading_drift_deg : of odometry, for each metre travelled
+    gate_m, gate_deg : two poses that differ by less are one place, beside what drift explains
+    apart_m, apart_deg : two views that differ by more, in either, are independent
+    strong_weight, weak_weight : of an answer `found`: with strong matches from two viewpoints or
+        more and no rival near, and any other
+    alternative_weight : of all alternatives of an ambiguous answer together
+    need : weight by which a place must lead for a first fix
+    ratio : of the weight of answers `found` there to those anywhere else, for a first fix
+    most_votes : answers that are remembered
+    half_life_m, half_life_s : way and time after which a vote counts half
+    contradictions : weight of contradictions, from places apart, that makes it lost; an answer
+        `found` elsewhere counts 1, an ambiguous one without the tracked place 0.5
+    patience_s : how long contradictions from one place may last before it is lost
+    most_deviation_m : it is lost beyond that deviation of the position
+    most_undecided_m : distance that answers may stay undecided between places, or rest on the
+        prior, before the state is ambiguous
+    alone_every : every so many questions one is asked without a prior
+    """
+
+    drift: float = 0.01
+    turn_drift: float = 0.01
+    heading_drift_deg: float = 0.1
+    gate_m: float = 0.35
+    gate_deg: float = 8.0
+    apart_m: float = 0.3
+    apart_deg: float = 15.0
+    strong_weight: float = 1.5
+    weak_weight: float = 0.6
+    alternative_weight: float = 0.4
+    need: float = 1.0
+    ratio: float = 2.0
+    most_votes: int = 32
+    half_life_m: float = 30.0
+    half_life_s: float = 120.0
+    contradictions: float = 2.0
+    patience_s: float = 1.5
+    most_deviation_m: float = 0.3
+    most_undecided_m: float = 10.0
+    alone_every: int = 4
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEvidence:
+    """A pose that an answer suggests.
+
+    Parameters
+    ----------
+    parent_frame : of the map
+    T_map_sensor : (4, 4)
+    weight : of an alternative, as the service says it
+    covariance : (6, 6) of errors (x, y, z, rx, ry, rz), metres and radians, or None
+    """
+
+    parent_frame: str
+    T_map_sensor: Array
+    weight: float = 1.0
+    covariance: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What the tracker takes from an answer.
+
+    Parameters
+    ----------
+    status : of the answer; `unanswered` where none came
+    poses : the pose that was found, or the alternatives of an ambiguous answer
+    strong : `found` by strong matches from two viewpoints or more, and no rival near
+    by_prior : `found` because the prior decided
+    reason : of the answer
+    """
+
+    status: Literal["found", "ambiguous", "not_found", "unanswered"]
+    poses: tuple[PoseEvidence, ...] = ()
+    strong: bool = False
+    by_prior: bool = False
+    reason: str = ""
+
+
+def observation_of(answer: Localization) -> Observation:
+    """What the tracker takes from an answer of `localize`."""
+    if answer.status == "found" and answer.pose is not None:
+        told = answer.uncertainty
+        covariance = None if told is None else np.reshape(np.array(told.covariance), (6, 6))
+        pose = PoseEvidence(
+            answer.pose.parent_frame, rigid_transform(np.array(answer.pose.matrix)), 1.0, covariance
+        )
+        near = answer.rival_ratio is not None and answer.rival_ratio > 0.5
+        strong = answer.strength == "strong" and answer.support >= 2 and not near
+        return Observation("found", (pose,), strong, answer.verified_by == "prior", answer.reason)
+    if answer.status == "found":
+        return Observation("not_found", reason="No frame that matched has a pose in the map.")
+    poses = tuple(
+        PoseEvidence(
+            one.pose.parent_frame, rigid_transform(np.array(one.pose.matrix)),
+            max(one.weight, one.score or 0.0, 1e-3),
+        )
+        for one in answer.alternatives
+    )  # fmt: skip
+    return Observation(answer.status, poses, reason=answer.reason)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Where the robot is, as far as that is known.
+
+    Parameters
+    ----------
+    status : `tracking`: drive on it; `ambiguous`: several places are possible, or the tracked one
+        is in doubt; `lost`: no place is known
+    stamp : of the odometry that it is told for, seconds
+    parent_frame : of the map, which T_map_odom leads to; None unless there is one
+    T_map_odom : (4, 4), or None; moves while tracking only by what answers correct
+    T_map_sensor : (4, 4) T_map_odom @ T_odom_sensor, or None
+    covariance : (6, 6) of T_map_sensor, errors (x, y, z, rx, ry, rz) as ROS orders them, or None
+    age : seconds since an answer confirmed the place without a prior, or None
+    reason : of the status
+    """
+
+    status: TrackerStatus
+    stamp: float
+    parent_frame: str | None
+    T_map_odom: Array | None
+    T_map_sensor: Array | None
+    covariance: Array | None
+    age: float | None
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Mark:
+    """A place of the odometry: pose, and the way until there in metres and radians."""
+
+    stamp: float
+    T_odom_sensor: Array
+    distance: float
+    angle: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Vote:
+    """A pose that an answer suggested somewhere on the way."""
+
+    number: int  #: of the answer
+    mark: _Mark
+    evidence: PoseEvidence
+    weight: float
+    found: bool
+    friends: set[int] = field(default_factory=set)  #: places in the list of votes that agree
+
+
+@dataclass(frozen=True, eq=False)
+class _Belief:
+    """The tracked pose, as it was at the last correction."""
+
+    parent_frame: str
+    mark: _Mark
+    T_map_sensor: Array
+    covariance: Array
+    confirmed: float  #: stamp of the last answer that confirmed it without a prior
+    undecided: float | None = None  #: distance at the first answer since that did not
+
+
+class TrackerCore:
+    """Votes over time, and the state that follows from them; not safe between threads."""
+
+    def __init__(self, parameters: TrackerParameters | None = None) -> None:
+        self.parameters = parameters or TrackerParameters()
+        self._marks: deque[_Mark] = deque(maxlen=_MOST_MARKS)
+        self._votes: list[_Vote] = []
+        self._belief: _Belief | None = None
+        self._against: list[tuple[int, _Mark, float]] = []
+        self._answers = 0
+        self._stamp = 0.0
+        self._verdict: tuple[TrackerStatus, str] = ("lost", "nothing was seen yet")
+
+    def move(self, stamp: float, T_odom_sensor: Array) -> State:
+        """The state after a move of the odometry, without an answer."""
+        mark = self._mark(stamp, rigid_transform(T_odom_sensor))
+        if self._belief is not None:
+            self._verdict = self._tracked(mark)
+        return self.state()
+
+    def update(self, stamp: float, T_odom_sensor: Array, observation: Observation) -> State:
+        """The state after an answer.
+
+        Parameters
+        ----------
+        stamp, T_odom_sensor : of the frame that was asked for, seconds; answers come in the order
+            of their frames, but moves after the frame may have come before
+        observation : what was answered
+
+        Returns
+        -------
+        state : of the latest odometry
+
+        Raises
+        ------
+        InvalidPose : the odometry is no rigid transform.
+        InvalidRequest : stamps do not rise.
+        """
+        mark = self._mark(stamp, rigid_transform(T_odom_sensor))
+        if observation.status == "unanswered":
+            status, reason = self._verdict[0], observation.reason
+            self._verdict = self._tracked(self._marks[-1]) if self._belief else (status, reason)
+            return self.state()
+        self._answers += 1
+        self._vote(mark, observation)
+        if self._belief is None:
+            self._verdict = self._fixed(mark, observation)
+        else:
+            self._compare(mark, observation)
+            self._verdict = self._tracked(self._marks[-1])
+        return self.state()
+
+    def reset(self, reason: str = "it was reset") -> State:
+        """Forget the place: after a lift, or when the robot was carried and knows it; clock and
+        odometry may begin anew. An answer to a frame from before is not to be given any more.
+        """
+        self._forget()
+        self._votes.clear()
+        self._stamp = self.state().stamp
+        self._marks.clear()
+        self._verdict = ("lost", reason)
+        return self.state()
+
+    def state(self) -> State:
+        """The state as it is."""
+        status, reason = self._verdict
+        stamp = self._marks[-1].stamp if self._marks else self._stamp
+        belief = self._belief
+        if belief is None:
+            return State(status, stamp, None, None, None, None, None, reason)
+        T, P = self._predicted(self._marks[-1])
+        T_map_odom = rigid_transform(belief.T_map_sensor @ inverse(belief.mark.T_odom_sensor))
+        age = stamp - belief.confirmed
+        return State(status, stamp, belief.parent_frame, T_map_odom, T, P, age, reason)
+
+    def prior(self, T_odom_sensor: Array) -> PoseEvidence | None:
+        """What the next question should say of the pose; None where it is to be asked alone."""
+        alone = (self._answers + 1) % self.parameters.alone_every == 0
+        if self._belief is None or self._against or alone or self._verdict[0] != "tracking":
+            return None
+        T, P = self._predicted(self._ahead(rigid_transform(T_odom_sensor)))
+        return PoseEvidence(self._belief.parent_frame, T, 1.0, P + _diagonal(0.05, 0.03))
+
+    # Odometry.
+
+    def _mark(self, stamp: float, T: Array) -> _Mark:
+        """The place of a frame; the way to it is measured where it is new."""
+        if self._marks and stamp <= self._marks[-1].stamp:
+            at = bisect_right([one.stamp for one in self._marks], stamp) - 1
+            known = self._marks[max(at, 0)]
+            if known.stamp != stamp or not np.allclose(known.T_odom_sensor, T, atol=1e-6):
+                raise InvalidRequest(
+                    f"The stamp {stamp} is not after {self._marks[-1].stamp}, that of the last "
+                    "odometry. Give stamps that rise; reset the tracker where the clock jumped.",
+                    (("stamp", "not after the last"),),
+                )
+            return known
+        mark = replace(self._ahead(T), stamp=stamp)
+        self._marks.append(mark)
+        return mark
+
+    def _ahead(self, T: Array) -> _Mark:
+        if not self._marks:
+            return _Mark(-math.inf, T, 0.0, 0.0)
+        last = self._marks[-1]
+        step, turn = difference(last.T_odom_sensor, T)
+        return _Mark(last.stamp, T, last.distance + step, last.angle + turn)
+
+    def _drifts(self, a: _Mark, b: _Mark) -> tuple[float, float]:
+        """Deviations of the odometry between two places, metres and radians."""
+        p, way = self.parameters, abs(a.distance - b.distance)
+        turned = math.radians(p.heading_drift_deg) * way + p.turn_drift * abs(a.angle - b.angle)
+        return p.drift * way, turned
+
+    def _apart(self, a: _Mark, b: _Mark) -> bool:
+        step, turn = difference(a.T_odom_sensor, b.T_odom_sensor)
+        return step > self.parameters.apart_m or turn > math.radians(self.parameters.apart_deg)
+
+    # Votes, and the first fix.
+
+    def _vote(self, mark: _Mark, observation: Observation) -> None:
+        p, total = self.parameters, sum(one.weight for one in observation.poses)
+        found = observation.status == "found"
+        if found and observation.by_prior:
+            return  # it says what we told it
+        for pose in observation.poses:
+            weight = p.alternative_weight * pose.weight / total
+            if found:
+                weight = p.strong_weight if observation.strong else p.weak_weight
+            vote = _Vote(self._answers, mark, pose, weight, found)
+            for place, other in enumerate(self._votes):
+                if self._agree(other, vote):
+                    vote.friends.add(place)
+                    other.friends.add(len(self._votes))
+            vote.friends.add(len(self._votes))
+            self._votes.append(vote)
+        self._keep(lambda vote: vote.number > self._answers - p.most_votes)
+
+    def _keep(self, wanted: Callable[[_Vote], bool]) -> None:
+        """Forget the other votes."""
+        if all(map(wanted, self._votes)):
+            return
+        kept = [old for old, vote in enumerate(self._votes) if wanted(vote)]
+        place = {old: new for new, old in enumerate(kept)}
+        self._votes = [
+            replace(one, friends={place[friend] for friend in one.friends if friend in place})
+            for one in map(self._votes.__getitem__, kept)
+        ]
+
+    def _agree(self, older: _Vote, newer: _Vote) -> bool:
+        """Whether two votes are one place: the older one carried to the newer by odometry."""
+        if older.evidence.parent_frame != newer.evidence.parent_frame:
+            return False
+        moved = inverse(older.mark.T_odom_sensor) @ newer.mark.T_odom_sensor
+        carried = older.evidence.T_map_sensor @ moved
+        step, turn = difference(carried, newer.evidence.T_map_sensor)
+        drift_m, drift_rad = self._drifts(older.mark, newer.mark)
+        p = self.parameters
+        return step <= p.gate_m + 2 * drift_m and turn <= math.radians(p.gate_deg) + 2 * drift_rad
+
+    def _weight(self, places: Iterable[int], *, found: bool) -> float:
+        """Of votes that agree: views from one place count once."""
+        votes = [self._votes[place] for place in places]
+        weighed = sorted(
+            ((self._aged(one), one) for one in votes if one.found or not found),
+            key=lambda pair: (-pair[0], pair[1].number),
+        )
+        counted: list[_Mark] = []
+        total = 0.0
+        for weight, one in weighed:
+            if all(self._apart(one.mark, other) for other in counted):
+                counted.append(one.mark)
+                total += weight
+        return total
+
+    def _aged(self, vote: _Vote) -> float:
+        """Weight of a vote by now."""
+        p, now = self.parameters, self._votes[-1].mark
+        halves = abs(now.distance - vote.mark.distance) / p.half_life_m
+        halves += abs(now.stamp - vote.mark.stamp) / p.half_life_s
+        return float(vote.weight * 0.5**halves)
+
+    def _fixed(self, mark: _Mark, observation: Observation) -> tuple[TrackerStatus, str]:
+        """Look for a place that leads, among all votes; it becomes the belief."""
+        p = self.parameters
+        own = [i for i, vote in enumerate(self._votes) if vote.number == self._answers]
+        if not own:
+            waits = "several places are possible; " if self._disputed() else ""
+            return "ambiguous" if waits else "lost", waits + observation.reason
+        totals = [self._weight(vote.friends, found=False) for vote in self._votes]
+        founds = [self._weight(vote.friends, found=True) for vote in self._votes]
+        best = max(own, key=lambda place: (founds[place], totals[place], -place))
+        others = [i for i in range(len(totals)) if i not in self._votes[best].friends]
+        rival = max((totals[i] for i in others), default=0.0)
+        rival_found = max((founds[i] for i in others), default=0.0)
+        leads = totals[best] - rival >= p.need - 1e-9 and founds[best] >= p.ratio * rival_found
+        if founds[best] > 0 and leads:
+            self._believe(mark, best)
+            return "tracking", "found: " + observation.reason
+        if observation.status == "ambiguous" or rival_found > 0:
+            return "ambiguous", "several places are possible; " + observation.reason
+        return "lost", "one view suggests a place; move, and look again"
+
+    def _disputed(self) -> bool:
+        return any(len(one.friends) < len(self._votes) for one in self._votes)
+
+    def _believe(self, mark: _Mark, best: int) -> None:
+        """Take the pose of the best place: of its newest vote `found`, carried by odometry."""
+        friends = [self._votes[place] for place in self._votes[best].friends]
+        vote = max((one for one in friends if one.found), key=lambda one: one.number)
+        pose = vote.evidence
+        start = _Belief(
+            pose.parent_frame, vote.mark, pose.T_map_sensor, _measured(pose), vote.mark.stamp
+        )
+        self._belief = start
+        T, P = self._predicted(mark)
+        self._belief = replace(start, mark=mark, T_map_sensor=T, covariance=P)
+        self._against.clear()
+
+    # The tracked place.
+
+    def _predicted(self, mark: _Mark) -> tuple[Array, Array]:
+        """T_map_sensor and its covariance at a place of the odometry."""
+        belief = self._belief
+        if belief is None:
+            raise AssertionError("nothing is tracked")
+        T = belief.T_map_sensor @ inverse(belief.mark.T_odom_sensor) @ mark.T_odom_sensor
+        x, y, z = T[:3, 3] - belief.T_map_sensor[:3, 3]
+        F = np.eye(6)  # an error of the rotation moves what lies ahead: e x (x, y, z)
+        F[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+        drift_m, drift_rad = self._drifts(belief.mark, mark)
+        return T, F @ belief.covariance @ F.T + _diagonal(drift_m, drift_rad)
+
+    def _is_tracked(self, pose: PoseEvidence, T: Array, P: Array) -> bool:
+        """Whether a pose is the tracked one, as far as the gate and its covariance say."""
+        if self._belief is None or pose.parent_frame != self._belief.parent_frame:
+            return False
+        step, turn = difference(T, pose.T_map_sensor)
+        gate = self.parameters.gate_m + 2 * _deviation(P[:3, :3])
+        gate_rad = math.radians(self.parameters.gate_deg) + 2 * _deviation(P[3:, 3:])
+        return step <= gate and turn <= gate_rad
+
+    def _compare(self, mark: _Mark, observation: Observation) -> None:
+        """Correct the belief by an answer that agrees; note one that does not."""
+        belief = self._belief
+        if belief is None or not observation.poses:
+            return
+        T, P = self._predicted(mark)
+        agreeing = [one for one in observation.poses if self._is_tracked(one, T, P)]
+        if observation.status == "found" and agreeing:
+            if observation.by_prior:
+                self._correct(mark, agreeing[0], _PRIOR_FACTOR)
+                self._undecided(mark)
+            else:
+                self._correct(mark, agreeing[0], 1.0)
+                if self._belief is not None:
+                    self._belief = replace(self._belief, confirmed=mark.stamp, undecided=None)
+                self._against.clear()
+        elif agreeing:
+            self._undecided(mark)
+        elif not observation.by_prior:
+            weight = 1.0 if observation.status == "found" else 0.5
+            self._against.append((self._answers, mark, weight))
+
+    def _undecided(self, mark: _Mark) -> None:
+        if self._belief is not None and self._belief.undecided is None:
+            self._belief = replace(self._belief, undecided=mark.distance)
+
+    def _correct(self, mark: _Mark, pose: PoseEvidence, factor: float) -> None:
+        """One step of a Kalman filter; a further view from one place says nothing new."""
+        belief = self._belief
+        if belief is None or not self._apart(belief.mark, mark):
+            return
+        T, P = self._predicted(mark)
+        R = _measured(pose) * factor**2
+        gain = P @ np.linalg.inv(P + R)
+        off = np.concatenate([
+            pose.T_map_sensor[:3, 3] - T[:3, 3],
+            rotation_vector(pose.T_map_sensor[:3, :3] @ T[:3, :3].T),
+        ])  # fmt: skip
+        shift = gain @ off
+        moved = np.eye(4)
+        moved[:3, :3] = rotation_matrix(shift[3:]) @ T[:3, :3]
+        moved[:3, 3] = T[:3, 3] + shift[:3]
+        covariance = P - gain @ P
+        covariance = (covariance + covariance.T) / 2
+        floor = np.diag(_diagonal(_LEAST_M, _LEAST_RAD))
+        covariance[np.diag_indices(6)] = np.maximum(np.diag(covariance), floor)
+        self._belief = replace(
+            belief, mark=mark, T_map_sensor=rigid_transform(moved), covariance=covariance
+        )
+
+    def _tracked(self, mark: _Mark) -> tuple[TrackerStatus, str]:
+        """The verdict on the belief; one that cannot be kept is dropped."""
+        p, belief = self.parameters, self._belief
+        if belief is None:
+            return self._verdict
+        _, P = self._predicted(mark)
+        if self._against:
+            first, since = self._against[0][:2]
+            lasted = mark.stamp - since.stamp
+            enough = self._contradiction() >= p.contradictions - 1e-9
+            if enough or (len(self._against) > 1 and lasted >= p.patience_s - 1e-9):
+                self._keep(lambda vote: vote.number >= first)
+                self._forget()
+                return "lost", "answers contradict the tracked place again and again"
+            if len(self._against) > 1:
+                return "ambiguous", "answers from one place contradict the tracked one"
+        deviation = _deviation(P[:3, :3])
+        if deviation > p.most_deviation_m:
+            self._forget()
+            return "lost", f"odometry since the last fix may be off by {deviation:.2f} m"
+        if belief.undecided is not None and mark.distance - belief.undecided > p.most_undecided_m:
+            return "ambiguous", "no answer has confirmed the place without the prior for long"
+        if self._against:
+            return "tracking", "one answer contradicts the tracked place; it is not moved"
+        return "tracking", "tracked by odometry since the last fix"
+
+    def _contradiction(self) -> float:
+        """Weight of the answers against the tracked place; views from one place count once."""
+        counted: list[tuple[int, _Mark, float]] = []
+        for one in sorted(self._against, key=lambda one: (-one[2], one[0])):
+            if all(self._apart(one[1], other[1]) for other in counted):
+                counted.append(one)
+        return sum(weight for _, _, weight in counted)
+
+    def _forget(self) -> None:
+        self._belief = None
+        self._against.clear()
+
+
+# Rigid transforms.
+
+
+def inverse(T: Array) -> Array:
+    """Of a rigid transform (4, 4)."""
+    back = np.eye(4)
+    back[:3, :3] = T[:3, :3].T
+    back[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return back
+
+
+def difference(a: Array, b: Array) -> tuple[float, float]:
+    """Metres and radians between two poses (4, 4)."""
+    angle = float(np.linalg.norm(rotation_vector(a[:3, :3].T @ b[:3, :3])))
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), angle
+
+
+def rotation_vector(R: Array) -> Array:
+    """Axis times angle, radians, of a rotation (3, 3)."""
+    # sine from the skew part, cosine from the trace; near half a turn the symmetric part tells
+    skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+    sine, cosine = float(np.linalg.norm(skew)), (float(np.trace(R)) - 1) / 2
+    angle = math.atan2(sine, cosine)
+    if sine > 1e-6:
+        return skew * (angle / sine)
+    if cosine > 0:
+        return skew
+    axis = np.linalg.eigh((R + R.T) / 2)[1][:, 2]
+    return np.asarray(axis * angle, np.float64)
+
+
+def rotation_matrix(vector: Array) -> Array:
+    """(3, 3) of axis times angle, radians."""
+    x, y, z = vector
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = float(np.linalg.norm(vector))
+    sine, cosine = 1.0, 0.5
+    if angle > 1e-9:
+        sine, cosine = math.sin(angle) / angle, (1 - math.cos(angle)) / angle**2
+    return np.asarray(np.eye(3) + sine * K + cosine * K @ K, np.float64)
+
+
+def _diagonal(metres: float, radians: float) -> Array:
+    """Covariance (6, 6) of independent deviations."""
+    return np.diag(np.repeat([metres**2, radians**2], 3))
+
+
+def _measured(pose: PoseEvidence) -> Array:
+    """Covariance of an answer: what it says, and what any answer may be off."""
+    least = _diagonal(_ANSWER_M, _ANSWER_RAD)
+    return least if pose.covariance is None else pose.covariance + least
+
+
+def _deviation(P: Array) -> float:
+    """The largest deviation in any direction."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(P)[-1]), 0.0))

@@ -1,0 +1,154 @@
+"""Frames as robots have them: arrays with a camera, path strings, poses as ROS names them."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import InvalidIntrinsics, InvalidRequest, UnreadableCloud, UnreadableFrame
+from sceneprint.formats.dataset import FrameReference
+from sceneprint.types import DepthFrame
+from sceneprint_client import Client
+from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, Prior
+from sceneprint_client.api.base import checked
+from sceneprint_client.frame_files import camera_of, sendable
+
+QUARTER = 0.5**0.5
+CAMERA = CameraIntrinsics(width=4, height=3, fx=5, fy=6, cx=1.5, cy=1)
+
+
+def loaded(data: bytes) -> np.ndarray:
+    return np.load(io.BytesIO(data), allow_pickle=False)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        CAMERA,
+        (5, 6, 1.5, 1),
+        np.array([5, 6, 1.5, 1]),
+        np.array([[5, 0, 1.5], [0, 6, 1], [0, 0, 1]]),
+        FrameMeta(intrinsics=CAMERA),
+    ],
+)
+def test_an_array_with_its_camera_is_depth(camera: Any) -> None:
+    millimetres = np.arange(12, dtype=np.uint16).reshape(3, 4)
+    data, meta = sendable(millimetres, camera, with_pose=False, up=(0, -1, 0))
+    np.testing.assert_array_equal(loaded(data), millimetres)
+    assert loaded(data).dtype == np.uint16
+    assert meta.intrinsics == CAMERA
+    assert meta.up is not None
+    assert meta.up.unit == [0, -1, 0]
+    metres = millimetres.T.astype(np.float64).T / 1000  # in Fortran's order
+    data, _ = sendable(metres, camera, with_pose=False)
+    assert loaded(data).dtype == np.float32  # float64 would take twice the bytes, for nothing
+    np.testing.assert_allclose(loaded(data), metres, rtol=1e-6)
+
+
+def test_an_array_without_a_camera_is_points() -> None:
+    points = np.arange(12, dtype=np.float32).reshape(4, 3)
+    data, meta = sendable(points, None, with_pose=False)
+    np.testing.assert_array_equal(loaded(data), points)
+    assert meta == FrameMeta()
+    assert sendable(points, FrameMeta(robot="r"), with_pose=False)[1].robot == "r"
+
+
+@pytest.mark.parametrize(
+    ("array", "camera", "error", "message"),
+    [
+        (np.zeros((3, 4), np.int32), CAMERA, UnreadableFrame, "int32, and depth is"),
+        (np.zeros((3, 4, 1), np.uint16), CAMERA, UnreadableFrame, r"shape \(3, 4, 1\)"),
+        (np.zeros((0, 4), np.uint16), CAMERA, UnreadableFrame, r"shape \(0, 4\)"),
+        (np.zeros((3, 5), np.uint16), None, UnreadableFrame, "give its camera"),
+        (np.zeros((3, 3), np.uint16), None, UnreadableCloud, "uint16, and points are"),
+        (np.zeros(3), None, UnreadableCloud, r"shape \(3,\)"),
+        (np.zeros((3, 4)), (5, 6, 1.5), InvalidIntrinsics, "camera is none"),
+        (np.zeros((3, 4)), (5, 0, 1.5, 1), InvalidIntrinsics, "camera is none"),
+        (np.zeros((3, 4)), np.diag([5, 6, 2]), InvalidIntrinsics, "camera is none"),
+        (np.zeros((3, 4)), "camera", InvalidIntrinsics, "camera is none"),
+    ],
+)
+def test_other_arrays_are_refused(
+    array: np.ndarray, camera: Any, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        sendable(array, camera, with_pose=False)
+
+
+def test_what_is_no_frame_is_refused(references: tuple[FrameReference, ...]) -> None:
+    wrong: Any = [[1, 2], [3, 4]]
+    with pytest.raises(TypeError, match="not list"):
+        sendable(wrong, CAMERA, with_pose=False)
+    with pytest.raises(TypeError, match="how large the image"):
+        sendable(references[0].path, (5, 6, 1.5, 1), with_pose=False)
+
+
+def test_a_path_string_and_arrays_are_one_frame(
+    client: Client,
+    map_name: str,
+    references: tuple[FrameReference, ...],
+    room_frames: tuple[DepthFrame, ...],
+) -> None:
+    client.create_map(map_name, "arrays")
+    added = client.upload(map_name, str(references[0].path), wait_s=30)
+    assert added.state == "indexed"
+    seen = room_frames[0]
+    K = np.array([[seen.intrinsics.fx, 0, seen.intrinsics.cx],
+                  [0, seen.intrinsics.fy, seen.intrinsics.cy], [0, 0, 1]])  # fmt: skip
+    units = np.round(seen.depth * 1000).astype(np.uint16)
+    meta = FrameMeta(intrinsics=client.frame(map_name, added.frame_id).intrinsics)
+    by_array = client.localize(map_name, units, K)
+    by_path = client.localize(map_name, str(references[0].path), meta)
+    assert by_array.best is not None
+    assert by_path.best is not None
+    assert by_array.best.frame_id == added.frame_id
+    assert by_array.best.distance == by_path.best.distance == 0
+    metres = client.localize(map_name, units / 1000.0, K)
+    assert metres.best is not None
+    assert metres.best.distance < 100
+    compared = client.similarity(units, str(references[0].path), K)
+    assert compared.similarity == 1.0
+
+
+def test_the_pose_of_the_base_is_stored_as_that_of_the_sensor(
+    client: Client, map_name: str, room_frames: tuple[DepthFrame, ...]
+) -> None:
+    """The base stands at (1, 2, 0), turned by 90 degrees; the camera sits 0.2 m ahead, 0.5 m up."""
+    k = room_frames[0].intrinsics
+    camera = camera_of((k.fx, k.fy, k.cx, k.cy), (k.width, k.height))
+    turn = {"x": 0, "y": 0, "z": QUARTER, "w": QUARTER}
+    still = {"x": 0, "y": 0, "z": 0, "w": 1}
+    told = {
+        "intrinsics": camera.model_dump(),
+        "pose": {"position": {"x": 1, "y": 2, "z": 0}, "orientation": turn, "of": "base",
+                 "parent_frame": "odom"},
+        "T_base_sensor": {"translation": {"x": 0.2, "y": 0, "z": 0.5}, "rotation": still},
+    }  # fmt: skip
+    client.create_map(map_name, "base")
+    meta = FrameMeta.model_validate(told)
+    added = client.upload(map_name, room_frames[0].depth, meta, wait_s=30)
+    pose = client.frame(map_name, added.frame_id).pose
+    assert pose is not None
+    np.testing.assert_allclose(np.array(pose.matrix)[:3, 3], [1, 2.2, 0.5], atol=1e-12)
+    with pytest.raises(InvalidRequest, match="give T_base_sensor"):
+        checked(FrameMeta, "The frame", **{**told, "T_base_sensor": None})
+    with pytest.raises(InvalidRequest, match="pose of the sensor"):
+        checked(Prior, "The prior", pose=told["pose"])
+    with pytest.raises(InvalidRequest, match="that of the base"):
+        client.edit_frame(map_name, added.frame_id, {"pose": {"of": "base"}})
+
+
+def test_poses_as_ros_names_them() -> None:
+    told = {"position": {"x": 1, "y": 2, "z": 3},
+            "orientation": {"x": 0, "y": 0, "z": QUARTER, "w": QUARTER}}  # fmt: skip
+    pose = GivenPose.model_validate({**told, "parent_frame": "map"})
+    assert pose.translation is not None
+    assert pose.rotation is not None
+    assert (pose.translation.y, pose.rotation.w) == (2, QUARTER)
+    assert set(pose.model_dump(exclude_defaults=True)) == {"translation", "rotation", "parent_frame"}
+    for twice in ({**told, "translation": told["position"]}, {"position": told["position"]}):
+        with pytest.raises(InvalidRequest):
+            checked(GivenPose, "The pose", **twice)

@@ -1,0 +1,365 @@
+"""The tracker asks with priors, goes on without answers, logs and replays; in a thread; and on runs
+through synthetic buildings, kidnapped and beside what looks alike.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.lab.synth import corridor, render, synthesise_lookalike, synthesise_room
+from sceneprint.lab.synth.trajectories import pose as camera_pose
+from sceneprint.types import DepthFrame, Floats
+from sceneprint_client import AsyncTracker, Client, Tracker, errors
+from sceneprint_client.api import FrameMeta, GivenPose, Localization
+from sceneprint_client.frame_files import camera_of
+from sceneprint_client.tracker import State, TrackerParameters, replay
+from sceneprint_client.tracker_core import difference, inverse, rotation_matrix
+
+DEPTH = np.ones((3, 4), np.float32)
+K = (5.0, 5.0, 1.5, 1.0)
+
+
+def answer(status: str, x: float = 0.0, **fields: Any) -> Localization:
+    """An answer of the service; `found` at (x, 0, 0)."""
+    matrix = np.eye(4)
+    matrix[0, 3] = x
+    pose = {
+        "parent_frame": "map", "child_frame": "query.optical",
+        "translation": {"x": x, "y": 0, "z": 0}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1},
+        "matrix": matrix.tolist(),
+    }  # fmt: skip
+    found = status == "found"
+    told = {
+        "status": status, "reason": f"{status}, told by a test", "map": "m",
+        "pose": pose if found else None, "support": 3 * found, "votes": 3 * found,
+        "spread_m": None, "spread_deg": None, "strength": "strong" if found else None,
+        "verified_by": "matches" if found else None, "rival_ratio": 0.0 if found else None,
+        "best": None, "matches": [], "query_id": "q", "seed": 0, "model": "depth",
+        "milliseconds": {},
+        "alternatives": [{"pose": pose, "weight": 1, "support": 1, "score": 0.5}]
+        if status == "ambiguous" else [],
+        **fields,
+    }  # fmt: skip
+    return Localization.model_validate(told)
+
+
+@dataclass
+class FakeClient:
+    """Answers as it was told; an error is raised."""
+
+    answers: list[Localization | Exception]
+    asked: list[dict[str, Any]] = field(default_factory=list)
+    begun: Event = field(default_factory=Event)
+    may_answer: Event = field(default_factory=Event)
+
+    def __post_init__(self) -> None:
+        self.may_answer.set()
+
+    def localize(self, map_name: str, frame: Any, meta: Any = None, **how: Any) -> Localization:
+        self.asked.append({"map": map_name, "frame": frame, "meta": meta, **how})
+        self.begun.set()
+        assert self.may_answer.wait(60)
+        told = self.answers[min(len(self.asked), len(self.answers)) - 1]
+        if isinstance(told, Exception):
+            raise told
+        return told
+
+
+def ahead(x: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
+def fake(*answers: Localization | Exception) -> Any:
+    return FakeClient(list(answers))
+
+
+def equal(a: State, b: State) -> bool:
+    names = ("T_map_odom", "T_map_sensor", "covariance")
+    same = all(np.array_equal(getattr(a, n), getattr(b, n)) for n in names)
+    plain = [(s.status, s.stamp, s.parent_frame, s.age, s.reason) for s in (a, b)]
+    return same and plain[0] == plain[1]
+
+
+def test_its_state_is_the_prior_of_the_next_question() -> None:
+    client = fake(answer("found", 5.0), answer("found", 6.0), answer("not_found"))
+    tracker = Tracker(client, "m", camera=K)
+    state = tracker.update(DEPTH, ahead(0), stamp=0.0, up=(0, -1, 0))
+    assert (state.status, state.parent_frame) == ("tracking", "map")
+    tracker.update(DEPTH, ahead(1), stamp=1.0, meta=FrameMeta())
+    first, second = client.asked
+    assert (first["map"], first["meta"], first["up"], first["prior"]) == ("m", K, (0, -1, 0), None)
+    assert second["meta"] == FrameMeta()
+    assert second["prior"].pose.parent_frame == "map"
+    np.testing.assert_allclose(second["prior"].pose.matrix, ahead(6), atol=1e-9)
+    covariance = np.reshape(second["prior"].covariance, (6, 6))
+    assert (np.diag(covariance) > 0).all()
+    assert tracker.update(DEPTH, ahead(2), stamp=2.0).age == 1.0
+
+
+def test_weak_and_rivalled_answers_are_no_fix_alone() -> None:
+    for fields in ({"support": 1}, {"strength": "weak"}, {"rival_ratio": 0.6}):
+        tracker = Tracker(fake(answer("found", 5.0, **fields)), "m", camera=K)
+        assert tracker.update(DEPTH, ahead(0), stamp=0.0).status == "lost"
+    told = answer("found", 5.0, verified_by="prior")
+    assert Tracker(fake(told), "m", camera=K).update(DEPTH, ahead(0)).status == "lost"
+    no_poses = Tracker(fake(answer("found", pose=None)), "m", camera=K)
+    assert "no frame" in no_poses.update(DEPTH, ahead(0)).reason.lower()
+
+
+def test_a_service_that_is_away_leaves_it_to_odometry() -> None:
+    away = (errors.Unreachable("away"), errors.Busy("busy"), errors.Refused("bad", 502, {}))
+    client = fake(answer("found", 5.0), *away, errors.UselessFrame("blank"))
+    tracker = Tracker(client, "m", camera=K)
+    states = [tracker.update(DEPTH, ahead(i), stamp=i) for i in range(5)]
+    assert {one.status for one in states} == {"tracking"}
+    np.testing.assert_allclose(states[-1].T_map_sensor, ahead(9), atol=1e-9)
+    assert states[-1].age == 4
+    for wrong in (errors.UnknownMap("no map"), errors.Refused("odd", 418, {})):
+        with pytest.raises(type(wrong)):
+            Tracker(fake(wrong), "m", camera=K).update(DEPTH, ahead(0))
+
+
+def test_its_log_replays_to_the_same_states() -> None:
+    told = [answer("found", 5.0), answer("ambiguous", 6.0), answer("found", 40.0),
+            answer("found", 41.0), answer("not_found"), answer("found", 43.0)]  # fmt: skip
+    log = io.StringIO()
+    tracker = Tracker(fake(*told), "m", camera=K, log=log)
+    states = []
+    for i in range(6):
+        states.append(tracker.move(ahead(i - 0.5), i - 0.5))
+        states.append(tracker.update(DEPTH, ahead(i), stamp=float(i)))
+    states.append(tracker.reset("a lift"))
+    assert "".join(one.status[0] for one in states) == "lttttttlllltl"
+    again = list(replay(log.getvalue().splitlines()))
+    assert len(again) == len(states)
+    assert all(map(equal, again, states))
+    other = list(replay(log.getvalue().splitlines(), TrackerParameters(strong_weight=0.1)))
+    assert {one.status for one in other} == {"lost", "ambiguous"}
+
+
+def test_a_thread_asks_for_the_latest_frame_alone() -> None:
+    client = fake(answer("found", 5.0), answer("found", 8.0))
+    client.may_answer.clear()
+    log = io.StringIO()
+    with AsyncTracker(Tracker(client, "m", camera=K, log=log)) as tracker:
+        assert tracker.submit("0", ahead(0), stamp=0.0).status == "lost"
+        assert client.begun.wait(60)
+        for i in (1, 2, 3):
+            assert tracker.submit(str(i), ahead(i), stamp=float(i)).status == "lost"
+        assert not tracker.wait(0)
+        client.may_answer.set()
+        assert tracker.wait(60)
+        assert [one["frame"] for one in client.asked] == ["0", "3"]
+        assert tracker.dropped == 2
+        state = tracker.submit("4", ahead(4), stamp=4.0)
+        assert (state.status, state.age) == ("tracking", 1.0)
+        np.testing.assert_allclose(state.T_map_sensor, ahead(9), atol=1e-9)
+        assert tracker.wait(60)
+    assert equal(list(replay(log.getvalue().splitlines()))[-2], state)
+
+
+def test_an_answer_to_a_frame_from_before_a_reset_is_not_used() -> None:
+    client = fake(answer("found", 5.0))
+    client.may_answer.clear()
+    inner = Tracker(client, "m", camera=K)
+    with AsyncTracker(inner) as tracker:
+        tracker.submit("0", ahead(0), stamp=0.0)
+        assert client.begun.wait(60)
+        tracker.submit("1", ahead(1), stamp=1.0)
+        assert inner.reset("a lift").reason == "a lift"
+        client.may_answer.set()
+        assert tracker.wait(60)
+        assert tracker.submit("2", ahead(0), stamp=0.5).status == "lost"  # the clock began anew
+        assert tracker.wait(60)
+        assert tracker.submit("3", ahead(0), stamp=0.6).status == "tracking"
+
+
+def test_what_the_thread_meets_is_raised_by_the_next_submit() -> None:
+    with AsyncTracker(Tracker(fake(errors.UnknownMap("no map")), "m", camera=K)) as tracker:
+        tracker.submit(DEPTH, ahead(0), stamp=0.0)
+        assert tracker.wait(60)
+        with pytest.raises(errors.UnknownMap):
+            tracker.submit(DEPTH, ahead(1), stamp=1.0)
+
+
+# Runs through synthetic buildings, against a service in this process.
+
+
+@dataclass
+class Seen:
+    """What a robot had while it drove, and where it truly was."""
+
+    depth: np.ndarray
+    T_map_sensor: Floats
+
+
+def drifted(poses: list[Floats], seed: int, share: float = 0.01) -> list[Floats]:
+    """Odometry that begins at the origin: too long by a share, turning by 0.1 deg/m, and noisy."""
+    rng = np.random.default_rng(seed)
+    odometry = [np.eye(4)]
+    for a, b in pairwise(poses):
+        moved = inverse(a) @ b
+        way = np.linalg.norm(moved[:3, 3])
+        moved[:3, 3] += share * moved[:3, 3] + rng.normal(0, share * way, 3)
+        moved[:3, :3] = moved[:3, :3] @ rotation_matrix(np.radians([0, 0.1 * way, 0]))
+        odometry.append(odometry[-1] @ moved)
+    return odometry
+
+
+def shifted(frame: DepthFrame, x: float) -> Seen:
+    assert frame.pose is not None
+    T = frame.pose.copy()
+    T[0, 3] += x
+    return Seen(frame.depth, T)
+
+
+@dataclass
+class Building:
+    """A map of a service, and its camera."""
+
+    client: Client
+    name: str
+    camera: Any
+
+    def fill(self, views: list[Seen]) -> None:
+        self.client.create_map(self.name, "a building", model="depth")
+        jobs = []
+        for view in views:
+            pose = GivenPose(parent_frame="building", matrix=view.T_map_sensor.tolist())
+            meta = FrameMeta(intrinsics=self.camera, session="walk", pose=pose)
+            jobs.append(self.client.upload(self.name, view.depth, meta).job_id)
+        self.client.wait(jobs)
+
+    def drive(self, views: list[Seen], odometry: list[Floats]) -> Iterator[tuple[State, float]]:
+        """Each state at 2.5 Hz, and how far off it is, metres; infinite where nothing is told."""
+        tracker = Tracker(self.client, self.name, camera=self.camera)
+        for i, (view, T) in enumerate(zip(views, odometry, strict=True)):
+            state = tracker.update(view.depth, T, stamp=0.4 * i)
+            off = np.inf
+            if state.T_map_sensor is not None:
+                off = difference(state.T_map_sensor, view.T_map_sensor)[0]
+            yield state, float(off)
+
+
+@pytest.fixture
+def building(client: Client, map_name: str) -> Callable[[DepthFrame], Building]:
+    def make(frame: DepthFrame) -> Building:
+        k = frame.intrinsics
+        return Building(client, map_name, camera_of((k.fx, k.fy, k.cx, k.cy), (k.width, k.height)))
+
+    return make
+
+
+def walked(seed: int, index: int, views: int) -> tuple[list[Seen], list[Seen]]:
+    """Of a walk in a room every third frame for the map, and the others."""
+    frames = [shifted(one, 20.0 * index) for one in
+              synthesise_room(seed, index, views, along_path=True).frames]  # fmt: skip
+    return frames[::3], [one for i, one in enumerate(frames) if i % 3]
+
+
+def check_kidnapping(site: Building, runs: list[list[Seen]]) -> None:
+    """Drive each run after the other, as if the robot had not moved in between."""
+    odometry: list[Floats] = []
+    for seed, run in enumerate(runs):
+        start = odometry[-1] if odometry else np.eye(4)
+        odometry += [start @ T for T in drifted([one.T_map_sensor for one in run], seed)]
+    states = list(site.drive([one for run in runs for one in run], odometry))
+    begin = 0
+    for run in runs:
+        part, begin = states[begin : begin + len(run)], begin + len(run)
+        right = [state.status == "tracking" and off < 0.3 for state, off in part]
+        assert any(right)
+        fixed = right.index(True)
+        assert np.mean(right[fixed:]) >= 0.99
+        # until it is lost it follows odometry from before: 2 s of contradictions at most
+        wrong = [state.stamp for state, off in part if state.status == "tracking" and off >= 0.3]
+        if run is runs[0]:
+            assert wrong == []
+        elif wrong:
+            assert wrong[-1] - wrong[0] <= 2.0
+            assert any(state.status == "lost" for state, _ in part[:fixed])
+
+
+def test_it_tracks_and_is_found_again_after_a_kidnapping(
+    building: Callable[[DepthFrame], Building],
+) -> None:
+    rooms = [walked(5, index, 24) for index in (0, 1)]
+    site = building(synthesise_room(5, 0, 1).frames[0])
+    site.fill([view for seen, _ in rooms for view in seen])
+    check_kidnapping(site, [rooms[0][1][::2], rooms[1][1][::2]])
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("seed", [5, 6])
+def test_it_tracks_through_a_building(
+    building: Callable[[DepthFrame], Building], seed: int
+) -> None:
+    rooms = [walked(seed, index, 60) for index in range(3)]
+    site = building(synthesise_room(seed, 0, 1).frames[0])
+    site.fill([view for seen, _ in rooms for view in seen])
+    check_kidnapping(site, [run for _, run in rooms])
+
+
+@pytest.mark.thorough
+def test_it_tracks_through_a_kitchen_that_was_recorded(
+    client: Client, map_name: str, data_root: Path
+) -> None:
+    frames = find_sequences(data_root / "7scenes" / "redkitchen")[0].frames
+    client.create_map(map_name, "a kitchen", model="depth")
+    client.wait([client.upload(map_name, one).job_id for one in frames[0:600:4]])
+    run = frames[650:1000:5]
+    truth = [one.pose for one in run if one.pose is not None]
+    assert len(truth) == len(run) == 70
+    tracker = Tracker(client, map_name)
+    right = []
+    for i, (frame, T) in enumerate(zip(run, drifted(truth, 0), strict=True)):
+        state = tracker.update(frame, T, stamp=i / 6)
+        if state.status == "tracking":
+            assert state.T_map_sensor is not None
+            assert difference(state.T_map_sensor, truth[i])[0] < 0.1
+        right.append(state.status == "tracking")
+    assert np.mean(right[right.index(True) :]) >= 0.99
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", ["object", "offices"])
+@pytest.mark.parametrize("index", range(4))
+def test_beside_what_looks_alike_it_never_tracks_wrongly(
+    building: Callable[[DepthFrame], Building], kind: str, index: int
+) -> None:
+    site = synthesise_lookalike(kind, 7000, index, queries=12)
+    place = building(site.map[0])
+    place.fill([shifted(one, 0.0) for one in site.map])
+    run = [shifted(one, 0.0) for one in site.queries]
+    for state, off in place.drive(run, drifted([one.T_map_sensor for one in run], index)):
+        assert state.status != "tracking" or off < 0.3
+
+
+@pytest.mark.thorough
+def test_in_a_corridor_of_equal_doors_it_never_tracks_wrongly(
+    building: Callable[[DepthFrame], Building],
+) -> None:
+    hall = corridor(8)
+    camera = synthesise_room(5, 0, 1).frames[0]
+
+    def looking(x: float, yaw: float) -> Seen:
+        T = camera_pose(np.array([x, 0.9, 1.4, yaw, -0.05, 0.0]))
+        return Seen(render(hall, T, camera.intrinsics), T)
+
+    place = building(camera)
+    place.fill([looking(x, yaw) for x in np.arange(1, 15.1, 0.7) for yaw in (0.3, -0.3)])
+    run = [looking(x, 0.25) for x in np.arange(4.1, 14, 0.25)]
+    states = list(place.drive(run, drifted([one.T_map_sensor for one in run], 1)))
+    assert all(off < 0.3 for state, off in states if state.status == "tracking")
