@@ -383,8 +383,7 @@ def _frames_of(
     places: dict[str, Path] = {}
     for path in paths:
         for sequence in find_sequences(path):
-            shared = sequence.parent_frame != sequence.name
-            place = (sequence.folder.parent if shared else sequence.folder).resolve()
+            place = sequence.place.resolve()
             if places.setdefault(sequence.parent_frame, place) != place and not one_frame:
                 raise DatasetError(
                     f"{path}: The name {sequence.parent_frame} is also used for "

@@ -731,8 +731,7 @@ class _Gathered:
 
     def _add(self, path: Path, new: list[tuple[Run, FrameReference]], use: Use) -> None:
         for run, reference in new:
-            scene, file = run.parent_frame, reference.path.resolve()
-            place = run.folder if run.name == scene else run.folder.parent
+            scene, file, place = run.parent_frame, reference.path.resolve(), run.place
             if self._places.setdefault(scene, place.resolve()) != place.resolve():
                 raise DatasetError(
                     f"{path}: Another scene is called {scene} too, {self._places[scene]}. "
