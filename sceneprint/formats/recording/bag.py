@@ -44,6 +44,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 #: Transforms that ROS 1 wrote before tf2; the fields are the same.
 OLD_TRANSFORMS = "tf/msg/tfMessage"
+_TRANSFORMS_FIELDS = "geometry_msgs/TransformStamped[] transforms"
 #: Types of messages that are decoded, and no others.
 TYPES = (IMAGE, COMPRESSED, POINTS, CAMERA, IMU, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
 
@@ -276,14 +277,17 @@ def _types(*, ros1: bool) -> Typestore:
     MissingDependency : rosbags is not installed.
     """
     try:
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as cause:
         raise MissingDependency(
             "Recordings of ROS are read with rosbags, which is not installed. "
             "Run: pip install 'sceneprint[ros]'"
         ) from cause
     _limit_decompression()
-    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    if TRANSFORMS not in types.fielddefs:
+        types.register(get_types_from_msg(_TRANSFORMS_FIELDS, TRANSFORMS))
+    return types
 
 
 def _limit_decompression() -> None:
