@@ -194,8 +194,9 @@ class FrameReference(FrameFile):
             return self.read_depth()
         if self.source is None:
             return read_cloud(self.path, self.cloud, name=self.name, pose=self.pose).cloud
+        data = self.source.read_bytes()
         with naming(str(self.path)):
-            scan = decode_scan(self.source.read_bytes(), pose=self.pose)
+            scan = decode_scan(data, pose=self.pose)
         return replace(scan.cloud, name=self.name)
 
     def read_depth(self) -> DepthFrame:

@@ -253,7 +253,13 @@ def _stated(path: Path, what: str = "The recording cannot be read") -> Iterator[
     except Exception as cause:
         reason = " ".join(str(cause).split()) or type(cause).__name__
         what = what[0].upper() + what[1:]
-        raise DatasetError(f"{path}: {what} ({reason:.200}). {_advice(path)}") from cause
+        told = printable(f"{what} ({reason:.200}). {_advice(path)}")
+        raise DatasetError(f"{path}: {told}") from cause
+
+
+def printable(text: str) -> str:
+    """A text of a bag as it can stand in a line: names in damaged bags may be anything."""
+    return text if text.isprintable() else ascii(text)[1:-1]
 
 
 def _advice(path: Path) -> str:

@@ -77,7 +77,7 @@ def _point_type(message: Any, step: int) -> np.dtype[Any]:
     if len(found) != 3:
         names = ", ".join(str(field.name) for field in message.fields[:20])
         raise UnreadableCloud(
-            f"The cloud has the fields {names or 'none'!r:.120}, and x, y and z are needed. "
+            f"The cloud has the fields {names[:120] or 'none'}, and x, y and z are needed. "
             "Name the topic of the points."
         )
     if any(offset + np.dtype(kind).itemsize > step for kind, offset in found.values()):

@@ -28,6 +28,7 @@ from sceneprint.formats.recording.bag import (
     POINTS,
     Bag,
     BagTopic,
+    printable,
     shared_bag,
 )
 from sceneprint.formats.recording.image_messages import (
@@ -265,7 +266,7 @@ def _without_transport(topic: str) -> str:
 def _listed(topics: Iterable[BagTopic]) -> str:
     """Names for people."""
     names = [f"{one.name} ({one.type.rpartition('/')[2]}, {one.count} messages)" for one in topics]
-    return ", ".join(names[:20]) or "none"
+    return printable(", ".join(names[:20])) or "none"
 
 
 # Frames.
@@ -437,7 +438,7 @@ def _note(frames: FrameTopic, scan: BagScan, motion: _Motion) -> str:
     where = f"poses in {motion.world}" if motion.world else "no poses"
     if motion.unknown and motion.world is None:
         where = "no poses, as no transform is known at the time of any frame"
-    told = f"{taken} of {total} frames of {frames.topic.name} taken, {where}"
+    told = f"{taken} of {total} frames of {printable(frames.topic.name)} taken, {where}"
     return f"{told}; left out: {', '.join(left)}" if left else told
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset.frame_reference import SensorTrajectory, interpolate
+from sceneprint.formats.recording.bag import printable
 from sceneprint.geometry.pose.rigid import rotation_of
 from sceneprint.types import Floats
 
@@ -261,5 +262,5 @@ class TransformTree:
 
 
 def frame_name(name: str) -> str:
-    """A frame's name without the leading slash of ROS 1."""
-    return name.lstrip("/")
+    """A frame's name without the leading slash of ROS 1, in one line of printable characters."""
+    return printable(name.lstrip("/"))
