@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidIntrinsics, UnreadableFrame
-from sceneprint.formats.image.depth_file import PNG_SIGNATURE, decode_png
+from sceneprint.formats.image.depth_file import PNG_SIGNATURE, decode_png, encode_png
 from sceneprint.types import MAXIMUM_SAMPLES, Floats32
 from sceneprint_client.sidecars import Intrinsics
 
@@ -73,7 +73,7 @@ def depth_file(message: Any, *, compressed: bool) -> bytes:
     samples = _samples(message, np.dtype((">" if message.is_bigendian else "<") + kind))
     if kind == "f4":
         return npy_file(samples.astype("<f4"))
-    return _png_file(samples.astype(np.uint16))
+    return encode_png(samples.astype(np.uint16))
 
 
 def _samples(message: Any, kind: np.dtype[Any]) -> NDArray[Any]:
@@ -135,15 +135,6 @@ def npy_file(samples: NDArray[Any]) -> bytes:
     """Bytes of an NPY file."""
     file = io.BytesIO()
     np.save(file, np.ascontiguousarray(samples))
-    return file.getvalue()
-
-
-def _png_file(samples: NDArray[np.uint16]) -> bytes:
-    """Bytes of a 16-bit greyscale PNG, compressed little, as it travels once."""
-    from PIL import Image
-
-    file = io.BytesIO()
-    Image.fromarray(samples).save(file, "PNG", compress_level=1)
     return file.getvalue()
 
 
