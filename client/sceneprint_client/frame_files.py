@@ -23,6 +23,7 @@ from sceneprint_client.file_formats import (
     HEAD,
     MAXIMUM_CLOUD_BYTES,
     MAXIMUM_IMAGE_BYTES,
+    RECORDING_SUFFIXES,
     SUFFIXES,
     format_of,
     is_cloud,
@@ -291,6 +292,11 @@ def _named(path: Path) -> FrameFile:
     file = path.resolve() if ".." in path.parts else path.absolute()
     if not file.is_file():
         raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
+    if file.suffix.lower() in RECORDING_SUFFIXES:
+        raise DatasetError(
+            f"{path}: This is a recording of ROS, and one frame is wanted. Upload it with "
+            "`sceneprint upload`, or send the frames that sceneprint.find_sequences returns."
+        )
     return find_frame_file(file)
 
 

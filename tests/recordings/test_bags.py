@@ -295,7 +295,7 @@ def test_a_map_comes_before_odometry_and_either_can_be_chosen(
     np.testing.assert_allclose(in_map.frames[4].pose, T_map_odom @ expected, atol=1e-9)
     in_odom = only(path, RecordingOptions(pose_frame="odom", keyframe_m=0))
     np.testing.assert_allclose(in_odom.frames[4].pose, expected, atol=1e-9)
-    with pytest.raises(DatasetError, match=r"from camera to mars.*base_link, odom, map"):
+    with pytest.raises(DatasetError, match=r"from camera to 'mars'.*base_link, odom, map"):
         only(path, RecordingOptions(pose_frame="mars"))
 
 
@@ -465,6 +465,7 @@ def test_several_topics_are_listed(tmp_path: Path, ros: SimpleNamespace, depth: 
         writer.image(0.1, depth(0))
         writer.compressed(0.1, depth(0))
         writer.points(0.1, rows)
+        writer.imu(0.1, (0, 0, 9.8))
 
     path = ros.write(tmp_path, fill)
     with pytest.raises(DatasetError) as caught:
@@ -476,11 +477,13 @@ def test_several_topics_are_listed(tmp_path: Path, ros: SimpleNamespace, depth: 
     assert only(path, RecordingOptions(topic="/points")).frames[0].kind == "cloud"
     compressed = "/camera/depth/image_raw/compressedDepth"
     assert only(path, RecordingOptions(topic=compressed)).frames[0].kind == "depth"
-    with pytest.raises(DatasetError, match="There is no topic /nothing"):
+    with pytest.raises(DatasetError, match="There is no topic '/nothing'"):
         only(path, RecordingOptions(topic="/nothing"))
+    with pytest.raises(DatasetError, match=r"/imu .sensor_msgs/msg/Imu, 1 messages. has no depth"):
+        only(path, RecordingOptions(topic="/imu"))
     with pytest.raises(DatasetError, match=r"/camera/color/image_raw .* has no depth"):
         only(path, RecordingOptions(topic="/camera/color/image_raw"))
-    with pytest.raises(DatasetError, match="no topic /points of CameraInfo"):
+    with pytest.raises(DatasetError, match="no topic '/points' of CameraInfo"):
         only(path, RecordingOptions(topic="/camera/depth/image_raw", camera_info="/points"))
     outline = bag_outline(path, RecordingOptions())
     assert [one.topic.name for one in outline.frames] == ["/camera/depth/image_raw", "/points"]

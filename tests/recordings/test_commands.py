@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 
 from sceneprint.cli import main
 from sceneprint.cli.demo import serving
+from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import decode_png, find_sequences
 from sceneprint.formats.recording import bag
 from sceneprint_client import Client
@@ -252,8 +254,26 @@ def test_without_rosbags_the_extra_is_named(
     )
 
 
+def test_a_client_is_told_that_a_bag_is_no_frame(service_url: str, recording: Path) -> None:
+    with Client(service_url) as client, pytest.raises(DatasetError, match="a recording of ROS"):
+        client.localize("bag", recording)
+
+
 def test_options_that_are_none(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for given in ("-1", "nan", "x"):
         with pytest.raises(SystemExit):
             main(["bag", "info", str(recording), "--keyframe-m", given])
         assert "is not a number from 0 up" in capsys.readouterr().err
+
+
+def test_rosbags_is_loaded_when_a_bag_is_opened_and_not_before(folder: Path) -> None:
+    program = (
+        "import sys\nfrom pathlib import Path\nimport sceneprint.cli.upload\n"
+        "from sceneprint.formats.dataset import find_sequences\n"
+        "find_sequences(Path(sys.argv[1]))\n"
+        "print([one for one in sys.modules if one.partition('.')[0] in ('rosbags', 'apsw')])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(folder)], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "[]\n"

@@ -278,7 +278,8 @@ def find_sequences(
             f"{path}: There is no depth image or cloud here or up to {_DEPTH} folders below. Name "
             "a 7-Scenes scene or sequence (frame-000000.depth.png), a TUM RGB-D folder "
             "(depth.txt), a folder of 16-bit PNG or float NPY depth images, one of PLY, PCD, "
-            "KITTI .bin, LAS or LAZ clouds, or one such file."
+            "KITTI .bin, LAS or LAZ clouds, one such file, or a recording of ROS (.mcap, .db3 or "
+            ".bag file, rosbag2 folder)."
         )
     _check_parent_frames(found)
     return found

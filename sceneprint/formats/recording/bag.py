@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.errors import DatasetError, MissingDependency, SceneprintError
+from sceneprint_client.file_formats import RECORDING_SUFFIXES
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -27,8 +28,7 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader as Ros2Reader
     from rosbags.typesys.store import Typestore
 
-#: Suffixes of files of ROS; a rosbag2 folder has `metadata.yaml`.
-SUFFIXES = (".mcap", ".db3", ".bag")
+#: What a rosbag2 folder has beside its databases.
 _METADATA = "metadata.yaml"
 #: Most bytes of one chunk once it is decompressed; recorders write 1 to 4 MB.
 MAXIMUM_CHUNK_BYTES = 256 << 20
@@ -53,7 +53,7 @@ def is_recording(path: Path) -> bool:
     """Whether a path is a recording of ROS by its name, or a folder with a rosbag2's metadata."""
     if path.is_dir():
         return (path / _METADATA).is_file() and not (path / "intrinsics.json").is_file()
-    return path.suffix.lower() in SUFFIXES
+    return path.suffix.lower() in RECORDING_SUFFIXES
 
 
 @dataclass(frozen=True)

@@ -192,16 +192,17 @@ def choose_topic(bag: Bag, wanted: str | None) -> FrameTopic:
         named = [one for one in bag.topics if one.name == wanted]
         if not named:
             raise DatasetError(
-                f"{bag.path}: There is no topic {wanted:.100}. Choose one of "
+                f"{bag.path}: There is no topic {wanted!r:.100}. Choose one of "
                 f"{_listed(one.topic for one in candidates)}; `sceneprint bag info` lists all."
             )
         found = next((one for one in candidates if one.topic.name == wanted), None)
-        found = found or _frame_topic(bag, named[0])
-        if found is None or named[0].type not in (IMAGE, COMPRESSED, POINTS):
+        if found is None and named[0].type in (IMAGE, COMPRESSED, POINTS):
+            found = _frame_topic(bag, named[0])
+        if found is None:
             raise DatasetError(
-                f"{bag.path}: The topic {wanted} ({named[0].type}, {named[0].count} messages) has "
-                "no depth images (16UC1, mono16, 32FC1, or PNG of compressedDepth) and no points. "
-                f"Choose one of {_listed(one.topic for one in candidates)}."
+                f"{bag.path}: The topic {printable(wanted)} ({printable(named[0].type)}, "
+                f"{named[0].count} messages) has no depth images (16UC1, mono16, 32FC1, or PNG of "
+                f"compressedDepth) and no points. Choose one of {_listed(one.topic for one in candidates)}."
             )
         return found
     if not candidates:
@@ -230,7 +231,7 @@ def camera_topic(bag: Bag, frames: FrameTopic, wanted: str | None) -> BagTopic |
         found = next((one for one in known if one.name == wanted), None)
         if found is None:
             raise DatasetError(
-                f"{bag.path}: There is no topic {wanted:.100} of CameraInfo. Choose one of "
+                f"{bag.path}: There is no topic {wanted!r:.100} of CameraInfo. Choose one of "
                 f"{_listed(known)} with --camera-info."
             )
         return found
@@ -341,7 +342,7 @@ def _motion(bag: Bag, scan: BagScan, frames: FrameTopic, options: RecordingOptio
     if options.pose_frame is not None and tree.path(options.pose_frame, frames.frame) is None:
         raise DatasetError(
             f"{bag.path}: No transforms lead from {frames.frame or 'the sensor'} to "
-            f"{options.pose_frame:.100}. Frames above it are "
+            f"{options.pose_frame!r:.100}. Frames above it are "
             f"{', '.join(tree.ancestors(frames.frame)[1:]) or 'none'}."
         )
     poses: list[Floats | None] = [None] * len(stamps)
