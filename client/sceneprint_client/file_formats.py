@@ -125,6 +125,10 @@ SUFFIXES: dict[str, CloudFormat] = {
 }  # fmt: skip
 
 
+#: Suffixes of recordings of ROS, whose messages are many frames.
+RECORDING_SUFFIXES = (".mcap", ".db3", ".bag")
+
+
 def format_of(data: bytes) -> CloudFormat | None:
     """What the first bytes of a file tell, or None; a KITTI scan has nothing that tells it.
 

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ from sceneprint_client.file_formats import (
     HEAD,
     MAXIMUM_CLOUD_BYTES,
     MAXIMUM_IMAGE_BYTES,
+    RECORDING_SUFFIXES,
     SUFFIXES,
     format_of,
     is_cloud,
@@ -55,6 +56,13 @@ SEVEN_SCENES = re.compile(r"frame-\d+\.depth\.png", re.ASCII)
 _DATES_S = (1e9, 4e9)
 
 
+class FrameSource(Protocol):
+    """Where the bytes of a frame come from that has no file of its own."""
+
+    def read_bytes(self) -> bytes:
+        """What a PNG, NPY or other file of the frame would hold; raises SceneprintError."""
+
+
 @dataclass(frozen=True, eq=False)
 class FrameFile:
     """The file of one frame, and what lies beside it; not yet read.
@@ -62,11 +70,13 @@ class FrameFile:
     Parameters
     ----------
     name : of the frame, after its sequence, such as "seq-01/frame-000000"
-    path : the depth image, or the file of points
+    path : the depth image, or the file of points; with `source` a path that no other frame has
     camera : the sensor; None for points
     timestamp : seconds, or None where the layout has none
     pose_source : file of the pose, the pose itself, or None where unknown
     cloud : how the points are read; None for a depth image. One of this and `camera` is given
+    source : where the bytes come from, if not from the file
+    base : where the sensor sits on the robot; None where not known
     """
 
     name: str
@@ -75,6 +85,8 @@ class FrameFile:
     timestamp: float | None = None
     pose_source: Path | NDArray[np.float64] | None = None
     cloud: CloudSource | None = None
+    source: FrameSource | None = None
+    base: GivenBase | None = None
 
     def __post_init__(self) -> None:
         if (self.camera is None) == (self.cloud is None):
@@ -84,6 +96,18 @@ class FrameFile:
     def kind(self) -> Literal["depth", "cloud"]:
         """What its file holds."""
         return "depth" if self.cloud is None else "cloud"
+
+    def read_bytes(self) -> bytes:
+        """Bytes of the frame, as they are sent.
+
+        Raises
+        ------
+        UnreadableFrame, UnreadableCloud : they cannot be read, or are too many.
+        DatasetError : what holds them is damaged.
+        """
+        if self.source is not None:
+            return self.source.read_bytes()
+        return _read(self.path, is_cloud=self.kind == "cloud")
 
     @property
     def pose(self) -> NDArray[np.float64] | None:
@@ -165,7 +189,7 @@ def meta_of(
     with_pose : send the pose where it is known
     parent_frame : what its pose leads to; default: the session's name. Sequences of one scene
         share it: `Sequence.parent_frame`
-    base : where the sensor sits on the robot
+    base : where the sensor sits on the robot; default: as the frame says
     up : unit vector in the sensor's axes; default: of the sidecar, for all of its frames
 
     Raises
@@ -192,7 +216,7 @@ def meta_of(
         session=sequence if session is None else session,
         captured_at=None if stamp is None else datetime.fromtimestamp(stamp, timezone.utc),
         pose=pose,
-        T_base_sensor=base,
+        T_base_sensor=reference.base if base is None else base,
         up=_direction(up),
         tags=list(tags),
     )
@@ -273,7 +297,7 @@ def sendable(
         return _read(Path(frame), is_cloud=known.intrinsics is None), known
     else:
         found = _named(Path(frame))
-    data = _read(found.path, is_cloud=found.kind == "cloud")
+    data = found.read_bytes()
     return data, meta_of(found, with_pose=with_pose, up=up) if known is None else known
 
 
@@ -396,6 +420,11 @@ def _named(path: Path) -> FrameFile:
     file = path.resolve() if ".." in path.parts else path.absolute()
     if not file.is_file():
         raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
+    if file.suffix.lower() in RECORDING_SUFFIXES:
+        raise DatasetError(
+            f"{path}: This is a recording of ROS, and one frame is wanted. Upload it with "
+            "`sceneprint upload`, or send the frames that sceneprint.find_sequences returns."
+        )
     return find_frame_file(file)
 
 

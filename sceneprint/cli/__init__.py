@@ -34,6 +34,7 @@ COMMANDS = {
     "reconstruct": "sessions",
     "jobs": "inventory",
     "events": "inventory",
+    "bag": "bag",
     "doctor": "doctor",
     "fsck": "storage",
     "reencode": "storage",

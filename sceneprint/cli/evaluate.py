@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
+from sceneprint.cli.bag import add_recording_options, sequences_at
 from sceneprint.cli.numbers import positive, whole_number
 from sceneprint.cli.options import add_judging_options, add_model_options, open_for
 from sceneprint.errors import DatasetError
@@ -53,6 +55,7 @@ def add_evaluate(commands: Any) -> None:
     add_model_options(command)
     _add_frames(command)
     _add_method(command)
+    add_recording_options(command)
     command.add_argument("--json", type=Path, metavar="FILE", help="write all figures as JSON")
     command.add_argument(
         "--plots",
@@ -261,6 +264,7 @@ def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
         database_step=options.db_step,
         query_step=options.query_step,
         shared=options.gap_m is not None,
+        find=partial(sequences_at, options=options),
     )
 
 

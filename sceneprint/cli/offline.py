@@ -20,6 +20,7 @@ from typing import Any
 from tqdm import tqdm
 
 from sceneprint.atomic_files import write_whole
+from sceneprint.cli.bag import add_recording_options, sequences_at
 from sceneprint.cli.numbers import metres, positive, whole_number
 from sceneprint.cli.options import add_model_options, open_for
 from sceneprint.errors import DatasetError, FrameError, TrainingError
@@ -61,6 +62,7 @@ def add_sign(commands: Any) -> None:
         metavar="DIR",
         help="write one FRAME.sig per frame (the bytes of the signature) and signatures.json",
     )
+    add_recording_options(command)
     command.set_defaults(run=run_sign)
 
 
@@ -75,7 +77,7 @@ class Signed:
     reason: str = ""
 
 
-def named_frames(paths: list[Path]) -> list[tuple[str, FrameReference]]:
+def named_frames(options: argparse.Namespace) -> list[tuple[str, FrameReference]]:
     """All frames below the paths, under names that are unique among them.
 
     Raises
@@ -84,10 +86,11 @@ def named_frames(paths: list[Path]) -> list[tuple[str, FrameReference]]:
     """
     frames: dict[str, FrameReference] = {}
     files: set[Path] = set()
+    paths = options.paths
     for path in paths:
         several = len(paths) > 1 and path.is_dir()  # a file is named by its folder already
         prefix = f"{path.resolve().name}/" if several else ""
-        for sequence in find_sequences(path):
+        for sequence in sequences_at(path, options):
             for reference in sequence.frames:
                 known = reference.name.startswith(prefix)
                 name = reference.name if known else prefix + reference.name
@@ -104,7 +107,7 @@ def named_frames(paths: list[Path]) -> list[tuple[str, FrameReference]]:
 
 def run_sign(options: argparse.Namespace) -> int:
     """Sign; returns 2 where a frame could not be signed."""
-    frames = named_frames(options.paths)
+    frames = named_frames(options)
     signer = open_for(options, Settings(), psi=options.psi)
     if options.out is not None:
         _claim(options.out, signer)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.atomic_files import check_writable, write_whole
+from sceneprint.cli.bag import add_recording_options, sequences_at
 from sceneprint.cli.numbers import whole_number
 from sceneprint.cli.options import (
     add_asking_options,
@@ -26,7 +27,7 @@ from sceneprint.cli.options import (
     settings_of,
 )
 from sceneprint.errors import DatasetError, FrameError, MissingDependency, TooLarge, UnknownFrame
-from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint.formats.dataset import FrameReference
 from sceneprint_client.api.query import MOST_OF_SEQUENCE
 from sceneprint_client.api.results import COLOURS, TRANSFORMS
 
@@ -112,7 +113,8 @@ def add_query(commands: Any) -> None:
         help="find frames of the same place in a map",
         description="Query a map with depth frames or point clouds: one file, or the frames of "
         "a folder (7-Scenes, TUM RGB-D or plain depth images, with an intrinsics.json beside "
-        "them or in a folder above; or clouds). They are not added to the map.",
+        "them or in a folder above; or clouds), or the keyframes of a recording of ROS. They are "
+        "not added to the map.",
     )
     command.add_argument("map", metavar="MAP")
     command.add_argument("path", type=Path, metavar="PATH")
@@ -141,13 +143,14 @@ def add_query(commands: Any) -> None:
     add_asking_options(command)
     add_prior_option(command)
     add_overlay_options(command)
+    add_recording_options(command)
     add_service_options(command)
     command.set_defaults(run=run_query)
 
 
 def run_query(options: argparse.Namespace) -> int:
     """Ask; returns 2 where a frame could not be looked up."""
-    references = query_frames(options.path, options.frame)
+    references = query_frames(options)
     how = {**options_of(options), "stages": options.stages, "prior": options.prior}
     several = options.map == "*" or options.also
     if several:
@@ -175,16 +178,22 @@ def run_query(options: argparse.Namespace) -> int:
     return 2 if failed else 0
 
 
-def query_frames(path: Path, wanted: str | None) -> list[FrameReference]:
-    """The frames to look up.
+def query_frames(options: argparse.Namespace) -> list[FrameReference]:
+    """The frames to look up: all, or that of `--frame`.
 
     Raises
     ------
     DatasetError : nothing is found at the path, or no such frame.
     """
-    references = [frame for sequence in find_sequences(path) for frame in sequence.frames]
-    if wanted is None:
-        return references
+    path = options.path
+    references = [frame for one in sequences_at(path, options) for frame in one.frames]
+    return references if options.frame is None else _wanted_frame(path, options.frame, references)
+
+
+def _wanted_frame(
+    path: Path, wanted: str, references: list[FrameReference]
+) -> list[FrameReference]:
+    """The frame of that index or name, alone; DatasetError where there is none."""
     if wanted.isascii() and wanted.isdigit():
         if int(wanted) < len(references):
             return [references[int(wanted)]]
@@ -327,7 +336,7 @@ def add_localize(commands: Any) -> None:
     )
     command.add_argument("map", metavar="MAP")
     command.add_argument(
-        "path", type=Path, metavar="FRAME", help="a depth image, a cloud or a folder"
+        "path", type=Path, metavar="FRAME", help="a depth image, a cloud, a folder or a recording"
     )
     command.add_argument(
         "--frame", metavar="N|FILE", help="frame of a folder: index from 0, or name (default: 0)"
@@ -341,14 +350,16 @@ def add_localize(commands: Any) -> None:
     add_up_option(command)
     add_asking_options(command)
     add_prior_option(command)
+    add_recording_options(command)
     add_service_options(command)
     command.set_defaults(run=run_localize)
 
 
 def run_localize(options: argparse.Namespace) -> int:
     """Ask; returns 1 where the frame is not found."""
-    reference = query_frames(options.path, options.frame)[0]
-    before = _frames_before(options, reference)
+    every = [frame for one in sequences_at(options.path, options) for frame in one.frames]
+    reference = _wanted_frame(options.path, options.frame or "0", every)[0]
+    before = _frames_before(options, every, reference)
     how = {**options_of(options), "prior": options.prior}
     with open_client(options) as client:
         if before:
@@ -362,7 +373,9 @@ def run_localize(options: argparse.Namespace) -> int:
     return 0 if there.status == "found" else 1
 
 
-def _frames_before(options: argparse.Namespace, reference: FrameReference) -> list[FrameReference]:
+def _frames_before(
+    options: argparse.Namespace, every: list[FrameReference], reference: FrameReference
+) -> list[FrameReference]:
     """The frames of a sequence before its last one; DatasetError where it cannot be asked so."""
     if options.last == 1:
         return []
@@ -374,7 +387,7 @@ def _frames_before(options: argparse.Namespace, reference: FrameReference) -> li
             "the frames."
         )
     run = reference.name.rpartition("/")[0]
-    frames = [f for f in query_frames(options.path, None) if f.name.rpartition("/")[0] == run]
+    frames = [frame for frame in every if frame.name.rpartition("/")[0] == run]
     place = [f.path for f in frames].index(reference.path)
     before = frames[max(place - options.last + 1, 0) : place]
     if len(before) < options.last - 1:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from sceneprint.cli.bag import add_recording_options, recording_options, tell
 from sceneprint.cli.numbers import positive
 from sceneprint.cli.options import (
     add_service_options,
@@ -262,8 +263,9 @@ def add_upload(commands: Any) -> None:
         help="upload depth frames and point clouds to a map of a service",
         description="Upload every frame of the given files and folders (7-Scenes, TUM RGB-D or "
         "plain depth images, with an intrinsics.json beside them or in a folder above; or point "
-        "clouds), and wait until they are signed. A zip or tar archive is sent whole and "
-        "unpacked by the service. A frame that the map already has is not stored twice.",
+        "clouds), and wait until they are signed. Of a recording of ROS (MCAP, rosbag2, ROS 1 "
+        "bag) keyframes are uploaded. A zip or tar archive is sent whole and unpacked by the "
+        "service. A frame that the map already has is not stored twice.",
     )
     command.add_argument(
         "map", metavar="MAP", help="map to upload to; created if it does not exist"
@@ -333,6 +335,7 @@ def add_upload(commands: Any) -> None:
         metavar="N",
         help="number of concurrent uploads (default: 4)",
     )
+    add_recording_options(command)
     add_service_options(command)
     command.set_defaults(run=run_upload)
 
@@ -341,7 +344,8 @@ def run_upload(options: argparse.Namespace) -> int:
     """Upload; returns 2 where a frame was not indexed."""
     archives = [path for path in options.paths if is_archive_file(path)]
     paths = [path for path in options.paths if path not in archives]
-    found = list(_frames_of(paths, options.every, one_frame=options.parent_frame is not None))
+    sequences = list(_sequences_of(paths, options))
+    found = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
     if options.base is not None and options.base_frame is not None:
         options.base = options.base.model_copy(update={"base_frame": options.base_frame})
     tally, start, stalled = Tally(), time.perf_counter(), False
@@ -356,6 +360,8 @@ def run_upload(options: argparse.Namespace) -> int:
         finally:  # what was received stays, however the run ended
             counted = tally.new + tally.there + tally.refused
             tally.report(max(len(found), counted), time.perf_counter() - start)
+            for sequence in sequences:
+                tell(sequence)
             if stalled:
                 print(
                     f"{len(tally.waiting)} frames are stored and waiting, but none was signed "
@@ -366,15 +372,8 @@ def run_upload(options: argparse.Namespace) -> int:
     return 2 if tally.errors or stalled else 0
 
 
-def _frames_of(
-    paths: list[Path], every: int, *, one_frame: bool
-) -> Iterator[tuple[FrameSequence, FrameReference]]:
-    """Frames with their sequences.
-
-    Parameters
-    ----------
-    paths, every : as given
-    one_frame : whether all poses lead to one frame, as the user says
+def _sequences_of(paths: list[Path], options: argparse.Namespace) -> Iterator[FrameSequence]:
+    """The sequences at all paths.
 
     Raises
     ------
@@ -382,18 +381,18 @@ def _frames_of(
     """
     places: dict[str, Path] = {}
     for path in paths:
-        for sequence in find_sequences(path):
-            shared = sequence.parent_frame != sequence.name
-            place = (sequence.folder.parent if shared else sequence.folder).resolve()
-            if places.setdefault(sequence.parent_frame, place) != place and not one_frame:
+        with recording_options(options) as recording:
+            found = find_sequences(path, recording)
+        for sequence in found:
+            place = sequence.place.resolve()
+            known = places.setdefault(sequence.parent_frame, place)
+            if known != place and options.parent_frame is None:
                 raise DatasetError(
-                    f"{path}: The name {sequence.parent_frame} is also used for "
-                    f"{places[sequence.parent_frame]}, and poses of the two would be mixed. "
-                    "Upload a folder above both, rename one, or, if their poses share one "
-                    "parent frame, name it with --parent-frame."
+                    f"{path}: The name {sequence.parent_frame} is also used for {known}, and poses "
+                    "of the two would be mixed. Upload a folder above both, rename one, or, if "
+                    "their poses share one parent frame, name it with --parent-frame."
                 )
-            for reference in sequence.frames[::every]:
-                yield sequence, reference
+            yield sequence
 
 
 def _see_to_map(client: Client, options: argparse.Namespace) -> None:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from PIL import Image, ImageFile
 
 from sceneprint.errors import FrameError, UnreadableFrame
-from sceneprint.formats.dataset import decode_png, make_frame
-from sceneprint.formats.image.depth_file import PNG_SIGNATURE
+from sceneprint.formats.dataset import decode_frame, decode_png, make_frame
+from sceneprint.formats.image.depth_file import PNG_SIGNATURE, encode_png, size_of
 from sceneprint.types import MAXIMUM_SAMPLES, DepthFrame, Intrinsics
 
 CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)
@@ -242,3 +242,27 @@ def test_any_pixels(
     size: tuple[int, int], rows: bytes, bits: int, colour: int, interlace: int
 ) -> None:
     frame_or_error(raw_png(*size, rows, bits=bits, colour=colour, interlace=interlace))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (7, 1), (60, 80)])
+def test_what_is_encoded_is_a_png_for_everybody(shape: tuple[int, int]) -> None:
+    samples = np.random.default_rng(0).integers(0, 65_536, shape).astype(np.uint16)
+    data = encode_png(samples)
+    np.testing.assert_array_equal(decode_png(data), samples)
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), samples)
+
+
+def test_a_compressed_depth_message_of_ros() -> None:
+    """A header of 12 bytes before the PNG: its size is told, and its samples are read."""
+    samples = np.arange(1, 49, dtype=np.uint16).reshape(6, 8)
+    camera = Intrinsics(8, 6, 10, 10, 4, 3)
+    for unset in (bytes(8), struct.pack("<ff", 4.5e-41, 0.0), struct.pack("<ff", 1.0, 0.0)):
+        data = bytes(4) + unset + encode_png(samples)
+        assert size_of(data[:64]) == (8, 6)
+        frame = decode_frame(data, camera)
+        np.testing.assert_array_equal(frame.depth, (samples / 1000).astype(np.float32))
+    inverse = struct.pack("<iff", 0, 10100.0, -1009.0) + encode_png(samples)
+    with pytest.raises(UnreadableFrame, match=r"inverse depth \(a = 10100, b = -1009\)"):
+        decode_frame(inverse, camera)
+    with pytest.raises(UnreadableFrame, match="ends early"):
+        decode_frame(bytes(12) + encode_png(samples)[:-5], camera)

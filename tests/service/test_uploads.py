@@ -235,3 +235,23 @@ def test_a_batch_that_is_none_is_refused_whole(
             "unsupported-type")  # fmt: skip
     frames = http.get(f"{hall}/frames", params={"limit": 1000}).json()["items"]
     assert not any(one["bytes"] == len(shot.png) for one in frames)
+
+
+def test_a_compressed_depth_message_of_ros_is_its_png(served, make_map, shots) -> None:
+    """The data of the message as it is, with the 12 bytes before the PNG: the same content."""
+    make_map(served, "transported")
+    path = "/v1/maps/transported/frames"
+    first = served.client.post(path, **shots[0].form())
+    assert first.status_code == 202, first.text
+    data = bytes(12) + shots[0].png
+    camera = {name: shots[0].camera[name] for name in ("fx", "fy", "cx", "cy")}
+    again = served.client.post(
+        path, params=camera, content=data, headers={"Content-Type": "application/octet-stream"}
+    )
+    assert again.status_code == 200, again.text
+    assert again.json()["frame_id"] == first.json()["frame_id"]
+    without = served.client.post(
+        path, content=data, headers={"Content-Type": "application/octet-stream"}
+    )
+    assert without.status_code == 422
+    assert "fx" in without.text

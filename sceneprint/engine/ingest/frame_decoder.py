@@ -16,6 +16,7 @@ import numpy as np
 from sceneprint import errors
 from sceneprint.engine.serializers import pose_matrix
 from sceneprint.formats.dataset import decode_frame
+from sceneprint.formats.image.depth_file import has_transport_header
 from sceneprint.formats.points import UNSAID, decode_cloud, decode_scan, format_of
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import AnyFrame, Cloud, Floats, Intrinsics
@@ -237,7 +238,7 @@ def _refuse(meta: FrameMeta, kind: str, defaults: dict[str, object]) -> None:
 
 def _without_camera(data: bytes) -> errors.SceneprintError:
     """Why an upload without intrinsics is not read."""
-    if data.startswith((b"\x89PNG", b"\x93NUMPY")):
+    if data.startswith((b"\x89PNG", b"\x93NUMPY")) or has_transport_header(data):
         return errors.InvalidRequest(
             "The frame is a depth image, but its intrinsics are missing. Send width, height, "
             "fx, fy, cx and cy of the camera. If it is a point cloud as NPY, give it the shape "

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.errors import DatasetError, InvalidPose, UnreadableCloud, naming
-from sceneprint.formats.image.depth_file import read_frame
+from sceneprint.formats.image.depth_file import decode_frame
 from sceneprint.formats.points import SUFFIXES, Scan, decode_scan
 from sceneprint.geometry.pose.rigid import rotation_of
 from sceneprint.types import AnyFrame, DepthFrame, Floats
@@ -181,6 +181,8 @@ class Layout(Enum):
     #: Files of points (PLY, PCD, KITTI .bin, LAS, LAZ) of any name, each with `NAME.pose.txt`
     #: where its pose is known.
     CLOUDS = "clouds"
+    #: Messages of a recording of ROS; poses of its transforms.
+    RECORDING = "recording"
 
 
 class FrameReference(FrameFile):
@@ -190,7 +192,12 @@ class FrameReference(FrameFile):
         """Return the frame; raises as `read_frame`, `read_cloud` and `pose`."""
         if self.cloud is None:
             return self.read_depth()
-        return read_cloud(self.path, self.cloud, name=self.name, pose=self.pose).cloud
+        if self.source is None:
+            return read_cloud(self.path, self.cloud, name=self.name, pose=self.pose).cloud
+        data = self.source.read_bytes()
+        with naming(str(self.path)):
+            scan = decode_scan(data, pose=self.pose)
+        return replace(scan.cloud, name=self.name)
 
     def read_depth(self) -> DepthFrame:
         """Return the frame, where only a depth image will do; raises as `read_frame` and `pose`.
@@ -204,14 +211,17 @@ class FrameReference(FrameFile):
                 f"{self.path}: This is a cloud, and a depth image is needed here. Name a folder or "
                 "file of depth images."
             )
-        return read_frame(
-            self.path,
-            self.camera.intrinsics,
-            depth_scale=self.camera.depth_scale,
-            along_ray=self.camera.along_ray,
-            name=self.name,
-            pose=self.pose,
-        )
+        camera = self.camera
+        data = self.read_bytes()
+        with naming(str(self.path)):
+            frame = decode_frame(
+                data,
+                camera.intrinsics,
+                depth_scale=camera.depth_scale,
+                along_ray=camera.along_ray,
+                pose=self.pose,
+            )
+        return replace(frame, name=self.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +237,7 @@ class FrameSequence:
         it, and their poses can be compared; others cannot
     split : what the scene's authors use it for, or None where they do not say
     frames : at least one
+    note : what was left out on the way, for people; empty where nothing was
     """
 
     name: str
@@ -235,3 +246,11 @@ class FrameSequence:
     parent_frame: str
     split: Split | None
     frames: tuple[FrameReference, ...]
+    note: str = ""
+
+    @property
+    def place(self) -> Path:
+        """Where its parent frame is named: the folder of the scene, or its own."""
+        if self.layout is Layout.RECORDING or self.parent_frame == self.name:
+            return self.folder
+        return self.folder.parent

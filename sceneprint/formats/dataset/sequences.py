@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 from sceneprint.errors import DatasetError, SceneprintError
 from sceneprint.formats.dataset.frame_reference import (
@@ -24,6 +25,9 @@ from sceneprint_client.file_formats import is_cloud
 from sceneprint_client.files import data_lines, read_text
 from sceneprint_client.frame_files import SEVEN_SCENES, find_frame_file
 from sceneprint_client.sidecars import CLOUDS_FILE, find_camera, find_cloud_source
+
+if TYPE_CHECKING:
+    from sceneprint.formats.recording import RecordingOptions
 
 # From a folder of known layout to the references of its frames; no frame is read.
 #
@@ -228,18 +232,22 @@ _SPLIT_FILES: tuple[tuple[str, Split], ...] = (
 _COLOUR_FOLDERS = ("rgb", "color", "colour")
 
 
-def find_sequences(path: Path | str) -> tuple[FrameSequence, ...]:
+def find_sequences(
+    path: Path | str, recording: RecordingOptions | None = None
+) -> tuple[FrameSequence, ...]:
     """Return the sequences at a path or up to 4 folders below it; no frame is read.
 
     Understood are a 7-Scenes sequence or scene (with TrainSplit.txt, TestSplit.txt), a TUM
     RGB-D folder, a folder of depth images (PNG or NPY; `*.color.png` and `*rgb*` are left
     out), a folder of point clouds (PLY, PCD, KITTI .bin, LAS, LAZ; NPY beside a clouds.json),
     one depth image or cloud, and folders of these. A sequence is named by its place below
-    the path, or by its own folder where that is the path.
+    the path, or by its own folder where that is the path. A recording of ROS (.mcap, .db3, .bag,
+    a rosbag2 folder) is one sequence, named after it.
 
     Parameters
     ----------
     path : a folder or a file
+    recording : what to take of a recording; default: what is found in it
 
     Returns
     -------
@@ -251,10 +259,15 @@ def find_sequences(path: Path | str) -> tuple[FrameSequence, ...]:
         not there, or two scenes have one name.
     InvalidIntrinsics : an intrinsics.json describes no camera.
     InvalidPose : a groundtruth.txt holds a line that is no pose.
+    MissingDependency : it is a recording, and rosbags is not installed.
     """
     # a name such as .. is none; a symlink's own name is what the user knows it by
     path = Path(path)
     root = path.resolve() if ".." in path.parts else path.absolute()
+    from sceneprint.formats import recording as ros  # what it takes, only bags need
+
+    if ros.is_recording(root) and root.exists():
+        return (ros.recording_sequence(root, recording or ros.RecordingOptions()),)
     if root.is_file():
         return (_single(root),)
     if not root.is_dir():
@@ -265,7 +278,8 @@ def find_sequences(path: Path | str) -> tuple[FrameSequence, ...]:
             f"{path}: There is no depth image or cloud here or up to {_DEPTH} folders below. Name "
             "a 7-Scenes scene or sequence (frame-000000.depth.png), a TUM RGB-D folder "
             "(depth.txt), a folder of 16-bit PNG or float NPY depth images, one of PLY, PCD, "
-            "KITTI .bin, LAS or LAZ clouds, or one such file."
+            "KITTI .bin, LAS or LAZ clouds, one such file, or a recording of ROS (.mcap, .db3 or "
+            ".bag file, rosbag2 folder)."
         )
     _check_parent_frames(found)
     return found
@@ -434,8 +448,7 @@ def _check_parent_frames(sequences: tuple[FrameSequence, ...]) -> None:
     """Two scenes of one name would pass for one place, and their poses for comparable."""
     scenes: dict[str, Path] = {}
     for sequence in sequences:
-        own = sequence.parent_frame == sequence.name
-        place = sequence.folder if own else sequence.folder.parent
+        place = sequence.place
         if scenes.setdefault(sequence.parent_frame, place) != place:
             raise DatasetError(
                 f"{place}: Another scene is called {sequence.parent_frame} too, "

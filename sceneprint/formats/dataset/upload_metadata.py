@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from sceneprint.formats.dataset.frame_reference import FrameSequence
+from sceneprint.formats.dataset.frame_reference import FrameSequence, Layout
 
 
 def session_of(sequence: FrameSequence) -> str:
     """Name of a sequence, the same whether its own folder was named or the scene's."""
-    if sequence.parent_frame == sequence.name:
+    if sequence.layout is Layout.RECORDING or sequence.parent_frame == sequence.name:
         return sequence.name
     return f"{sequence.parent_frame}/{sequence.folder.name}"
 

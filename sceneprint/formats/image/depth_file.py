@@ -172,20 +172,66 @@ def _samples(header: bytes, rows: bytes) -> NDArray[np.uint16]:
     """Undo filters and interlacing: Pillow on a PNG of nothing but header and pixels."""
     from PIL.PngImagePlugin import PngImageFile
 
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        check = crc32(content, crc32(kind))
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check)
-
-    plain = PNG_SIGNATURE + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows, 0))
+    plain = _png(header, zlib.compress(rows, 0))
     try:
         # not by Image.open, whose limit of pixels is the program's
-        with PngImageFile(io.BytesIO(plain + chunk(b"IEND", b""))) as image:
+        with PngImageFile(io.BytesIO(plain)) as image:
             samples = np.asarray(image)
     except (OSError, ValueError, SyntaxError) as cause:
         raise UnreadableFrame(
             f"The PNG is damaged: its rows do not decode ({cause}). Write it again."
         ) from cause
     return np.array(samples, dtype=np.uint16)  # some versions of Pillow give int32
+
+
+def encode_png(samples: NDArray[np.uint16]) -> bytes:
+    """Return a 16-bit greyscale PNG of the samples (H, W), in a sixth of Pillow's time.
+
+    Each row holds its differences from the one above, and ISA-L deflates them.
+    """
+    height, width = samples.shape
+    raw = samples.astype(">u2").view(np.uint8)
+    rows = np.zeros((height, 1 + raw.shape[1]), np.uint8)
+    rows[:, 1:] = raw
+    rows[1:, 1:] -= raw[:-1]
+    rows[1:, 0] = 2  # the filter Up; the first row is as it is
+    header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+    return _png(header, isal_zlib.compress(rows.tobytes(), 1))
+
+
+def _png(header: bytes, pixels: bytes) -> bytes:
+    """A PNG of a header and compressed rows, and nothing else."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        check = crc32(content, crc32(kind))
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check)
+
+    return (
+        PNG_SIGNATURE + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+    )  # fmt: skip
+
+
+# Images of ROS's compressed_depth_image_transport: a PNG after a header of 12 bytes.
+
+_TRANSPORT_BYTES = 12
+
+
+def has_transport_header(data: bytes) -> bool:
+    """Whether bytes are the data of a compressedDepth message, of which a PNG is the rest."""
+    return data.startswith(PNG_SIGNATURE, _TRANSPORT_BYTES)
+
+
+def _decode_transported(data: bytes) -> NDArray[np.uint16]:
+    """Samples of a 16UC1 image; the header of a 32FC1 image says how its depth is quantised."""
+    a, b = struct.unpack_from("<ff", data, 4)
+    # of 16UC1 images the transport leaves these numbers unset: most often zero, or tiny
+    if 1e-3 < a < 1e9 and 1e-3 < abs(b) < 1e9:
+        raise UnreadableFrame(
+            f"The compressedDepth image has inverse depth (a = {a:g}, b = {b:g}), as of 32FC1. "
+            "Send float32 metres a / (v - b) as NPY, or upload the recording with `sceneprint "
+            "upload`."
+        )
+    return decode_png(data[_TRANSPORT_BYTES:])
 
 
 # NPY files of float metres or of stored units, read without trusting their header.
@@ -390,6 +436,8 @@ def _decode(data: bytes) -> NDArray[np.uint16] | Floats32:
         return decode_png(data)
     if data.startswith(NPY_SIGNATURE):
         return decode_npy(data)
+    if has_transport_header(data):
+        return _decode_transported(data)
     raise UnreadableFrame(
         "This is neither PNG nor NPY. Write the depth as a 16-bit greyscale PNG, or as a "
         "float32 array in metres or a uint16 array in stored units with numpy.save."
@@ -435,6 +483,8 @@ def size_of(head: bytes) -> tuple[int, int] | None:
     ----------
     head : first HEAD bytes of the file (sceneprint_client.file_formats): of a PNG 24 are enough
     """
+    if has_transport_header(head):
+        head = head[_TRANSPORT_BYTES:]
     if head.startswith(PNG_SIGNATURE) and len(head) >= 24:
         width, height = struct.unpack_from(">II", head, 16)
         return width, height

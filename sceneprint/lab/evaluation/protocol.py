@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
@@ -626,6 +626,7 @@ def choose(
     database_step: int = 1,
     query_step: int = 1,
     shared: bool = False,
+    find: Callable[[Path], tuple[Run, ...]] = find_sequences,
 ) -> EvaluationProtocol:
     """Tell the frames of each path to the database or the queries; no frame is read.
 
@@ -639,13 +640,14 @@ def choose(
     database, queries : for paths without ranges of their own
     database_step, query_step : take every so manieth frame, where a range says no step itself
     shared : a frame may be both, and paths without ranges are, as a whole, both
+    find : what finds the sequences of a path; asked once for each
 
     Raises
     ------
     DatasetError : nothing says what is database and what query, a range lies outside its path,
         a frame is chosen twice, two scenes have one name, or there is no query.
     """
-    gathered = _Gathered(shared=shared)
+    gathered = _Gathered(shared=shared, find=find)
     every = (Range(None, None, None),)
     splits = []
     for part in parts:
@@ -698,14 +700,18 @@ def every_frame(paths: Sequence[Path]) -> tuple[ProtocolFrame, ...]:
 class _Gathered:
     """Frames so far, by the file they are in."""
 
-    def __init__(self, *, shared: bool = False) -> None:
+    def __init__(
+        self, *, shared: bool = False,
+        find: Callable[[Path], tuple[Run, ...]] = find_sequences,
+    ) -> None:  # fmt: skip
         self._shared = shared
+        self._find = cache(find)
         self.frames: dict[Path, ProtocolFrame] = {}
         self._names: set[str] = set()
         self._places: dict[str, Path] = {}
 
     def add_split(self, path: Path, database_step: int, query_step: int) -> None:
-        sequences = find_sequences(path)
+        sequences = self._find(path)
         if not any(s.split for s in sequences):
             raise DatasetError(
                 f"{path}: Nothing says which frames are the database and which the queries. "
@@ -720,7 +726,7 @@ class _Gathered:
             self._add(path, test[::query_step], "query")
 
     def add_ranges(self, path: Path, ranges: Iterable[Range], use: Use, step: int) -> None:
-        every = [(s, f) for s in find_sequences(path) for f in s.frames]
+        every = [(s, f) for s in self._find(path) for f in s.frames]
         for one in ranges:
             if (one.start or 0) >= len(every) or (one.stop or 0) > len(every):
                 raise DatasetError(
@@ -731,8 +737,7 @@ class _Gathered:
 
     def _add(self, path: Path, new: list[tuple[Run, FrameReference]], use: Use) -> None:
         for run, reference in new:
-            scene, file = run.parent_frame, reference.path.resolve()
-            place = run.folder if run.name == scene else run.folder.parent
+            scene, file, place = run.parent_frame, reference.path.resolve(), run.place
             if self._places.setdefault(scene, place.resolve()) != place.resolve():
                 raise DatasetError(
                     f"{path}: Another scene is called {scene} too, {self._places[scene]}. "

@@ -1,0 +1,200 @@
+"""`sceneprint bag`, and the options of every command that takes a recording of ROS."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from sceneprint.cli.options import one_line
+from sceneprint.formats.dataset import FrameSequence, find_sequences
+from sceneprint.formats.recording import BagOutline, RecordingOptions, bag_outline, is_recording
+from sceneprint_client.frame_files import meta_of
+
+_DEFAULT = RecordingOptions()
+
+
+def add_recording_options(command: argparse.ArgumentParser) -> None:
+    """`--topic` and its like."""
+    group = command.add_argument_group(
+        "recordings of ROS", "for .mcap, .db3 and .bag files and rosbag2 folders"
+    )
+    group.add_argument(
+        "--topic", metavar="NAME", help="topic of depth images or points (default: the only one)"
+    )
+    group.add_argument(
+        "--camera-info",
+        metavar="NAME",
+        help="topic of the depth images' camera (default: the one beside them)",
+    )
+    group.add_argument(
+        "--pose-frame",
+        metavar="FRAME",
+        help="frame that poses lead to (default: map, else odom, else the topmost frame)",
+    )
+    group.add_argument(
+        "--keyframe-m",
+        type=_from_zero,
+        default=_DEFAULT.keyframe_m,
+        metavar="METRES",
+        help="take a frame this far from the last one taken; 0 takes every frame (default: 0.3)",
+    )
+    group.add_argument(
+        "--keyframe-deg",
+        type=_from_zero,
+        default=_DEFAULT.keyframe_deg,
+        metavar="DEGREES",
+        help="or turned by this much (default: 15)",
+    )
+    group.add_argument(
+        "--keyframe-s",
+        type=_from_zero,
+        default=_DEFAULT.keyframe_s,
+        metavar="SECONDS",
+        help="without poses, take a frame this long after the last one taken (default: 0.5)",
+    )
+
+
+def _from_zero(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 <= number < math.inf:  # false for NaN as well
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 up")
+    return number
+
+
+@contextmanager
+def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]:
+    """What to take of recordings, with a bar while they are read."""
+    with tqdm(desc="read recording", unit="message", delay=0.5, leave=False, disable=None) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield RecordingOptions(
+            topic=options.topic,
+            camera_info=options.camera_info,
+            pose_frame=options.pose_frame,
+            keyframe_m=options.keyframe_m,
+            keyframe_deg=options.keyframe_deg,
+            keyframe_s=options.keyframe_s,
+            progress=progress,
+        )
+
+
+def sequences_at(path: Path, options: argparse.Namespace) -> tuple[FrameSequence, ...]:
+    """The sequences at a path, of a recording as the options say; what was left out of one is told
+    on standard error. Raises as `find_sequences`.
+    """
+    if not is_recording(path):
+        return find_sequences(path)
+    with recording_options(options) as recording:
+        found = find_sequences(path, recording)
+    for sequence in found:
+        tell(sequence)
+    return found
+
+
+def tell(sequence: FrameSequence) -> None:
+    """Say on standard error what was left out of a recording."""
+    if sequence.note:
+        print(f"{one_line(str(sequence.folder))}: {sequence.note}", file=sys.stderr)
+
+
+# `sceneprint bag info`.
+
+
+def add_bag(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "bag",
+        help="show what a recording of ROS holds",
+        description="Look into a recording of ROS: an MCAP file, a rosbag2 folder or database, or "
+        "a ROS 1 bag.",
+    )
+    what = command.add_subparsers(dest="what", required=True, metavar="ACTION")
+    info = what.add_parser(
+        "info",
+        help="list topics, and which frames, camera and poses would be taken; exit code 1 if none",
+    )
+    info.add_argument("path", type=Path, metavar="FILE")
+    add_recording_options(info)
+    command.set_defaults(run=run_bag)
+
+
+def run_bag(options: argparse.Namespace) -> int:
+    """Print what is in a recording; returns 1 where nothing of it would be taken."""
+    with recording_options(options) as recording:
+        outline = bag_outline(options.path, recording)
+    print("\n".join(_lines(options.path, outline)))
+    return 1 if outline.sequence is None else 0
+
+
+def _lines(path: Path, outline: BagOutline) -> list[str]:
+    seconds = max(outline.end_ns - outline.start_ns, 0) * 1e-9
+    count = sum(one.count for one in outline.topics)
+    lines = [
+        f"{one_line(str(path))}: {outline.kind}, {count} messages of {len(outline.topics)} topics, "
+        f"{_span(outline)}"
+    ]
+    width = max((len(one_line(one.name)) for one in outline.topics), default=0)
+    kinds = max((len(one_line(one.type)) for one in outline.topics), default=0)
+    frames = {one.topic.name: one.encoding or "points" for one in outline.frames}
+    for one in outline.topics:
+        rate = f"{one.count / seconds:.1f} Hz" if seconds > 0 and one.count > 1 else ""
+        uses = frames.get(one.name, "")
+        if outline.chosen is not None and one.name == outline.chosen.topic.name:
+            uses += ", taken"
+        if one.name == outline.camera:
+            uses = "camera"
+        lines.append(
+            f"  {one_line(one.name):{width}}  {one_line(one.type):{kinds}}  {one.count:8}  "
+            f"{rate:>9}  {uses}".rstrip()
+        )
+    if outline.sequence is None:
+        return [*lines, f"nothing would be taken: {one_line(outline.problem)}"]
+    return [*lines, *_taken(outline.sequence)]
+
+
+def _span(outline: BagOutline) -> str:
+    """When it was recorded, and for how long."""
+    seconds = (outline.end_ns - outline.start_ns) * 1e-9
+    if not 0 <= seconds < 1e9:
+        return "no messages"
+    try:
+        start = datetime.fromtimestamp(outline.start_ns * 1e-9, UTC)
+    except (ValueError, OverflowError, OSError):
+        return f"{seconds:.1f} s"
+    return f"{seconds:.1f} s from {start:%Y-%m-%dT%H:%M:%SZ}"
+
+
+def _taken(sequence: FrameSequence) -> list[str]:
+    """What would be taken, a line each."""
+    first = sequence.frames[0]
+    lines = [sequence.note]
+    if first.camera is not None:
+        k = first.camera.intrinsics
+        lens = f", distortion {' '.join(f'{d:g}' for d in k.distortion)}" if k.distortion else ""
+        lines.append(
+            f"camera: {k.width} x {k.height}, fx {k.fx:g}, fy {k.fy:g}, cx {k.cx:g}, cy {k.cy:g}"
+            f"{lens}"
+        )
+    lines.append(f"poses: {f'in {sequence.parent_frame}' if first.pose is not None else 'none'}")
+    base = meta_of(first, with_pose=False).T_base_sensor
+    if base is not None and base.matrix is not None:
+        x, y, z = (round(row[3], 3) + 0.0 for row in base.matrix[:3])
+        lines.append(f"mounting: at {x:.3f} {y:.3f} {z:.3f} m in {one_line(base.base_frame)}")
+    sensors = (one.camera or one.cloud for one in sequence.frames)
+    ups = sum(sensor is not None and sensor.up is not None for sensor in sensors)
+    lines.append(f"up: of {ups} of {len(sequence.frames)} frames")
+    return lines

@@ -1,0 +1,23 @@
+"""Recordings of ROS: bags with depth or points, cameras and transforms, as sequences of frames.
+
+path  --recording_sequence-->  FrameSequence
+
+Only `bag.py` imports rosbags, and only when a bag is opened.
+"""
+
+from sceneprint.formats.recording.bag import Bag, is_recording
+from sceneprint.formats.recording.selection import (
+    BagOutline,
+    RecordingOptions,
+    bag_outline,
+    recording_sequence,
+)
+
+__all__ = [
+    "Bag",
+    "BagOutline",
+    "RecordingOptions",
+    "bag_outline",
+    "is_recording",
+    "recording_sequence",
+]

@@ -1,0 +1,339 @@
+"""The files of ROS: MCAP, rosbag2 folders and databases, ROS 1 bags. The boundary to rosbags.
+
+path  --Bag-->  topics, raw messages; raw message  --Bag.decode-->  its fields
+
+rosbags raises whatever its parsers meet in a damaged file, so every call into it is made within
+`_stated`, and what it decompresses is limited.
+"""
+
+from __future__ import annotations
+
+import bz2
+import struct
+import threading
+import weakref
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sceneprint.errors import DatasetError, MissingDependency, SceneprintError
+from sceneprint_client.file_formats import RECORDING_SUFFIXES
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.rosbag1 import Reader as Ros1Reader
+    from rosbags.rosbag2 import Reader as Ros2Reader
+    from rosbags.typesys.store import Typestore
+
+#: What a rosbag2 folder has beside its databases.
+_METADATA = "metadata.yaml"
+#: Most bytes of one chunk once it is decompressed; recorders write 1 to 4 MB.
+MAXIMUM_CHUNK_BYTES = 256 << 20
+#: Most bytes of one message.
+MAXIMUM_MESSAGE_BYTES = 256 << 20
+
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+POINTS = "sensor_msgs/msg/PointCloud2"
+CAMERA = "sensor_msgs/msg/CameraInfo"
+IMU = "sensor_msgs/msg/Imu"
+ODOMETRY = "nav_msgs/msg/Odometry"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+#: Transforms that ROS 1 wrote before tf2; the fields are the same.
+OLD_TRANSFORMS = "tf/msg/tfMessage"
+_TRANSFORMS_FIELDS = "geometry_msgs/TransformStamped[] transforms"
+#: Types of messages that are decoded, and no others.
+TYPES = (IMAGE, COMPRESSED, POINTS, CAMERA, IMU, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path is a recording of ROS by its name, or a folder with a rosbag2's metadata."""
+    if path.is_dir():
+        return (path / _METADATA).is_file() and not (path / "intrinsics.json").is_file()
+    return path.suffix.lower() in RECORDING_SUFFIXES
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """A topic of a bag.
+
+    Parameters
+    ----------
+    name : such as "/camera/depth/image_raw"
+    type : of its messages, such as "sensor_msgs/msg/Image"
+    count : of its messages
+    """
+
+    name: str
+    type: str
+    count: int
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """A message as it was recorded.
+
+    Parameters
+    ----------
+    topic : its name
+    log_ns : when it was recorded, nanoseconds
+    data : its bytes, as ROS serialised them
+    """
+
+    topic: str
+    log_ns: int
+    data: bytes
+
+
+class Bag:
+    """A recording of ROS, open until it is closed or nobody refers to it; safe among threads.
+
+    Parameters
+    ----------
+    path : an .mcap, .db3 or .bag file, or a rosbag2 folder
+
+    Raises
+    ------
+    DatasetError : there is no such file, or it is damaged or of a kind that is not read.
+    MissingDependency : rosbags is not installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.is_ros1 = path.suffix.lower() == ".bag" and not path.is_dir()
+        self._lock = threading.RLock()
+        if not path.exists():
+            raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
+        self._types = _types(ros1=self.is_ros1)
+        with _stated(path):
+            self._reader = _open_reader(path, ros1=self.is_ros1)
+        self._closes = weakref.finalize(self, _close, self._reader)
+        with _stated(path):
+            self._connections: list[Connection] = list(self._reader.connections)
+            self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time
+            self.topics = _topics(self._connections)
+
+    def close(self) -> None:
+        """Close the file; later calls do nothing."""
+        self._closes()
+
+    def of_type(self, *types: str) -> list[BagTopic]:
+        """Topics of these types that have messages, by name."""
+        return [one for one in self.topics if one.type in types and one.count]
+
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Messages of topics in the order in which they were recorded.
+
+        Parameters
+        ----------
+        topics : their names
+        start_ns, stop_ns : recorded from the first on, and before the second
+
+        Raises
+        ------
+        DatasetError : the file is damaged where they are.
+        """
+        wanted = [one for one in self._connections if one.topic in topics]
+        if not wanted:
+            return
+        with self._lock, _stated(self.path):
+            for connection, log_ns, data in self._reader.messages(wanted, start_ns, stop_ns):
+                if len(data) > MAXIMUM_MESSAGE_BYTES:
+                    raise DatasetError(
+                        f"{self.path}: A message of {connection.topic} has {len(data)} bytes; at "
+                        f"most {MAXIMUM_MESSAGE_BYTES} are read. Leave the topic out."
+                    )
+                yield RawMessage(connection.topic, log_ns, bytes(data))
+
+    def first(self, topic: str) -> RawMessage | None:
+        """The first message of a topic; None where it has none."""
+        with self._lock:
+            messages = self.messages([topic])
+            try:
+                return next(messages, None)
+            finally:
+                messages.close()  # type: ignore[attr-defined]  # a generator, which holds the lock
+
+    def at(self, topic: str, log_ns: int, occurrence: int) -> RawMessage:
+        """The message of a topic with this time of recording; of several, by number from 0.
+
+        Raises
+        ------
+        DatasetError : there is none any more, or the file is damaged.
+        """
+        with self._lock:
+            found = list(self.messages([topic], log_ns, log_ns + 1))
+        if occurrence >= len(found):
+            raise DatasetError(
+                f"{self.path}: The message of {topic} at {log_ns} ns is no longer there. Read the "
+                "recording again."
+            )
+        return found[occurrence]
+
+    def decode(self, message: RawMessage, kind: str) -> Any:
+        """The fields of a message, as attributes.
+
+        Parameters
+        ----------
+        message : of this bag
+        kind : one of TYPES
+
+        Raises
+        ------
+        DatasetError : its bytes are not of this type.
+        """
+        known = TRANSFORMS if kind == OLD_TRANSFORMS else kind
+        with _stated(self.path, f"a message of {message.topic} does not decode"):
+            if self.is_ros1:
+                return self._types.deserialize_ros1(message.data, known)
+            return self._types.deserialize_cdr(message.data, known)
+
+    def stamp_ns(self, message: RawMessage) -> int:
+        """When a message with a header was measured, nanoseconds; of one that says nothing, when
+        it was recorded. Only the beginning is decoded.
+        """
+        head = message.data[:12]
+        if len(head) < 12:
+            return message.log_ns
+        if self.is_ros1:
+            seconds, nanoseconds = struct.unpack_from("<II", head, 4)
+        else:
+            order = "<" if head[1] & 1 else ">"
+            seconds, nanoseconds = struct.unpack_from(f"{order}iI", head, 4)
+        if seconds <= 0 or nanoseconds >= 1_000_000_000:
+            return message.log_ns
+        return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+@lru_cache(maxsize=4)
+def shared_bag(path: Path) -> Bag:
+    """A bag that all frames of this process share whose references came from another process."""
+    return Bag(path)
+
+
+def _topics(connections: list[Connection]) -> tuple[BagTopic, ...]:
+    """Topics by name; one with messages of several types is there with each."""
+    counts: dict[tuple[str, str], int] = {}
+    for one in connections:
+        key = (str(one.topic), str(one.msgtype))
+        counts[key] = counts.get(key, 0) + int(one.msgcount)
+    return tuple(BagTopic(name, kind, n) for (name, kind), n in sorted(counts.items()))
+
+
+def _open_reader(path: Path, *, ros1: bool) -> Ros1Reader | Ros2Reader:
+    if ros1:
+        from rosbags.rosbag1 import Reader as Ros1Reader
+
+        bag = Ros1Reader(path)
+        bag.open()
+        return bag
+    from rosbags.rosbag2 import Reader as Ros2Reader
+
+    recording = Ros2Reader(path)
+    recording.open()
+    return recording
+
+
+def _close(reader: Ros1Reader | Ros2Reader) -> None:
+    reader.close()
+
+
+@contextmanager
+def _stated(path: Path, what: str = "The recording cannot be read") -> Iterator[None]:
+    """Turn whatever rosbags raises into an error of ours."""
+    try:
+        yield
+    except (SceneprintError, GeneratorExit):
+        raise
+    except Exception as cause:
+        reason = " ".join(str(cause).split()) or type(cause).__name__
+        what = what[0].upper() + what[1:]
+        told = printable(f"{what} ({reason:.200}). {_advice(path)}")
+        raise DatasetError(f"{path}: {told}") from cause
+
+
+def printable(text: str) -> str:
+    """A text of a bag as it can stand in a line: names in damaged bags may be anything."""
+    return text if text.isprintable() else ascii(text)[1:-1]
+
+
+def _advice(path: Path) -> str:
+    """What mends a recording that was cut off."""
+    suffix = path.suffix.lower()
+    tool = {".mcap": "mcap recover", ".bag": "rosbag reindex"}.get(suffix, "ros2 bag reindex")
+    return (
+        f"If the recorder was stopped before it closed the file, run `{tool}`; else copy it again."
+    )
+
+
+# rosbags itself, and how much it may decompress.
+
+
+@lru_cache(maxsize=2)
+def _types(*, ros1: bool) -> Typestore:
+    """Definitions of the messages of ROS; those in the bag are not needed, and may be of anything.
+
+    Raises
+    ------
+    MissingDependency : rosbags is not installed.
+    """
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError as cause:
+        raise MissingDependency(
+            "Recordings of ROS are read with rosbags, which is not installed. "
+            "Run: pip install 'sceneprint[ros]'"
+        ) from cause
+    _limit_decompression()
+    types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    if TRANSFORMS not in types.fielddefs:
+        types.register(get_types_from_msg(_TRANSFORMS_FIELDS, TRANSFORMS))
+    return types
+
+
+def _limit_decompression() -> None:
+    """Let chunks become no larger than they announce or than we take.
+
+    rosbags inflates a chunk whole before it compares the size, so that a damaged or hostile one
+    would fill the memory. Its tables of decompressors are the place where it can be limited.
+    """
+    from rosbags.rosbag1 import reader as ros1
+    from rosbags.rosbag2 import storage_mcap as mcap
+
+    mcap.DECOMPRESSORS["zstd"] = lambda data, size: _inflate(_zstd(), data, size)
+    mcap.DECOMPRESSORS["lz4"] = lambda data, size: _inflate(_lz4(), data, size)
+    ros1.decompressors["bz2"] = lambda data: _inflate(
+        bz2.BZ2Decompressor(), data, MAXIMUM_CHUNK_BYTES
+    )
+    ros1.decompressors["lz4"] = lambda data: _inflate(_lz4(), data, MAXIMUM_CHUNK_BYTES)
+
+
+def _zstd() -> Any:
+    import sys
+
+    if sys.version_info >= (3, 14):
+        from compression import zstd
+    else:
+        from backports import zstd
+    return zstd.ZstdDecompressor()
+
+
+def _lz4() -> Any:
+    from lz4.frame import LZ4FrameDecompressor
+
+    return LZ4FrameDecompressor()
+
+
+def _inflate(stream: Any, data: bytes, most: int) -> bytes:
+    """Content of one compressed chunk of at most so many bytes."""
+    if most > MAXIMUM_CHUNK_BYTES:
+        raise ValueError(f"a chunk announces {most} bytes, more than {MAXIMUM_CHUNK_BYTES}")
+    found: bytes = stream.decompress(data, most + 1)
+    if len(found) > most or not stream.eof:
+        raise ValueError(f"a chunk does not end within {most} bytes")
+    return found

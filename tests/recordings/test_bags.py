@@ -1,0 +1,563 @@
+"""Bags in all containers and encodings: the same poses and samples as the folder they came from."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import DatasetError, InvalidIntrinsics, UnreadableFrame
+from sceneprint.formats.dataset import FrameSequence, Layout, find_sequences
+from sceneprint.formats.dataset.upload_metadata import session_of
+from sceneprint.formats.recording import RecordingOptions, bag_outline
+from sceneprint.types import Cloud, DepthFrame, Floats
+from sceneprint_client.frame_files import meta_of
+
+Walk = list[tuple[float, Floats]]
+Samples = Callable[[int], np.ndarray]
+ALL = RecordingOptions(keyframe_m=0)
+
+
+def only(path: Path, options: RecordingOptions = ALL) -> FrameSequence:
+    (sequence,) = find_sequences(path, options)
+    return sequence
+
+
+def angle(a: Floats, b: Floats) -> float:
+    turn = a[:3, :3].T @ b[:3, :3]
+    return float(np.degrees(np.linalg.norm(turn - turn.T) / np.sqrt(8)))
+
+
+def drive(
+    writer: Any, ros: SimpleNamespace, walk: Walk, put: Callable[[Any, int, float], None]
+) -> None:
+    """A robot with a camera off its base: its frames lie between the stamps of its odometry."""
+    writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
+    for i, (t, T) in enumerate(walk):
+        writer.transforms(t, {("odom", "base_link"): T})
+        writer.camera_info(t)
+        put(writer, i, t)
+
+
+@pytest.mark.parametrize("container", ["mcap", "sqlite3", "ros1"])
+@pytest.mark.parametrize(
+    ("encoding", "how"),
+    [
+        ("16UC1", {}), ("mono16", {"padding": 6}), ("16UC1", {"big": True, "padding": 1}),
+        ("16UC1", {"compressed": True}),
+    ],
+)  # fmt: skip
+def test_poses_and_samples_are_those_that_were_recorded(
+    container: str, encoding: str, how: dict[str, Any], tmp_path: Path, ros: SimpleNamespace,
+    walk: Walk, depth: Samples,
+) -> None:  # fmt: skip
+    def put(writer: Any, i: int, t: float) -> None:
+        if how.get("compressed"):
+            writer.compressed(t, depth(i))
+        else:
+            writer.image(t, depth(i), encoding, **how)
+
+    path = ros.write(tmp_path, lambda writer: drive(writer, ros, walk, put), container)
+    sequence = only(path)
+    assert (sequence.name, sequence.layout) == ("run", Layout.RECORDING)
+    assert (sequence.parent_frame, session_of(sequence)) == ("run/odom", "run")
+    assert [one.name for one in sequence.frames] == [f"run/{i:06d}" for i in range(len(walk))]
+    for i, (reference, (t, T)) in enumerate(zip(sequence.frames, walk, strict=True)):
+        frame = reference.read()
+        assert isinstance(frame, DepthFrame)
+        metres = (depth(i) / 1000.0).astype(np.float32)
+        np.testing.assert_array_equal(frame.depth, metres)
+        expected = T @ ros.camera
+        assert frame.pose is not None
+        assert np.linalg.norm(frame.pose[:3, 3] - expected[:3, 3]) < 1e-6
+        assert angle(frame.pose, expected) < 1e-5
+        assert reference.timestamp == pytest.approx(ros.start + t, abs=1e-6)
+        k = frame.intrinsics
+        assert (k.width, k.height, k.fx, k.fy, k.cx, k.cy) == (*ros.size, *ros.k)
+        meta = meta_of(reference)
+        assert meta.captured_at is not None
+        assert meta.captured_at.timestamp() == pytest.approx(ros.start + t, abs=1e-6)
+        assert meta.T_base_sensor is not None
+        assert meta.T_base_sensor.base_frame == "base_link"
+        np.testing.assert_allclose(meta.T_base_sensor.matrix, ros.camera, atol=1e-9)
+
+
+@pytest.mark.parametrize("compression", ["message", "file", "bz2", "lz4", "storage"])
+def test_compressed_bags(
+    compression: str, tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
+) -> None:
+    container = {"bz2": "ros1", "lz4": "ros1", "storage": "mcap"}.get(compression, "sqlite3")
+
+    def put(writer: Any, i: int, t: float) -> None:
+        writer.image(t, depth(i))
+
+    path = ros.write(
+        tmp_path, lambda writer: drive(writer, ros, walk, put), container, compression=compression
+    )
+    frames = only(path).frames
+    assert len(frames) == len(walk)
+    np.testing.assert_array_equal(frames[7].read().depth, (depth(7) / 1000).astype(np.float32))
+
+
+def test_metres_are_taken_as_they_are(
+    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
+) -> None:
+    def put(writer: Any, i: int, t: float) -> None:
+        metres = depth(i).astype(np.float32) / 777
+        metres[depth(i) == 0] = np.nan
+        writer.image(t, metres, "32FC1", padding=4 * (i % 3), big=i % 2 == 1)
+
+    path = ros.write(tmp_path, lambda writer: drive(writer, ros, walk, put))
+    for i, reference in enumerate(only(path).frames):
+        expected = depth(i).astype(np.float32) / 777
+        np.testing.assert_array_equal(reference.read().depth, expected)
+
+
+def test_inverse_depth_by_hand(
+    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
+) -> None:
+    """z = a / (v - b), with the parameters that the transport writes for a depth up to 10 m."""
+    a, b = 10100.0, 1.0 - 10100.0 / 10.0
+    stored = np.zeros((60, 80), np.uint16)
+    stored[:, 1:] = np.arange(1, 80) * 100
+
+    def put(writer: Any, i: int, t: float) -> None:
+        writer.compressed(t, stored, "32FC1", a=a, b=b)
+
+    path = ros.write(tmp_path, lambda writer: drive(writer, ros, walk, put))
+    found = only(path).frames[3].read().depth
+    assert (found[:, 0] == 0).all()
+    # v = 100: 10100 / (100 + 1009) m; v = 7900: 10100 / 8909 m
+    assert found[5, 1] == pytest.approx(9.107304, abs=1e-5)
+    assert found[5, 79] == pytest.approx(1.133685, abs=1e-5)
+    np.testing.assert_allclose(found[0, 1:], a / (stored[0, 1:] - b), rtol=1e-6)
+
+
+@pytest.mark.parametrize("container", ["mcap", "sqlite3", "ros1"])
+@pytest.mark.parametrize("layout", ["plain", "packed", "organised", "doubles", "whole"])
+def test_points_of_any_layout(
+    container: str, layout: str, tmp_path: Path, ros: SimpleNamespace, walk: Walk
+) -> None:
+    rng = np.random.default_rng(3)
+    xyz = rng.uniform(-5, 5, (120, 3)).astype(np.float32)
+    xyz[5] = np.nan
+    xyz[17, 1] = np.inf
+    xyz[40] = 0.0
+    form: Any = {
+        "plain": [("x", "<f4"), ("y", "<f4"), ("z", "<f4")],
+        "packed": {"names": ["ring", "z", "intensity", "x", "y"],
+                   "formats": ["<u2", "<f4", "<f4", "<f4", "<f4"],
+                   "offsets": [0, 2, 6, 10, 17], "itemsize": 23},
+        "organised": [("x", ">f4"), ("y", ">f4"), ("z", ">f4"), ("t", ">f8")],
+        "doubles": [("intensity", "<f4"), ("x", "<f8"), ("y", "<f8"), ("z", "<f8")],
+        "whole": [("x", "<i2"), ("y", "<i2"), ("z", "<i2")],
+    }[layout]  # fmt: skip
+    if layout == "whole":
+        xyz = rng.integers(-9, 9, (120, 3)).astype(np.float32)
+    rows = np.zeros(len(xyz), np.dtype(form))
+    for axis, name in enumerate("xyz"):
+        rows[name] = xyz[:, axis]
+    organised = {"height": 8, "padding": 9, "big": True} if layout == "organised" else {}
+
+    def fill(writer: Any) -> None:
+        writer.transforms(0.0, {("base_link", "lidar"): ros.camera}, "/tf_static")
+        for t, T in walk:
+            writer.transforms(t, {("odom", "base_link"): T})
+            writer.points(t, rows, **organised)
+
+    path = ros.write(tmp_path, fill, container)
+    reference = only(path).frames[2]
+    cloud = reference.read()
+    assert isinstance(cloud, Cloud)
+    present = np.isfinite(xyz).all(axis=1) & xyz.any(axis=1)
+    assert layout == "whole" or present.sum() == 117
+    np.testing.assert_array_equal(cloud.points, xyz[present])
+    assert cloud.pose is not None
+    np.testing.assert_allclose(cloud.pose, walk[2][1] @ ros.camera, atol=1e-9)
+
+
+def test_interpolation_by_hand(tmp_path: Path, ros: SimpleNamespace, depth: Samples) -> None:
+    """A base that turns by 40 degrees and drives 2 m in 0.4 s, seen after 0.1 s and later."""
+    turn = np.radians(20)
+
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.transforms(0.0, {("base_link", "camera"): ros.transform(0.3, 0, 0.5)}, "/tf_static")
+        writer.transforms(1.0, {("odom", "base_link"): ros.transform(1, 0, 0)})
+        ahead = ros.transform(3, 0, 0, 0, 0, np.sin(turn), np.cos(turn))
+        writer.transforms(1.4, {("odom", "base_link"): ahead})
+        writer.transforms(2.0, {("odom", "base_link"): ros.transform(4, 0, 0)})
+        for i, t in enumerate((0.97, 0.985, 1.1, 1.4, 1.7, 2.015, 2.03)):
+            writer.image(t, depth(i))
+
+    sequence = only(ros.write(tmp_path, fill))
+    poses = {round(f.timestamp - ros.start, 3): f.pose for f in sequence.frames}
+    # 1.7 lies in a gap of 0.6 s; 0.97 and 2.03 are more than 20 ms outside
+    assert sorted(poses) == [0.985, 1.1, 1.4, 2.015]
+    quarter = np.radians(10)
+    c, s = np.cos(quarter), np.sin(quarter)
+    expected = [[c, -s, 0, 1.5 + 0.3 * c], [s, c, 0, 0.3 * s], [0, 0, 1, 0.5], [0, 0, 0, 1]]
+    np.testing.assert_allclose(poses[1.1], expected, atol=1e-9)
+    np.testing.assert_allclose(poses[0.985][:3, 3], (1.3, 0, 0.5), atol=1e-9)
+    np.testing.assert_allclose(poses[2.015][:3, 3], (4.3, 0, 0.5), atol=1e-9)
+    assert sequence.note == (
+        "4 of 7 frames of /camera/depth/image_raw taken, poses in odom; left out: 3 without a "
+        "transform at their time"
+    )
+
+
+def test_keyframes_by_hand(tmp_path: Path, ros: SimpleNamespace, depth: Samples) -> None:
+    """0.3 m or 15 degrees from the last one that was taken, not from the last one."""
+    places = [
+        (0, 0),
+        (0.2, 0),
+        (0.31, 0),
+        (0.4, 14),
+        (0.45, 16),
+        (0.45, 30),
+        (0.74, 16),
+        (0.76, 16),
+    ]
+
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.transforms(0.0, {("base_link", "camera"): np.eye(4)}, "/tf_static")
+        for i, (x, degrees) in enumerate(places):
+            half = np.radians(degrees) / 2
+            T = ros.transform(x, 0, 0, 0, 0, np.sin(half), np.cos(half))
+            writer.transforms(0.1 * i, {("odom", "base_link"): T})
+            writer.image(0.1 * i, depth(i))
+
+    path = ros.write(tmp_path, fill)
+    sequence = only(path, RecordingOptions())
+    assert [f.name for f in sequence.frames] == [
+        "run/000000",
+        "run/000002",
+        "run/000004",
+        "run/000007",
+    ]
+    assert "4 of 8 frames" in sequence.note
+    assert "4 between keyframes" in sequence.note
+    wide = only(path, RecordingOptions(keyframe_m=10, keyframe_deg=29))
+    assert [f.name for f in wide.frames] == ["run/000000", "run/000005"]
+
+
+def test_without_poses_frames_are_taken_by_time(
+    tmp_path: Path, ros: SimpleNamespace, depth: Samples
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        for i in range(20):
+            writer.image(0.1 * i, depth(i))
+
+    path = ros.write(tmp_path, fill)
+    sequence = only(path, RecordingOptions())
+    assert [f.name[-2:] for f in sequence.frames] == ["00", "05", "10", "15"]
+    assert sequence.frames[0].pose is None
+    assert sequence.parent_frame == "run"
+    assert "no poses" in sequence.note
+    assert len(only(path, RecordingOptions(keyframe_s=0)).frames) == 20
+
+
+def test_odometry_gives_poses_where_tf_does_not(
+    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
+        writer.camera_info(0.0)
+        for i, (t, T) in enumerate(walk):
+            writer.odometry(t, T)
+            writer.image(t, depth(i))
+
+    frames = only(ros.write(tmp_path, fill)).frames
+    for (_, T), frame in zip(walk, frames, strict=True):
+        np.testing.assert_allclose(frame.pose, T @ ros.camera, atol=1e-9)
+
+
+def test_a_map_comes_before_odometry_and_either_can_be_chosen(
+    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
+) -> None:
+    T_map_odom = ros.transform(5, 6, 0, 0, 0, 1, 1)
+
+    def put(writer: Any, i: int, t: float) -> None:
+        writer.image(t, depth(i))
+        writer.transforms(t, {("/map", "/odom"): T_map_odom})  # ROS 1 wrote the slash
+
+    path = ros.write(tmp_path, lambda writer: drive(writer, ros, walk, put), "ros1")
+    in_map = only(path)
+    assert in_map.parent_frame == "run/map"
+    expected = walk[4][1] @ ros.camera
+    np.testing.assert_allclose(in_map.frames[4].pose, T_map_odom @ expected, atol=1e-9)
+    in_odom = only(path, RecordingOptions(pose_frame="odom", keyframe_m=0))
+    np.testing.assert_allclose(in_odom.frames[4].pose, expected, atol=1e-9)
+    with pytest.raises(DatasetError, match=r"from camera to 'mars'.*base_link, odom, map"):
+        only(path, RecordingOptions(pose_frame="mars"))
+
+
+def test_fixed_joints_that_are_published_again_and_again(
+    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
+) -> None:
+    """As by robot_state_publisher of ROS 1, seldom and at other times than the frames."""
+
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        for i, (t, T) in enumerate(walk):
+            if i in (0, 10):
+                writer.transforms(t, {("base_footprint", "camera"): ros.camera})
+            writer.transforms(t, {("odom", "base_footprint"): T})
+            writer.image(t, depth(i))
+
+    frames = only(ros.write(tmp_path, fill, "ros1")).frames
+    assert len(frames) == len(walk)
+    np.testing.assert_allclose(frames[20].pose, walk[20][1] @ ros.camera, atol=1e-9)
+    assert frames[20].base is not None
+    assert frames[20].base.base_frame == "base_footprint"
+
+
+def test_up_of_an_imu_at_rest(tmp_path: Path, ros: SimpleNamespace, depth: Samples) -> None:
+    """The IMU hangs upside down beside the camera; the robot stands, and drives off after 3 s."""
+    T_base_imu = ros.transform(0, 0.1, 0.2, 1, 0, 0, 0)  # half a turn about x
+    rng = np.random.default_rng(1)
+
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        fixed = {("base_link", "camera"): ros.camera, ("base_link", "imu"): T_base_imu}
+        writer.transforms(0.0, fixed, "/tf_static")
+        for i in range(600):
+            t = 0.01 * i
+            shake = rng.normal(0, 0.03, 3) if t < 3 else rng.normal(0, 1.5, 3)
+            writer.imu(t, shake - (0, 0, 9.81))
+            if i % 100 == 50:
+                writer.image(t, depth(i))
+
+    frames = only(ros.write(tmp_path, fill), RecordingOptions(keyframe_s=0)).frames
+    ups = [frame.camera.up if frame.camera else None for frame in frames]
+    expected = ros.camera[:3, :3].T @ (0, 0, 1)
+    for up in ups[:2]:
+        np.testing.assert_allclose(up, expected, atol=2e-3)
+    assert ups[3:] == [None] * 3
+    assert meta_of(frames[0]).up is not None
+
+
+def test_without_a_transform_from_the_imu_there_is_no_up(
+    tmp_path: Path, ros: SimpleNamespace, depth: Samples
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        for i in range(100):
+            writer.imu(0.01 * i, (0, 0, 9.81))
+        writer.image(0.5, depth(0))
+
+    (frame,) = only(ros.write(tmp_path, fill)).frames
+    assert frame.camera is not None
+    assert frame.camera.up is None
+
+
+# Cameras.
+
+
+def one_image(
+    ros: SimpleNamespace, folder: Path, topic: str = "/camera/depth/image_raw", **info: Any
+) -> Path:
+    samples = np.full((60, 80), 2000, np.uint16)
+
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0, topic.rpartition("/")[0] + "/camera_info", **info)
+        writer.image(0.1, samples, topic=topic)
+
+    return ros.write(folder, fill)
+
+
+@pytest.mark.parametrize(
+    ("d", "model", "expected"),
+    [
+        ((), "plumb_bob", ()),
+        ((0, 0, 0, 0, 0), "plumb_bob", ()),
+        ((0.1, -0.2, 0.001, 0.002, 0.03), "plumb_bob", (0.1, -0.2, 0.001, 0.002, 0.03)),
+        ((0.1, -0.2, 0.001, 0.002), "plumb_bob", (0.1, -0.2, 0.001, 0.002)),
+        ((0.1, 0.2, 0, 0, 0.3, 0, 0, 0), "rational_polynomial", (0.1, 0.2, 0, 0, 0.3)),
+        ((0, 0, 0, 0), "equidistant", ()),
+    ],
+)
+def test_lenses(
+    d: tuple[float, ...], model: str, expected: tuple[float, ...], tmp_path: Path,
+    ros: SimpleNamespace,
+) -> None:  # fmt: skip
+    (frame,) = only(one_image(ros, tmp_path, d=d, model=model)).frames
+    assert frame.camera is not None
+    assert frame.camera.intrinsics.distortion == expected
+    assert frame.read().intrinsics.distortion == ()  # undistorted
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"d": (0.1, 0.2, 0, 0, 0.3, 0.4, 0, 0), "model": "rational_polynomial"}, "k4, k5 or k6"),
+        ({"d": (0.1, 0.2, 0.3, 0.4), "model": "equidistant"}, "'equidistant' with 4"),
+        ({"binning": 2}, "binning of 2"),
+        ({"k": (70.0, 71.0, float("nan"), 29.5)}, "principal point"),
+    ],
+)
+def test_lenses_that_are_not_supported(
+    more: dict[str, Any], message: str, tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    with pytest.raises(InvalidIntrinsics, match=message) as caught:
+        only(one_image(ros, tmp_path, **more))
+    assert "run.mcap, /camera/depth/camera_info: " in str(caught.value)
+
+
+def test_rectified_images_have_the_camera_of_the_projection(
+    tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    made = {"d": (0.1, 0.2, 0, 0, 0), "p": (65.0, 66.0, 38.0, 28.0)}
+    (frame,) = only(one_image(ros, tmp_path, "/camera/depth/image_rect", **made)).frames
+    assert frame.camera is not None
+    k = frame.camera.intrinsics
+    assert (k.fx, k.fy, k.cx, k.cy, k.distortion) == (65, 66, 38, 28, ())
+
+
+def test_a_part_of_the_image(tmp_path: Path, ros: SimpleNamespace) -> None:
+    roi = {"x_offset": 10, "y_offset": 20, "width": 80, "height": 60}
+    (frame,) = only(one_image(ros, tmp_path, size=(640, 480), **roi)).frames
+    assert frame.camera is not None
+    k = frame.camera.intrinsics
+    assert (k.width, k.height, k.cx, k.cy) == (80, 60, 29.5, 9.5)
+    assert frame.read().depth.shape == (60, 80)
+
+
+def test_a_camera_that_is_nowhere(tmp_path: Path, ros: SimpleNamespace, depth: Samples) -> None:
+    path = ros.write(tmp_path, lambda writer: writer.image(0.0, depth(0)))
+    with pytest.raises(DatasetError, match=r"image_raw is unknown.*--camera-info"):
+        only(path)
+    (tmp_path / "intrinsics.json").write_text(
+        '{"width": 80, "height": 60, "fx": 70, "fy": 70, "cx": 40, "cy": 30}'
+    )
+    assert len(only(path).frames) == 1
+
+
+def test_an_uncalibrated_camera(tmp_path: Path, ros: SimpleNamespace) -> None:
+    with pytest.raises(DatasetError, match="is not calibrated"):
+        only(one_image(ros, tmp_path, k=(0.0, 0.0, 0.0, 0.0)))
+
+
+def test_a_camera_of_another_size(tmp_path: Path, ros: SimpleNamespace) -> None:
+    (frame,) = only(one_image(ros, tmp_path, size=(640, 480))).frames
+    with pytest.raises(InvalidIntrinsics, match="80 x 60 pixels, the intrinsics are of 640 x 480"):
+        frame.read()
+
+
+# Topics.
+
+
+def test_several_topics_are_listed(tmp_path: Path, ros: SimpleNamespace, depth: Samples) -> None:
+    rows = np.zeros(20, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    rows["x"] = np.arange(20) + 1
+
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.camera_info(0.0, "/other/camera_info", frame="elsewhere")
+        writer.image(0.0, np.zeros((2, 6)), "rgb8", "/camera/color/image_raw")
+        writer.image(0.1, depth(0))
+        writer.compressed(0.1, depth(0))
+        writer.points(0.1, rows)
+        writer.imu(0.1, (0, 0, 9.8))
+
+    path = ros.write(tmp_path, fill)
+    with pytest.raises(DatasetError) as caught:
+        only(path)
+    assert str(caught.value) == (
+        f"{path}: 2 topics can be taken: /camera/depth/image_raw (Image, 1 messages), /points "
+        "(PointCloud2, 1 messages). Choose one with --topic."
+    )
+    assert only(path, RecordingOptions(topic="/points")).frames[0].kind == "cloud"
+    compressed = "/camera/depth/image_raw/compressedDepth"
+    assert only(path, RecordingOptions(topic=compressed)).frames[0].kind == "depth"
+    with pytest.raises(DatasetError, match="There is no topic '/nothing'"):
+        only(path, RecordingOptions(topic="/nothing"))
+    with pytest.raises(DatasetError, match=r"/imu .sensor_msgs/msg/Imu, 1 messages. has no depth"):
+        only(path, RecordingOptions(topic="/imu"))
+    with pytest.raises(DatasetError, match=r"/camera/color/image_raw .* has no depth"):
+        only(path, RecordingOptions(topic="/camera/color/image_raw"))
+    with pytest.raises(DatasetError, match="no topic '/points' of CameraInfo"):
+        only(path, RecordingOptions(topic="/camera/depth/image_raw", camera_info="/points"))
+    outline = bag_outline(path, RecordingOptions())
+    assert [one.topic.name for one in outline.frames] == ["/camera/depth/image_raw", "/points"]
+    assert "--topic" in outline.problem
+    assert outline.sequence is None
+
+
+def test_a_bag_without_frames(tmp_path: Path, ros: SimpleNamespace) -> None:
+    path = ros.write(tmp_path, lambda writer: writer.imu(0.0, (0, 0, 9.8)))
+    with pytest.raises(DatasetError, match=r"no topic of depth images .* or of points"):
+        only(path)
+
+
+def test_a_camera_elsewhere_is_found_by_its_frame(
+    tmp_path: Path, ros: SimpleNamespace, depth: Samples
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0, "/a/info", frame="color", k=(1.0, 1.0, 1.0, 1.0))
+        writer.camera_info(0.0, "/b/info", frame="camera")
+        writer.image(0.0, depth(0))
+
+    (frame,) = only(ros.write(tmp_path, fill)).frames
+    assert frame.camera is not None
+    assert frame.camera.intrinsics.fx == 70.0
+
+
+# References.
+
+
+def test_a_reference_travels_to_another_process(
+    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
+) -> None:
+    def put(writer: Any, i: int, t: float) -> None:
+        writer.image(t, depth(i))
+
+    path = ros.write(tmp_path, lambda writer: drive(writer, ros, walk, put))
+    reference = only(path).frames[5]
+    travelled = pickle.loads(pickle.dumps(reference))
+    np.testing.assert_array_equal(travelled.read().depth, reference.read().depth)
+    assert travelled.read_bytes() == reference.read_bytes()
+    assert len({frame.path for frame in only(path).frames}) == len(walk)
+
+
+def test_several_messages_at_one_time_are_told_apart(
+    tmp_path: Path, ros: SimpleNamespace, depth: Samples
+) -> None:
+    for container in ros.containers:
+
+        def fill(writer: Any) -> None:
+            writer.camera_info(0.0)
+            for i in range(3):
+                message = depth(i)
+                writer.image(0.5, message)
+
+        frames = only(
+            ros.write(tmp_path / container, fill, container), RecordingOptions(keyframe_s=0)
+        ).frames
+        for i in range(3):
+            np.testing.assert_array_equal(
+                frames[i].read().depth, (depth(i) / 1000).astype(np.float32)
+            )
+
+
+def test_one_image_of_another_encoding_costs_no_other(
+    tmp_path: Path, ros: SimpleNamespace, depth: Samples
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.image(0.0, depth(0))
+        writer.image(1.0, np.zeros((2, 6)), "rgb8")
+        writer.image(2.0, depth(2))
+
+    first, second, third = only(ros.write(tmp_path, fill)).frames
+    with pytest.raises(UnreadableFrame, match=r"run\.mcap, /camera/depth/image_raw at .* 'rgb8'"):
+        second.read()
+    assert first.read().depth.any()
+    assert third.read().depth.any()

@@ -1,0 +1,279 @@
+"""Commands that take a bag: what they say, and that they do as with the folder it was made of."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from sceneprint.cli import main
+from sceneprint.cli.demo import serving
+from sceneprint.errors import DatasetError
+from sceneprint.formats.dataset import decode_png, find_sequences
+from sceneprint.formats.recording import bag
+from sceneprint_client import Client
+from sceneprint_client.api import Frame
+
+
+class Said(NamedTuple):
+    """What a command printed."""
+
+    stdout: str
+    stderr: str
+
+
+Run = Callable[..., Said]
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with serving(tmp_path_factory.mktemp("service"), 1) as url:
+        yield url
+
+
+@pytest.fixture
+def sceneprint(
+    service_url: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Run:
+    """Runs a command in this process against the service and checks its exit code."""
+    monkeypatch.setenv("SCENEPRINT_URL", service_url)
+
+    def run(*arguments: object, expect: int = 0) -> Said:
+        capsys.readouterr()
+        code = main([str(one) for one in arguments])
+        said = Said(*capsys.readouterr())
+        assert code == expect, said
+        return said
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def folder(building: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first frames of a walk through a room."""
+    made = tmp_path_factory.mktemp("folder") / "room"
+    made.mkdir()
+    for one in find_sequences(building / "room-0" / "seq-01")[0].frames[:FRAMES]:
+        (made / one.path.name).write_bytes(one.path.read_bytes())
+        pose = one.path.name.replace(".depth.png", ".pose.txt")
+        (made / pose).write_bytes((one.path.parent / pose).read_bytes())
+    camera = building / "room-0" / "intrinsics.json"
+    (made / "intrinsics.json").write_bytes(camera.read_bytes())
+    return made
+
+
+@pytest.fixture(scope="module")
+def recording(folder: Path, ros: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same frames as a robot would have recorded them, its camera off its base."""
+    (sequence,) = find_sequences(folder)
+
+    def fill(writer: Any) -> None:
+        writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
+        for i, one in enumerate(sequence.frames):
+            assert one.pose is not None
+            assert one.camera is not None
+            k = one.camera.intrinsics
+            t = 0.2 * i
+            T_odom_base = one.pose @ np.linalg.inv(ros.camera)
+            writer.camera_info(t, k=(k.fx, k.fy, k.cx, k.cy), size=(k.width, k.height))
+            writer.transforms(t, {("odom", "base_link"): T_odom_base})
+            writer.image(t, decode_png(one.read_bytes()))
+
+    return ros.write(tmp_path_factory.mktemp("recording"), fill, name="lab")
+
+
+@pytest.fixture(scope="module")
+def maps(
+    service_url: str, folder: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[str, str]:
+    """One map of the folder, one of the recording."""
+    for name, path in (("folder", folder), ("bag", recording)):
+        assert main(["upload", name, str(path), "--keyframe-m", "0", "--url", service_url]) == 0
+    return "folder", "bag"
+
+
+def test_frames_of_a_bag_are_those_of_the_folder(
+    maps: tuple[str, str], service_url: str, ros: SimpleNamespace
+) -> None:
+    with Client(service_url) as client:
+        of_folder, of_bag = ({one.content_id: one for one in client.frames(m)} for m in maps)
+    assert len(of_folder) == FRAMES
+    assert of_bag.keys() == of_folder.keys()  # the same samples and camera, exactly
+    for content, one in of_bag.items():
+        check_pose(of_folder[content], one)
+        assert one.session == "lab"
+        assert one.pose is not None
+        assert one.pose.parent_frame == "lab/odom"
+        assert one.captured_at is not None
+        assert one.captured_at.timestamp() == pytest.approx(ros.start, abs=2)
+        assert one.base_frame == "base_link"
+        assert one.T_base_sensor is not None
+        np.testing.assert_allclose(one.T_base_sensor.matrix, ros.camera, atol=1e-6)
+
+
+def check_pose(expected: Frame, found: Frame) -> None:
+    """Equal to 1 mm and 0.01 degrees."""
+    assert expected.pose is not None
+    assert found.pose is not None
+    a, b = np.array(expected.pose.matrix), np.array(found.pose.matrix)
+    assert np.linalg.norm(a[:3, 3] - b[:3, 3]) < 1e-3
+    turn = a[:3, :3].T @ b[:3, :3]
+    assert np.degrees(np.linalg.norm(turn - turn.T) / np.sqrt(8)) < 0.01
+
+
+def test_uploading_again_changes_nothing(
+    sceneprint: Run, maps: tuple[str, str], recording: Path
+) -> None:
+    done = sceneprint("upload", "bag", recording, "--keyframe-m", 0)
+    assert done.stdout.startswith(f"{FRAMES} frames: 0 received, {FRAMES} already there; ")
+    assert done.stderr == (
+        f"{recording}: {FRAMES} of {FRAMES} frames of /camera/depth/image_raw taken, poses in "
+        "odom\n"
+    )
+
+
+def test_keyframes_are_uploaded_and_the_rest_is_counted(
+    sceneprint: Run, recording: Path, service_url: str
+) -> None:
+    done = sceneprint("upload", "sparse", recording, "--keyframe-m", 100, "--keyframe-deg", 360)
+    assert "1 frames: 1 received" in done.stdout
+    assert f"1 of {FRAMES} frames" in done.stderr
+    assert f"left out: {FRAMES - 1} between keyframes" in done.stderr
+
+
+def test_queries_with_a_bag_answer_as_with_the_folder(
+    sceneprint: Run, maps: tuple[str, str], folder: Path, recording: Path
+) -> None:
+    by_path = {}
+    for path in (folder, recording):
+        done = sceneprint(
+            "query", "folder", path, "--frame", 3, "--keyframe-m", 0, "--json", "--k", 2
+        )
+        by_path[path] = json.loads(done.stdout)
+    a, b = by_path[folder], by_path[recording]
+    assert b["name"] == "lab/000003"
+    assert [one["frame_id"] for one in a["matches"]] == [one["frame_id"] for one in b["matches"]]
+    assert a["location"]["pose"] == b["location"]["pose"] | {
+        "child_frame": a["location"]["pose"]["child_frame"]
+    }
+
+
+def test_localize_and_sequences_of_a_bag(
+    sceneprint: Run, maps: tuple[str, str], recording: Path
+) -> None:
+    done = sceneprint("localize", "bag", recording, "--keyframe-m", 0)
+    assert done.stdout.startswith("lab/000000: found")
+    done = sceneprint("localize", "bag", recording, "--keyframe-m", 0, "--frame", 4, "--last", 3)
+    assert done.stdout.startswith("lab/000004: found")
+    done = sceneprint("query", "bag", recording, "--frame", 99, expect=2)
+    assert "Set --frame to an index from 0 to" in done.stderr
+
+
+def test_signatures_of_a_bag_are_those_of_the_folder(
+    sceneprint: Run, folder: Path, recording: Path, tmp_path: Path
+) -> None:
+    for name, path in (("a", folder), ("b", recording)):
+        sceneprint("sign", path, "--out", tmp_path / name, "--keyframe-m", 0)
+    a, b = (sorted((tmp_path / name).rglob("*.sig")) for name in "ab")
+    assert [one.read_bytes() for one in a] == [one.read_bytes() for one in b]
+    assert len(a) == FRAMES
+
+
+def test_an_evaluation_of_a_bag(sceneprint: Run, recording: Path, tmp_path: Path) -> None:
+    figures = tmp_path / "figures.json"
+    done = sceneprint(
+        "evaluate", recording, "--db", "0:6", "--queries", "6:8", "--keyframe-m", 0,
+        "--json", figures,
+    )  # fmt: skip
+    assert json.loads(figures.read_text())
+    assert done.stderr.count("frames of /camera/depth/image_raw taken") == 1
+
+
+def test_what_a_bag_holds(sceneprint: Run, recording: Path) -> None:
+    done = sceneprint("bag", "info", recording, "--keyframe-m", 0)
+    head, *lines = done.stdout.splitlines()
+    assert head == f"{recording}: ROS 2, 25 messages of 4 topics, 1.4 s from 2023-11-14T22:13:20Z"
+    table = [re.sub(" +", " ", line.strip()) for line in lines]
+    assert table == [
+        "/camera/depth/camera_info sensor_msgs/msg/CameraInfo 8 5.7 Hz camera",
+        "/camera/depth/image_raw sensor_msgs/msg/Image 8 5.7 Hz 16UC1, taken",
+        "/tf tf2_msgs/msg/TFMessage 8 5.7 Hz",
+        "/tf_static tf2_msgs/msg/TFMessage 1",
+        "8 of 8 frames of /camera/depth/image_raw taken, poses in odom",
+        table[5],
+        "poses: in lab/odom",
+        "mounting: at 0.210 -0.050 0.930 m in base_link",
+        "up: of 0 of 8 frames",
+    ]
+    assert table[5].startswith("camera: 640 x 480, fx ")
+
+
+def test_a_bag_of_which_nothing_would_be_taken(
+    sceneprint: Run, tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    path = ros.write(tmp_path, lambda writer: writer.imu(0.0, (0, 0, 9.8)), "ros1")
+    done = sceneprint("bag", "info", path, expect=1)
+    assert "ROS 1, 1 messages of 1 topics" in done.stdout
+    assert "nothing would be taken: " in done.stdout
+    done = sceneprint("upload", "none", path, expect=2)
+    assert done.stderr.startswith(f"sceneprint upload: {path}: There is no topic of depth images")
+    assert done.stderr.count("\n") == 1
+
+
+def test_files_that_are_no_bags(sceneprint: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"no bag")
+    done = sceneprint("bag", "info", tmp_path / "a.mcap", expect=2)
+    assert re.fullmatch(
+        r"sceneprint bag: .*a\.mcap: The recording cannot be read \(File magic is invalid\.\)\. If "
+        r"the recorder was stopped before it closed the file, run `mcap recover`; else copy it "
+        r"again\.\n",
+        done.stderr,
+    )
+    done = sceneprint("bag", "info", tmp_path / "gone.mcap", expect=2)
+    assert "There is no such file or folder" in done.stderr
+
+
+def test_without_rosbags_the_extra_is_named(
+    sceneprint: Run, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag._types.cache_clear()
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    done = sceneprint("upload", "bag", recording, expect=2)
+    assert done.stderr == (
+        "sceneprint upload: Recordings of ROS are read with rosbags, which is not installed. Run: "
+        "pip install 'sceneprint[ros]'\n"
+    )
+
+
+def test_a_client_is_told_that_a_bag_is_no_frame(service_url: str, recording: Path) -> None:
+    with Client(service_url) as client, pytest.raises(DatasetError, match="a recording of ROS"):
+        client.localize("bag", recording)
+
+
+def test_options_that_are_none(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for given in ("-1", "nan", "x"):
+        with pytest.raises(SystemExit):
+            main(["bag", "info", str(recording), "--keyframe-m", given])
+        assert "is not a number from 0 up" in capsys.readouterr().err
+
+
+def test_rosbags_is_loaded_when_a_bag_is_opened_and_not_before(folder: Path) -> None:
+    program = (
+        "import sys\nfrom pathlib import Path\nimport sceneprint.cli.upload\n"
+        "from sceneprint.formats.dataset import find_sequences\n"
+        "find_sequences(Path(sys.argv[1]))\n"
+        "print([one for one in sys.modules if one.partition('.')[0] in ('rosbags', 'apsw')])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(folder)], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "[]\n"

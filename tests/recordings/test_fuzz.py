@@ -1,0 +1,320 @@
+"""Damaged bags: only stated errors, in bounded time and memory."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import DatasetError, SceneprintError, UnreadableCloud, UnreadableFrame
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.formats.recording import RecordingOptions, bag_outline
+from sceneprint.types import Floats
+
+Walk = list[tuple[float, Floats]]
+Samples = Callable[[int], np.ndarray]
+
+
+DEPTH, POINTS = "/camera/depth/image_raw", "/points"
+
+
+def read_all(path: Path) -> int:
+    """How many frames can be read of whatever is there; what is raised is ours."""
+    count = 0
+    for topic in (DEPTH, POINTS):
+        try:
+            (sequence,) = find_sequences(
+                path, RecordingOptions(topic=topic, keyframe_m=0, keyframe_s=0)
+            )
+        except SceneprintError as error:
+            check(error)
+            continue
+        for frame in sequence.frames:
+            try:
+                frame.read()
+                count += 1
+            except SceneprintError as error:
+                check(error)
+    try:
+        bag_outline(path, RecordingOptions())
+    except SceneprintError as error:
+        check(error)
+    return count
+
+
+def check(error: SceneprintError) -> None:
+    """An error is one line that says what to do."""
+    told = str(error)
+    assert told.isprintable()
+    assert told.endswith("."), told
+    assert len(told) < 2000
+
+
+@pytest.fixture(scope="module")
+def small(
+    tmp_path_factory: pytest.TempPathFactory, ros: SimpleNamespace, walk: Walk
+) -> dict[str, Path]:
+    """A bag of everything in each container, small enough to be cut at many places."""
+    rng = np.random.default_rng(0)
+    rows = np.zeros(30, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    for name in "xyz":
+        rows[name] = rng.uniform(1, 5, 30)
+
+    def fill(writer: Any) -> None:
+        writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
+        for i, (t, T) in enumerate(walk[:4]):
+            writer.transforms(t, {("odom", "base_link"): T})
+            writer.odometry(t, T)
+            writer.camera_info(t, size=(8, 6))
+            writer.imu(t, (0, 0, 9.8))
+            writer.image(t, rng.integers(500, 4000, (6, 8)))
+            writer.points(t, rows, height=1 + i % 2)
+
+    folder = tmp_path_factory.mktemp("small")
+    made = {one: ros.write(folder / one, fill, one) for one in ros.containers}
+    made["zstd"] = ros.write(folder / "zstd", fill, "mcap", compression="storage")
+    made["bz2"] = ros.write(folder / "bz2", fill, "ros1", compression="bz2")
+    made["message"] = ros.write(folder / "message", fill, "sqlite3", compression="message")
+    return made
+
+
+def damaged(bag: Path, folder: Path, content: bytes, number: int) -> Path:
+    """A copy of a bag with another content of its file."""
+    if bag.is_file():
+        path = folder / f"{number}{bag.suffix}"
+        path.write_bytes(content)
+        return path
+    copy = folder / f"{number}"
+    shutil.copytree(bag, copy)
+    next(copy.glob("*.db3")).write_bytes(content)
+    return copy
+
+
+def content_of(bag: Path) -> bytes:
+    return (bag if bag.is_file() else next(bag.glob("*.db3"))).read_bytes()
+
+
+ALL_KINDS = ["mcap", "sqlite3", "ros1", "zstd", "bz2", "message"]
+
+
+@pytest.mark.parametrize("kind", ALL_KINDS)
+def test_whole_bags_are_read(kind: str, small: dict[str, Path]) -> None:
+    assert read_all(small[kind]) == 8
+
+
+@pytest.mark.parametrize("kind", ALL_KINDS)
+def test_bags_that_were_cut_off(kind: str, small: dict[str, Path], tmp_path: Path) -> None:
+    whole = content_of(small[kind])
+    places = {0, 1, 7, 8, 9, 13, 40, len(whole) - 1, len(whole) - 8, len(whole) - 37}
+    places |= set(np.random.default_rng(1).integers(0, len(whole), 40).tolist())
+    for number, place in enumerate(sorted(places)):
+        read_all(damaged(small[kind], tmp_path, whole[:place], number))
+
+
+@pytest.mark.parametrize("kind", ALL_KINDS)
+def test_bags_with_other_bytes(kind: str, small: dict[str, Path], tmp_path: Path) -> None:
+    whole, rng = content_of(small[kind]), np.random.default_rng(2)
+    start = time.monotonic()
+    for number in range(60):
+        content = bytearray(whole)
+        for _ in range(int(rng.integers(1, 4))):
+            at = int(rng.integers(0, len(content) - 8))
+            kinds = (
+                bytes(rng.integers(0, 256, int(rng.integers(1, 9))).tolist()), b"\xff" * 8,
+                b"\x00" * 8, struct.pack("<Q", 2**40), struct.pack("<I", 2**31 - 1),
+            )  # fmt: skip
+            new = kinds[int(rng.integers(0, len(kinds)))]
+            content[at : at + len(new)] = new
+        read_all(damaged(small[kind], tmp_path, bytes(content), number))
+    assert time.monotonic() - start < 120
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "[", "a: b", "rosbag2_bagfile_information: 3",
+        "rosbag2_bagfile_information: {version: 99}",
+        "rosbag2_bagfile_information: {version: 9, relative_file_paths: [gone.db3]}", "\x00",
+    ],
+)  # fmt: skip
+def test_folders_with_other_metadata(text: str, small: dict[str, Path], tmp_path: Path) -> None:
+    copy = tmp_path / "bag"
+    shutil.copytree(small["sqlite3"], copy)
+    (copy / "metadata.yaml").write_text(text)
+    with pytest.raises(DatasetError, match=r"The recording cannot be read \(.*ros2 bag reindex"):
+        find_sequences(copy)
+
+
+def test_unknown_types_beside_ours_cost_nothing(
+    tmp_path: Path, ros: SimpleNamespace, depth: Samples
+) -> None:
+    def fill(writer: Any) -> None:
+        unknown = "my_robot/msg/Thing"
+        writer.connections["/thing"] = writer.writer.add_connection(
+            "/thing", unknown, msgdef="not (a definition", rihs01="RIHS01_" + "0" * 64
+        )
+        writer.raw("/thing", unknown, 0.0, b"\x00\x01\x00\x00????")
+        writer.camera_info(0.0)
+        writer.image(0.0, depth(0))
+
+    (sequence,) = find_sequences(ros.write(tmp_path, fill))
+    assert sequence.frames[0].read().depth.any()
+
+
+def messages(writer: Any, depth: Samples) -> Iterator[tuple[str, bytes]]:
+    """Images whose sizes contradict each other, or are absurd."""
+    name = "sensor_msgs/msg/Image"
+    for width, height, step, bytes_there in (
+        (80, 60, 160, 9599), (80, 60, 159, 9600), (0, 0, 0, 0),
+        (2**32 - 1, 2**32 - 1, 2**32 - 1, 9),
+        (80, 2**32 - 1, 160, 9600), (2**31, 1, 2**32 - 1, 9600), (1, 2**31, 0, 16),
+    ):  # fmt: skip
+        image = writer.make(
+            name, header=writer.header(0.0, "camera"), height=height, width=width,
+            encoding="16UC1", is_bigendian=0, step=step, data=np.zeros(bytes_there, np.uint8),
+        )  # fmt: skip
+        yield name, writer.serialized(name, image)
+    whole = writer.serialized(name, image)
+    for place in (0, 3, 4, 11, 12, 20, 40, len(whole) - 1):
+        yield name, whole[:place]
+    yield name, whole[:-20] + b"\xff" * 20
+    yield name, b"\xff" * 100
+
+
+@pytest.mark.parametrize("container", ["mcap", "ros1"])
+def test_images_of_absurd_sizes(
+    container: str, tmp_path: Path, ros: SimpleNamespace, depth: Samples
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.image(0.0, depth(0))
+        for number, (name, data) in enumerate(messages(writer, depth)):
+            writer.raw("/camera/depth/image_raw", name, 0.1 + 0.1 * number, data)
+
+    path = ros.write(tmp_path, fill, container)
+    (sequence,) = find_sequences(path, RecordingOptions(keyframe_s=0))
+    assert len(sequence.frames) == 18
+    by_name = {frame.name[-2:]: frame for frame in sequence.frames}
+    assert by_name.pop("00").read().depth.any()
+    for frame in by_name.values():
+        with pytest.raises(UnreadableFrame, match=r"run\.\w+, /camera/depth/image_raw at \d+ ns"):
+            frame.read()
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"point_step": 0}, {"point_step": 11}, {"point_step": 2**32 - 1}, {"width": 2**32 - 1},
+        {"width": 2**31, "point_step": 2**31}, {"row_step": 3}, {"row_step": 1},
+    ],
+)  # fmt: skip
+def test_points_of_absurd_sizes(more: dict[str, int], tmp_path: Path, ros: SimpleNamespace) -> None:
+    rows = np.ones(30, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    path = ros.write(tmp_path, lambda writer: writer.points(0.0, rows, **({"height": 2} | more)))
+    (sequence,) = find_sequences(path)
+    with pytest.raises(UnreadableCloud):
+        sequence.frames[0].read()
+
+
+def test_points_without_coordinates(tmp_path: Path, ros: SimpleNamespace) -> None:
+    rows = np.ones(30, [("x", "<f4"), ("y", "<f4"), ("intensity", "<f4")])
+    (sequence,) = find_sequences(ros.write(tmp_path, lambda writer: writer.points(0.0, rows)))
+    with pytest.raises(UnreadableCloud, match="has the fields x, y, intensity, and x, y and z"):
+        sequence.frames[0].read()
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "only PNG"), (b"\x00" * 12, "only PNG"), (b"\x00" * 12 + b"\xff\xd8\xff", "only PNG"),
+        (b"\x00" * 80 + b"\x89PNG\r\n\x1a\n", "only PNG"),
+        (b"\x00" * 12 + b"\x89PNG\r\n\x1a\n", "ends early"),
+    ],
+)  # fmt: skip
+def test_compressed_images_that_are_none(
+    data: bytes, message: str, tmp_path: Path, ros: SimpleNamespace, depth: Samples
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.compressed(0.0, depth(0))
+        name = "sensor_msgs/msg/CompressedImage"
+        image = writer.make(
+            name, header=writer.header(1.0, "camera"), format="16UC1; compressedDepth",
+            data=np.frombuffer(data, np.uint8),
+        )  # fmt: skip
+        writer.write("/camera/depth/image_raw/compressedDepth", name, 1.0, image)
+
+    (sequence,) = find_sequences(ros.write(tmp_path, fill))
+    with pytest.raises(UnreadableFrame, match=message):
+        sequence.frames[1].read()
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [(np.nan, 1.0), (np.inf, 0.0), (-1.0, 0.0), (0.0, 0.0), (1.0, np.nan)],
+)  # fmt: skip
+def test_parameters_of_inverse_depth_that_are_none(
+    a: float, b: float, tmp_path: Path, ros: SimpleNamespace, depth: Samples
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.compressed(0.0, depth(0), "32FC1", a=a, b=b)
+
+    (sequence,) = find_sequences(ros.write(tmp_path, fill))
+    with pytest.raises(UnreadableFrame, match="inverse depth"):
+        sequence.frames[0].read()
+
+
+def test_a_chunk_that_grows_beyond_what_it_announces(tmp_path: Path) -> None:
+    """A gigabyte of zeros in a small file: refused, and never held."""
+    backports = pytest.importorskip("backports.zstd")
+    bomb = backports.compress(bytes(1 << 30), 1)
+    assert len(bomb) < 200_000
+    out = io.BytesIO()
+
+    def record(op: int, content: bytes) -> None:
+        out.write(bytes([op]) + struct.pack("<Q", len(content)) + content)
+
+    def text(value: bytes) -> bytes:
+        return struct.pack("<I", len(value)) + value
+
+    out.write(b"\x89MCAP0\r\n")
+    record(1, text(b"ros2") + text(b""))
+    chunk = struct.pack("<QQQI", 0, 1, 4096, 0) + text(b"zstd")
+    record(6, chunk + struct.pack("<Q", len(bomb)) + bomb)
+    record(2, struct.pack("<QQI", 0, 0, 0))
+    out.write(b"\x89MCAP0\r\n")
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(out.getvalue())
+    program = (
+        "import resource, sys\nfrom pathlib import Path\n"
+        "from sceneprint.formats.dataset import find_sequences\n"
+        "from sceneprint.errors import DatasetError\n"
+        "try:\n    find_sequences(Path(sys.argv[1]))\n"
+        "except DatasetError as error:\n    print(error)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True
+    )
+    told, peak = done.stdout.strip().rsplit("\n", 1)
+    assert "a chunk does not end within 4096 bytes" in told
+    assert int(peak) < 400_000  # KB
+
+
+def test_a_chunk_of_ros_1_that_grows(
+    small: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sceneprint.formats.recording.bag.MAXIMUM_CHUNK_BYTES", 2000)
+    with pytest.raises(DatasetError):
+        find_sequences(small["bz2"], RecordingOptions(topic="/points"))
