@@ -148,11 +148,8 @@ def test_poses_as_ros_names_them() -> None:
     assert pose.translation is not None
     assert pose.rotation is not None
     assert (pose.translation.y, pose.rotation.w) == (2, QUARTER)
-    assert set(pose.model_dump(exclude_defaults=True)) == {
-        "translation",
-        "rotation",
-        "parent_frame",
-    }
+    given = pose.model_dump(exclude_defaults=True)
+    assert set(given) == {"translation", "rotation", "parent_frame"}
     for twice in ({**told, "translation": told["position"]}, {"position": told["position"]}):
         with pytest.raises(InvalidRequest):
             checked(GivenPose, "The pose", **twice)
