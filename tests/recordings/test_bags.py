@@ -279,6 +279,40 @@ def test_odometry_gives_poses_where_tf_does_not(
         np.testing.assert_allclose(frame.pose, T @ ros.camera, atol=1e-9)
 
 
+def test_transforms_come_before_odometry_of_the_same_frames(
+    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
+) -> None:
+    """Wheels slip: what a filter makes of their odometry is in tf."""
+
+    def put(writer: Any, i: int, t: float) -> None:
+        writer.odometry(t, ros.transform(9, 9, 9))
+        writer.image(t, depth(i))
+
+    frames = only(ros.write(tmp_path, lambda writer: drive(writer, ros, walk, put))).frames
+    for (_, T), frame in zip(walk, frames, strict=True):
+        np.testing.assert_allclose(frame.pose, T @ ros.camera, atol=1e-9)
+
+
+@pytest.mark.parametrize("container", ["mcap", "sqlite3", "ros1"])
+def test_the_stamp_counts_and_not_the_time_of_recording(
+    container: str, tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
+) -> None:
+    """Images are recorded 0.35 s late, as by slow drivers."""
+
+    def put(writer: Any, i: int, t: float) -> None:
+        writer.late = 0.35
+        writer.image(t, depth(i))
+        writer.late = 0.0
+
+    def fill(writer: Any) -> None:
+        drive(writer, ros, walk[:3], put)
+
+    frames = only(ros.write(tmp_path, fill, container)).frames
+    assert [round(frame.timestamp - ros.start, 6) for frame in frames] == [0.0, 0.1, 0.2]
+    for (_, T), frame in zip(walk, frames, strict=False):
+        np.testing.assert_allclose(frame.pose, T @ ros.camera, atol=1e-9)
+
+
 def test_a_map_comes_before_odometry_and_either_can_be_chosen(
     tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
 ) -> None:

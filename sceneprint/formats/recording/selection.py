@@ -202,7 +202,8 @@ def choose_topic(bag: Bag, wanted: str | None) -> FrameTopic:
             raise DatasetError(
                 f"{bag.path}: The topic {printable(wanted)} ({printable(named[0].type)}, "
                 f"{named[0].count} messages) has no depth images (16UC1, mono16, 32FC1, or PNG of "
-                f"compressedDepth) and no points. Choose one of {_listed(one.topic for one in candidates)}."
+                "compressedDepth) and no points. Choose one of "
+                f"{_listed(one.topic for one in candidates)}."
             )
         return found
     if not candidates:
