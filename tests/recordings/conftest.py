@@ -49,6 +49,7 @@ class BagWriter:
             of_tf = "geometry_msgs/TransformStamped[] transforms"
             self.types.register(get_types_from_msg(of_tf, "tf2_msgs/msg/TFMessage"))
         self.connections: dict[str, Any] = {}
+        self.late = 0.0  #: seconds from the stamp of a message to its recording
 
     def make(self, name: str, /, **fields: Any) -> Any:
         kind = self.types.types[name]
@@ -76,7 +77,9 @@ class BagWriter:
     def raw(self, topic: str, name: str, t: float, data: bytes) -> None:
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.types)
-        self.writer.write(self.connections[topic], START * 10**9 + round(t * 1e9), data)
+        self.writer.write(
+            self.connections[topic], START * 10**9 + round((t + self.late) * 1e9), data
+        )
 
     # What robots record.
 

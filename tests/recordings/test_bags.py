@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -276,6 +277,45 @@ def test_odometry_gives_poses_where_tf_does_not(
 
     frames = only(ros.write(tmp_path, fill)).frames
     for (_, T), frame in zip(walk, frames, strict=True):
+        np.testing.assert_allclose(frame.pose, T @ ros.camera, atol=1e-9)
+
+
+def test_transforms_come_before_odometry_of_the_same_frames(
+    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
+) -> None:
+    """Wheels slip: what a filter makes of their odometry is in tf."""
+
+    found = []
+    for name in ("with", "without"):
+
+        def put(writer: Any, i: int, t: float, name: str = name) -> None:
+            if name == "with":
+                writer.odometry(t + 0.03, ros.transform(9, 9, 9))
+            writer.image(t + 0.03, depth(i))
+
+        path = ros.write(tmp_path / name, partial(drive, ros=ros, walk=walk, put=put))
+        found.append([frame.pose for frame in only(path).frames])
+    assert len(found[0]) == len(walk) - 1  # the last lies 30 ms after the last transform
+    np.testing.assert_array_equal(found[0], found[1])
+
+
+@pytest.mark.parametrize("container", ["mcap", "sqlite3", "ros1"])
+def test_the_stamp_counts_and_not_the_time_of_recording(
+    container: str, tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
+) -> None:
+    """Images are recorded 0.35 s late, as by slow drivers."""
+
+    def put(writer: Any, i: int, t: float) -> None:
+        writer.late = 0.35
+        writer.image(t, depth(i))
+        writer.late = 0.0
+
+    def fill(writer: Any) -> None:
+        drive(writer, ros, walk[:3], put)
+
+    frames = only(ros.write(tmp_path, fill, container)).frames
+    assert [round(frame.timestamp - ros.start, 6) for frame in frames] == [0.0, 0.1, 0.2]
+    for (_, T), frame in zip(walk, frames, strict=False):
         np.testing.assert_allclose(frame.pose, T @ ros.camera, atol=1e-9)
 
 
