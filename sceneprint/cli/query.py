@@ -331,20 +331,20 @@ def add_localize(commands: Any) -> None:
     command = commands.add_parser(
         "localize",
         help="find the pose of a frame in a map",
-        description="Find the pose in a map at which a depth frame or cloud was taken. The "
-        "frame is not added to the map. Exit code 0: found; 1: ambiguous or not found.",
+        description="Find the poses in a map at which depth frames or clouds were taken. They are "
+        "not added to the map. Exit code 0: all are found; 1: one is ambiguous or not found.",
     )
     command.add_argument("map", metavar="MAP")
     command.add_argument(
         "path", type=Path, metavar="FRAME", help="a depth image, a cloud, a folder or a recording"
     )
     command.add_argument(
-        "--frame", metavar="N|FILE", help="frame of a folder: index from 0, or name (default: 0)"
+        "--frame", metavar="N|FILE", help="frame of a folder: index from 0, or name (default: all)"
     )
     command.add_argument(
         "--last", type=whole_number, default=1, metavar="K",
-        help="ask with the K last frames up to this one, 2 to 10, whose poses in the folder are "
-        "the odometry (default: 1, this one alone)",
+        help="ask with the K last frames up to --frame (default: the last), 2 to 10, whose poses "
+        "in the folder are the odometry (default: 1, each frame alone)",
     )  # fmt: skip
     command.add_argument("--json", action="store_true", help="print JSON")
     add_up_option(command)
@@ -356,21 +356,52 @@ def add_localize(commands: Any) -> None:
 
 
 def run_localize(options: argparse.Namespace) -> int:
-    """Ask; returns 1 where the frame is not found."""
+    """Ask; returns 1 where a frame is not found, and 2 where one could not be looked up."""
     every = [frame for one in sequences_at(options.path, options) for frame in one.frames]
-    reference = _wanted_frame(options.path, options.frame or "0", every)[0]
-    before = _frames_before(options, every, reference)
+    chosen = _frames_to_localize(options, every)
     how = {**options_of(options), "prior": options.prior}
+    lost = failed = 0
     with open_client(options) as client:
-        if before:
-            there = client.localize_sequence(options.map, [*before, reference], **how)
-        else:
-            there = client.localize(options.map, reference, up=options.up, **how)
-    if options.json:
-        print(there.model_dump_json())
-    else:
-        print("\n".join(localization_lines(reference.name, there)))
-    return 0 if there.status == "found" else 1
+        for reference in chosen:
+            before = _frames_before(options, every, reference)
+            try:
+                if before:
+                    there = client.localize_sequence(options.map, [*before, reference], **how)
+                else:
+                    there = client.localize(options.map, reference, up=options.up, **how)
+            except (FrameError, MissingDependency, TooLarge) as error:  # of this file alone
+                if len(chosen) == 1:
+                    raise
+                failed += 1
+                print(f"{one_line(reference.name)}: {one_line(str(error))}", file=sys.stderr)
+                continue
+            lost += there.status != "found"
+            if options.json:
+                told = {"name": reference.name, **there.model_dump(mode="json")}
+                print(json.dumps(told), flush=True)
+            else:
+                print("\n".join(localization_lines(reference.name, there)), flush=True)
+    return 2 if failed else min(lost, 1)
+
+
+def _frames_to_localize(
+    options: argparse.Namespace, every: list[FrameReference]
+) -> list[FrameReference]:
+    """All frames; that of `--frame`; or, of a sequence that ends anywhere, the last one.
+
+    Raises
+    ------
+    DatasetError : no such frame, or a prior of several.
+    """
+    if options.frame is not None:
+        return _wanted_frame(options.path, options.frame, every)
+    if options.last > 1:
+        return every[-1:]
+    if options.prior is not None and len(every) > 1:
+        raise DatasetError(
+            f"{options.path} has {len(every)} frames, and --prior is of one. Name it with --frame."
+        )
+    return every
 
 
 def _frames_before(

@@ -88,8 +88,16 @@ def test_a_frame_is_localized(sceneprint: Run, maps: dict[str, list[str]], rooms
     assert ": found (strong); " in lines[0]
     assert lines[1].startswith("  at ")
     assert " m in room-0/seq-01, rotation " in lines[1]
-    there = json.loads(sceneprint("localize", "near", rooms / "room-0", "--json").stdout)
-    assert (there["status"], there["matches"][0]) == ("found", maps["near"][0])
+    told = sceneprint("localize", "near", rooms / "room-0", "--json", expect=1).stdout.splitlines()
+    there = [json.loads(line) for line in told]
+    assert [one["status"] for one in there] == ["found", "found", "not_found"]
+    assert [one["matches"][0] for one in there[:2]] == maps["near"]
+    queried = sceneprint("query", "near", rooms / "room-0", "--json").stdout.splitlines()
+    assert [json.loads(line)["name"] for line in queried] == [one["name"] for one in there]
+    prior = {"pose": {"parent_frame": "room-0/seq-01", "matrix": np.eye(4).tolist()}}
+    asked = ("localize", "near", rooms / "room-0", "--prior", json.dumps(prior))
+    refused = sceneprint(*asked, expect=2).stderr
+    assert "has 3 frames, and --prior is of one. Name it with --frame.\n" in refused
     lost = sceneprint("localize", "near", rooms / "room-1", "--frame", 0, expect=1).stdout
     assert ": not found; none of 2 candidates is accepted" in lost
     assert lost.splitlines()[1] == "  cause: nothing_alike"

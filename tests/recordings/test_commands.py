@@ -170,7 +170,7 @@ def test_queries_with_a_bag_answer_as_with_the_folder(
 def test_localize_and_sequences_of_a_bag(
     sceneprint: Run, maps: tuple[str, str], recording: Path
 ) -> None:
-    done = sceneprint("localize", "bag", recording, "--keyframe-m", 0)
+    done = sceneprint("localize", "bag", recording, "--keyframe-m", 0, "--frame", 0)
     assert done.stdout.startswith("lab/000000: found")
     done = sceneprint("localize", "bag", recording, "--keyframe-m", 0, "--frame", 4, "--last", 3)
     assert done.stdout.startswith("lab/000004: found")
