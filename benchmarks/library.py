@@ -86,3 +86,11 @@ def accepted(answer: Answer, names: Mapping[str, int]) -> Matches:
         for match in answer.matches
         if match.validation.status == "accepted" and match.transform is not None
     ]
+
+
+def are_same(some: Matches, others: Matches) -> bool:
+    """Whether matches are the same, but for the last bits of poses that a service stores."""
+    return [i for i, _ in some] == [i for i, _ in others] and all(
+        np.allclose(one, other, rtol=0, atol=1e-9)
+        for (_, one), (_, other) in zip(some, others, strict=True)
+    )
