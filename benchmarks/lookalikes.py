@@ -19,6 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from sceneprint.errors import UselessFrame
+from sceneprint.geometry.pose.rigid import rotation_of
 from sceneprint.lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
 from sceneprint.lab.evaluation.measures import answers
 from sceneprint.lab.evaluation.protocol import (
@@ -30,14 +31,17 @@ from sceneprint.lab.evaluation.protocol import (
 )
 from sceneprint.lab.synth import synthesise_lookalike
 from sceneprint.lab.synth.lookalikes import KINDS
+from sceneprint.localization import PosePrior
 from sceneprint.models import PRESETS, read_model
 from sceneprint.pipeline import Signer, open_signer, prepare
-from sceneprint.types import DepthFrame, Geometry
+from sceneprint.types import DepthFrame, Floats, Geometry
 
 #: From this overlap, smaller direction, a frame of the map is enough to answer a query.
 ANSWERABLE = 0.3
 #: Queries of one site when absent scenes are asked by the thousand.
 ABSENT_BLOCK = 100
+#: Deviations that a robot gives with its prior, and how far that is turned at most, degrees.
+PRIOR_M, PRIOR_DEG = 0.3, 10.0
 
 
 @dataclass(frozen=True)
@@ -78,8 +82,30 @@ def signed(
     return kept, members, geometries
 
 
+def prior_about(
+    pose: Floats, parent: str, least: float, most: float, rng: np.random.Generator
+) -> PosePrior:
+    """What a robot believes that is off by `least` to `most` metres, any way, and up to 10 degrees.
+
+    It says of itself 30 cm and 10 degrees, whatever it is.
+    """
+    directions = rng.standard_normal((2, 3))
+    shift, axis = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    T = np.eye(4)
+    half = np.deg2rad(rng.uniform(0.0, PRIOR_DEG)) / 2
+    T[:3, :3] = rotation_of(np.array([*(np.sin(half) * axis), np.cos(half)])) @ pose[:3, :3]
+    T[:3, 3] = pose[:3, 3] + shift * rng.uniform(least, most)
+    told = [PRIOR_M] * 3 + [np.deg2rad(PRIOR_DEG)] * 3
+    return PosePrior(parent, T, np.diag(np.square(told)))
+
+
 def ask_site(
-    signer: Signer, work: tuple[str, int, int], *, seed: int, candidates: int = 10
+    signer: Signer,
+    work: tuple[str, int, int],
+    *,
+    seed: int,
+    candidates: int = 10,
+    prior: tuple[float, float] | None = None,
 ) -> list[Told]:
     """Build one site and ask all its queries.
 
@@ -88,8 +114,10 @@ def ask_site(
     work : kind, index and number of queries
     seed : of the collection
     candidates : size of C
+    prior : least and most metres that the robot's belief is off; None: it has none
     """
     kind, index, queries = work
+    rng = np.random.default_rng([seed, index, KINDS.index(kind)])
     site = synthesise_lookalike(kind, seed, index, queries=queries)
     shown, database, of_map = signed(site.map, site.name, signer, 0)
     # of another place: a pose in its own frame is a pose in no map
@@ -111,7 +139,8 @@ def ask_site(
         )
         rows = np.arange(len(database))
         task = QueryTask(query.number, scene, query.pose, [], one.selection, among, rows)
-        told.append(Told(site.name, kind, number, able[number], answer_of(judge, task)))
+        believed = None if prior is None else prior_about(query.pose, site.name, *prior, rng)
+        told.append(Told(site.name, kind, number, able[number], answer_of(judge, task, believed)))
     return told
 
 
@@ -152,6 +181,10 @@ def main() -> None:
     parser.add_argument(
         "--absent", type=int, default=0, metavar="N", help="queries of other places"
     )
+    parser.add_argument(
+        "--prior", nargs=2, type=float, metavar=("LEAST", "MOST"),
+        help="metres that the robot's prior is off, as 0 0.3 or 1.5 4 (default: it has none)",
+    )  # fmt: skip
     parser.add_argument("--candidates", type=int, default=10, help="size of C (default: 10)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
     parser.add_argument("--model", default=PRESETS[0])
@@ -169,7 +202,8 @@ def main() -> None:
             for b in blocks
         ]
     start, told = time.monotonic(), []
-    do = partial(ask_site, seed=options.seed, candidates=options.candidates)
+    prior = None if options.prior is None else (options.prior[0], options.prior[1])
+    do = partial(ask_site, seed=options.seed, candidates=options.candidates, prior=prior)
     opening = partial(_open, options.model)
     for of_site in tqdm(map_over(work, do, opening, options.jobs), total=len(work), disable=None):
         told += of_site

@@ -85,6 +85,10 @@ class QueryFrame:
     T: Floats = field(default_factory=lambda: np.eye(4))
 
 
+#: Metres between two cameras that still see the same surfaces.
+SAME_SURFACES_M = 8.0
+
+
 @dataclass(frozen=True, eq=False)
 class PosePrior:
     """What a robot believes of its pose before it asks.
@@ -99,6 +103,15 @@ class PosePrior:
     parent: str
     T: Floats
     covariance: Floats
+
+    def reaches(self, pose: Floats) -> bool:
+        """Whether a frame at T_parent_sensor (4, 4) may see what the robot sees.
+
+        They stand at most `SAME_SURFACES_M` apart, and three deviations of the prior.
+        """
+        deviation = math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+        apart = float(np.linalg.norm(pose[:3, 3] - self.T[:3, 3]))
+        return apart <= SAME_SURFACES_M + 3 * deviation
 
 
 @dataclass(frozen=True, eq=False)

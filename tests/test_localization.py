@@ -24,6 +24,7 @@ from sceneprint.geometry.validation.map_verification import (
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.lab.synth import KINECT, render, symmetric_box, synthesise_room
 from sceneprint.localization import (
+    SAME_SURFACES_M,
     LocalizationParameters,
     PoseEstimate,
     PosePrior,
@@ -845,3 +846,15 @@ def test_the_numbers_are_those_of_the_docs() -> None:
     p = LocalizationParameters()
     told = (p.weak, p.outweigh, p.rival, p.violations, p.map_score, p.rival_unsure, p.map_planes)
     assert told == (0.4, 2.0, 0.6, 0.05, 0.3, 0.3, 12.0)
+
+
+def test_a_prior_reaches_frames_within_sight_and_three_deviations() -> None:
+    T, covariance = np.eye(4), np.diag([0.01, 0.25, 0.04, 1.0, 1.0, 1.0])  # 0.5 m at most
+    T[:3, 3] = (1.0, 2.0, 3.0)
+    prior = PosePrior("room", T, covariance)
+    reach = SAME_SURFACES_M + 3 * 0.5
+    pose = np.eye(4)
+    pose[:3, 3] = (1.0 + reach - 1e-6, 2.0, 3.0)
+    assert prior.reaches(pose)
+    pose[0, 3] += 2e-6
+    assert not prior.reaches(pose)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from benchmarks.lookalikes import Told, ask_site, table
+from benchmarks.lookalikes import Told, ask_site, prior_about, table
+from sceneprint.geometry.pose.rigid import difference
 from sceneprint.lab.evaluation.measures import upper_bound
 from sceneprint.lab.evaluation.protocol import Error, JudgedAnswer
 from sceneprint.pipeline import Signer
@@ -55,3 +57,19 @@ def test_a_site_is_asked_and_every_answer_is_one_of_three(small_signer: Signer) 
     assert [(a.answer.status, a.answer.error) for a in again] == [
         (a.answer.status, a.answer.error) for a in answers
     ]
+
+
+def test_a_prior_is_off_by_as_much_as_asked_for() -> None:
+    rng = np.random.default_rng(3)
+    pose = np.eye(4)
+    pose[:3, 3] = (4.0, -2.0, 1.0)
+    priors = [prior_about(pose, "object-000", 1.5, 4.0, rng) for _ in range(200)]
+    shifts, turns = zip(*(difference(pose, one.T) for one in priors), strict=True)
+    assert min(shifts) >= 1.5
+    assert max(shifts) <= 4.0
+    assert min(shifts) < 1.7
+    assert max(shifts) > 3.8
+    assert np.rad2deg(max(turns)) <= 10.0 + 1e-9
+    assert np.rad2deg(max(turns)) > 9.0
+    assert {one.parent for one in priors} == {"object-000"}
+    np.testing.assert_allclose(np.sqrt(np.diag(priors[0].covariance)), [0.3] * 3 + [np.pi / 18] * 3)

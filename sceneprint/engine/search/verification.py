@@ -24,6 +24,7 @@ from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.map_verification import MapViews, looks_ahead
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.localization import (
+    SAME_SURFACES_M,
     LocalizationParameters,
     PoseEstimate,
     PosePrior,
@@ -163,8 +164,8 @@ def validated(
 #: first close by, as a map may hold thousands, and farther off where that gives too few. Scans
 #: see farther than cameras.
 _NEAR_FRAMES = 48
-_NEAR_M = (2.0, 8.0)
-_NEAR_SCANS_M = (2.0, 8.0, 15.0)
+_NEAR_M = (2.0, SAME_SURFACES_M)
+_NEAR_SCANS_M = (*_NEAR_M, 15.0)
 #: Poses this near are looked about once, metres.
 _CELL_M = 1.0
 #: Places that are looked about, at most.
@@ -301,14 +302,12 @@ def nearest_first(
     """Candidates, positions in R, those that were taken near a prior first, else as they were."""
     with store.queried.read() as connection:
         rows = frames_of(connection, ranking.indices[list(chosen)].tolist())
-    deviation = math.sqrt(float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]))
-    reach = _NEAR_M[-1] + 3 * deviation
 
     def far(position: int) -> bool:
         row = rows.get(int(ranking.indices[position]))
         if row is None or row.pose is None or parent_key(row) != prior.parent:
             return True
-        return bool(np.linalg.norm(np.array(row.pose)[:3, 3] - prior.T[:3, 3]) > reach)
+        return not prior.reaches(np.array(row.pose))
 
     return sorted(chosen, key=far)
 

@@ -39,7 +39,13 @@ from sceneprint.lab.evaluation.protocol import (
     pose_error,
     unwatched,
 )
-from sceneprint.localization import PoseEstimate, QueryFrame, localize, views_of_rows
+from sceneprint.localization import (
+    PoseEstimate,
+    PosePrior,
+    QueryFrame,
+    localize,
+    views_of_rows,
+)
 from sceneprint.matches import PairMatch, associate, searched
 from sceneprint.pipeline import validate
 from sceneprint.types import Bytes, Floats, Geometry
@@ -206,11 +212,16 @@ def judge(judging: Judge, task: QueryTask) -> Judged:
     )
 
 
-def answer_of(judging: Judge, task: QueryTask) -> JudgedAnswer:
+def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -> JudgedAnswer:
     """The answer that a robot gets from the candidates of C, by the true pose.
 
     What a service does with a query after the selection, in one place: validation until enough
     are accepted, the pose of those, and how sure that is.
+
+    Parameters
+    ----------
+    judging, task : see there
+    prior : what the robot believes of its pose, its parent a scene of the database
     """
     allowed = set(task.allowed.tolist())
 
@@ -218,13 +229,17 @@ def answer_of(judging: Judge, task: QueryTask) -> JudgedAnswer:
         return judging.geometry(judging.database[row].number) if row in allowed else None
 
     start = time.perf_counter()
-    n = len(task.selection)
-    selected = Ranking(
-        np.array(task.selection, np.intp), np.zeros(n, np.int64), np.zeros(n)
-    )  # neither distance decides here
     poses = [frame.pose for frame in judging.database]
     # what a query may not find must not tell poses apart either: a scene of its own
     scenes = [frame.scene if row in allowed else "" for row, frame in enumerate(judging.database)]
+
+    def far(row: int) -> bool:
+        return prior is not None and not (scenes[row] == prior.parent and prior.reaches(poses[row]))
+
+    n = len(task.selection)
+    selected = Ranking(
+        np.array(sorted(task.selection, key=far), np.intp), np.zeros(n, np.int64), np.zeros(n)
+    )  # neither distance decides here
     query = judging.geometry(task.number)
     validating = partial(
         associate, query, selected, range(n), open_geometry,
@@ -237,7 +252,7 @@ def answer_of(judging: Judge, task: QueryTask) -> JudgedAnswer:
         )
         return localize(
             [QueryFrame(query, matches)], poses, scenes,
-            views_of if judging.mode == "full" else None, overlap_p=judging.p.agreement,
+            views_of if judging.mode == "full" else None, prior, overlap_p=judging.p.agreement,
         )  # fmt: skip
 
     matches = validating(pose_of=lambda row: (scenes[row], poses[row]))
