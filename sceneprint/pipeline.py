@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from sceneprint.errors import ModelMismatch
-from sceneprint.geometry.cores import both
+from sceneprint.geometry.core_pool import both
 from sceneprint.geometry.registration.gravity import NO_UPS, Ups
 from sceneprint.geometry.registration.overlap import thinned
 from sceneprint.geometry.registration.patch_descriptors import compress, patch_descriptors

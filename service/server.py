@@ -25,8 +25,8 @@ from sceneprint.errors import UnusableStore
 from sceneprint.process_limits import raise_descriptors
 from sceneprint.settings import Settings
 from sceneprint.store import open_store
-from sceneprint.store.patience import open_patiently
-from service.front import Front
+from sceneprint.store.startup_retry import open_patiently
+from service.startup import Front
 
 if TYPE_CHECKING:
     from fastapi import FastAPI

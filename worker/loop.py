@@ -18,7 +18,7 @@ from sceneprint.maintenance.snapshot.catalog import SNAPSHOT, snapshot_handler
 from sceneprint.process_limits import StopSignal, limit_memory, raise_descriptors
 from sceneprint.settings import Settings
 from sceneprint.store.wakeup import Listening, process_name
-from worker.traces import Trace
+from worker.crash_traces import Trace
 
 log = logging.getLogger(__name__)
 

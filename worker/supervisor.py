@@ -18,8 +18,8 @@ from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import worker_died
 from sceneprint.errors import SceneprintError
 from sceneprint.settings import Settings
+from worker.crash_traces import Left, Trace
 from worker.loop import work
-from worker.traces import Left, Trace
 
 log = logging.getLogger(__name__)
 

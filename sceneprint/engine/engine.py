@@ -31,12 +31,12 @@ from sceneprint.engine.serializers import frame_records, map_record
 from sceneprint.engine.sessions.association_job import Associating
 from sceneprint.engine.sessions.associations import ASSOCIATE, AssociationJobs
 from sceneprint.engine.signers import Signers, warm
-from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
+from sceneprint.engine.upkeep.frame_retention import Retention
+from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep, VectorTables
 from sceneprint.engine.upkeep.purge import Purging
-from sceneprint.engine.upkeep.retention import Retention
 from sceneprint.errors import ModelError
-from sceneprint.geometry.cores import Cores
+from sceneprint.geometry.core_pool import Cores
 from sceneprint.models import Model
 from sceneprint.settings import Settings
 from sceneprint.store import frames as stored_frames
@@ -44,8 +44,8 @@ from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import open_store, queue
 from sceneprint.store.deletion import remove_map
-from sceneprint.store.patience import PATIENCE_S, open_patiently
 from sceneprint.store.reencoding_rows import models_of
+from sceneprint.store.startup_retry import PATIENCE_S, open_patiently
 from sceneprint.store.tables import MapRow
 from sceneprint.store.wakeup import Notices, Wakeup
 from sceneprint_client.api import (

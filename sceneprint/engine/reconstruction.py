@@ -19,7 +19,7 @@ from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
 from sceneprint.engine.maps.map_frames import living
 from sceneprint.engine.results.stored_results import ResultValidity, StoredResult
 from sceneprint.engine.serializers import when
-from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import (
     DamagedBlob,
     FrameError,

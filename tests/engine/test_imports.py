@@ -17,7 +17,7 @@ from sceneprint.engine.ingest import archive_import
 from sceneprint.engine.ingest import uploads as uploading
 from sceneprint.engine.jobs.lifecycle import cancel, list_jobs
 from sceneprint.engine.jobs.tasks import LongJob
-from sceneprint.engine.upkeep.blob_collection import collect_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import LostLease, UnknownMap, UnusableStore
 from sceneprint.formats.archive.archive import Archive
 from sceneprint.store.queue import files_of

@@ -11,7 +11,7 @@ from sqlalchemy import select, update
 from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import list_jobs
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
-from sceneprint.engine.upkeep.blob_collection import collect_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
 from sceneprint.store.queue import JobFile, files_of, find_job, items_of, remove_job
 from sceneprint.store.tables import events, jobs

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from sceneprint.engine import Engine
-from sceneprint.engine.upkeep import blob_collection
+from sceneprint.engine.upkeep import garbage_collection
 from sceneprint.errors import FrameConflict, InvalidIntrinsics, UnknownFrame, UselessFrame
 from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
 
@@ -181,7 +181,7 @@ def test_a_blob_swept_while_its_upload_comes_in_is_put_again(
         digest = put(data)
         puts.append(digest)
         if len(puts) == 1:
-            blob_collection.collect_blobs(empty.store, [digest])
+            garbage_collection.collect_blobs(empty.store, [digest])
         return digest
 
     monkeypatch.setattr(empty.store.blobs, "put", swept)

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.pose.loops import CycleParameters, LoopEdges, RobotPath, run_of, verdicts
+from sceneprint.geometry.pose.loop_consistency import (
+    CycleParameters,
+    LoopEdges,
+    RobotPath,
+    run_of,
+    verdicts,
+)
 from sceneprint.geometry.pose.rigid import difference, inverse
 from sceneprint.types import Floats
 

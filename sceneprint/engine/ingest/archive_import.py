@@ -20,7 +20,7 @@ from sceneprint.engine.ingest.uploads import Upload, Uploads, item_of
 from sceneprint.engine.ingest.uploads import UploadResult as UploadOutcome
 from sceneprint.engine.jobs.lifecycle import get_job
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
-from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.formats.archive.archive import Archive, open_archive
 from sceneprint.formats.archive.entries import Inflater
 from sceneprint.formats.dataset import FrameReference

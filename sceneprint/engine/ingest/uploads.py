@@ -18,7 +18,7 @@ from sqlalchemy import Connection, select
 
 from sceneprint import errors
 from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upload
-from sceneprint.engine.upkeep import blob_collection, repair
+from sceneprint.engine.upkeep import garbage_collection, repair
 from sceneprint.store import Store
 from sceneprint.store.database import Grouping
 from sceneprint.store.events import record_event
@@ -333,7 +333,7 @@ class Uploads:
         # what came takes the place of an upload that was lost
         left = repair.take_upload(self._store, map_name, there.frame_id, ready.upload.data)
         if left:
-            blob_collection.collect_blobs(self._store, left)
+            garbage_collection.collect_blobs(self._store, left)
         return UploadResult(there.model_copy(update={"reason": repair.without_loss(there.reason)}))
 
     def _write(
@@ -380,10 +380,10 @@ class Uploads:
                 found = self._writes.run(do)
             except errors.SceneprintError:
                 with suppress(errors.UnusableStore):  # leave nothing, on a full disk least of all
-                    blob_collection.collect_blobs(self._store, list(blobs))
+                    garbage_collection.collect_blobs(self._store, list(blobs))
                 raise
             if found is not None:
-                blob_collection.collect_deleted_blobs(self._store, left)
+                garbage_collection.collect_deleted_blobs(self._store, left)
                 return found
 
 

@@ -17,7 +17,7 @@ from sceneprint.engine.jobs import lifecycle
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.search.local_index import Readers
 from sceneprint.engine.signers import Signers
-from sceneprint.engine.upkeep.blob_collection import collect_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.formats.artifact import write_geometry
 from sceneprint.geometry.retrieval.distance import Metric, distance_share, distances
 from sceneprint.models import Model

@@ -17,7 +17,7 @@ from typing import Any
 
 from sceneprint.engine.jobs.lifecycle import LEFT_S, failure_texts, renewed
 from sceneprint.engine.serializers import job_record
-from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import (
     Conflict,
     FrameError,

@@ -18,7 +18,7 @@ import numpy as np
 from sceneprint import errors
 from sceneprint.engine.search.local_index import trusted
 from sceneprint.engine.serializers import map_record, model_label
-from sceneprint.engine.upkeep.blob_collection import collect_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.index import Generation
 from sceneprint.models import Model, read_model, write_model

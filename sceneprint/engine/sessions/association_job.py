@@ -23,7 +23,7 @@ from sceneprint.engine.sessions.associations import Plan, eligible, runs_of
 from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, UnreadableGeometry
-from sceneprint.geometry.pose.loops import (
+from sceneprint.geometry.pose.loop_consistency import (
     LoopEdges,
     RobotPath,
     Verdicts,

@@ -14,7 +14,7 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.jobs.tasks import Tasks
 from sceneprint.engine.serializers import sensor_frame, transform, when
-from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.formats.pose_graph import PoseEdge, g2o, information_of

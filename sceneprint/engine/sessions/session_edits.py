@@ -12,7 +12,7 @@ import time
 
 from sqlalchemy import Connection
 
-from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import InvalidRequest, UnknownSession
 from sceneprint.store import Store
 from sceneprint.store.deletion import delete_frames

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from sceneprint.engine.reconstruction import ReconstructionJobs
 from sceneprint.engine.results.stored_results import ResultValidity, StoredResults
-from sceneprint.engine.upkeep.blob_collection import collect_doomed_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_doomed_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.errors import BusyIndex, SceneprintError, UnknownJob, UnknownMap
 from sceneprint.store import Store

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.pose.loops import Votes
+from sceneprint.geometry.pose.loop_consistency import Votes
 from sceneprint.geometry.pose.rigid import nearest_rotation
 from sceneprint.types import Floats
 

@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from sceneprint.geometry.cores import both
+from sceneprint.geometry.core_pool import both
 from sceneprint.geometry.pose.rigid import (
     difference,
     inverse,

@@ -14,7 +14,7 @@ from pathlib import Path
 from sqlalchemy import Connection, Text, cast, delete, func, select, update
 from sqlalchemy.exc import DBAPIError
 
-from sceneprint.engine.upkeep.blob_collection import collect_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.engine.upkeep.repair import PRIORITY, is_known_loss, reason_of_loss
 from sceneprint.errors import StoreError
 from sceneprint.maintenance.fsck.findings import Finding, Folder, each

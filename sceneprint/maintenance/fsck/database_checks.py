@@ -8,7 +8,7 @@ from functools import partial
 
 from sqlalchemy import Connection, ForeignKeyConstraint, and_, delete, insert, select, text, update
 
-from sceneprint.engine.upkeep.blob_collection import collect_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.engine.upkeep.repair import is_known_loss, without_loss
 from sceneprint.errors import UnreadableModel, UnusableStore
 from sceneprint.maintenance.fsck.findings import Finding, Folder, each, is_of_rows

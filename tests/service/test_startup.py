@@ -16,7 +16,7 @@ from sceneprint import __version__
 from sceneprint.errors import UnusableStore
 from sceneprint.settings import Settings
 from service.app import create_app
-from service.front import Front
+from service.startup import Front
 
 
 async def _lived(front: Front, test: Callable[[httpx.AsyncClient], Awaitable[Any]]) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import time
 
-from sceneprint.engine.upkeep.blob_collection import collect_deleted_blobs
+from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import SceneprintError
 from sceneprint.store import Store
 from sceneprint.store.deletion import DAY_S, aging_maps, delete_frames, old_frames
