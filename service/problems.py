@@ -100,11 +100,20 @@ def invalid(error: ValidationError, what: str) -> errors.InvalidRequest:
     return _invalid([dict(one) for one in found], what)
 
 
+#: Names of RFC 9110 that the standard library has from Python 3.13 on.
+_PHRASES = {413: "Content Too Large", 416: "Range Not Satisfiable", 422: "Unprocessable Content"}
+
+
+def phrase(status: int) -> str:
+    """The name of a status, the same with every version of Python."""
+    return _PHRASES.get(status, HTTPStatus(status).phrase)
+
+
 def declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Responses of these statuses for the OpenAPI document."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
-        status: {"description": HTTPStatus(status).phrase, "content": content}
+        status: {"description": phrase(status), "content": content}
         for status in (*statuses, 401, 403, 408, 421, 429, 500, 503, 507)
     }
 
@@ -136,7 +145,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> JSONResponse:
-        name = HTTPStatus(error.status_code).phrase.title().replace(" ", "")
+        name = phrase(error.status_code).title().replace(" ", "")
         detail = f"{request.method} {request.url.path}: {error.detail}. See /docs."
         answer = problem(_id(request), name, error.status_code, detail)
         answer.headers.update(error.headers or {})

@@ -136,6 +136,7 @@ def promised(document: dict[str, Any], answer: httpx.Response) -> None:
 def begin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Server]]:
     """Start `sceneprint serve` or another command; settings are given as for Settings."""
     begun = []
+    document: dict[str, Any] = {}  # of the first: they all have the same, and it takes a while
 
     def start(
         *arguments: str, folder: Path | None = None, command: tuple[str, ...] | None = None,
@@ -160,7 +161,8 @@ def begin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Se
             assert line.startswith("sceneprint: serving http://"), errors.read_text()
             server.url = line.split()[-1]
             server.client.base_url = httpx.URL(server.url)
-            document = server.client.get("/openapi.json").json()
+            if not document:
+                document.update(server.client.get("/openapi.json").json())
             server.client.event_hooks = {"response": [lambda answer: promised(document, answer)]}
         return server
 
