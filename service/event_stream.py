@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 #: Seconds between two looks at the database, and after one that failed.
 POLL_S, TROUBLE_S = 0.25, 1.0
 #: Seconds of silence after which a stream says that it lives.
-ALIVE_S = 15.0
+ALIVE_S = 3.0
 #: Events held in memory, and read or told at once.
 HELD, MOST = 4096, 500
 

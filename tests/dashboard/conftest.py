@@ -85,12 +85,14 @@ class Station:
     url : where it listens, without a slash at the end
     data : its folder
     client : asks it as one of its own machine, which needs no key
+    process : its number
     frames : of the map `building`, in the order of time
     """
 
     url: str
     data: Path
     client: httpx.Client
+    process: int
     frames: list[Sent] = field(default_factory=list)
 
     @property
@@ -127,7 +129,7 @@ def running(data: Path, workers: int, port: int = 0) -> Iterator[Station]:
         assert line.startswith("sceneprint: serving http://"), said
         url = line.split()[-1].rstrip("/")
         with httpx.Client(base_url=url, timeout=60, trust_env=False) as client:
-            yield Station(url, data, client)
+            yield Station(url, data, client, process.pid)
     finally:
         process.terminate()
         try:

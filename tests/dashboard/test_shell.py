@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,7 @@ from typing import Any
 from playwright.sync_api import Page, expect
 
 PROXIED = {"X-Forwarded-For": "192.0.2.7"}
-BUDGET = 30_000
+BUDGET = 35_000
 
 
 def test_the_first_page_is_small_and_asks_for_nothing_long(
@@ -187,6 +189,21 @@ def test_a_service_without_maps_goes_and_comes_back(
         page.get_by_role("radio", name="Rooms").check()
         page.get_by_role("button", name="Create map").click()
         expect(page).to_have_url(f"{alone.home}#/maps/first")
+        page.goto(alone.home + "#/")
+        settle(page)
+        expect(page.locator(".map")).to_have_count(1)
+        page.goto(alone.home + "#/operations")
+        settle(page)
+        health = page.locator(".health .badge").first
+        expect(health).to_have_text("ready")
+        os.kill(alone.process, signal.SIGSTOP)  # it takes connections, and answers none
+        try:
+            expect(page.locator("#banner")).to_contain_text("does not answer", timeout=60_000)
+            expect(health).to_have_text("not answering")
+        finally:
+            os.kill(alone.process, signal.SIGCONT)
+        expect(page.locator("#banner")).to_be_hidden(timeout=60_000)
+        expect(health).to_have_text("ready", timeout=60_000)
         page.goto(alone.home + "#/")
         settle(page)
         expect(page.locator(".map")).to_have_count(1)

@@ -10,6 +10,7 @@ import { drawHead, drawRail, setTitle } from "./lib/shell.js";
 const PAGES = new URL("./", import.meta.url);
 const LATE_MS = 2500;
 const AGES_MS = 20_000; // "just now" is not true for long
+const PULSE_MS = 2500; // with what `lives` waits and LATE_MS, within ten seconds
 const main = document.getElementById("main");
 const sheets = new Map(); // address -> <link> of styles
 let turn = new AbortController(); // aborts what the page that is shown began
@@ -134,9 +135,19 @@ function lost(isLost) {
 function tellLost() {
   banner.hidden = false;
   put(banner, "The service does not answer. The data shown may be out of date; retrying…");
+  window.dispatchEvent(new CustomEvent("sceneprint:lost"));
+}
+
+// a service that hangs answers nothing and refuses nothing: no request of a page would ever tell
+async function pulse() {
+  const before = late !== null;
+  const isUp = document.hidden || await lives();
+  if (isUp === before) window.dispatchEvent(new CustomEvent("sceneprint:live", { detail: isUp ? "live" : "waiting" }));
+  setTimeout(pulse, PULSE_MS);
 }
 
 window.addEventListener("sceneprint:live", (event) => lost(event.detail === "waiting"));
+setTimeout(pulse, PULSE_MS);
 window.addEventListener("unhandledrejection", uncaught);
 setInterval(() => { for (const one of document.querySelectorAll("time")) put(one, ago(one.dateTime)); }, AGES_MS);
 window.addEventListener("hashchange", show);

@@ -31,9 +31,17 @@ export function at(...segments) {
   return segments.map((one) => encodeURIComponent(one)).join("/");
 }
 
-/** Whether the service lives. @param {AbortSignal} [signal] */
+const PULSE_S = 4; // a service that takes longer to say that it lives hangs
+
+/** Whether the service lives, and says so in time. @param {AbortSignal} [signal] */
 export async function lives(signal) {
-  try { return (await fetch(new URL("healthz", ROOT), { signal, cache: "no-store" })).ok; } catch { return false; }
+  const late = AbortSignal.timeout(1000 * PULSE_S);
+  const init = { signal: signal ? AbortSignal.any([signal, late]) : late, cache: /** @type {RequestCache} */ ("no-store") };
+  try {
+    const answer = await fetch(new URL("healthz", ROOT), init);
+    await answer.text(); // else the connection stays taken
+    return answer.ok;
+  } catch { return false; }
 }
 
 /** Ask the API, with the key if there is one; Problem where it refuses or does not answer. */

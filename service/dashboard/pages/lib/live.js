@@ -3,6 +3,7 @@ import { ask, whole } from "./http.js";
 
 const FIRST_S = 1;
 const LONGEST_S = 15;
+const SILENT_S = 8; // a stream says every three seconds that it lives
 
 /**
  * Hear what happens until `signal` aborts. Where the stream breaks off it goes on at the last
@@ -22,19 +23,28 @@ export async function watch({ map, kinds, onevent, onstate = () => {}, signal })
     const rest = () => { if (document.hidden) turn.abort(); };
     signal.addEventListener("abort", stop);
     document.addEventListener("visibilitychange", rest);
+    let silent = false;
     let lost = true;
+    /** @type {Timer} */
+    let timer = null;
+    const heard = () => {
+      clearTimeout(timer);
+      timer = setTimeout(() => { silent = true; turn.abort(); }, 1000 * SILENT_S);
+    };
     try {
       if (signal.aborted) return;
+      heard();
       const headers = { Accept: "text/event-stream" };
       if (state.last !== null) headers["Last-Event-ID"] = state.last;
       const answer = await ask("events", { map, kind: kinds }, { headers, signal: turn.signal });
       wait = FIRST_S;
       tell("live", onstate);
-      await messages(answer.body, state, onevent);
+      await messages(answer.body, state, onevent, heard);
     } catch (error) {
-      lost = !turn.signal.aborted; // else it rests
+      lost = silent || !turn.signal.aborted; // else it rests
       if (error.name !== "AbortError" && !passes(error)) throw error;
     } finally {
+      clearTimeout(timer);
       signal.removeEventListener("abort", stop);
       document.removeEventListener("visibilitychange", rest);
     }
@@ -57,12 +67,13 @@ function tell(state, onstate) {
   window.dispatchEvent(new CustomEvent("sceneprint:live", { detail: state }));
 }
 
-async function messages(body, state, onevent) {
+async function messages(body, state, onevent, heard) {
   const reader = body.pipeThrough(new TextDecoderStream()).getReader();
   let rest = "";
   for (;;) {
     const { done, value } = await whole(reader.read());
     if (done) return;
+    heard();
     const parts = (rest + value).split("\n\n");
     rest = parts.pop() ?? "";
     for (const part of parts) {

@@ -4,9 +4,10 @@ import { h, put } from "../lib/dom.js";
 
 /**
  * Whether the service works, its version, and whether this page is live.
+ * @param {AbortSignal} signal
  * @returns {{element: HTMLElement, look: (signal: AbortSignal) => Promise<void>, live: (state: "live" | "waiting") => void}}
  */
-export function health() {
+export function health(signal) {
   const ready = h("span", { class: "badge" }, "asking");
   const version = h("span", { class: "muted" });
   const live = h("span", { class: "badge", dataset: { figure: "live" } }, "waiting");
@@ -21,6 +22,15 @@ export function health() {
     put(said, `The service is ${text}`);
   }
 
+  // a service that hangs leaves `look` waiting
+  window.addEventListener("sceneprint:lost", () => { tell("bad", "not answering"); tellLive("waiting"); }, { signal });
+
+  function tellLive(state) {
+    live.dataset.kind = state === "live" ? "good" : "warn";
+    live.title = state === "live" ? "Live events" : "The event stream was interrupted; reconnecting";
+    put(live, state);
+  }
+
   return {
     element: h("div", { class: "health" }, ready, live, version, said),
     async look(signal) {
@@ -33,10 +43,6 @@ export function health() {
         tell("bad", error.status === 0 ? "not answering" : `not ready: ${error.detail ?? error.message}`);
       }
     },
-    live(state) {
-      live.dataset.kind = state === "live" ? "good" : "warn";
-      live.title = state === "live" ? "Live events" : "The event stream was interrupted; reconnecting";
-      put(live, state);
-    },
+    live: tellLive,
   };
 }

@@ -30,7 +30,7 @@ export async function renderTab(root, { search, signal }) {
     }
   }
   const whole = map === null;
-  const line = health();
+  const line = health(signal);
   const failures = failureList(map, signal);
   const figures = tiles(whole);
   const hour = history(whole);
