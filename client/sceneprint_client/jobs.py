@@ -10,6 +10,7 @@ from typing import Any, BinaryIO, Literal, get_args
 import httpx
 
 from sceneprint_client.api import Answer, Filter, Job, JobState, Page, ValidationOptions
+from sceneprint_client.api.admin import RetriedJobs
 from sceneprint_client.api.base import checked
 from sceneprint_client.api.frames import ImportItem, ImportOptions
 from sceneprint_client.api.reconstructions import NewReconstruction, Reconstruction
@@ -75,6 +76,27 @@ class JobMethods(ServiceConnection):
         CannotRetry : it was not given up, or there is nothing to try again.
         """
         return self._ask(Job, "POST", f"{job_path(job_id)}/retry")
+
+    def retry_dead_jobs(self, map_name: str | None = None) -> Iterator[RetriedJobs]:
+        """Try again all dead jobs, or those of a map; those that were tried since stay.
+
+        Yields
+        ------
+        done : of a page of them, as it is done
+
+        Raises
+        ------
+        UnknownMap : there is no map of that name.
+        """
+        cursor: str | None = None
+        while True:
+            given = {"map": map_name, "cursor": cursor}
+            asked = {name: value for name, value in given.items() if value is not None}
+            done = self._ask(RetriedJobs, "POST", "/v1/jobs/retry", params=asked)
+            yield done
+            cursor = done.next_cursor
+            if cursor is None:
+                return
 
     def wait(
         self, job_ids: Iterable[str], *, timeout_s: float = 600.0,

@@ -15,7 +15,7 @@ from pydantic_core import from_json
 from sceneprint.atomic_files import write_whole
 from sceneprint.cli.numbers import positive, whole_number
 from sceneprint.cli.options import add_service_options, one_line, open_client, up_of
-from sceneprint.errors import CannotRetry, InvalidRequest
+from sceneprint.errors import InvalidRequest
 from sceneprint.models import PRESETS
 from sceneprint_client.api.base import FrameState, JobState
 from sceneprint_client.api.results import CLOUD_FRAMES, VIEWS, WIDTH
@@ -327,18 +327,12 @@ def _retry_dead(client: Client, *, as_json: bool) -> int:
     code : 2 where one cannot be tried again
     """
     again, refused = 0, 0
-    for job in list(client.jobs(JobState.DEAD)):  # all before the first: pages would shift
-        of_frame = job.map is not None and job.frame_id is not None and job.kind == "sign"
-        if of_frame and client.frame(str(job.map), str(job.frame_id)).job_id != job.job_id:
-            continue
-        try:
-            retried = client.retry_job(job.job_id)
-        except CannotRetry as error:
-            refused += 1
-            print(f"sceneprint jobs: {one_line(str(error))}", file=sys.stderr)
-            continue
-        again += 1
-        _print_job(retried, as_json=as_json)
+    for done in client.retry_dead_jobs():
+        again, refused = again + len(done.retried), refused + len(done.refused)
+        for one in done.refused:
+            print(f"sceneprint jobs: {one_line(one.reason)}", file=sys.stderr)
+        for job in done.retried:
+            _print_job(job, as_json=as_json)
     if not as_json:
         print(f"{again} jobs queued again, {refused} cannot be retried")
     return 2 if refused else 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -62,7 +62,7 @@ from sceneprint_client.api import (
     Page,
     Query,
 )
-from sceneprint_client.api.admin import MadeKey, Scope
+from sceneprint_client.api.admin import MadeKey, RetriedJobs, Scope
 from sceneprint_client.api.listing import FrameListing
 
 log = logging.getLogger(__name__)
@@ -193,6 +193,16 @@ class Engine:
         if new:
             self.bell.ring()
         return job, new
+
+    def retry_dead_jobs(
+        self, cursor: str | None = None, limit: int = 100,
+        map_names: Collection[str] | None = None,
+    ) -> RetriedJobs:  # fmt: skip
+        """Try again a page of dead jobs; see `lifecycle.retry_dead`."""
+        done = lifecycle.retry_dead(self.store, cursor, limit, map_names)
+        if done.retried:
+            self.bell.ring()
+        return done
 
     # keys
 

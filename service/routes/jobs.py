@@ -16,13 +16,16 @@ from sceneprint.engine.jobs import lifecycle
 from sceneprint.store.events import Wanted
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint_client.api import Job, JobState, Page
-from sceneprint_client.api.admin import EventPage
+from sceneprint_client.api.admin import EventPage, RetriedJobs
 from service.auth import Asking, Caller, v1_router
 from service.context import Context, Here
 from service.event_stream import BEGIN, MEDIA_TYPE, EventStream, Feed, alive, message
 from service.problems import declared
 
 router = v1_router("/jobs", "jobs")
+
+#: Dead jobs that one request looks at: each that is tried again is a commit.
+MOST_RETRIED = 200
 
 
 @router.get("", responses=declared(404, 422))
@@ -47,6 +50,29 @@ def list_jobs(
     elif names is None and not asking.may("admin"):
         names = tuple(one.name for one in here.engine.list_maps().items)
     return lifecycle.list_jobs(here.engine.store, state, cursor, limit, kind, names)
+
+
+@router.post("/retry", responses=declared(404, 422))
+def retry_dead_jobs(
+    here: Here,
+    asking: Asking,
+    map_name: Annotated[str | None, Query(alias="map", description="Of this map alone.")] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=MOST_RETRIED, description="Jobs looked at.")] = 100,
+) -> RetriedJobs:
+    """Try again all dead jobs, a page of them at a time; those that were tried since stay.
+
+    Without `map` the key must write to all maps; jobs of no map are for admins.
+    """
+    if map_name is not None:
+        asking.require(map_name, "write")
+        here.engine.get_map(map_name)
+        names: tuple[str, ...] | None = (map_name,)
+    else:
+        asking.require_every("write")
+        every = None if asking.may("admin") else here.engine.list_maps().items
+        names = None if every is None else tuple(one.name for one in every)
+    return here.engine.retry_dead_jobs(cursor, limit, names)
 
 
 @router.get("/{job_id}", responses=declared(404))
@@ -88,7 +114,7 @@ events_router = v1_router("/events", "operations")
 _STREAM = {
     "description": "A page of events; or, where `Accept` names text/event-stream, a stream that "
     "goes on: each message has the event's `id` and the event as JSON in `data`. "
-    "A comment comes every 15 s.",
+    "A comment comes every 3 s.",
     "model": EventPage,
     "content": {MEDIA_TYPE: {"schema": {"type": "string"}}},
 }

@@ -106,6 +106,34 @@ def test_what_cannot_be_signed_again_is_refused_with_the_reason(
         empty.retry_job(gone.job_id)
 
 
+def test_all_dead_jobs_are_tried_again_page_by_page(
+    empty: Engine, uploads: Any, due_now: DueNow
+) -> None:
+    added = [empty.add_frame("hall", one.data, one.meta)[0] for one in uploads[:4]]
+    for _ in added:
+        while die(empty, claimed(empty)) != JobState.DEAD:
+            due_now(empty)
+    ids = [one.job_id for one in added]
+    empty.store.blobs.remove(empty.store.blobs.put(uploads[1].data))
+    tried, _ = empty.retry_job(ids[3])  # by hand, before
+    first = empty.retry_dead_jobs(limit=2)  # the newest: 3, which has a follower, and 2
+    assert [one.frame_id for one in first.retried] == [added[2].frame_id]
+    assert first.refused == []
+    assert first.next_cursor is not None
+    second = empty.retry_dead_jobs(first.next_cursor, limit=2)
+    assert [one.frame_id for one in second.retried] == [added[0].frame_id]
+    assert [one.job_id for one in second.refused] == [ids[1]]
+    assert "is missing" in second.refused[0].reason
+    assert second.next_cursor is None
+    waiting = list_jobs(empty.store, JobState.QUEUED).items
+    assert {one.job_id for one in waiting} == {
+        tried.job_id, first.retried[0].job_id, second.retried[0].job_id
+    }  # fmt: skip
+    again = empty.retry_dead_jobs()
+    assert (again.retried, [one.job_id for one in again.refused]) == ([], [ids[1]])
+    assert empty.retry_dead_jobs(map_names=("elsewhere",)).refused == []
+
+
 def test_a_job_whose_worker_dies_is_tried_again_thrice(
     empty: Engine, uploads: Any, due_now: DueNow, told: Told
 ) -> None:

@@ -98,6 +98,7 @@ OF_A_MAP = {
     "GET /v1/jobs/{job_id}": Case(),
     "POST /v1/jobs/{job_id}/cancel": Case("write"),
     "POST /v1/jobs/{job_id}/retry": Case("write"),
+    "POST /v1/jobs/retry": Case("write", query={"map": "{map}"}),
     "GET /v1/events": Case(query={"map": "{map}"}),
     "GET /v1/stats": Case(query={"map": "{map}"}),
     "POST /v1/maps/{map_name}/reencoding": Case("admin", body={"model": "depth"}),
@@ -433,7 +434,7 @@ def test_what_is_not_noted_is_said(operations):
     assert names - UNNOTED == {
         "create_key", "revoke_key", "create_map", "patch_map", "delete_map", "patch_frame",
         "delete_frame", "patch_session", "delete_session_frames", "cancel_job", "retry_job",
-        "reencode", "cancel_reencoding",
+        "retry_dead_jobs", "reencode", "cancel_reencoding",
         "begin_association", "delete_association", "reconstruct", "delete_reconstruction",
         "add_import", "take_snapshot", "delete_snapshot",
     }  # fmt: skip

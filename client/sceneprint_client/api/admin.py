@@ -337,6 +337,21 @@ class Job(ApiRecord):
     )
 
 
+class RefusedRetry(ApiRecord):
+    """A dead job that cannot be tried again."""
+
+    job_id: str
+    reason: str
+
+
+class RetriedJobs(ApiRecord):
+    """What came of a page of dead jobs that were to be tried again."""
+
+    retried: list[Job] = Field(description="The new ones.")
+    refused: list[RefusedRetry]
+    next_cursor: str | None = Field(description="Of the next page; null: there is none.")
+
+
 # Events as JSON: what happened, in the order in which it happened.
 
 #: Every kind of event with what it means. A test holds the code to it.

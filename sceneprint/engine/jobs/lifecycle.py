@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from sqlalchemy import Connection
 
 from sceneprint.engine.serializers import job_record
-from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError
+from sceneprint.errors import CannotRetry, FrameError, LostLease, SceneprintError, UnknownJob
 from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import frame_of, set_state
@@ -23,6 +23,7 @@ from sceneprint.store.queue import list_jobs as list_stored
 from sceneprint.store.reencoding_rows import REENCODE
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
 from sceneprint_client.api import FrameState, Job, JobState, Page
+from sceneprint_client.api.admin import RefusedRetry, RetriedJobs
 
 log = logging.getLogger(__name__)
 
@@ -265,6 +266,32 @@ def retry(store: Store, job_id: str) -> tuple[Job, bool]:
             set_state(connection, frame.number, FrameState.RECEIVED)
             record_event(connection, "frame.received", row.name, frame.id, again.id)
         return _job_record(connection, again), True
+
+
+def retry_dead(
+    store: Store, cursor: str | None = None, limit: int = 100,
+    map_names: Collection[str] | None = None,
+) -> RetriedJobs:  # fmt: skip
+    """Try again a page of dead jobs, the newest first; those that were tried since stay.
+
+    Each is a commit of its own: what was tried again before a fault is.
+
+    Raises
+    ------
+    InvalidRequest : a cursor that was not given out.
+    """
+    page = list_jobs(store, JobState.DEAD, cursor, limit, map_names=map_names)
+    retried, refused = [], []
+    for job in page.items:
+        if job.followed_by is not None:
+            continue
+        try:
+            again, is_new = retry(store, job.job_id)
+        except (CannotRetry, UnknownJob) as error:
+            refused.append(RefusedRetry(job_id=job.job_id, reason=str(error)))
+        else:
+            retried += [again] if is_new else []
+    return RetriedJobs(retried=retried, refused=refused, next_cursor=page.next_cursor)
 
 
 def worker_died(

@@ -1,5 +1,5 @@
 // Jobs as rows: what each is about, how it went, its traceback folded, and trying it again.
-import { at, get, send } from "../lib/api.js";
+import { at, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, ms, seconds, shortId, time } from "../lib/format.js";
 import { link } from "../lib/router.js";
@@ -11,16 +11,16 @@ export const STATES = {
   queued: "neutral", running: "warn", succeeded: "good", failed: "bad", cancelled: "neutral", dead: "bad",
 };
 const GIVEN_UP = new Set(["dead", "cancelled", "failed"]);
-const SIDE_BY_SIDE = 4; // requests of "retry all" at a time: the service has others to serve
 
 /** A state with its shape. @param {string} state @returns {HTMLElement} */
 export function stateBadge(state) {
   return h("span", { class: "badge", dataset: { kind: STATES[state] ?? "neutral" } }, state);
 }
 
-/** Whether a job can be tried again: given up, and by nobody tried since. */
+/** Whether to try again: given up, by nobody tried since, and not as its frame cannot be used. */
 export function canRetry(job) {
-  return GIVEN_UP.has(job.state) && !job.followed_by && may("write", job.map ?? undefined);
+  const isRejected = job.state === "failed" && job.frame_id;
+  return GIVEN_UP.has(job.state) && !isRejected && !job.followed_by && may("write", job.map ?? undefined);
 }
 
 /** Seconds that the latest try took, or takes so far; null where it has not begun. */
@@ -107,33 +107,18 @@ export function actions(job, changed) {
  * @param {(text: string) => void} tell how far it is
  */
 export async function retryAll(map, signal, tell) {
-  const dead = [];
+  const text = h("p", {}, `All dead jobs${map ? ` of map ${map}` : ""} will be queued again with a fresh number of attempts. They may fail again for the same reason.`);
+  if (!(await confirm({ title: "Retry all dead jobs", text, action: "Retry all" }))) return;
+  let [done, refused] = [0, 0];
   /** @type {string | null} */
   let cursor = null;
   do {
-    const page = await get("jobs", { params: { state: "dead", map, cursor, limit: 1000 }, signal });
-    dead.push(...page.items.filter(canRetry).map((job) => job.job_id)); // a traceback of each is much
-    cursor = page.next_cursor;
+    const { data } = await send("POST", "jobs/retry", { params: { map, cursor }, signal });
+    done += data.retried.length;
+    refused += data.refused.length;
+    cursor = data.next_cursor;
+    tell(`Queued ${count(done)}…`);
   } while (cursor);
-  if (dead.length === 0) { tell("No dead job is left to be retried."); return; }
-  const many = dead.length === 1 ? "1 dead job" : `${count(dead.length)} dead jobs`;
-  const text = h("p", {}, `${many}${map ? ` of map ${map}` : ""} will be queued again with a fresh number of attempts. They may fail again for the same reason.`);
-  if (!(await confirm({ title: "Retry all dead jobs", text, action: `Retry ${many}` }))) return;
-  const left = dead.toReversed(); // taken from its end
-  let done = 0;
-  let refused = 0;
-  await Promise.all(Array.from({ length: SIDE_BY_SIDE }, async () => {
-    for (let job = left.pop(); job !== undefined && !signal.aborted; job = left.pop()) {
-      try {
-        await send("POST", at("jobs", job, "retry"), { signal });
-        done += 1;
-      } catch (error) {
-        if (error.status === 409 || error.status === 404) refused += 1; // somebody else was first
-        else { left.length = 0; throw error; }
-      }
-      tell(`Queued ${count(done)} of ${count(dead.length)}…`);
-    }
-  }));
   tell(`${count(done)} queued again${refused ? `, ${count(refused)} could not be` : ""}.`);
 }
 
