@@ -141,7 +141,7 @@ def test_dead_jobs_are_shown_with_their_tracebacks_and_tried_again(
     page.goto(f"{station.home}#/operations?tab=jobs&state=dead&map=spoilt")
     settle(page)
     page.get_by_role("button", name="Retry all dead").click()
-    page.get_by_role("dialog").get_by_role("button", name="Retry 2 dead jobs").click()
+    page.get_by_role("dialog").get_by_role("button", name="Retry all").click()
     frames = lambda: station.client.get("/v1/maps/spoilt").json()["frames"]  # noqa: E731
     until(lambda: frames() == {"indexed": 3})
     assert page.get_by_text("2 queued again.").is_visible()
