@@ -149,6 +149,8 @@ class MatchDetails(ApiRecord):
     query_id: str
     frame_id: str
     map: str
+    name: str | None = Field(default=None, description="Of the original file or message.")
+    sequence: int | None = Field(default=None, description="Place within the session.")
     validation: Validation
     transform: Transform | None = Field(
         description="Query to match; null where the frames gave no hypothesis."

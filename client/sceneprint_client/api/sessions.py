@@ -178,6 +178,8 @@ class Vertex(ApiRecord):
     robot: str | None
     session: str | None
     captured_at: datetime | None
+    name: str | None = Field(default=None, description="Of the original file or message.")
+    sequence: int | None = Field(default=None, description="Place within the session.")
     pose: Transform | None = Field(
         description="In `frame` of the graph where the sessions are joined; else in the parent "
         "frame that it was sent with. null where it has none and no edge leads to one that has."

@@ -490,7 +490,7 @@ def _spread(
 def graph_text(graph: PoseGraph, kind: GraphFormat) -> str:
     """A graph as a file.
 
-    A trajectory has the vertices with a time whose poses are in the frame of most. In g2o, where
+    A trajectory has the vertices with a stamp whose poses are in the frame of most. In g2o, where
     every vertex has a pose, one without stands at the origin.
     """
     if kind == "json":
@@ -507,16 +507,32 @@ def _main(graph: PoseGraph) -> str | None:
 
 
 def _tum(graph: PoseGraph) -> str:
-    main, rows = _main(graph), []
-    for stop, pose, frame in zip(graph.stops, graph.poses, graph.frames, strict=True):
-        if stop.captured_at is not None and pose is not None and frame == main:
-            rows.append(trajectory_row(stop.captured_at, pose))
+    main = _main(graph)
+    placed = [
+        (i, stop, pose)
+        for i, (stop, pose, frame) in enumerate(
+            zip(graph.stops, graph.poses, graph.frames, strict=True)
+        )
+        if pose is not None and frame == main
+    ]
+    rows = [
+        trajectory_row(stop.captured_at, pose)
+        for _, stop, pose in placed
+        if stop.captured_at is not None
+    ]
+    stamped = "seconds since 1970"
+    if not rows:  # places in a session may be there twice in two sessions
+        stamped = "numbers of the vertices, as in g2o: no frame has captured_at"
+        rows = [trajectory_row(i, pose) for i, _, pose in placed]
     comments = [
         f"poses of the sensors' frames in {main or 'no frame'}, metres",
         f"{len(rows)} poses; {len(graph.stops) - len(rows)} frames left out, as they have no "
         "time or are not joined to it",
+        f"t: {stamped}",
         "t tx ty tz qx qy qz qw",
     ]
+    if not rows:
+        comments.insert(2, "empty: no frame has a pose")
     return trajectory_text(sorted(rows), comments)
 
 
@@ -524,7 +540,7 @@ def _json(graph: PoseGraph) -> Graph:
     vertices = [
         Vertex(
             vertex=i, frame_id=stop.id, robot=stop.robot, session=stop.session,
-            captured_at=when(stop.captured_at),
+            captured_at=when(stop.captured_at), name=stop.name, sequence=stop.sequence,
             pose=(
                 None if pose is None
                 else transform(pose, frame or "", sensor_frame(stop.id, stop.kind))
