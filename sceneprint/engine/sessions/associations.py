@@ -507,33 +507,33 @@ def _main(graph: PoseGraph) -> str | None:
 
 
 def _tum(graph: PoseGraph) -> str:
-    main = _main(graph)
-    placed = [
-        (i, stop, pose)
-        for i, (stop, pose, frame) in enumerate(
-            zip(graph.stops, graph.poses, graph.frames, strict=True)
-        )
-        if pose is not None and frame == main
-    ]
+    main, stamps, stamped = _main(graph), *_stamps(graph)
     rows = [
-        trajectory_row(stop.captured_at, pose)
-        for _, stop, pose in placed
-        if stop.captured_at is not None
+        trajectory_row(stamp, pose)
+        for stamp, pose, frame in zip(stamps, graph.poses, graph.frames, strict=True)
+        if stamp is not None and pose is not None and frame == main
     ]
-    stamped = "seconds since 1970"
-    if not rows:  # places in a session may be there twice in two sessions
-        stamped = "numbers of the vertices, as in g2o: no frame has captured_at"
-        rows = [trajectory_row(i, pose) for i, _, pose in placed]
     comments = [
         f"poses of the sensors' frames in {main or 'no frame'}, metres",
         f"{len(rows)} poses; {len(graph.stops) - len(rows)} frames left out, as they have no "
-        "time or are not joined to it",
-        f"t: {stamped}",
+        "stamp or are not joined to it",
+        f"t: {stamped}" if rows else "empty: no frame with a stamp has a pose",
         "t tx ty tz qx qy qz qw",
     ]
-    if not rows:
-        comments.insert(2, "empty: no frame has a pose")
     return trajectory_text(sorted(rows), comments)
+
+
+def _stamps(graph: PoseGraph) -> tuple[Sequence[float | None], str]:
+    """A stamp for each vertex, and what it is: its time; its place in the session where none has a
+    time and all have places of their own; else its number.
+    """
+    times = [stop.captured_at for stop in graph.stops]
+    if any(at is not None for at in times):
+        return times, "captured_at, seconds since 1970"
+    places = [stop.sequence for stop in graph.stops]
+    if None not in places and len(set(places)) == len(places):
+        return places, "sequence, place within the session"
+    return range(len(places)), "number of the vertex, as in g2o"
 
 
 def _json(graph: PoseGraph) -> Graph:

@@ -82,6 +82,19 @@ export function shortId(id) {
   return id.length > 12 && /^[0-9a-f-]+$/.test(id) ? id.slice(0, 8) : id;
 }
 
+/**
+ * What people call a frame: the last part of the name of its file, or the beginning of its id.
+ * @param {Object<string, any>} frame
+ */
+export function frameLabel({ frame_id: id, name }) {
+  return name ? name.slice(name.lastIndexOf("/") + 1) : shortId(id);
+}
+
+/** All of a frame's name and id, for a title. @param {Object<string, any>} frame */
+export function frameTitle({ frame_id: id, name }) {
+  return name ? `${name}, frame ${id}` : id;
+}
+
 function span(s) {
   if (s < 10) return null;
   if (s < 59.5) return `${Math.round(s)} s`;
