@@ -339,7 +339,7 @@ def _edge(item: dict[str, Any], stops: dict[int, PathFrame]) -> Edge:
         from_pose=_pose(here), to_pose=_pose(there),
         number=item["number"], from_frame=here.id, to_frame=there.id,
         from_session=here.session, to_session=there.session,
-        from_robot=here.robot, to_robot=there.robot,
+        from_robot=here.robot, to_robot=there.robot, from_name=here.name, to_name=there.name,
         transform=transform(
             T, sensor_frame(there.id, there.kind), sensor_frame(here.id, here.kind)
         ),
