@@ -24,4 +24,6 @@ def upgrade() -> None:
     op.add_column("frames", sa.Column("sequence", whole, nullable=True))
     op.drop_index("ix_frames_searched", "frames")
     op.create_index("ix_frames_searched", "frames", SEARCHED)
-    op.create_index("ix_frames_named", "frames", ["map_number", "name", "state"])
+    op.create_index(
+        "ix_frames_named", "frames", ["map_number", "name", "state", "session", "robot"]
+    )

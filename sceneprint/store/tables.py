@@ -142,7 +142,7 @@ frames = Table(
         "pose_z",
     ),
     Index(None, "blob"),
-    Index("ix_frames_named", "map_number", "name", "state"),
+    Index("ix_frames_named", "map_number", "name", "state", "session", "robot"),
     Index("ix_frames_placed", "map_number", "pose_parent", "pose_x", "pose_y", "pose_z"),
     sqlite_autoincrement=True,
 )
