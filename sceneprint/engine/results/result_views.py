@@ -285,6 +285,7 @@ class Inspection:
             query_id=query_id,
             model=kept.answer.model,
             frames=[FrameName(map=names[rows[n].map_number], frame_id=rows[n].id) for n in there],
+            names=[rows[n].name for n in there],
             similarity=shares.round(4).tolist(),
         )
 
