@@ -61,13 +61,15 @@ def test_what_is_no_name_or_place_is_refused(
     assert problem["errors"][0]["field"].split(".")[-1] == field
 
 
-def test_lists_refuse_an_order_that_has_no_session(
+def test_lists_refuse_what_they_cannot_have(
     served: Any, make_map: Callable[..., str], refused: Callable[..., dict[str, Any]]
 ) -> None:
     path = make_map(served, "unordered")
     for more in ({}, {"session": ["a", "b"]}):
         answer = served.client.get(f"{path}/frames", params={"order": "taken", **more})
         assert "order of one session" in refused(answer, 422, "invalid-request")["detail"]
+    for name in ("", "a\0", "a" * 256):
+        refused(served.client.get(f"{path}/frames", params={"name": name}), 422, "invalid-request")
 
 
 def test_an_import_of_two_folders_into_one_session_is_one_path(

@@ -37,6 +37,12 @@ def _one_or_many(given: object) -> object:
 _Names = Annotated[list[Label], BeforeValidator(_one_or_many), Field(max_length=100)]
 
 
+#: The beginning of a name.
+_Prefix = Annotated[
+    str, Field(min_length=1, max_length=MOST_OF_NAME, pattern=r"^[^\x00-\x1f\x7f]+$")
+]
+
+
 class FrameListing(Given):
     """Which frames a list has; all that is given must hold.
 
@@ -62,9 +68,7 @@ class FrameListing(Given):
     content_id: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = Field(
         default=None, description="Of its samples and camera."
     )
-    name: Annotated[str, Field(min_length=1, max_length=MOST_OF_NAME)] | None = Field(
-        default=None, description="Its name begins so; case matters."
-    )
+    name: _Prefix | None = Field(default=None, description="Its name begins so; case matters.")
     order: Literal["asc", "desc", "taken"] = Field(
         default="asc",
         description="As they came; `desc`: the newest first; `taken`, of one session: by "
