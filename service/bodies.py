@@ -55,7 +55,7 @@ _IN_MEMORY = 1 << 20
 _CAMERA = ("fx", "fy", "cx", "cy", "width", "height", "distortion")
 _PLAIN = (
     "depth_scale", "depth_along_ray", "units_per_metre", "format", "robot", "session",
-    "captured_at",
+    "captured_at", "name", "sequence",
 )  # fmt: skip
 _OTHERS = ("viewpoint", "tags", "pose", "parent_frame", "base", "base_frame", "up")
 _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -88,6 +88,8 @@ def parameters() -> list[dict[str, Any]]:
         "robot": (text, "who took it."),
         "session": (text, "in which run."),
         "captured_at": ({"type": "string", "format": "date-time"}, "when, with its time zone."),
+        "name": (text, "of the original file or message."),
+        "sequence": ({"type": "integer", "minimum": 0}, "place within the session."),
         "tags": (text, "with commas between."),
         "pose": (text, f"T_parent_sensor as {','.join(_SEVEN)}: metres, unit quaternion."),
         "parent_frame": (text, "what `pose` leads to; default: ROBOT/SESSION."),

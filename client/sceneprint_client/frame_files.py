@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint_client.api.base import GivenDirection, checked
+from sceneprint_client.api.base import MOST_OF_NAME, GivenDirection, checked
 from sceneprint_client.api.frames import CameraIntrinsics, FrameMeta, GivenBase, GivenPose
 from sceneprint_client.errors import (
     DatasetError,
@@ -77,6 +77,9 @@ class FrameFile:
     cloud : how the points are read; None for a depth image. One of this and `camera` is given
     source : where the bytes come from, if not from the file
     base : where the sensor sits on the robot; None where not known
+    original : what the file is called within the folder of its sequence, or the message within its
+        bag; default: the file's own name
+    sequence : place within its sequence; None where not known, as of a file that was named alone
     """
 
     name: str
@@ -87,6 +90,8 @@ class FrameFile:
     cloud: CloudSource | None = None
     source: FrameSource | None = None
     base: GivenBase | None = None
+    original: str = ""
+    sequence: int | None = None
 
     def __post_init__(self) -> None:
         if (self.camera is None) == (self.cloud is None):
@@ -144,7 +149,8 @@ def find_frame_file(file: Path) -> FrameFile:
         return FrameFile(f"{folder.name}/{stem}", file, None, pose_source=pose, cloud=source)
     camera = find_camera(folder)
     if SEVEN_SCENES.fullmatch(file.name):
-        return FrameFile(f"{folder.name}/{stem}", file, camera, pose_source=pose)
+        number = seven_scenes_number(file.name)
+        return FrameFile(f"{folder.name}/{stem}", file, camera, pose_source=pose, sequence=number)
     # what is named outright is taken, whatever its name; its content decides
     return FrameFile(f"{folder.name}/{file.stem}", file, camera)
 
@@ -178,6 +184,7 @@ def meta_of(
     parent_frame: str | None = None,
     base: GivenBase | None = None,
     up: Sequence[float] | None = None,
+    with_name: bool = True,
 ) -> FrameMeta:
     """What a data set knows of one of its frames, as it is sent with an upload.
 
@@ -191,6 +198,7 @@ def meta_of(
         share it: `Sequence.parent_frame`
     base : where the sensor sits on the robot; default: as the frame says
     up : unit vector in the sensor's axes; default: of the sidecar, for all of its frames
+    with_name : send the original name and the place in the sequence; queries have no use for them
 
     Raises
     ------
@@ -215,11 +223,39 @@ def meta_of(
         robot=robot,
         session=sequence if session is None else session,
         captured_at=None if stamp is None else datetime.fromtimestamp(stamp, timezone.utc),
+        name=file_name(reference.original or reference.path.name) if with_name else None,
+        sequence=reference.sequence if with_name else None,
         pose=pose,
         T_base_sensor=reference.base if base is None else base,
         up=_direction(up),
         tags=list(tags),
     )
+
+
+def file_name(name: str) -> str | None:
+    """A name of a file as it may be sent, whatever it was: a bad name must not cost the frame.
+
+    Returns
+    -------
+    name : relative, its parts with `/` between; `_` where a character is not allowed; of a longer
+        one the end. None where nothing is left
+    """
+    text = name.encode("utf-8", "replace").decode()  # half of a surrogate pair is no text
+    text = re.sub(r"[\x00-\x1f\x7f\\]", "_", text)
+    parts = text[-MOST_OF_NAME:].split("/")
+    return "/".join(part for part in parts if part not in ("", ".", "..")) or None
+
+
+def seven_scenes_number(name: str) -> int | None:
+    """The number of a frame of the 7-Scenes layout by the name of its file; None of any other."""
+    if not SEVEN_SCENES.fullmatch(name):
+        return None
+    number = name.removeprefix("frame-").removesuffix(".depth.png")
+    return int(number) if len(number) <= _MOST_DIGITS else None
+
+
+#: Digits of a number that every reader of JSON reads exactly.
+_MOST_DIGITS = 15
 
 
 def _direction(up: Sequence[float] | None) -> GivenDirection | None:
@@ -267,6 +303,7 @@ def sendable(
 ) -> tuple[bytes, FrameMeta]:  # fmt: skip
     """Bytes of a frame and what is known of it; a path's camera is looked for beside it.
 
+    `with_pose` sends all that a map keeps: the pose, the file's name, its place in the sequence.
     Where `up` is given, it stands in the place of what `meta` or a sidecar says.
 
     Raises
@@ -294,11 +331,23 @@ def sendable(
             f"{type(frame).__name__}"
         )
     elif known is not None:
-        return _read(Path(frame), is_cloud=known.intrinsics is None), known
+        data, name = _read(Path(frame), is_cloud=known.intrinsics is None), Path(frame).name
+        return data, _named_as(known, name, seven_scenes_number(name)) if with_pose else known
     else:
         found = _named(Path(frame))
     data = found.read_bytes()
-    return data, meta_of(found, with_pose=with_pose, up=up) if known is None else known
+    if known is None:
+        return data, meta_of(found, with_pose=with_pose, up=up, with_name=with_pose)
+    if not with_pose:
+        return data, known
+    return data, _named_as(known, found.original or found.path.name, found.sequence)
+
+
+def _named_as(known: FrameMeta, name: str, sequence: int | None) -> FrameMeta:
+    """What is known of a frame, with name and place of its file where it says none."""
+    labels = {"name": file_name(name), "sequence": sequence}
+    missing = {field: label for field, label in labels.items() if getattr(known, field) is None}
+    return known.model_copy(update=missing)
 
 
 def _meta_without_array(meta: MetaInput | None) -> FrameMeta | None:

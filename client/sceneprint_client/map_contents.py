@@ -10,7 +10,14 @@ from pydantic_core import to_json
 
 from sceneprint_client.api import Frame, FrameState, Map, NewMap, Page
 from sceneprint_client.api.base import checked
-from sceneprint_client.api.listing import FrameListing, Run, Session, SessionChange, Trajectory
+from sceneprint_client.api.listing import (
+    Clock,
+    FrameListing,
+    Run,
+    Session,
+    SessionChange,
+    Trajectory,
+)
 from sceneprint_client.api.maps import By, Growth, GrowthOf
 from sceneprint_client.api.results import (
     CLOUD_FRAMES,
@@ -136,8 +143,8 @@ class MapMethods(ServiceConnection):
         tags: str | Iterable[str] = (), captured_after: datetime | None = None,
         captured_before: datetime | None = None, received_after: datetime | None = None,
         received_before: datetime | None = None, parent_frame: str | None = None,
-        has_pose: bool | None = None, content_id: str | None = None,
-        order: Literal["asc", "desc"] = "asc",
+        has_pose: bool | None = None, content_id: str | None = None, name: str | None = None,
+        order: Literal["asc", "desc", "taken"] = "asc",
     ) -> Iterator[Frame]:  # fmt: skip
         """Frames of a map in the order they came; deleted ones only where asked for.
 
@@ -154,7 +161,9 @@ class MapMethods(ServiceConnection):
         parent_frame : its pose leads there
         has_pose : whether it has one
         content_id : of its samples and camera, or points and viewpoint
-        order : "desc" for the newest first
+        name : its name begins so, such as "frame-000123"
+        order : "desc" for the newest first; "taken", of one session, in the order in which its
+            frames were taken
 
         Raises
         ------
@@ -165,7 +174,8 @@ class MapMethods(ServiceConnection):
             FrameListing, "The list", state=state, robot=_names(robot), session=_names(session),
             tag=_names(tags), captured_after=captured_after, captured_before=captured_before,
             received_after=received_after, received_before=received_before,
-            parent_frame=parent_frame, has_pose=has_pose, content_id=content_id, order=order,
+            parent_frame=parent_frame, has_pose=has_pose, content_id=content_id, name=name,
+            order=order,
         )  # fmt: skip
         parameters = wanted.model_dump(mode="json", exclude_defaults=True)
         return self._items(Page[Frame], f"{map_path(map_name)}/frames", **parameters)
@@ -264,9 +274,9 @@ class MapMethods(ServiceConnection):
         self, map_name: str, session: str, *, robot: str | None = None,
         parent_frame: str | None = None, captured_after: datetime | None = None,
         captured_before: datetime | None = None, most: int | None = None,
-        clock: Literal["captured", "received"] = "captured",
+        clock: Clock = "taken",
     ) -> Trajectory:  # fmt: skip
-        """The poses of a run in the order of time.
+        """The poses of a run in the order in which they were taken.
 
         Parameters
         ----------
@@ -275,7 +285,8 @@ class MapMethods(ServiceConnection):
         robot : needed where several called a run so
         parent_frame : needed where the poses lead to several
         captured_after, captured_before : a part of it; with a time zone
-        clock : `received` has frames too that do not say when they were taken, as they came
+        clock : by what poses are stamped: "captured" (`captured_at`), "sequence", or "received",
+            which every frame has; "taken": `captured_at`, and where none has one `sequence`
         most : poses, evenly taken along it, at most so many; `posed` tells how many there are
 
         Raises
@@ -290,7 +301,7 @@ class MapMethods(ServiceConnection):
         self, map_name: str, session: str, *, robot: str | None = None,
         parent_frame: str | None = None, captured_after: datetime | None = None,
         captured_before: datetime | None = None, most: int | None = None,
-        clock: Literal["captured", "received"] = "captured",
+        clock: Clock = "taken",
     ) -> str:  # fmt: skip
         """As `trajectory`, as text of a TUM file."""
         run = _run(session, robot, parent_frame, captured_after, captured_before, most, clock)
@@ -359,7 +370,7 @@ def _names(given: str | Iterable[str]) -> list[str]:
 
 def _run(
     session: str, robot: str | None, parent_frame: str | None, after: datetime | None,
-    before: datetime | None, most: int | None, clock: Literal["captured", "received"],
+    before: datetime | None, most: int | None, clock: Clock,
 ) -> Run:  # fmt: skip
     return checked(
         Run, "The run", session=session, robot=robot, parent_frame=parent_frame,

@@ -8,7 +8,7 @@ import sys
 from datetime import datetime
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from pydantic_core import from_json
 
@@ -18,6 +18,7 @@ from sceneprint.cli.options import add_service_options, one_line, open_client, u
 from sceneprint.errors import InvalidRequest
 from sceneprint.models import PRESETS
 from sceneprint_client.api.base import FrameState, JobState
+from sceneprint_client.api.listing import Clock
 from sceneprint_client.api.results import CLOUD_FRAMES, VIEWS, WIDTH
 
 if TYPE_CHECKING:
@@ -36,9 +37,9 @@ def add_frames(commands: Any) -> None:
     command = commands.add_parser(
         "frames",
         help="list frames of a map, download their files, edit metadata",
-        description="List the frames of a map in order of upload, or write the trajectory of a "
-        "session. With FRAME: show that frame, download its files, or edit its "
-        "metadata.",
+        description="List the frames of a map in order of upload, those of one session in the "
+        "order they were taken, or write the trajectory of a session. With FRAME: show that "
+        "frame, download its files, or edit its metadata.",
     )
     command.add_argument("map", metavar="MAP")
     command.add_argument("frame_id", nargs="?", metavar="FRAME", help="id of one frame")
@@ -53,6 +54,9 @@ def _add_listing(group: Any) -> None:
     group.add_argument("--robot", action="append", metavar="NAME", help="repeatable: matches any")
     group.add_argument("--session", action="append", metavar="NAME", help="repeatable: matches any")
     group.add_argument("--tag", action="append", metavar="TAG", help="repeatable: matches all")
+    group.add_argument(
+        "--name", metavar="PREFIX", help="original file name starts with this; case matters"
+    )
     group.add_argument("--state", choices=[str(state) for state in FrameState])
     group.add_argument("--parent-frame", metavar="NAME", help="parent frame of the poses")
     group.add_argument(
@@ -71,6 +75,13 @@ def _add_listing(group: Any) -> None:
         type=Path,
         metavar="FILE",
         help="write the poses of one --session as a TUM trajectory",
+    )
+    group.add_argument(
+        "--clock",
+        choices=get_args(Clock),
+        default="taken",
+        help="stamps of the trajectory: taken is captured_at, or sequence if no frame has a "
+        "captured_at (default: taken)",
     )
 
 
@@ -114,10 +125,16 @@ def run_frames(options: argparse.Namespace) -> int:
                 options.map, None if options.state is None else FrameState(options.state),
                 robot=options.robot or (), session=options.session or (), tags=options.tag or (),
                 parent_frame=options.parent_frame, captured_after=options.after,
-                captured_before=options.before, order="desc" if options.newest else "asc",
+                captured_before=options.before, name=options.name, order=_order(options),
             )  # fmt: skip
             _print_frames(itertools.islice(found, options.limit), as_json=options.json)
     return 0
+
+
+def _order(options: argparse.Namespace) -> Literal["asc", "desc", "taken"]:
+    if options.newest:
+        return "desc"
+    return "taken" if len(options.session or ()) == 1 else "asc"
 
 
 def _one(client: Client, options: argparse.Namespace) -> None:
@@ -148,11 +165,13 @@ def _trajectory(client: Client, options: argparse.Namespace) -> None:
     text = client.trajectory_text(
         options.map, options.session[0], robot=(options.robot or [None])[0],
         parent_frame=options.parent_frame, captured_after=options.after,
-        captured_before=options.before,
+        captured_before=options.before, clock=options.clock,
     )  # fmt: skip
     write_whole(options.trajectory, text.encode())
-    poses = sum(not line.startswith("#") for line in text.splitlines())
-    print(f"wrote {options.trajectory}: {poses} poses")
+    lines = text.splitlines()
+    poses = sum(not line.startswith("#") for line in lines)
+    why = [line.removeprefix("# empty") for line in lines if line.startswith("# empty: ")]
+    print(f"wrote {options.trajectory}: {poses} poses{one_line(''.join(why[:1]))}")
 
 
 def _print_frames(frames: Iterable[Frame], *, as_json: bool) -> None:
@@ -162,13 +181,21 @@ def _print_frames(frames: Iterable[Frame], *, as_json: bool) -> None:
             print(one.model_dump_json())
             continue
         if not any_yet:
-            print(f"{'frame':32}  state      captured             pose  robot/session  tags")
+            print(
+                f"{'frame':32}  state      captured             pose  sequence  "
+                "robot/session  name  tags"
+            )
             any_yet = True
         at = "" if one.captured_at is None else f"{one.captured_at:%Y-%m-%d %H:%M:%S}"
         who = one_line(f"{one.robot or '-'}/{one.session or '-'}")
         pose = "no" if one.pose is None else "yes"
         tags = one_line(",".join(one.tags))
-        print(f"{one.frame_id:32}  {one.state:9}  {at:19}  {pose:4}  {who}  {tags}".rstrip())
+        place = "" if one.sequence is None else one.sequence
+        name = one_line(one.name or "-")
+        print(
+            f"{one.frame_id:32}  {one.state:9}  {at:19}  {pose:4}  {place:>8}  {who}  {name}  "
+            f"{tags}".rstrip()
+        )
     if not any_yet and not as_json:
         print("no frames match")
 

@@ -376,18 +376,24 @@ def settings_of(given: Sequence[tuple[str, str]] | None) -> dict[str, str] | Non
     return None if given is None else dict(given)
 
 
+def frame_label(frame_id: str, name: str | None) -> str:
+    """A frame for people: its id, and what its file was called."""
+    return one_line(frame_id if name is None else f"{frame_id} ({name})")
+
+
 def explained_lines(answer: Answer) -> list[str]:
     """Why the frames of the ranking came as far as they did, a line each; none if not asked."""
     lines = [
-        f"  {one.rank:4}  {one_line(one.frame_id)}  {one.similarity:4.2f}  {one.stage}: "
-        f"{one.outcome.replace('_', ' ')}; {one_line(one.reason)}"
+        f"  {one.rank:4}  {frame_label(one.frame_id, one.name)}  {one.similarity:4.2f}  "
+        f"{one.stage}: {one.outcome.replace('_', ' ')}; {one_line(one.reason)}"
         for one in answer.explanations or []
     ]
     one = answer.explained_frame
     if one is not None:
         place = "not searched" if one.rank is None else f"rank {one.rank} of {one.of}"
         lost = "a match" if one.lost_at is None else f"lost at {one.lost_at}"
-        lines.append(f"  {one_line(one.frame_id)}: {place}; {lost}: {one_line(one.reason)}")
+        label = frame_label(one.frame_id, one.name)
+        lines.append(f"  {label}: {place}; {lost}: {one_line(one.reason)}")
     return lines
 
 

@@ -20,6 +20,7 @@ from sceneprint.cli.options import (
     add_service_options,
     add_up_option,
     explained_lines,
+    frame_label,
     one_line,
     open_client,
     options_of,
@@ -103,7 +104,7 @@ def save_overlay(client: Client, answer: Answer, options: argparse.Namespace) ->
         answer.query_id, best.frame_id, best.map, color=options.color, transform=options.by
     )
     write_whole(options.overlay, data)
-    return f"{options.overlay}: the query aligned with {best.frame_id}"
+    return f"{options.overlay}: the query aligned with {frame_label(best.frame_id, best.name)}"
 
 
 def add_query(commands: Any) -> None:
@@ -302,8 +303,8 @@ def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
 
 
 def _label(match: Match, several: bool) -> str:
-    """Who saw it, in which of several maps, and the frame's id to ask for the rest."""
-    seen = "/".join(one_line(who) for who in (match.robot, match.session) if who)
+    """Who saw it, in which of several maps, its file, and its id to ask for the rest."""
+    seen = "/".join(one_line(who) for who in (match.robot, match.session, match.name) if who)
     return "  ".join(part for part in (match.map if several else "", seen, match.frame_id) if part)
 
 
@@ -441,7 +442,8 @@ def localization_lines(name: str, there: Localization) -> list[str]:
     if there.pose is not None:
         lines += [_pose_line(there.pose), f"  {_grounds(there)}"]
     elif there.best is not None:
-        lines.append(f"  at {metres(there.best.transform)} m from frame {there.best.frame_id}")
+        best = frame_label(there.best.frame_id, there.best.name)
+        lines.append(f"  at {metres(there.best.transform)} m from frame {best}")
     return lines + _alternative_lines(there.alternatives)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -344,7 +343,7 @@ def run_upload(options: argparse.Namespace) -> int:
     """Upload; returns 2 where a frame was not indexed."""
     archives = [path for path in options.paths if is_archive_file(path)]
     paths = [path for path in options.paths if path not in archives]
-    sequences = list(_sequences_of(paths, options))
+    sequences = _sequences_of(paths, options)
     found = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
     if options.base is not None and options.base_frame is not None:
         options.base = options.base.model_copy(update={"base_frame": options.base_frame})
@@ -372,14 +371,17 @@ def run_upload(options: argparse.Namespace) -> int:
     return 2 if tally.errors or stalled else 0
 
 
-def _sequences_of(paths: list[Path], options: argparse.Namespace) -> Iterator[FrameSequence]:
-    """The sequences at all paths.
+def _sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSequence]:
+    """The sequences at all paths, numbered within their sessions.
 
     Raises
     ------
     DatasetError : nothing is found at a path, or two places share the name of their poses' frame.
     """
+    from sceneprint.formats.dataset.upload_metadata import numbered_sequences
+
     places: dict[str, Path] = {}
+    sequences = []
     for path in paths:
         with recording_options(options) as recording:
             found = find_sequences(path, recording)
@@ -392,7 +394,8 @@ def _sequences_of(paths: list[Path], options: argparse.Namespace) -> Iterator[Fr
                     "of the two would be mixed. Upload a folder above both, rename one, or, if "
                     "their poses share one parent frame, name it with --parent-frame."
                 )
-            yield sequence
+            sequences.append(sequence)
+    return numbered_sequences(sequences, options.session)
 
 
 def _see_to_map(client: Client, options: argparse.Namespace) -> None:

@@ -40,7 +40,7 @@ from sceneprint_client.api.frames import GivenTransform, Kind
 
 # Entity tags: short texts that change when what they stand for does.
 
-#: Columns of a frame that can be edited, beside `up`.
+#: Columns of a frame that can be edited, beside `up`, `name` and `sequence`.
 EDITABLE = (
     "robot", "session", "captured_at", "tags", "pose_parent", "pose", "base_frame", "base",
 )  # fmt: skip
@@ -54,9 +54,11 @@ def tag_of(*parts: object) -> str:
 
 def frame_tag(frame: FrameRow) -> str:
     """Stands for all of a frame that can be edited."""
-    # as it was where there is no `up`: a tag that somebody holds outlives the upgrade
+    # as it was where there is no `up` or name: a tag that somebody holds outlives the upgrade
     up = [] if frame.up is None else [frame.up]
-    return tag_of("frame", [getattr(frame, name) for name in EDITABLE] + up)
+    label = (frame.name, frame.sequence)
+    named = [] if label == (None, None) else [["name", *label]]
+    return tag_of("frame", [getattr(frame, name) for name in EDITABLE] + up + named)
 
 
 def map_tag(row: MapRow) -> str:
@@ -238,6 +240,8 @@ def _frame(row: MapRow, frame: FrameRow, job: JobRow) -> Frame:
         **_sensor_record(frame),
         robot=frame.robot,
         session=frame.session,
+        name=frame.name,
+        sequence=frame.sequence,
         captured_at=when(frame.captured_at),
         received_at=when(frame.received_at),
         indexed_at=when(frame.indexed_at),

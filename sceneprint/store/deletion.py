@@ -48,7 +48,7 @@ from sceneprint_client.api import FrameState
 #: What is known of a frame, and not of its camera; cleared with it.
 _KNOWN = (
     "content_id", "reason", "robot", "session", "captured_at", "pose_parent", "pose", "pose_x",
-    "pose_y", "pose_z", "base_frame", "base", "novelty", "up",
+    "pose_y", "pose_z", "base_frame", "base", "novelty", "up", "name", "sequence",
 )  # fmt: skip
 
 

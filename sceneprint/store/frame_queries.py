@@ -14,6 +14,7 @@ from sqlalchemy import (
     Connection,
     Select,
     String,
+    and_,
     cast,
     func,
     null,
@@ -37,9 +38,40 @@ from sceneprint.store.tables import (
 )
 from sceneprint_client.api import Filter, FrameState, Region
 from sceneprint_client.api.frames import Kind
-from sceneprint_client.api.listing import FrameListing, Run
+from sceneprint_client.api.listing import FrameListing, Run, Stamp
 
 _NONE: NDArray[np.int64] = np.empty(0, np.int64)
+
+#: The order in which the frames of a session were taken: by time; then those without one, by their
+#: place in the session; then those without either, and those alike in both, as they came. Every
+#: list, path and graph of a session follows it, so the order of upload does not matter.
+TAKEN_ORDER: tuple[ColumnElement[Any], ...] = (
+    frames.c.captured_at.is_(None), frames.c.captured_at,
+    frames.c.sequence.is_(None), frames.c.sequence, frames.c.number,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TakenPosition:
+    """Where a frame stands in `TAKEN_ORDER`; fields as in the table."""
+
+    number: int
+    captured_at: float | None
+    sequence: int | None
+
+
+def _after_taken(last: TakenPosition) -> ColumnElement[bool]:
+    """That a frame comes after a position in `TAKEN_ORDER`."""
+    after: ColumnElement[bool] = frames.c.number > last.number
+    for column, value in (
+        (frames.c.sequence, last.sequence),
+        (frames.c.captured_at, last.captured_at),
+    ):
+        if value is None:
+            after = and_(column.is_(None), after)
+        else:
+            after = or_(column > value, column.is_(None), and_(column == value, after))
+    return after
 
 
 @dataclass(frozen=True)
@@ -143,15 +175,17 @@ _LIVING = tuple(state for state in FrameState if state != FrameState.DELETED)
 
 
 def list_frames(
-    connection: Connection, map_number: int, beyond: int | None, limit: int, wanted: FrameListing
-) -> list[FrameRow]:
-    """Frames of a map in the order they came, or the newest first.
+    connection: Connection, map_number: int, beyond: TakenPosition | None, limit: int,
+    wanted: FrameListing,
+) -> list[FrameRow]:  # fmt: skip
+    """Frames of a map in the order they came, the newest first, or in the order they were taken.
 
     Parameters
     ----------
     connection : of the database
     map_number : of the map
-    beyond : number of the frame that the page before ended with; None for the first page
+    beyond : the frame that the page before ended with, by its number unless in the order they were
+        taken; None for the first page
     limit : most frames
     wanted : which frames; deleted ones only where it asks for them
     """
@@ -164,10 +198,19 @@ def list_frames(
     numbers: Select[Any] = select(frames.c.number).where(
         frames.c.map_number == map_number, frames.c.state.in_(states), *_listing_conditions(wanted)
     )
-    if beyond is not None:
-        numbers = numbers.where(number < beyond if wanted.order == "desc" else number > beyond)
-    numbers = numbers.order_by(number.desc() if wanted.order == "desc" else number).limit(limit)
-    chosen = list(connection.execute(numbers).scalars())
+    if wanted.order == "taken":
+        numbers = numbers.order_by(*TAKEN_ORDER)
+        if beyond is not None:
+            numbers = numbers.where(_after_taken(beyond))
+    elif wanted.order == "desc":
+        numbers = numbers.order_by(number.desc())
+        if beyond is not None:
+            numbers = numbers.where(number < beyond.number)
+    else:
+        numbers = numbers.order_by(number)
+        if beyond is not None:
+            numbers = numbers.where(number > beyond.number)
+    chosen = list(connection.execute(numbers.limit(limit)).scalars())
     if not chosen:
         return []
     found = connection.execute(select(frames).where(frames.c.number.in_(chosen))).mappings()
@@ -180,7 +223,9 @@ def _is_narrow(wanted: FrameListing) -> bool:
         return False  # these have indexes of their own
     named = (wanted.captured_after, wanted.captured_before, wanted.parent_frame, wanted.has_pose)
     rare = wanted.state not in (None, FrameState.INDEXED)
-    return bool(wanted.robot or wanted.session or rare) or any(one is not None for one in named)
+    return bool(wanted.robot or wanted.session or wanted.name or rare) or any(
+        one is not None for one in named
+    )
 
 
 def _listing_conditions(wanted: FrameListing) -> list[ColumnElement[bool]]:
@@ -196,7 +241,26 @@ def _listing_conditions(wanted: FrameListing) -> list[ColumnElement[bool]]:
         found.append(c.pose_x.is_not(None) if wanted.has_pose else c.pose_x.is_(None))
     if wanted.content_id is not None:
         found.append(c.content_id == wanted.content_id)
+    if wanted.name is not None:
+        found += _named(wanted.name)
     return found
+
+
+def _named(prefix: str) -> list[ColumnElement[bool]]:
+    """That a name begins so, as a range that an index serves: names are in the order of their code
+    points on both databases.
+    """
+    kept = prefix.rstrip(_LAST)
+    if not kept:
+        return [frames.c.name >= prefix]
+    above = ord(kept[-1]) + 1
+    if above in _SURROGATES:  # no characters
+        above = _SURROGATES.stop
+    return [frames.c.name >= prefix, frames.c.name < kept[:-1] + chr(above)]
+
+
+#: The last code point, and those that stand for halves of others.
+_LAST, _SURROGATES = chr(0x10FFFF), range(0xD800, 0xE000)
 
 
 # The runs of a map: who took what, when, and where their poses lead.
@@ -282,11 +346,30 @@ def count_run(
     return [(robot, parent, count) for robot, parent, count in found]
 
 
+def stamps_of_run(connection: Connection, map_number: int, run: Run) -> Stamp | None:
+    """By what the poses of a run are stamped: their times, or where none has one their places in
+    the session; None where they have neither.
+
+    `run.clock` is what was asked for; only `taken` leaves a choice.
+    """
+    if run.clock != "taken":
+        return run.clock
+    known: tuple[tuple[Stamp, ColumnElement[Any]], ...] = (
+        ("captured", frames.c.captured_at),
+        ("sequence", frames.c.sequence),
+    )
+    for stamp, column in known:
+        some = select(frames.c.number).where(*_posed(map_number, run), column.is_not(None))
+        if connection.execute(some.limit(1)).first() is not None:
+            return stamp
+    return None
+
+
 def poses_of_run(
-    connection: Connection, map_number: int, run: Run
+    connection: Connection, map_number: int, run: Run, stamp: Stamp
 ) -> tuple[list[tuple[str, float, list[list[float]]]], int]:
-    """Frames of a session with time and pose in the order of time, of one time the first that came;
-    by the clock `received` all with a pose, as they came.
+    """Frames of a session with stamp and pose in the order of their stamps, of one stamp the first
+    that was taken; by `received` all with a pose, as they came.
 
     Parameters
     ----------
@@ -294,25 +377,25 @@ def poses_of_run(
     map_number : of the map
     run : whose; with `most`, so many of them at most, evenly taken. Only their rows are read: an
         index holds what the choice needs.
+    stamp : see `stamps_of_run`
 
     Returns
     -------
-    poses : id of the frame, when by the clock of the run, and T_parent_sensor
+    poses : id of the frame, its stamp (seconds since 1970, or its place), and T_parent_sensor
     count : how many there are of all of them
     """
-    taken = run.clock == "captured"
-    at = frames.c.captured_at if taken else frames.c.received_at
-    posed = [
-        *_of_session(map_number, run),
-        frames.c.pose_parent == run.parent_frame,
-        frames.c.pose_x.is_not(None),
-    ]
-    if taken:
-        least = func.min(frames.c.number).label("number")
-        timed = select(least, at.label("order")).where(*posed, at.is_not(None)).group_by(at)
+    c = frames.c
+    at = {"captured": c.captured_at, "sequence": c.sequence, "received": c.received_at}[stamp]
+    posed = select(c.number).where(*_posed(map_number, run))
+    order: tuple[ColumnElement[Any], ...] = (c.number,)
+    if stamp == "received":
+        first = posed.add_columns(c.number.label("order")).subquery()
     else:
-        timed = select(frames.c.number, frames.c.number.label("order")).where(*posed)
-    first = timed.subquery()
+        order = (at, *TAKEN_ORDER)
+        again = func.row_number().over(partition_by=at, order_by=TAKEN_ORDER).label("again")
+        stamped = posed.add_columns(at.label("order"), again).where(at.is_not(None)).subquery()
+        once = select(stamped.c.number, stamped.c.order).where(stamped.c.again == 1)
+        first = once.subquery()
     chosen = select(first.c.number)
     count = int(connection.execute(select(func.count()).select_from(first)).scalar_one())
     if run.most is not None and run.most < count:
@@ -321,12 +404,17 @@ def poses_of_run(
         # the multiples of (count - 1) / (most - 1), rounded up: with 0 and count - 1, `most`
         even = (placed.c.place * (run.most - 1)) % (count - 1) < run.most - 1
         chosen = select(placed.c.number).where(even)
-    found = connection.execute(
-        select(frames.c.id, at, frames.c.pose)
-        .where(frames.c.number.in_(chosen))
-        .order_by(at if taken else frames.c.number, frames.c.number)
-    )
-    return [(frame_id, when, pose) for frame_id, when, pose in found], count
+    asked = select(c.id, at, c.pose).where(c.number.in_(chosen)).order_by(*order)
+    return [(frame_id, when, pose) for frame_id, when, pose in connection.execute(asked)], count
+
+
+def _posed(map_number: int, run: Run) -> list[ColumnElement[bool]]:
+    """What must hold of the frames of a run whose poses lead to its parent frame."""
+    return [
+        *_of_session(map_number, run),
+        frames.c.pose_parent == run.parent_frame,
+        frames.c.pose_x.is_not(None),
+    ]
 
 
 def _of_session(map_number: int, run: Run) -> list[ColumnElement[bool]]:
@@ -372,7 +460,7 @@ class PathFrame:
     Parameters
     ----------
     number, id : of the frame
-    robot, session, captured_at : as far as is known
+    robot, session, captured_at, name, sequence : as far as is known
     parent : that its pose leads to
     pose : T_parent_sensor, or None
     is_cloud : whether it is a point cloud
@@ -386,6 +474,8 @@ class PathFrame:
     parent: str | None
     pose: list[list[float]] | None
     is_cloud: bool
+    name: str | None = None
+    sequence: int | None = None
 
     @property
     def kind(self) -> Kind:
@@ -396,10 +486,7 @@ class PathFrame:
 def numbers_of_session(
     connection: Connection, map_number: int, session: str, robot: str | None
 ) -> list[int]:
-    """Numbers of the indexed frames of a session in the order of time, then as they came.
-
-    Those without a time come last.
-    """
+    """Numbers of the indexed frames of a session in the order in which they were taken."""
     asked = select(frames.c.number).where(
         frames.c.map_number == map_number,
         frames.c.state == FrameState.INDEXED,
@@ -407,15 +494,15 @@ def numbers_of_session(
     )
     if robot is not None:
         asked = asked.where(frames.c.robot == robot)
-    time = frames.c.captured_at
-    return list(connection.execute(asked.order_by(time.is_(None), time, frames.c.number)).scalars())
+    return list(connection.execute(asked.order_by(*TAKEN_ORDER)).scalars())
 
 
 def stops_of(connection: Connection, numbers: Iterable[int]) -> dict[int, PathFrame]:
     """Frames by their numbers; those that are deleted, or not indexed any more, are left out."""
     asked = select(
         frames.c.number, frames.c.id, frames.c.robot, frames.c.session, frames.c.captured_at,
-        frames.c.pose_parent, frames.c.pose, frames.c.cloud.is_not(null()),
+        frames.c.pose_parent, frames.c.pose, frames.c.cloud.is_not(null()), frames.c.name,
+        frames.c.sequence,
     ).where(frames.c.state == FrameState.INDEXED)  # fmt: skip
     return {
         row.number: PathFrame(*row)

@@ -121,6 +121,8 @@ frames = Table(
     Column("revision", WHOLE),
     Column("cloud", JSON(none_as_null=True)),  # what its points are; null: it is a depth image
     Column("up", JSON(none_as_null=True)),  # unit vector in the sensor's axes
+    Column("name", _string(255)),  # of the original file or message; a label, never a path
+    Column("sequence", WHOLE),  # place within the session
     UniqueConstraint("map_number", "id"),
     Index(None, "map_number", "content_id"),
     Index(None, "map_number", "revision"),
@@ -133,12 +135,14 @@ frames = Table(
         "session",
         "robot",
         "captured_at",
+        "sequence",
         "pose_parent",
         "pose_x",
         "pose_y",
         "pose_z",
     ),
     Index(None, "blob"),
+    Index("ix_frames_named", "map_number", "name", "state", "session", "robot"),
     Index("ix_frames_placed", "map_number", "pose_parent", "pose_x", "pose_y", "pose_z"),
     sqlite_autoincrement=True,
 )
@@ -410,6 +414,8 @@ class FrameRow:
     revision: int | None
     cloud: dict[str, Any] | None
     up: list[float] | None = None
+    name: str | None = None
+    sequence: int | None = None
 
     @property
     def kind(self) -> Kind:

@@ -65,9 +65,10 @@ def test_a_query_says_where_frames_were_lost(
     outcomes = [one["outcome"] for one in told["explanations"]]
     assert outcomes == ["accepted", "not_selected"]
     lines = sceneprint(*asked, "--explain", "--explain-frame", maps["near"][1]).stdout.splitlines()
-    assert lines[-3].startswith(f"     1  {maps['near'][0]}  1.00  validate: accepted; accepted:")
+    first, second = (f"{maps['near'][i]} (frame-00000{i}.depth.png)" for i in range(2))
+    assert lines[-3].startswith(f"     1  {first}  1.00  validate: accepted; accepted:")
     assert "retrieve: not selected; most similar to the selected frame" in lines[-2]
-    assert lines[-1].startswith(f"  {maps['near'][1]}: rank 2 of 2; lost at selection: ")
+    assert lines[-1].startswith(f"  {second}: rank 2 of 2; lost at selection: ")
     both = json.loads(sceneprint(*asked, "--map", "far", "--json").stdout)
     assert (both["maps"], both["counts"]["map"]) == (["near", "far"], 4)
     line = sceneprint(*asked, "--map", "far", "--diversity", "omega=1000").stdout.splitlines()[2]

@@ -26,6 +26,24 @@ def test_lists_files_and_edits(
     assert len(ids) == 3
     table = sceneprint("frames", name, "--newest", "--limit", "2").stdout.splitlines()
     assert [line.split()[0] for line in table] == ["frame", ids[2], ids[1]]
+    # four at a time they come in any order, and are told in that of their files
+    (session,) = {one["session"] for one in frames}
+    names = [f"frame-00000{i}.depth.png" for i in range(3)]
+    table = sceneprint("frames", name, "--session", session).stdout.splitlines()
+    assert [line.split()[-1] for line in table[1:]] == names
+    found = sceneprint("frames", name, "--name", "frame-000001", "--json").stdout.splitlines()
+    assert [(one["name"], one["sequence"]) for one in map(json.loads, found)] == [(names[1], 1)]
+    places = tmp_path / "places.tum"
+    said = sceneprint("frames", name, "--session", session, "--trajectory", places)
+    assert said.stdout == f"wrote {places}: 3 poses\n"
+    assert read_trajectory(places).stamps.tolist() == [0.0, 1.0, 2.0]
+    said = sceneprint(
+        "frames", name, "--session", session, "--trajectory", tmp_path / "e", "--clock", "captured"
+    )
+    assert said.stdout == (
+        f"wrote {tmp_path / 'e'}: 0 poses: none of its 3 frames has a pose in 'r1/room-0' with "
+        "`captured_at`\n"
+    )
     assert sceneprint("frames", name, "--tag", "nowhere").stdout == "no frames match\n"
 
     png, ply, lists = tmp_path / "a.png", tmp_path / "a.ply", tmp_path / "a.json"

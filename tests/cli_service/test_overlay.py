@@ -19,7 +19,7 @@ def test_a_query_is_laid_on_its_match(
     said = sceneprint(*one, "--overlay", path, "--color", "normal")
     answer = json.loads(said.stdout)
     best = answer["matches"][0]["frame_id"]
-    assert said.stderr == f"{path}: the query aligned with {best}\n"
+    assert said.stderr == f"{path}: the query aligned with {best} (frame-000001.depth.png)\n"
     with Client(service_url) as client:
         assert path.read_bytes() == client.overlay(answer["query_id"], best, color="normal")
         client.delete_map("overlaid")

@@ -168,7 +168,8 @@ def test_a_query_is_told_in_a_table(sceneprint: Run, house: str, rooms: Path) ->
     )
     assert titles.split()[:4] == ["match", "rank", "similarity", "validation"]
     first = re.match(
-        r"  r1/room-0/seq-01  [0-9a-f]{32} +1 +1\.00  accepted strong +1\.00 +"
+        r"  r1/room-0/seq-01/frame-000001\.depth\.png  [0-9a-f]{32} +1 +1\.00  accepted strong +"
+        r"1\.00 +"
         r"(\S+) (\S+) (\S+) +0\.0 +(\S+) (\S+) (\S+)  surfaces agree",
         matches[0],
     )

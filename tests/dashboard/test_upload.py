@@ -122,6 +122,17 @@ def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(
     link = row(page, "frame-000001.depth.png").get_by_role("link")
     assert link.get_attribute("href") == f"#/maps/dropped/frames/{posed['frame_id']}"
 
+    assert (posed["name"], posed["sequence"]) == ("frame-000001.depth.png", 1)
+    page.goto(f"{station.home}#/maps/dropped")
+    settle(page)
+    page.get_by_label("File name").fill("frame-000001")
+    page.get_by_label("File name").blur()
+    settle(page)
+    tiles = page.locator(".tile-name a")
+    expect(tiles).to_have_text(["frame-000001"])
+    expect(tiles).to_have_attribute("title", f"frame-000001.depth.png, frame {posed['frame_id']}")
+    assert axe(page) == []
+
 
 def test_a_drop_waits_for_its_camera_and_an_archive_goes_to_imports(
     page: Page, station: Any, settle: Callable[[Page], None]

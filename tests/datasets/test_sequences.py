@@ -1,6 +1,7 @@
 """Folders made by the writers are found again; folders that are wrong say so."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from sceneprint.errors import DatasetError, InvalidPose, UnreadableFrame
 from sceneprint.formats.dataset import (
     Camera,
+    FrameSequence,
     Layout,
     find_sequences,
     sequences,
@@ -16,6 +18,7 @@ from sceneprint.formats.dataset import (
     write_intrinsics,
     write_pose,
 )
+from sceneprint.formats.dataset.upload_metadata import numbered_sequences
 from sceneprint.types import Intrinsics
 
 CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)
@@ -189,3 +192,47 @@ def test_a_whole_disk_is_not_searched(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(sequences, "_MAXIMUM_FOLDERS", 5)
     with pytest.raises(DatasetError, match="more than 5 folders"):
         find_sequences(tmp_path)
+
+
+def test_frames_have_the_numbers_and_names_of_their_files(kitchen: Path, tmp_path: Path) -> None:
+    (kitchen / "seq-01" / "frame-000000.depth.png").unlink()  # a part has the numbers of the whole
+    first, second, _ = find_sequences(kitchen)
+    assert [(f.original, f.sequence) for f in first.frames] == [("frame-000001.depth.png", 1)]
+    assert [f.sequence for f in second.frames] == [0, 1]
+    (alone,) = find_sequences(kitchen / "seq-02" / "frame-000001.depth.png")
+    assert alone.frames[0].sequence == 1
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    write_intrinsics(plain, CAMERA)
+    for name in ("b10.png", "b9.png", "a.png"):
+        write_depth_png(plain / name, DEPTH, 1000.0)
+    (told,) = find_sequences(plain)
+    assert [(f.original, f.sequence) for f in told.frames] \
+        == [("a.png", 0), ("b9.png", 1), ("b10.png", 2)]  # fmt: skip
+    (alone,) = find_sequences(plain / "b9.png")
+    assert alone.frames[0].sequence is None  # its place is not known
+
+
+def test_sequences_of_one_session_are_numbered_one_after_the_other(kitchen: Path) -> None:
+    def places(found: Iterable[FrameSequence], session: str | None) -> list[list[int | None]]:
+        told = numbered_sequences(found, session)
+        return [[frame.sequence for frame in one.frames] for one in told]
+
+    found = find_sequences(kitchen)
+    assert places(found, None) == [[0, 1], [0, 1], [0, 1]]
+    assert places(found, "all") == [[0, 1], [2, 3], [4, 5]]
+    # files of one folder, named one by one, keep its numbers
+    files = [kitchen / f"seq-{s}/frame-00000{i}.depth.png" for s in ("02", "01") for i in (1, 0)]
+    singles = [one for file in files for one in find_sequences(file)]
+    assert places(singles, None) == [[1], [0], [1], [0]]
+    assert places(singles, "all") == [[1], [0], [3], [2]]
+
+
+def test_files_without_a_number_are_numbered_as_they_were_named(tmp_path: Path) -> None:
+    write_intrinsics(tmp_path, CAMERA)
+    for name in ("b.png", "a.png"):
+        write_depth_png(tmp_path / name, DEPTH, 1000.0)
+    singles = [find_sequences(tmp_path / name)[0] for name in ("b.png", "a.png")]
+    told = numbered_sequences(singles, None)
+    assert [one.frames[0].sequence for one in told] == [0, 1]
+    assert numbered_sequences(singles[:1], None)[0].frames[0].sequence is None

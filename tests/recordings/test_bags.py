@@ -83,6 +83,10 @@ def test_poses_and_samples_are_those_that_were_recorded(
         meta = meta_of(reference)
         assert meta.captured_at is not None
         assert meta.captured_at.timestamp() == pytest.approx(ros.start + t, abs=1e-6)
+        assert meta.sequence == i
+        topic, _, stamp = str(meta.name).rpartition("/")
+        assert topic == "camera/depth/image_raw/compressedDepth"[: len(topic)]
+        assert float(stamp) == pytest.approx(ros.start + t, abs=1e-6)
         assert meta.T_base_sensor is not None
         assert meta.T_base_sensor.base_frame == "base_link"
         np.testing.assert_allclose(meta.T_base_sensor.matrix, ros.camera, atol=1e-9)

@@ -132,7 +132,8 @@ def received(store: Store, hall: MapRow) -> Callable[..., FrameRow]:
         values: dict[str, Any] = {
             "content_id": content, "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1},
             "depth_scale": 1000.0, "depth_along_ray": False, "robot": None, "session": None,
-            "captured_at": None, "tags": [], "pose_parent": None, "pose": None,
+            "captured_at": None, "tags": [], "pose_parent": None, "pose": None, "name": None,
+            "sequence": None,
         }  # fmt: skip
         if within is not None:
             return add_frame(within, row.number, values | given, frame_id)

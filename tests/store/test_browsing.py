@@ -14,7 +14,14 @@ import pytest
 from sqlalchemy import Connection, update
 
 from sceneprint.store import Store
-from sceneprint.store.frame_queries import count_run, list_frames, list_runs, poses_of_run
+from sceneprint.store.frame_queries import (
+    TakenPosition,
+    count_run,
+    list_frames,
+    list_runs,
+    poses_of_run,
+    stamps_of_run,
+)
 from sceneprint.store.frames import write_frame
 from sceneprint.store.maps import add_map
 from sceneprint.store.tables import FrameRow, MapRow, frames
@@ -38,7 +45,17 @@ def drawn(rng: np.random.Generator) -> dict[str, Any]:
         "captured_at": None if at is None else at.timestamp(),
         "tags": [tag for tag in ("door", "é", "c") if rng.random() < 0.5],
         "pose_parent": parent, "pose": None if parent is None else pose.tolist(),
+        "name": rng.choice([None, "a/1.png", "a/2.png", "b", "b\U0010ffff\U0010ffff", "c\ud7ff9"]),
+        "sequence": None if rng.random() < 0.3 else int(rng.integers(6)),
     }  # fmt: skip
+
+
+def taken(one: FrameRow) -> tuple[Any, ...]:
+    """The order in which frames were taken, by its sentence."""
+    return (
+        one.captured_at is None, one.captured_at or 0.0, one.sequence is None, one.sequence or 0,
+        one.number,
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -86,6 +103,7 @@ def passes(one: FrameRow, w: FrameListing) -> bool:
         and (w.parent_frame is None or one.pose_parent == w.parent_frame)
         and (w.has_pose is None or (one.pose is not None) == w.has_pose)
         and (w.content_id is None or one.content_id == w.content_id)
+        and (w.name is None or (one.name or "").startswith(w.name))
     )
 
 
@@ -99,25 +117,34 @@ def some_listing(rng: np.random.Generator) -> FrameListing:
         "captured_after": a, "captured_before": b, "received_after": c, "received_before": d,
         "parent_frame": "p1", "has_pose": bool(rng.random() < 0.5),
         "content_id": f"{rng.integers(0, 50):064d}",
+        "name": str(rng.choice(["a", "a/2", "b", "b\U0010ffff", "c\ud7ff", "\U0010ffff", "B"])),
     }  # fmt: skip
     names = rng.permutation(list(every))[: rng.integers(0, 4)]
     given = {name: every[name] for name in names}
-    return FrameListing.model_validate({**given, "order": rng.choice(["asc", "desc"])})
+    orders = ["asc", "desc", "taken", "taken"] if "session" in given else ["asc", "desc"]
+    return FrameListing.model_validate({**given, "order": rng.choice(orders)})
+
+
+def position(one: FrameRow) -> TakenPosition:
+    return TakenPosition(one.number, one.captured_at, one.sequence)
 
 
 def test_every_list_is_that_of_plain_python(
     store: Store, hall: MapRow, mixed: list[FrameRow]
 ) -> None:
     rng, sizes = np.random.default_rng(9), Counter[bool]()
+    sessions = [FrameListing(session=name, order="taken") for name in (["s1"], ["s2"])]
     with store.database.read() as connection:
-        for _ in range(100):
-            wanted, limit = some_listing(rng), int(rng.integers(1, 9))
+        for wanted in [*sessions, *(some_listing(rng) for _ in range(110))]:
+            limit = int(rng.integers(1, 9))
             expected = [one for one in mixed if passes(one, wanted)]
             if wanted.order == "desc":
                 expected.reverse()
+            elif wanted.order == "taken":
+                expected.sort(key=taken)
             found: list[FrameRow] = []
             while True:  # pages follow each other without a gap or a double
-                last = found[-1].number if found else None
+                last = position(found[-1]) if found else None
                 page = list_frames(connection, hall.number, last, limit, wanted)
                 found += page
                 if len(page) < limit:
@@ -176,10 +203,11 @@ def test_poses_of_a_run_are_those_of_plain_python(
             for one in own
             if one.pose_parent == run.parent_frame and one.captured_at is not None
         ]
-        expected.sort(key=lambda one: (one.captured_at, -one.number))
-        expected = list({one.captured_at: one for one in expected}.values())  # the least number
+        expected.sort(key=taken, reverse=True)
+        expected = list({one.captured_at: one for one in expected}.values())[::-1]  # the first
         with store.database.read() as connection:
-            found, count = poses_of_run(connection, hall.number, run)
+            assert stamps_of_run(connection, hall.number, run) == "captured"
+            found, count = poses_of_run(connection, hall.number, run, "captured")
             counted = count_run(connection, hall.number, run)
         assert expected
         assert found == [(one.id, one.captured_at, one.pose) for one in expected]
@@ -187,6 +215,36 @@ def test_poses_of_a_run_are_those_of_plain_python(
         assert {(robot, parent): count for robot, parent, count in counted} == Counter(
             (one.robot, one.pose_parent) for one in own
         )
+        placed = [
+            one for one in own if one.pose_parent == run.parent_frame and one.sequence is not None
+        ]
+        placed.sort(key=lambda one: (one.sequence, taken(one)), reverse=True)
+        placed = list({one.sequence: one for one in placed}.values())[::-1]
+        with store.database.read() as connection:
+            found, _ = poses_of_run(connection, hall.number, run, "sequence")
+        assert found == [(one.id, one.sequence, one.pose) for one in placed]
+
+
+def test_poses_are_stamped_by_time_or_else_by_place(
+    store: Store, hall: MapRow, received: Received
+) -> None:
+    posed = {"session": "s", "pose_parent": "p", "pose": np.eye(4).tolist()}
+    run = Run(session="s", parent_frame="p")
+
+    def stamps(clock: str = "taken") -> str | None:
+        with store.database.read() as connection:
+            asked = run.model_copy(update={"clock": clock})
+            return stamps_of_run(connection, hall.number, asked)
+
+    received("0" * 64, **posed)
+    received("1" * 64, session="s", captured_at=1.0)  # of no pose, it stamps none
+    assert stamps() is None
+    assert stamps("received") == "received"
+    received("2" * 64, **posed, sequence=0)
+    assert stamps() == "sequence"
+    received("3" * 64, **posed, captured_at=0.0)
+    assert stamps() == "captured"
+    assert stamps("sequence") == "sequence"
 
 
 def test_poses_are_taken_evenly(store: Store, hall: MapRow, received: Received) -> None:
@@ -205,7 +263,7 @@ def test_poses_are_taken_evenly(store: Store, hall: MapRow, received: Received) 
     ):  # fmt: skip
         with store.database.read() as connection:
             run = Run(session="s", parent_frame="p", most=most)
-            found, count = poses_of_run(connection, hall.number, run)
+            found, count = poses_of_run(connection, hall.number, run, "captured")
         assert count == 11
         assert [at - START.timestamp() for _, at, _ in found] == list(places), most
         assert found[0][0] == rows[0].id  # of two of one time, the first that came
@@ -231,8 +289,12 @@ def test_each_list_takes_the_index_that_is_meant_for_it(
         ({"parent_frame": "p"}, SEARCHED),
         ({"tag": "a"}, "INDEX ix_frame_tags_tag_frame_number (tag=?)"),
         ({"content_id": "a" * 64}, "INDEX ix_frames_map_number_content_id"),
+        ({"name": "frame-0001"},
+         "USING COVERING INDEX ix_frames_named (map_number=? AND name>? AND name<?)"),
+        ({"session": "s", "order": "taken"},
+         f"{SEARCHED} (map_number=? AND state=? AND session=?"),
     ]  # fmt: skip
-    for (wanted, way), beyond in product(ways, (None, 7)):
+    for (wanted, way), beyond in product(ways, (None, TakenPosition(7, 1.0, None))):
         listing = FrameListing.model_validate(wanted)
         with store.database.read() as connection, plans(connection) as told:
             list_frames(connection, hall.number, beyond, 9, listing)
@@ -246,5 +308,6 @@ def test_sessions_are_counted_without_reading_a_row(
     with store.database.read() as connection, plans(connection) as told:
         list_runs(connection, hall.number, ("a", "b"), 9)
         count_run(connection, hall.number, Run(session="s"))
+        stamps_of_run(connection, hall.number, Run(session="s", parent_frame="p"))
     assert all(SEARCHED in step or step.startswith("USE TEMP B-TREE") for step in told), told
     assert any("session=?" in step for step in told)

@@ -188,7 +188,11 @@ def test_pages_follow_the_order_of_arrival(
     with store.database.read() as connection:
         first = frame_queries.list_frames(connection, hall.number, None, 2, FrameListing())
         rest = frame_queries.list_frames(
-            connection, hall.number, first[-1].number, 9, FrameListing()
+            connection,
+            hall.number,
+            frame_queries.TakenPosition(first[-1].number, None, None),
+            9,
+            FrameListing(),
         )
         found = frame_queries.list_frames(connection, hall.number, None, 9, done)
         assert stored.count_states(connection, hall.number) == {"indexed": 1, "received": 4}

@@ -169,3 +169,22 @@ def test_codes_of_before_there_were_vectors_go(
     left = postgres.execute("SELECT relname FROM pg_class WHERE relname ~ '^code.*'", "coded")
     assert left == [("codes_of_ours",)]
     postgres.drop("coded")
+
+
+def test_frames_of_before_there_were_names_have_none(
+    old: Path, bring_to: Callable[[str, str], None]
+) -> None:
+    bring_to(f"sqlite:///{old}", "0009")
+    database = open_database(f"sqlite:///{old}")
+    with database.write() as connection:
+        row, map_row = frame_of(connection, 1), find_map(connection, "hall")
+        assert (row.name, row.sequence, row.tags, row.pose) == (None, None, *FRAMES[0])
+        named = write_frame(connection, map_row, row, {"name": "a/1.png", "sequence": 2**53 - 1})
+        assert (named.name, named.sequence) == ("a/1.png", 2**53 - 1)
+    with closing(sqlite3.connect(old)) as connection:
+        indexes = dict(
+            connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'index'")
+        )
+    assert "captured_at, sequence, pose_parent" in indexes["ix_frames_searched"]
+    assert "map_number, name, state" in indexes["ix_frames_named"]
+    database.close()

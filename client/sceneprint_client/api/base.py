@@ -7,6 +7,7 @@ import sys
 from typing import Annotated, Any, Generic, TypeVar
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -35,6 +36,24 @@ Record = TypeVar("Record", bound=BaseModel)
 #: Names that people give: printable, one line.
 Label = Annotated[
     str, StringConstraints(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")
+]
+
+
+#: Characters of the name of a frame.
+MOST_OF_NAME = 255
+
+
+def _without_a_way_out(name: str) -> str:
+    if "\\" in name or any(part in ("", ".", "..") for part in name.split("/")):
+        raise ValueError("relative, with `/` between its parts, and without `.`, `..` and `\\`")
+    return name
+
+
+#: What an original file or message was called: a label, never a path that anybody opens.
+FileName = Annotated[
+    str,
+    StringConstraints(min_length=1, max_length=MOST_OF_NAME, pattern=r"^[^\x00-\x1f\x7f\\]+$"),
+    AfterValidator(_without_a_way_out),
 ]
 
 

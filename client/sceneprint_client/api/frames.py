@@ -11,6 +11,7 @@ from pydantic import AwareDatetime, Field, StringConstraints, field_validator, m
 from sceneprint_client.api.base import (
     ApiRecord,
     Direction,
+    FileName,
     FrameState,
     Given,
     Label,
@@ -31,6 +32,11 @@ from sceneprint_client.errors import (
 MOST_TAGS = 32
 #: A frame's priority is a whole number from minus this to this.
 MOST_PRIORITY = 10
+
+#: A frame's place in its session is at most this, which every reader of JSON reads exactly.
+MOST_SEQUENCE = 2**53 - 1
+#: Place of a frame within its session.
+Place = Annotated[int, Field(ge=0, le=MOST_SEQUENCE)]
 
 #: What a frame is: a depth image or a point cloud.
 Kind = Literal["depth", "cloud"]
@@ -155,6 +161,16 @@ class FrameMeta(Given):
         default=None,
         description="When, with its time zone.",
     )
+    name: FileName | None = Field(
+        default=None,
+        description="Of the original file or message, such as `frame-000123.depth.png`: to find "
+        "the frame again by. A label: nothing opens it as a path.",
+    )
+    sequence: Place | None = Field(
+        default=None,
+        description="Place within the session, such as the number of the file or message: orders "
+        "the frames that have no `captured_at`, whatever the order of upload.",
+    )
     pose: GivenPose | None = None
     T_base_sensor: GivenBase | None = Field(
         default=None,
@@ -226,6 +242,8 @@ class Frame(ApiRecord):
     )
     robot: str | None
     session: str | None
+    name: str | None = Field(default=None, description="Of the original file or message.")
+    sequence: int | None = Field(default=None, description="Place within the session.")
     captured_at: datetime | None
     received_at: datetime
     indexed_at: datetime | None

@@ -15,8 +15,17 @@ from pydantic import (
 )
 from pydantic_core import from_json
 
-from sceneprint_client.api.base import ApiRecord, FrameState, Given, Label, Note, Up
-from sceneprint_client.api.frames import MOST_TAGS, GivenBase, GivenPose, GivenVector
+from sceneprint_client.api.base import (
+    MOST_OF_NAME,
+    ApiRecord,
+    FileName,
+    FrameState,
+    Given,
+    Label,
+    Note,
+    Up,
+)
+from sceneprint_client.api.frames import MOST_TAGS, GivenBase, GivenPose, GivenVector, Place
 from sceneprint_client.api.maps import Days, Quota
 
 
@@ -26,6 +35,12 @@ def _one_or_many(given: object) -> object:
 
 #: One name or several, as a query string repeats them.
 _Names = Annotated[list[Label], BeforeValidator(_one_or_many), Field(max_length=100)]
+
+
+#: The beginning of a name.
+_Prefix = Annotated[
+    str, Field(min_length=1, max_length=MOST_OF_NAME, pattern=r"^[^\x00-\x1f\x7f]+$")
+]
 
 
 class FrameListing(Given):
@@ -53,9 +68,19 @@ class FrameListing(Given):
     content_id: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = Field(
         default=None, description="Of its samples and camera."
     )
-    order: Literal["asc", "desc"] = Field(
-        default="asc", description="As they came; `desc`: the newest first."
+    name: _Prefix | None = Field(default=None, description="Its name begins so; case matters.")
+    order: Literal["asc", "desc", "taken"] = Field(
+        default="asc",
+        description="As they came; `desc`: the newest first; `taken`, of one session: by "
+        "`captured_at`, those without by `sequence`, the rest as they came.",
     )
+
+    @field_validator("order")
+    @classmethod
+    def _of_one_session(cls, order: str, info: ValidationInfo) -> str:
+        if order == "taken" and len(info.data.get("session", [None])) != 1:
+            raise ValueError("`taken` is the order of one session; name it with `session`")
+        return order
 
 
 class FramePage(FrameListing):
@@ -79,6 +104,12 @@ class Session(ApiRecord):
     )
 
 
+#: By what poses are stamped.
+Stamp = Literal["captured", "sequence", "received"]
+#: How to choose it.
+Clock = Literal["taken", "captured", "sequence", "received"]
+
+
 class Run(Given):
     """Whose poses a trajectory has."""
 
@@ -98,15 +129,16 @@ class Run(Given):
         description="At most so many poses, evenly taken along the run, the first and the last "
         "among them. A run may then be of any length.",
     )
-    clock: Literal["captured", "received"] = Field(
-        default="captured",
-        description="By which time: `received`, in the order in which frames came, has those too "
-        "that do not say when they were taken.",
+    clock: Clock = Field(
+        default="taken",
+        description="By what poses are stamped: `captured_at`; `sequence`; `received`, in the "
+        "order in which frames came, which every frame has. `taken`: by `captured_at`, and where "
+        "no frame with a pose has one, by `sequence`.",
     )
 
 
 class Trajectory(ApiRecord):
-    """The poses of one run, in the order of time."""
+    """The poses of one run, in the order of their stamps."""
 
     map: str
     session: str
@@ -120,16 +152,22 @@ class Trajectory(ApiRecord):
     )
     frame_ids: list[str]
     poses: list[list[float]] = Field(
-        description="A row for each frame, as in a TUM file: t tx ty tz qx qy qz qw, seconds "
-        "since 1970 by the clock that was asked for, metres, unit quaternion."
+        description="A row for each frame, as in a TUM file: t tx ty tz qx qy qz qw, stamp as "
+        "`stamps` says, metres, unit quaternion."
+    )
+    stamps: Stamp | None = Field(
+        default=None,
+        description="What t is: `captured` and `received` in seconds since 1970, or `sequence`, "
+        "places in the session. Null where no pose has a stamp.",
     )
     posed: int = Field(
         description="Poses that there are: as many as are told, or more where `most` was given."
     )
     left_out: int = Field(
-        description="Frames of the run that are not in it: without pose or time, with a pose that "
-        "leads elsewhere, of a time that is there already, or one too many for `most`."
+        description="Frames of the run that are not in it: without pose or stamp, with a pose that "
+        "leads elsewhere, of a stamp that is there already, or one too many for `most`."
     )
+    reason: str | None = Field(default=None, description="Why there is no pose; else null.")
 
 
 # Which frames of a map a query may find, as JSON.
@@ -226,6 +264,8 @@ class FrameEdit(Given):
         description="In which run. The parent frame of a pose that was named after it stays.",
     )
     captured_at: AwareDatetime | None = Field(default=None, description="When, with its zone.")
+    name: FileName | None = Field(default=None, description="Of the original file or message.")
+    sequence: Place | None = Field(default=None, description="Place within the session.")
     tags: Annotated[list[Label], Field(max_length=MOST_TAGS)] | None = Field(
         default=None, description="All of them: they are replaced together."
     )

@@ -111,6 +111,8 @@ class Match(ApiRecord):
     map: str
     robot: str | None
     session: str | None
+    name: str | None = Field(default=None, description="Of the original file or message.")
+    sequence: int | None = Field(default=None, description="Place within the session.")
     rank: int = Field(description="Place in the ranking R, from 1.")
     distance: int = Field(description="L1 distance of the stored signatures.")
     similarity: float = Field(description="1 - distance / that of unrelated frames, 0 to 1.")
@@ -212,6 +214,7 @@ class Explanation(ApiRecord):
 
     frame_id: str
     map: str
+    name: str | None = Field(default=None, description="Of the original file or message.")
     rank: int = Field(description="Place in the ranking R, from 1.")
     distance: int
     similarity: float
@@ -228,6 +231,7 @@ class ExplainedFrame(ApiRecord):
 
     frame_id: str
     map: str
+    name: str | None = Field(default=None, description="Of the original file or message.")
     state: str = Field(description="Of the frame; only indexed ones are searched.")
     passes_filter: bool | None = Field(description="Null where it is not searched at all.")
     distance: int | None = Field(description="Exact, whether or not the query compared it.")

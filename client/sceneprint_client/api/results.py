@@ -113,6 +113,9 @@ class Similarities(ApiRecord):
     frames: list[FrameName] = Field(
         description="Of the ranking, the nearest first; those deleted since are left out."
     )
+    names: list[str | None] = Field(
+        default=[], description="What the files of `frames` were called, in their order."
+    )
     similarity: list[list[float]] = Field(
         description="1 - distance / that of unrelated frames, 0 to 1. The first row and column are "
         "the query's, the others those of `frames`, in their order."
@@ -149,6 +152,8 @@ class MatchDetails(ApiRecord):
     query_id: str
     frame_id: str
     map: str
+    name: str | None = Field(default=None, description="Of the original file or message.")
+    sequence: int | None = Field(default=None, description="Place within the session.")
     validation: Validation
     transform: Transform | None = Field(
         description="Query to match; null where the frames gave no hypothesis."

@@ -104,6 +104,8 @@ class Edge(ApiRecord):
         default=None, description="Of `from_frame`, in the parent frame that it was sent with."
     )
     to_pose: Transform | None = Field(default=None, description="Of `to_frame`.")
+    from_name: str | None = Field(default=None, description="What the file was called.")
+    to_name: str | None = None
     consistent: bool | None = Field(
         description="Whether loops with edges near by close. `false`: it was outvoted, and is "
         "left out of graphs and joins. null: there is nothing near by to compare it with, or no "
@@ -178,6 +180,8 @@ class Vertex(ApiRecord):
     robot: str | None
     session: str | None
     captured_at: datetime | None
+    name: str | None = Field(default=None, description="Of the original file or message.")
+    sequence: int | None = Field(default=None, description="Place within the session.")
     pose: Transform | None = Field(
         description="In `frame` of the graph where the sessions are joined; else in the parent "
         "frame that it was sent with. null where it has none and no edge leads to one that has."

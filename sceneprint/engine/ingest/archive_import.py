@@ -25,7 +25,11 @@ from sceneprint.formats.archive.archive import Archive, open_archive
 from sceneprint.formats.archive.entries import Inflater
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.formats.dataset.frame_reference import FrameSequence
-from sceneprint.formats.dataset.upload_metadata import parent_frame_of, session_of
+from sceneprint.formats.dataset.upload_metadata import (
+    numbered_sequences,
+    parent_frame_of,
+    session_of,
+)
 from sceneprint.store import Store, queue
 from sceneprint.store.blobs.folder import IncomingBlob
 from sceneprint.store.database_errors import unusable
@@ -57,11 +61,14 @@ class Step:
     refused: errors.SceneprintError | None = None
 
 
-def steps_of(archive: Archive, every: int) -> Iterator[Step]:
-    """All there is to tell of an archive, in the same order each time."""
+def steps_of(archive: Archive, every: int, session: str | None = None) -> Iterator[Step]:
+    """All there is to tell of an archive, in the same order each time.
+
+    `session` is that of all its frames; by default each sequence is one.
+    """
     for name, reason in archive.refused:
         yield Step(name, refused=errors.UnreadableArchive(reason))
-    for sequence in archive.sequences:
+    for sequence in numbered_sequences(archive.sequences, session):
         for reference in sequence.frames[::every]:
             yield Step(archive.name_of(reference), sequence, reference)
 
@@ -345,7 +352,7 @@ class Imports:
     def _slice(
         self, task: LongJob, archive: Archive, options: ImportOptions, until: float
     ) -> SliceResult:
-        steps = list(steps_of(archive, options.every))
+        steps = list(steps_of(archive, options.every, options.session))
         progress = {"done": 0, "received": 0, "there": 0, "refused": 0} | task.progress
         progress["total"] = len(steps)
         items: list[dict[str, Any]] = []

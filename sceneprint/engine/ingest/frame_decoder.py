@@ -150,6 +150,8 @@ def columns(
         "base_frame": None if base is None else base[0],
         "base": None if base is None else base[1].tolist(),
         "up": None if meta.up is None else meta.up.unit,
+        "name": meta.name,
+        "sequence": meta.sequence,
     }
 
 

@@ -22,7 +22,14 @@ from sceneprint.engine.upkeep import garbage_collection, repair
 from sceneprint.store import Store
 from sceneprint.store.database import Grouping
 from sceneprint.store.events import record_event
-from sceneprint.store.frames import add_frame, frames_of_content, living_frame, loosen, renew_frame
+from sceneprint.store.frames import (
+    add_frame,
+    frames_of_content,
+    living_frame,
+    loosen,
+    renew_frame,
+    write_frame,
+)
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import find_map, require_room
 from sceneprint.store.queue import enqueue, jobs_of
@@ -38,6 +45,9 @@ _FIELDS = {
     "pose_parent": "pose.parent_frame", "base": "T_base_sensor", "content_id": "content",
     "cloud": "units_per_metre",
 }  # fmt: skip
+#: Columns that do not tell uploads apart: the same content under another name is the frame that is
+#: there, and keeps the name that it came with.
+_LABELS = ("name", "sequence")
 
 
 def find_duplicate(
@@ -86,7 +96,8 @@ def _differing(frame: FrameRow, known: dict[str, Any]) -> list[str]:
     return [
         _FIELDS.get(name, name)
         for name, value in known.items()
-        if _given_value(name, getattr(frame, name)) != _given_value(name, value)
+        if name not in _LABELS
+        and _given_value(name, getattr(frame, name)) != _given_value(name, value)
     ]
 
 
@@ -96,6 +107,17 @@ def _given_value(name: str, value: Any) -> Any:
     Its viewpoint is part of its content.
     """
     return value["units_per_metre"] if name == "cloud" and value is not None else value
+
+
+def _missing_labels(frame: FrameRow, known: dict[str, Any]) -> dict[str, Any]:
+    """Name and sequence of an upload, as far as the frame that is there has none: one of before
+    there were names gets them when its file is sent again.
+    """
+    return {
+        name: known[name]
+        for name in _LABELS
+        if known[name] is not None and getattr(frame, name) is None
+    }
 
 
 def is_retried(state: FrameState) -> bool:
@@ -325,6 +347,8 @@ class Uploads:
                 waits = frame.state in (FrameState.RECEIVED, FrameState.SIGNING)
                 if waits and frame.novelty is not None:
                     return None  # its condition may have to be loosened
+                if _missing_labels(frame, ready.known):
+                    return None
                 there = upload_response(connection, frame)
         except (errors.StoreError, errors.UnknownMap):
             raise
@@ -405,6 +429,7 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
         return UploadResult(None, error=error)
     if frame is not None and not is_retried(frame.state):
         loosen(connection, frame.number, upload.if_novel)
+        frame = write_frame(connection, row, frame, _missing_labels(frame, ready.known))
         left.append(ready.blob)
         return UploadResult(upload_response(connection, frame))
     new = frame is None or frame.state == FrameState.REDUNDANT
@@ -421,7 +446,8 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
         frame = add_frame(connection, row.number, values, upload.frame_id)
     else:  # it was given up, and somebody asks for another try
         left.append(frame.blob)  # it was packed otherwise
-        frame = renew_frame(connection, frame.number, of_blob)
+        labels = _missing_labels(frame, ready.known)
+        frame = renew_frame(connection, frame.number, {**of_blob, **labels})
     job = enqueue(connection, "sign", frame.number, upload.priority)
     record_event(connection, "frame.received", row.name, frame.id, job.id)
     added = Added(frame_id=frame.id, job_id=job.id, state=frame.state, reason=None)

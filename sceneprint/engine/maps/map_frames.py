@@ -8,10 +8,11 @@ from __future__ import annotations
 import base64
 import io
 import json
+import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -27,7 +28,15 @@ from sceneprint.geometry.pose.rigid import moved
 from sceneprint.previews import depth_view, normals_view, onto, patches_view, picture, vista_of
 from sceneprint.signing import hierarchy_of, see
 from sceneprint.store import Store, frame_queries
-from sceneprint.store.frame_queries import Held, count_run, indexed_by_time, list_runs, poses_of_run
+from sceneprint.store.frame_queries import (
+    Held,
+    TakenPosition,
+    count_run,
+    indexed_by_time,
+    list_runs,
+    poses_of_run,
+    stamps_of_run,
+)
 from sceneprint.store.frames import count_states, find_frame
 from sceneprint.store.maps import find_map, model_names
 from sceneprint.store.opaque_ids import invalid_cursor
@@ -35,6 +44,7 @@ from sceneprint.store.signatures import geometry_blobs, patch_counts, stored_vec
 from sceneprint.store.tables import FrameRow, MapRow
 from sceneprint.types import Geometry, Hierarchy, Intrinsics, Ints32, Patches, Surface
 from sceneprint_client.api import Frame, FrameState, Page
+from sceneprint_client.api.frames import MOST_SEQUENCE
 from sceneprint_client.api.listing import FrameListing, Run, Session, Trajectory
 from sceneprint_client.api.maps import By, Grown, Growth
 from sceneprint_client.api.results import CloudFrame, FramePatches, FrameSignature, PatchLevel, View
@@ -135,20 +145,52 @@ _MOST_PARENTS = 20
 def list_frames(
     store: Store, map_name: str, wanted: FrameListing, cursor: str | None, limit: int
 ) -> Page[Frame]:
-    """Frames of a map in the order they came, or the newest first.
+    """Frames of a map in the order they came, the newest first, or in the order they were taken.
 
     Raises
     ------
     UnknownMap : no such map.
     InvalidRequest : a cursor that was not given out.
     """
-    beyond = store.seals.row("frame", cursor)
+    beyond = _position_of(store, cursor, wanted)
     with store.database.read() as connection:
         row = find_map(connection, map_name)
         found = frame_queries.list_frames(connection, row.number, beyond, limit + 1, wanted)
         items = frame_records(connection, row, found[:limit])
-    more = store.seals.next_cursor("frame", [one.number for one in found], limit)
+    more = _position_cursor(store, found[limit - 1], wanted) if len(found) > limit else None
     return Page[Frame](items=items, next_cursor=more)
+
+
+def _position_cursor(store: Store, last: FrameRow, wanted: FrameListing) -> str:
+    """The cursor of the page after a frame; where it was taken is in it, as it may be deleted."""
+    sealed = store.seals.seal("frame", last.number)
+    if wanted.order != "taken":
+        return sealed
+    return f"{sealed}~{_packed([last.captured_at, last.sequence])}"
+
+
+def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> TakenPosition | None:
+    """The frame that a page before ended with; InvalidRequest for a cursor that no page of such a
+    list gave out.
+    """
+    if cursor is None:
+        return None
+    if wanted.order != "taken":
+        number = store.seals.row("frame", cursor)
+        return None if number is None else TakenPosition(number, None, None)
+    sealed, _, told = cursor.partition("~")
+    number = store.seals.row("frame", sealed)
+    try:
+        at, sequence = _unpacked(told)
+        is_time = at is None or (isinstance(at, float) and math.isfinite(at))
+        is_place = sequence is None or (
+            isinstance(sequence, int) and 0 <= sequence <= MOST_SEQUENCE
+        )
+    except (ValueError, TypeError, RecursionError):  # whatever somebody may think up
+        is_time = is_place = False
+    if number is None or not (is_time and is_place):
+        raise invalid_cursor(cursor)
+    return TakenPosition(number, at, sequence)
 
 
 def list_sessions(store: Store, map_name: str, cursor: str | None, limit: int) -> Page[Session]:
@@ -169,7 +211,7 @@ def list_sessions(store: Store, map_name: str, cursor: str | None, limit: int) -
 
 
 def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
-    """The poses of one run in the order of time; of frames of one time the first that came.
+    """The poses of one run in the order of their stamps; of one stamp the first that was taken.
 
     Raises
     ------
@@ -192,7 +234,11 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
                 (("session", "too long for one answer"),),
             )
         only = run.model_copy(update={"robot": robot, "parent_frame": parent})
-        kept, posed = ([], 0) if parent is None else poses_of_run(connection, row.number, only)
+        stamps = None if parent is None else stamps_of_run(connection, row.number, only)
+        kept: list[tuple[str, float, list[list[float]]]] = []
+        posed = 0
+        if stamps is not None:
+            kept, posed = poses_of_run(connection, row.number, only, stamps)
     return Trajectory(
         map=row.name,
         session=run.session,
@@ -202,7 +248,32 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
         poses=[trajectory_row(at, np.array(pose)) for _, at, pose in kept],
         posed=posed,
         left_out=total - len(kept),
+        stamps=stamps if kept else None,
+        reason=None if kept else _why_empty(only, total, posed=bool(parents)),
     )
+
+
+def _why_empty(run: Run, total: int, *, posed: bool) -> str:
+    """Why a trajectory has no pose."""
+    if not total:
+        part = run.captured_after is not None or run.captured_before is not None
+        return f"the map has no frame of session {run.session!r:.140}{' in that time' * part}"
+    if not posed:
+        return f"none of its {total} frames has a pose; send `pose` with uploads, or edit them"
+    where = "" if run.parent_frame is None else f" in {run.parent_frame!r:.140}"
+    lacking = {
+        "taken": " with `captured_at` or `sequence`; `clock=received` orders them as they came",
+        "captured": " with `captured_at`", "sequence": " with `sequence`", "received": "",
+    }[run.clock]  # fmt: skip
+    return f"none of its {total} frames has a pose{where}{lacking}"
+
+
+#: What the stamps of a file are, for people.
+_STAMPS = {
+    "captured": "captured_at, seconds since 1970",
+    "received": "when it was received, seconds since 1970",
+    "sequence": "sequence, place within the session",
+}
 
 
 def trajectory_file(told: Trajectory) -> str:
@@ -215,6 +286,7 @@ def trajectory_file(told: Trajectory) -> str:
         f"map {told.map}, session {told.session}{robot}",
         f"poses of the sensors' frames in {told.parent_frame or 'no frame'}, metres",
         f"poses: {told_of}; frames left out: {told.left_out}",
+        f"empty: {told.reason}" if told.stamps is None else f"t: {_STAMPS[told.stamps]}",
         "t tx ty tz qx qy qz qw",
     ]
     return trajectory_text(told.poses, comments)
@@ -248,20 +320,26 @@ def _session(run: Held) -> Session:
 
 
 def _cursor(run: Held) -> str:
-    names = json.dumps([run.session or "", run.robot or ""])
-    return base64.urlsafe_b64encode(names.encode()).decode().rstrip("=")
+    return _packed([run.session or "", run.robot or ""])
 
 
 def _names_of(cursor: str) -> tuple[str, str]:
     try:
-        names = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
-        session, robot = names
+        session, robot = _unpacked(cursor)
         if isinstance(session, str) and isinstance(robot, str):
             f"{session}{robot}".encode()  # half of a pair of surrogates is no text
             return session, robot
     except (ValueError, TypeError, RecursionError):  # whatever else somebody may think up
         pass
     raise invalid_cursor(cursor)
+
+
+def _packed(values: list[Any]) -> str:
+    return base64.urlsafe_b64encode(json.dumps(values).encode()).decode().rstrip("=")
+
+
+def _unpacked(text: str) -> Any:
+    return json.loads(base64.urlsafe_b64decode(text + "=" * (-len(text) % 4)))
 
 
 # How a map grew: frames by the hour or the day in which they were indexed.

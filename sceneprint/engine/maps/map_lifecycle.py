@@ -69,6 +69,8 @@ _COLUMNS = {
     "pose": ("pose_parent", "pose"),
     "T_base_sensor": ("base_frame", "base"),
     "up": ("up",),
+    "name": ("name",),
+    "sequence": ("sequence",),
 }
 _CONTENT = (
     "intrinsics", "depth_scale", "depth_along_ray", "viewpoint", "units_per_metre", "format",
@@ -165,6 +167,8 @@ def _merged(frame: FrameRow, patch: Mapping[str, Any]) -> FrameMeta:
         "pose": _relative_transform(frame.pose, "parent_frame", frame.pose_parent),
         "T_base_sensor": _relative_transform(frame.base, "base_frame", frame.base_frame),
         "up": frame.up,
+        "name": frame.name,
+        "sequence": frame.sequence,
     }
     for field, given in patch.items():
         is_transform = field in ("pose", "T_base_sensor") and isinstance(given, Mapping)

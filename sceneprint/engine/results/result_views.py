@@ -285,6 +285,7 @@ class Inspection:
             query_id=query_id,
             model=kept.answer.model,
             frames=[FrameName(map=names[rows[n].map_number], frame_id=rows[n].id) for n in there],
+            names=[rows[n].name for n in there],
             similarity=shares.round(4).tolist(),
         )
 
@@ -315,6 +316,8 @@ class Inspection:
             query_id=query_id,
             frame_id=match.frame_id,
             map=match.map,
+            name=match.name,
+            sequence=match.sequence,
             validation=validation_record(v),
             transform=None if T is None else transform(T, *names),
             uncertainty=uncertainty_record(v.covariance, PAIR_METHOD, p.covariance),
@@ -365,6 +368,8 @@ class Inspection:
             f"query {query_id} and frame {pair.match.frame_id} of map {pair.match.map}, metres",
             f"transform {by}, colours by {colour}", f"model {pair.kept.answer.model}",
         ]  # fmt: skip
+        if pair.match.name is not None:
+            comments.append(f"name of the frame: {pair.match.name}")
         return write_ply(points, normals, colours, comments=comments)
 
 

@@ -94,6 +94,7 @@ def _each(
         yield Explanation(
             frame_id=found.rows[number].id,
             map=found.maps[found.rows[number].map_number],
+            name=found.rows[number].name,
             rank=position + 1,
             distance=int(found.ranking.distances[position]),
             similarity=float(found.ranking.similarities[position]),
@@ -153,9 +154,9 @@ def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
     name = part.place.row.name
     if absent is not None:
         return ExplainedFrame(
-            frame_id=row.id, map=name, state=row.state, passes_filter=None, distance=None,
-            similarity=None, rank=None, of=None, shortlisted=None, ranked=None, selected=None,
-            validation=None, transform=None, lost_at=absent[0], reason=absent[1],
+            frame_id=row.id, map=name, name=row.name, state=row.state, passes_filter=None,
+            distance=None, similarity=None, rank=None, of=None, shortlisted=None, ranked=None,
+            selected=None, validation=None, transform=None, lost_at=absent[0], reason=absent[1],
         )  # fmt: skip
     view, number = part.place.view, np.array([row.number], np.int64)
     stored = view.signatures(number)
@@ -179,6 +180,7 @@ def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
     return ExplainedFrame(
         frame_id=row.id,
         map=name,
+        name=row.name,
         state=row.state,
         passes_filter=passes,
         distance=int(distance[0]),

@@ -155,6 +155,8 @@ def _match(
         map=found.maps[row.map_number],
         robot=row.robot,
         session=row.session,
+        name=row.name,
+        sequence=row.sequence,
         rank=position + 1,
         distance=int(found.ranking.distances[position]),
         similarity=float(found.ranking.similarities[position]),

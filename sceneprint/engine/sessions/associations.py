@@ -339,7 +339,7 @@ def _edge(item: dict[str, Any], stops: dict[int, PathFrame]) -> Edge:
         from_pose=_pose(here), to_pose=_pose(there),
         number=item["number"], from_frame=here.id, to_frame=there.id,
         from_session=here.session, to_session=there.session,
-        from_robot=here.robot, to_robot=there.robot,
+        from_robot=here.robot, to_robot=there.robot, from_name=here.name, to_name=there.name,
         transform=transform(
             T, sensor_frame(there.id, there.kind), sensor_frame(here.id, here.kind)
         ),
@@ -490,7 +490,7 @@ def _spread(
 def graph_text(graph: PoseGraph, kind: GraphFormat) -> str:
     """A graph as a file.
 
-    A trajectory has the vertices with a time whose poses are in the frame of most. In g2o, where
+    A trajectory has the vertices with a stamp whose poses are in the frame of most. In g2o, where
     every vertex has a pose, one without stands at the origin.
     """
     if kind == "json":
@@ -507,24 +507,40 @@ def _main(graph: PoseGraph) -> str | None:
 
 
 def _tum(graph: PoseGraph) -> str:
-    main, rows = _main(graph), []
-    for stop, pose, frame in zip(graph.stops, graph.poses, graph.frames, strict=True):
-        if stop.captured_at is not None and pose is not None and frame == main:
-            rows.append(trajectory_row(stop.captured_at, pose))
+    main, stamps, stamped = _main(graph), *_stamps(graph)
+    rows = [
+        trajectory_row(stamp, pose)
+        for stamp, pose, frame in zip(stamps, graph.poses, graph.frames, strict=True)
+        if stamp is not None and pose is not None and frame == main
+    ]
     comments = [
         f"poses of the sensors' frames in {main or 'no frame'}, metres",
         f"{len(rows)} poses; {len(graph.stops) - len(rows)} frames left out, as they have no "
-        "time or are not joined to it",
+        "stamp or are not joined to it",
+        f"t: {stamped}" if rows else "empty: no frame with a stamp has a pose",
         "t tx ty tz qx qy qz qw",
     ]
     return trajectory_text(sorted(rows), comments)
+
+
+def _stamps(graph: PoseGraph) -> tuple[Sequence[float | None], str]:
+    """A stamp for each vertex, and what it is: its time; its place in the session where none has a
+    time and all have places of their own; else its number.
+    """
+    times = [stop.captured_at for stop in graph.stops]
+    if any(at is not None for at in times):
+        return times, "captured_at, seconds since 1970"
+    places = [stop.sequence for stop in graph.stops]
+    if None not in places and len(set(places)) == len(places):
+        return places, "sequence, place within the session"
+    return range(len(places)), "number of the vertex, as in g2o"
 
 
 def _json(graph: PoseGraph) -> Graph:
     vertices = [
         Vertex(
             vertex=i, frame_id=stop.id, robot=stop.robot, session=stop.session,
-            captured_at=when(stop.captured_at),
+            captured_at=when(stop.captured_at), name=stop.name, sequence=stop.sequence,
             pose=(
                 None if pose is None
                 else transform(pose, frame or "", sensor_frame(stop.id, stop.kind))

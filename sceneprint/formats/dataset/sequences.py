@@ -9,6 +9,7 @@ import math
 import os
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,7 @@ from sceneprint.formats.dataset.frame_reference import (
 )
 from sceneprint_client.file_formats import is_cloud
 from sceneprint_client.files import data_lines, read_text
-from sceneprint_client.frame_files import SEVEN_SCENES, find_frame_file
+from sceneprint_client.frame_files import SEVEN_SCENES, find_frame_file, seven_scenes_number
 from sceneprint_client.sidecars import CLOUDS_FILE, find_camera, find_cloud_source
 
 if TYPE_CHECKING:
@@ -122,7 +123,19 @@ def references(
                 f"{first[frame.name].name}. Rename or remove one of them."
             )
         first[frame.name] = frame.path
-    return frames
+    return tuple(_numbered(folder, frame, i) for i, frame in enumerate(frames))
+
+
+def _numbered(folder: Path, frame: FrameReference, place: int) -> FrameReference:
+    """A frame with its name within the folder and its number: its own where files are numbered, so
+    that a part of a folder has the numbers of the whole, else its place.
+    """
+    number = seven_scenes_number(frame.path.name)
+    return replace(
+        frame,
+        original=frame.path.relative_to(folder).as_posix(),
+        sequence=place if number is None else number,
+    )
 
 
 def _seven_scenes(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:

@@ -404,7 +404,14 @@ def _reference(
         CloudSource(up=direction) if camera is None else None,
         source=BagSource(bag, frames.topic, *scan.places[place]),
         base=base,
+        original=f"{frames.topic.name}/{_seconds(scan.stamps_ns[place])}",
+        sequence=place,
     )
+
+
+def _seconds(stamp_ns: int) -> str:
+    """A stamp in seconds, to the nanosecond, which no float holds."""
+    return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
 
 
 def _camera(bag: Bag, frames: FrameTopic, topic: BagTopic | None, scan: BagScan) -> Camera:

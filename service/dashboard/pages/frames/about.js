@@ -16,6 +16,8 @@ export function about(frame, job, { edit }) {
     ["Robot", frame.robot], ["Session", frame.session],
     ["Tags", frame.tags.length ? h("span", { class: "chips" }, frame.tags.map((one) => h("span", { class: "chip" }, one))) : null],
     ["Taken", frame.captured_at && exact(frame.captured_at)],
+    ["Name", frame.name && mono(frame.name)],
+    ["Place in session", frame.sequence === null ? null : count(frame.sequence)],
   ];
   return [
     card("State", null, list([

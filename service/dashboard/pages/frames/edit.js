@@ -3,10 +3,10 @@ import { at, get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { sheet, toast } from "../lib/states.js";
 
-const NAMES = { robot: "Robot", session: "Session", tags: "Tags" };
+const NAMES = { robot: "Robot", session: "Session", name: "File name", tags: "Tags" };
 
 /**
- * A dialog for robot, session and tags.
+ * A dialog for robot, session, file name and tags.
  * @param {Object<string, any>} frame as it was read
  * @param {(frame: Object<string, any>) => void} edited
  */
@@ -21,7 +21,7 @@ export function editFrame(frame, edited) {
   const save = h("button", { class: "button primary", type: "submit" }, "Save");
   const dialog = sheet({
     title: "Edit the frame",
-    children: [field("robot", "none"), field("session", "none"), field("tags", "comma-separated"), said],
+    children: [field("robot", "none"), field("session", "none"), field("name", "none"), field("tags", "comma-separated"), said],
     buttons: [save],
   });
   let base = frame;

@@ -1,7 +1,7 @@
 // One frame: what it looks like, what is known of it, which frames are near.
 import { at, bytes, get, save, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { shortId } from "../lib/format.js";
+import { frameLabel, shortId } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { confirm, toast } from "../lib/states.js";
@@ -26,7 +26,7 @@ export async function render(root, { params, search, signal, go, title, actions 
   const main = h("div", { class: "frame-main" });
   /** @type {string | null} */
   let drawn = null; // the state that the main part shows
-  title(`Frame ${shortId(frame.frame_id)}`);
+  title(`Frame ${frameLabel(frame)}`);
   put(root, h("div", { class: "frame-page" }, main, side));
 
   async function draw() {

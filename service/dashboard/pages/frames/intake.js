@@ -103,6 +103,30 @@ function nearest(beside, { path, source }) {
   return {};
 }
 
+const MOST_OF_NAME = 255;
+const SEVEN_SCENES = /^frame-(\d{1,15})\.depth\.png$/;
+
+/**
+ * What files are called, and their places in their sessions: the number of the file where the layout has
+ * one, else its place among those of its folder; a file alone has none.
+ * @param {{path: string, file: File}[]} found in their order
+ * @returns {{name: string, sequence?: number}[]}
+ */
+export function labelsOf(found) {
+  const counts = new Map(), places = new Map();
+  for (const { path } of found) counts.set(folderOf(path), (counts.get(folderOf(path)) ?? 0) + 1);
+  return found.map(({ path, file }) => {
+    const folder = folderOf(path), place = places.get(folder) ?? 0;
+    places.set(folder, place + 1);
+    // as the service takes it: whatever a file is called, its frame is sent
+    // eslint-disable-next-line no-control-regex
+    const name = file.name.replace(/[\u0000-\u001f\u007f\\/\p{Cs}]/gu, "_").slice(-MOST_OF_NAME);
+    const number = SEVEN_SCENES.exec(file.name);
+    if (number) return { name, sequence: Number(number[1]) };
+    return counts.get(folder) > 1 ? { name, sequence: place } : { name };
+  });
+}
+
 /** The folders of a path. @param {string} path */
 export function folderOf(path) {
   return path.includes("/") ? path.slice(0, path.lastIndexOf("/")) : "";

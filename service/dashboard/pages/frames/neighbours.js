@@ -1,7 +1,7 @@
 // The frames nearest to one, by signature alone: what a query would begin with.
 import { at, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { count, percent, shortId } from "../lib/format.js";
+import { count, frameLabel, frameTitle, percent } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { failed, loading } from "../lib/states.js";
 import { preview, who } from "./tile.js";
@@ -38,10 +38,10 @@ export function neighbours(frame, signal) {
 }
 
 function tileOf(match, signal) {
-  const told = { frame_id: match.frame_id, map: match.map, state: "indexed" };
+  const told = { frame_id: match.frame_id, name: match.name, map: match.map, state: "indexed" };
   return h("li", { class: "tile", dataset: { frame: match.frame_id } }, h("div", { class: "tile-top" }, preview(told, { width: 192, signal })),
     h("div", { class: "tile-words" },
-      h("div", { class: "tile-name" }, h("a", { class: "mono", href: link("maps", match.map, "frames", match.frame_id), title: match.frame_id }, shortId(match.frame_id)),
+      h("div", { class: "tile-name" }, h("a", { class: "mono", href: link("maps", match.map, "frames", match.frame_id), title: frameTitle(match) }, frameLabel(match)),
         h("strong", { class: "number" }, percent(match.similarity))),
       h("div", { class: "tile-who" }, who(match)),
       h("div", { class: "tile-when muted number" }, `distance ${count(match.distance)}`)));

@@ -2,7 +2,7 @@
 // the page that shows it, so that one may look around while it works.
 import { at, get, send } from "../lib/api.js";
 import { isPending } from "./badge.js";
-import { namesOf } from "./intake.js";
+import { folderOf, labelsOf, namesOf } from "./intake.js";
 import { poseOf, stemOf } from "./kinds.js";
 import { formOf, settings } from "./source.js";
 
@@ -13,7 +13,7 @@ const REST_S = 5;
 // what would be said of all that follow as well
 const ENDS_ALL = new Set([401, 403, 404, 507]);
 
-/** @typedef {import("./intake.js").Found & {id: number, state: string, share: number,
+/** @typedef {import("./intake.js").Found & {id: number, state: string, share: number, label: {name: string, sequence?: number},
  *   frame_id: string | null, job: Object<string, any> | null, reason: string | null, problem: Error | null,
  *   isThere: boolean, tries: number, until: number, stop: AbortController | null}} Item
  *   state: ready, waiting, sending, sent, importing, imported, refused, cancelled, or a frame's */
@@ -37,6 +37,7 @@ export class Queue {
     this.map = map;
     this.items = [];
     this.given = settings();
+    this.folders = new Set(); // that files came from
     this.byFrame = new Map(); // the items of each: the same file may have been given twice
     this.running = false;
     this.stopped = null; // the Problem that ended all
@@ -46,8 +47,10 @@ export class Queue {
 
   /** @param {import("./intake.js").Found[]} found */
   add(found) {
-    for (const one of found) {
-      this.items.push({ ...one, id: numbers += 1, state: "ready", share: 0, frame_id: null, job: null,
+    const labels = labelsOf(found);
+    for (const one of found) this.folders.add(folderOf(one.path));
+    for (const [i, one] of found.entries()) {
+      this.items.push({ ...one, label: labels[i], id: numbers += 1, state: "ready", share: 0, frame_id: null, job: null,
         reason: null, problem: null, isThere: false, tries: 0, until: 0, stop: null });
     }
     this.tell(null);
@@ -137,13 +140,18 @@ export class Queue {
     // the service would speak of the size of an image that this is not
     if (item.source.kind === "depth" && !item.source.format) throw new Error("It is named like an image, but it is neither a PNG nor an NPY file.");
     const pose = item.pose ? await poseOf(item.pose) : null;
-    const form = await formOf(item.file, this.saidOf(item), { source: item.source, pose });
+    const form = await formOf(item.file, this.saidOf(item), { source: item.source, pose, label: this.labelOf(item) });
     const answer = await send("POST", at("maps", this.map, "frames"), {
       form, signal: item.stop.signal, onprogress: (share) => this.change(item, { share }),
     });
     const { frame_id, job_id, state, reason } = answer.data;
     this.byFrame.set(frame_id, [...(this.byFrame.get(frame_id) ?? []).filter((one) => one !== item), item]);
     this.change(item, { frame_id, job: { job_id }, state, reason, share: 1, isThere: answer.status === 200 });
+  }
+
+  /** What a file is called, and its place: folders that go into one session follow each other there. */
+  labelOf({ label, id }) {
+    return this.given.session.trim() && this.folders.size > 1 ? { ...label, sequence: id } : label;
   }
 
   /** Settings of the form, with what lay beside a file in place of theirs. */

@@ -40,10 +40,11 @@ export function remember(given) {
  * @param {Object<string, any>} given settings, with what intrinsics.json or clouds.json say in place of theirs
  * @param {import("./kinds.js").Source} source of the file
  * @param {number[][] | null} [pose] T_parent_sensor
+ * @param {{name?: string, sequence?: number}} [label] what the file is called, and its place in the session
  * @returns {Object<string, any>}
  */
-export function metaOf(given, source, pose = null) {
-  const meta = {};
+export function metaOf(given, source, pose = null, label = {}) {
+  const meta = /** @type {Object<string, any>} */ ({ ...label });
   for (const name of ["robot", "session"]) if (said(given[name])) meta[name] = given[name].trim();
   const tags = listOf(given.tags);
   if (tags.length) meta.tags = tags;
@@ -91,12 +92,13 @@ function ofCloud(given, source) {
  * The form that uploads and queries send: parts `frame` and `meta`.
  * @param {File} file
  * @param {Object<string, any>} given as of `metaOf`
- * @param {{source?: import("./kinds.js").Source, pose?: number[][] | null}} [more]
+ * @param {{source?: import("./kinds.js").Source, pose?: number[][] | null,
+ *   label?: {name?: string, sequence?: number}}} [more] see metaOf
  * @returns {Promise<FormData>}
  */
-export async function formOf(file, given, { source, pose = null } = {}) {
+export async function formOf(file, given, { source, pose = null, label } = {}) {
   const form = new FormData();
-  form.append("meta", JSON.stringify(metaOf(given, source ?? await kindOf(file), pose)));
+  form.append("meta", JSON.stringify(metaOf(given, source ?? await kindOf(file), pose, label)));
   form.append("frame", file, file.name);
   return form;
 }

@@ -1,7 +1,7 @@
 // A frame of the gallery: its picture, or in its place why there is none, and whose it is.
 import { at } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { shortId, time } from "../lib/format.js";
+import { frameLabel, frameTitle, time } from "../lib/format.js";
 import { picture } from "../lib/picture.js";
 import { link } from "../lib/router.js";
 import { badge, isPending, sentence } from "./badge.js";
@@ -20,7 +20,7 @@ const VIEW = { depth: "Depth", normals: "Normals", patches: "Patches" };
 export function preview(frame, { view = "depth", width = PREVIEW, signal }) {
   if (frame.state === "indexed") {
     const path = `${at("maps", frame.map, "frames", frame.frame_id)}/preview.png`;
-    const alt = `${VIEW[view]} of frame ${shortId(frame.frame_id)}`;
+    const alt = `${VIEW[view]} of frame ${frameLabel(frame)}`;
     const shown = picture(path, { view, width }, { alt, width, height: 0.75 * width, signal });
     return h("div", { class: "frame-picture" }, shown);
   }
@@ -49,7 +49,7 @@ export function tile(frame, { view, signal }) {
     const href = link("maps", given.map, "frames", given.frame_id, wanted === "depth" ? {} : { view: wanted });
     put(words,
       h("div", { class: "tile-name" },
-        h("a", { href, class: "mono", title: given.frame_id }, shortId(given.frame_id)), badge(given.state)),
+        h("a", { href, class: "mono", title: frameTitle(given) }, frameLabel(given)), badge(given.state)),
       h("div", { class: "tile-who" }, who(given)),
       h("div", { class: "tile-when muted" }, when(given), given.kind === "cloud" && " · cloud"));
   }

@@ -82,6 +82,22 @@ export function shortId(id) {
   return id.length > 12 && /^[0-9a-f-]+$/.test(id) ? id.slice(0, 8) : id;
 }
 
+/** Ends of names that say how files are packed, and nothing of a frame. */
+const PACKED = /(\.depth)?\.(png|npy|ply|pcd|bin|las|laz)$/i;
+
+/**
+ * What people call a frame: the last part of the name of its file without its type, or the beginning of its id.
+ * @param {Object<string, any>} frame
+ */
+export function frameLabel({ frame_id: id, name }) {
+  return (name && name.slice(name.lastIndexOf("/") + 1).replace(PACKED, "")) || shortId(id);
+}
+
+/** All of a frame's name and id, for a title. @param {Object<string, any>} frame */
+export function frameTitle({ frame_id: id, name }) {
+  return name ? `${name}, frame ${id}` : id;
+}
+
 function span(s) {
   if (s < 10) return null;
   if (s < 59.5) return `${Math.round(s)} s`;

@@ -1,6 +1,6 @@
 // Beside the view: the verdict, what it was reached from, and how far it can be trusted.
 import { h } from "../lib/dom.js";
-import { count, degrees, metres, percent, shortId } from "../lib/format.js";
+import { count, degrees, frameLabel, metres, percent, shortId } from "../lib/format.js";
 import { coded, sentence } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { voteOf } from "../query/alternatives.js";
@@ -133,6 +133,6 @@ export function framesCard(answer, details, frame, query) {
   return card("Frames", h("ul", { class: "overlay-who" },
     row("query", asked ? shortId(asked.frame_id) : "an upload, not stored in a map",
       asked && link("maps", asked.map, "frames", asked.frame_id), asked && [`map ${asked.map}`, told(query)].filter(Boolean).join(", ")),
-    row("match", shortId(details.frame_id), link("maps", details.map, "frames", details.frame_id),
+    row("match", frameLabel(details), link("maps", details.map, "frames", details.frame_id),
       [`map ${details.map}`, told(frame)].filter(Boolean).join(", "))));
 }

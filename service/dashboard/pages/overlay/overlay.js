@@ -2,7 +2,7 @@
 // it: the service validates the match meanwhile, which takes longest.
 import { at, bytes, get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { shortId } from "../lib/format.js";
+import { frameLabel, shortId } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { empty } from "../lib/states.js";
 import { parsePoints } from "../viewer/points.js";
@@ -49,6 +49,7 @@ export async function render(root, context) {
     put(root, why);
     return;
   }
+  title(`Overlay of ${frameLabel(told.details)}`);
   if (!signal.aborted) told.show(root, context, { ...told, query, match, map, load });
 }
 

@@ -50,7 +50,7 @@ export function chooser({ map, signal, onchoose, onapproach }) {
       h("div", { class: "paths-told" },
         h("a", { class: "mono", href: link("maps", map, "frames", id), title: id }, shortId(id)),
         h("span", {}, path.session, path.robot !== null && path.robot !== path.session && h("span", { class: "muted" }, ` ${path.robot}`)),
-        h("span", { class: "muted" }, path.byTime ? "Taken " : "Received ", time(new Date(1000 * path.times[one.place]).toISOString())),
+        h("span", { class: "muted" }, whenOf(path, one.place)),
         h("span", { class: "muted number" }, `${[x, y, z].map((v) => v.toFixed(2)).join(", ")} m in ${path.parent}`),
         h("div", { class: "toolbar" },
           h("button", { class: "button", type: "button", onClick: onapproach }, "Go to it"),
@@ -79,4 +79,10 @@ export function wayOf(poses) {
     sum += Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
   }
   return metres(sum);
+}
+
+/** When a frame of a path was taken or came, or its place in the session. @param {import("./data.js").Path} path @param {number} i */
+function whenOf({ stamps, times }, i) {
+  if (stamps === "sequence") return `Number ${times[i]} of the session`;
+  return [stamps === "captured" ? "Taken " : "Received ", time(new Date(1000 * times[i]).toISOString())];
 }

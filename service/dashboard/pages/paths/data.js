@@ -11,11 +11,11 @@ export const MOST_EDGES = 2000;
 
 /**
  * @typedef {{session: string, robot: string | null, parent: string, number: number, frames: number,
- *   timed: boolean, last: string | null}} Run
- *   frames: of the session, with those that have no pose; timed: whether they say when they were taken
+ *   last: string | null}} Run
+ *   frames: of the session, with those that have no pose
  * @typedef {Run & {ids: string[], times: number[], poses: number[][], posed: number, leftOut: number,
- *   camera: Object<string, number> | null, isCloud: boolean, byTime: boolean}} Path
- *   poses: T_parent_sensor, 16 column-major
+ *   camera: Object<string, number> | null, isCloud: boolean, stamps: "captured" | "sequence" | "received" | null}} Path
+ *   poses: T_parent_sensor, 16 column-major; times: seconds, or places in the session where stamps are `sequence`
  */
 
 /**
@@ -41,7 +41,7 @@ export function runsOf(sessions) {
       for (const parent of one.parent_frames) {
         runs.push({
           session: one.session, robot: one.robot, parent, frames, number: runs.length,
-          timed: one.first_captured_at !== null, last: one.last_captured_at,
+          last: one.last_captured_at,
         });
       }
     }
@@ -64,17 +64,18 @@ export async function sessionsOf(map, signal) {
 export async function pathOf(map, run, share, signal) {
   const { session, robot, parent } = run;
   const most = Math.max(Math.min(Math.floor(POSES / share), MOST_POSES), 50);
-  const params = { session, robot, parent_frame: parent, most, clock: run.timed ? "captured" : "received" };
+  const params = { session, robot, parent_frame: parent, most };
   const sample = { session, robot: robot ?? [], parent_frame: parent, has_pose: true, limit: 1 };
+  const trajectory = async (clock) => get(at("maps", map, "trajectory"), { params: { ...params, clock }, signal });
   const [told, frames] = await Promise.all([
-    get(at("maps", map, "trajectory"), { params, signal }),
+    trajectory("taken").then((found) => (found.stamps === null ? trajectory("received") : found)),
     get(at("maps", map, "frames"), { params: sample, signal }),
   ]);
   const first = frames.items[0];
   return {
     ...run, ids: told.frame_ids, times: told.poses.map((row) => row[0]), posed: told.posed,
     poses: told.poses.map(([, x, y, z, ...q]) => ofQuaternion(q, [x, y, z])),
-    leftOut: told.left_out, byTime: run.timed,
+    leftOut: told.left_out, stamps: told.stamps,
     camera: first?.intrinsics ?? null, isCloud: first?.kind === "cloud",
   };
 }

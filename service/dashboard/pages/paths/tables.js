@@ -15,7 +15,7 @@ export function runsTable(paths, parent) {
     h("td", { class: "number" }, count(one.posed)), h("td", { class: "number" }, count(one.ids.length)),
     h("td", { class: "number" }, count(one.leftOut - (one.posed - one.ids.length))),
     h("td", { class: "number" }, wayOf(one.poses)),
-    h("td", {}, one.byTime ? time(iso(one.times[0])) : "–")));
+    h("td", {}, one.stamps === "captured" ? time(iso(one.times[0])) : "–")));
   return h("div", { class: "paths-scroll", tabindex: "0", role: "region", "aria-label": "Runs shown" }, h("table", { class: "table" },
     h("caption", { class: "visually-hidden" }, "Runs shown"),
     h("thead", {}, h("tr", {}, [["No.", 1], ["Run"], ["Robot"], ["Parent frame"], ["Joined by"], ["Poses", 1], ["Drawn", 1], ["Without", 1], ["Path length", 1], ["Started"]]

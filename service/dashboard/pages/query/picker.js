@@ -1,7 +1,7 @@
 // A small gallery of a map's frames to pick one from, on the page or in a dialog.
 import { at, get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { shortId } from "../lib/format.js";
+import { frameLabel, frameTitle } from "../lib/format.js";
 import { failed, loading, sheet } from "../lib/states.js";
 
 const A_PAGE = 12;
@@ -35,9 +35,9 @@ export function gallery(map, { pictures, signal, onpick }) {
       next.disabled = page.next_cursor === null;
       next.value = page.next_cursor ?? "";
       put(grid, page.items.length === 0 && h("li", { class: "muted" }, "No indexed frame."), page.items.map((one) => h("li", {},
-        h("button", { type: "button", class: "query-pick", title: one.frame_id, "aria-label": `Use frame ${one.frame_id}`, onclick: () => onpick(one.frame_id) },
-          pictures.frame(map, one.frame_id, "depth", `Preview of frame ${shortId(one.frame_id)}`),
-          h("span", { class: "mono" }, shortId(one.frame_id)), h("small", { class: "muted" }, one.session ?? "")))));
+        h("button", { type: "button", class: "query-pick", title: frameTitle(one), "aria-label": `Use frame ${frameTitle(one)}`, onclick: () => onpick(one.frame_id) },
+          pictures.frame(map, one.frame_id, "depth", `Preview of frame ${frameLabel(one)}`),
+          h("span", { class: "mono" }, frameLabel(one)), h("small", { class: "muted" }, one.session ?? "")))));
     } catch (error) {
       if (own === turn && error.name !== "AbortError") put(grid, h("li", { class: "query-picker-wait" }, failed(error, load)));
     }

@@ -1,7 +1,7 @@
 // An answer as it is shown: the verdict, the rows, the funnel, the heat map, "why not?".
 import { at, get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { degrees, metres, percent, shortId } from "../lib/format.js";
+import { degrees, frameLabel, metres, percent, shortId } from "../lib/format.js";
 import { heatmap } from "../lib/heatmap.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
@@ -108,7 +108,7 @@ function fromSimilarities(answer, alike) {
   const frames = alike.frames.map((one, i) => {
     const match = known.get(keyOf(one));
     if (match) last = match.rank; else next();
-    return { ...one, rank: last, similarity: alike.similarity[0][i + 1], ...match };
+    return { ...one, name: alike.names[i], rank: last, similarity: alike.similarity[0][i + 1], ...match };
   });
   return { ranking: frames, told: frames.every((one) => one.distance !== undefined) };
 }
@@ -139,7 +139,7 @@ function heat(root, answer, { alike, ranked }, looked, signal, turn) {
     }
   }
 
-  function draw({ frames, similarity }) {
+  function draw({ frames, names, similarity }) {
     if (frames.length === 0) {
       put(body, h("p", { class: "muted" }, "No ranked frame is left to compare: the frames were deleted, or the map changed its model."));
       return;
@@ -149,7 +149,7 @@ function heat(root, answer, { alike, ranked }, looked, signal, turn) {
     const rank = (i) => ranks.get(keys[i]) ?? i + 1; // frames deleted since are left out
     shown = heatmap({
       values: similarity, signal, marked,
-      names: ["the query", ...frames.map((one, i) => `${rank(i)}: frame ${shortId(one.frame_id)}${marked.has(i + 1) ? ", selected" : ""}`)],
+      names: ["the query", ...frames.map((one, i) => `${rank(i)}: frame ${frameLabel({ ...one, name: names[i] })}${marked.has(i + 1) ? ", selected" : ""}`)],
       ticks: ["Q", ...frames.map((_, i) => String(rank(i)))],
       label: gist(similarity), format: percent, size: Math.max(240, Math.min(560, body.clientWidth)),
       onmove: (cell) => looked.point(cell === null ? null : keys[Math.max(...cell) - 1] ?? null),

@@ -1,6 +1,6 @@
 // The rows R, DR and VDR one under the other, the query at their left, as in the paper's figure.
 import { h, put } from "../lib/dom.js";
-import { count, percent, shortId } from "../lib/format.js";
+import { count, frameLabel, frameTitle, percent, shortId } from "../lib/format.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { voteOf } from "./alternatives.js";
@@ -73,16 +73,16 @@ export function rows(answer, ranked, { pictures, choice, before = null }) {
 
   function tile(one, told, row) {
     const key = keyOf(one);
-    const label = `Rank ${one.rank}, frame ${one.frame_id}${several ? ` of map ${one.map}` : ""}`;
+    const label = `Rank ${one.rank}, frame ${frameTitle(one)}${several ? ` of map ${one.map}` : ""}`;
     const status = row === "VDR" ? one.validation.status : null;
     const button = h("button", { type: "button", class: "query-pick", "aria-pressed": "false", "aria-label": `${label}: highlight it in all rows`,
       onclick: () => choice.toggle(key) },
-    pictures.frame(one.map, one.frame_id, view, `Preview of frame ${shortId(one.frame_id)}`), h("span", { class: "query-rank" }, one.rank));
+    pictures.frame(one.map, one.frame_id, view, `Preview of frame ${frameLabel(one)}`), h("span", { class: "query-rank" }, one.rank));
     const element = h("li", { class: "query-tile", dataset: { key, status },
       onmouseenter: () => choice.point(key), onmouseleave: () => choice.point(null),
       onfocusin: () => choice.point(key), onfocusout: () => choice.point(null) },
     button, h("div", { class: "query-tile-text" },
-      h("a", { class: "mono query-id", href: link("maps", one.map, "frames", one.frame_id), title: one.frame_id }, shortId(one.frame_id)),
+      h("a", { class: "mono query-id", href: link("maps", one.map, "frames", one.frame_id), title: frameTitle(one) }, frameLabel(one)),
       several && h("span", { class: "muted" }, one.map), told));
     tiles.push({ key, element, button });
     return element;

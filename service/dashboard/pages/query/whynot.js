@@ -1,6 +1,6 @@
 // "Why not this frame?": asks again with `explain_frame`, and says where the frame was lost.
 import { h, put } from "../lib/dom.js";
-import { count, percent, shortId } from "../lib/format.js";
+import { count, frameLabel, frameTitle, percent, shortId } from "../lib/format.js";
 import { sentence } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { failed, loading } from "../lib/states.js";
@@ -96,7 +96,7 @@ function explained(told, answer, change) {
   return [
     h("div", { class: "query-why-head", dataset: { lost: told.lost_at ?? "none" } },
       h("span", { class: "badge", dataset: { kind } }, title),
-      h("a", { class: "mono", href: link("maps", told.map, "frames", told.frame_id), title: told.frame_id }, shortId(told.frame_id)),
+      h("a", { class: "mono", href: link("maps", told.map, "frames", told.frame_id), title: frameTitle(told) }, frameLabel(told)),
       h("span", { class: "muted" }, `of map ${told.map}`)),
     h("p", {}, sentence(told.reason).startsWith(text.replace(/\.$/, "")) ? null : `${text} `, sentence(told.reason)),
     change && offer && h("button", { type: "button", class: "button", onclick: () => change(said) }, offer),

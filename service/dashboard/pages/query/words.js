@@ -1,5 +1,5 @@
 // What an answer says, in one line a lost person understands, and in figures.
-import { count, degrees, metres, percent, shortId } from "../lib/format.js";
+import { count, degrees, frameLabel, metres, percent, shortId } from "../lib/format.js";
 import { sentence } from "../lib/prose.js";
 
 const STATUS = {
@@ -68,7 +68,7 @@ function found({ matches, counts, location, maps }) {
   if (location === null) {
     const [best] = matches, { strength } = best.validation;
     return { kind: strength === "weak" ? "warn" : "good",
-      text: `The query shows the same place as frame ${shortId(best.frame_id)} in map ${best.map}. Its position is unknown, as no match has a pose.`,
+      text: `The query shows the same place as frame ${frameLabel(best)} in map ${best.map}. Its position is unknown, as no match has a pose.`,
       details: [`${strength ?? "strong"} match`, `${counts.accepted} of ${counts.validated} validated frames accepted`] };
   }
   const p = location.pose.translation, spread = deviation(location.uncertainty?.covariance);
@@ -84,7 +84,7 @@ function unvalidated({ matches, counts, deadline_reached: late }) {
   const [near] = matches.filter((one) => one.validation.status === "skipped").sort((a, b) => a.rank - b.rank);
   const nearest = counts.validated ? "The nearest frame that was not tried" : "The nearest frame";
   return {
-    text: near ? `${why} ${nearest} is ${shortId(near.frame_id)} of map ${near.map}, ${percent(near.similarity)} similar; it may or may not show the same place.` : why,
+    text: near ? `${why} ${nearest} is ${frameLabel(near)} of map ${near.map}, ${percent(near.similarity)} similar; it may or may not show the same place.` : why,
     next: late ? "Allow more time." : null,
   };
 }

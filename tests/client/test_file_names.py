@@ -1,0 +1,91 @@
+"""Names of files and places in sequences, as they are sent by themselves."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.formats.dataset import FrameReference
+from sceneprint_client import Client
+from sceneprint_client.api import FrameMeta
+from sceneprint_client.errors import InvalidRequest
+from sceneprint_client.frame_files import file_name, meta_of, sendable, seven_scenes_number
+
+
+@pytest.mark.parametrize(
+    ("name", "sent"),
+    [
+        ("a.png", "a.png"), ("depth/1.5.png", "depth/1.5.png"), ("/points/3.001", "points/3.001"),
+        ("../../etc/./passwd", "etc/passwd"), ("a\\b\n.png", "a_b_.png"),
+        ("é\U0001f600", "é\U0001f600"), (os.fsdecode(b"a\xff"), "a?"), ("x" * 300, "x" * 255),
+        ("x../" + "y" * 252, "y" * 252), ("/", None), ("", None),
+    ],
+)  # fmt: skip
+def test_whatever_a_file_is_called_it_can_be_sent(name: str, sent: str | None) -> None:
+    assert file_name(name) == sent
+    if sent is not None:
+        assert FrameMeta(name=sent).name == sent
+
+
+def test_the_number_of_a_file_is_its_place() -> None:
+    assert seven_scenes_number("frame-000123.depth.png") == 123
+    assert seven_scenes_number("frame-" + "9" * 16 + ".depth.png") is None
+    assert seven_scenes_number("frame-000123.png") is None
+
+
+def test_a_frame_is_sent_with_its_name_and_a_query_without(
+    references: tuple[FrameReference, ...], tmp_path: Path
+) -> None:
+    one = references[1]
+    path, depth = one.path, np.full((4, 4), 1.5, np.float32)
+    meta, camera = meta_of(one), (5.0, 5.0, 2.0, 2.0)
+    assert (meta.name, meta.sequence) == ("frame-000001.depth.png", 1)
+
+    def labels(frame: Any, known: Any = None, *, with_pose: bool = True) -> tuple[Any, Any]:
+        sent = sendable(frame, known, with_pose=with_pose)[1]
+        return sent.name, sent.sequence
+
+    for frame in (one, path, str(path)):
+        assert labels(frame) == ("frame-000001.depth.png", 1)
+        assert labels(frame, with_pose=False) == (None, None)
+        assert labels(frame, FrameMeta(intrinsics=meta.intrinsics)) == ("frame-000001.depth.png", 1)
+        own = FrameMeta(intrinsics=meta.intrinsics, name="own", sequence=9)
+        assert labels(frame, own) == ("own", 9)
+    assert labels(depth, camera) == (None, None)
+    assert labels(path.read_bytes(), meta) == (meta.name, meta.sequence)
+    alone = tmp_path / "alone.npy"
+    np.save(alone, depth)
+    assert labels(alone, meta.intrinsics) == ("alone.npy", None)
+
+
+def test_names_come_back_in_matches_and_are_searched(
+    client: Client, references: tuple[FrameReference, ...], map_name: str
+) -> None:
+    client.create_map(map_name)
+    for one in reversed(references[:3]):
+        client.upload(map_name, one, wait_s=60)
+    names = [f"frame-00000{i}.depth.png" for i in range(3)]
+    assert [one.name for one in client.frames(map_name)] == names[::-1]
+    taken = client.frames(map_name, session="seq-01", order="taken")
+    session = next(client.frames(map_name)).session
+    assert [one.sequence for one in client.frames(map_name, session=session, order="taken")] \
+        == [0, 1, 2]  # fmt: skip
+    assert [one.name for one in client.frames(map_name, name="frame-000001")] == names[1:2]
+    assert [one.name for one in client.frames(map_name, name="frame-", order="desc")] == names
+    assert list(client.frames(map_name, name="000001")) == []  # the beginning alone
+    assert list(taken) == []
+    with pytest.raises(InvalidRequest, match="`taken` is the order of one session"):
+        client.frames(map_name, order="taken")
+    answer = client.query(map_name, references[1], explain=True)
+    first = next(one for one in answer.matches if one.rank == 1)
+    assert (first.name, first.sequence) == (names[1], 1)
+    assert answer.explanations is not None
+    assert {one.name for one in answer.explanations} == set(names)
+    details = client.match_details(answer.query_id, first.frame_id)
+    assert (details.name, details.sequence) == (names[1], 1)
+    path = client.trajectory(map_name, str(session))
+    assert (path.stamps, [row[0] for row in path.poses]) == ("sequence", [0.0, 1.0, 2.0])
