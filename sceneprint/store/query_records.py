@@ -205,7 +205,7 @@ def names_of(
         select(maps.c.number, maps.c.name).where(maps.c.number.in_(numbers))
     )
     of_keys = connection.execute(select(keys.c.id, keys.c.name).where(keys.c.id.in_(ids)))
-    return dict(of_maps.tuples().all()), dict(of_keys.tuples().all())
+    return {row.number: row.name for row in of_maps}, {row.id: row.name for row in of_keys}
 
 
 # Which records go: those that are old, those that a map has too many of, and those of keys that
