@@ -140,8 +140,8 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
 
 # Rows that nobody needs any more, however many.
 
-#: Rows removed in one commit: other writers wait meanwhile, for some 20 ms.
-BLOCK = 2000
+#: Rows removed in one commit: other writers wait meanwhile, for some 30 ms.
+BLOCK = 500
 
 
 def remove_in_blocks(

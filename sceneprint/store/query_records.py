@@ -184,7 +184,9 @@ def list_records(
 def _conditions(wanted: WantedRecords) -> Iterator[ColumnElement[bool]]:
     numbers = wanted.map_numbers
     if numbers is not None:
-        yield _c.map_number == numbers[0] if len(numbers) == 1 else _c.map_number.in_(numbers)
+        # a sum is in no index: the records of a robot are few, and found by its own
+        own = _c.map_number if wanted.robot is None else _c.map_number + 0
+        yield own == numbers[0] if len(numbers) == 1 else own.in_(numbers)
     if wanted.statuses:
         yield _c.status.in_(wanted.statuses)
     if wanted.robot is not None:

@@ -53,7 +53,7 @@ def test_the_rows_are_the_records_and_filters_are_in_the_address(station, asked,
     ]
     assert [one["status"] for one in rows] == ["failed", "not_found", "found", "found"]
     failed, lost, second, first = (one["cells"] for one in rows)
-    assert (failed[1:5], failed[7]) == (["not named", "Failed", "–", "–"], "none")
+    assert (failed[1:5], failed[7]) == (["not named", "Failed", "–", "–"], "no answer")
     assert failed[6] == told[0]["reason"]
     assert lost[2] == "Not found"
     assert lost[6] == asked[2]["reason"][0].upper() + asked[2]["reason"][1:] + "."

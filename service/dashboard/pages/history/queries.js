@@ -31,11 +31,11 @@ export async function render(root, { params, search, signal, go, title }) {
   const asked = Object.fromEntries(["status", "robot", "last", "since", "until"].map((name) => [name, search.get(name)]));
   const to = (change) => go(link("maps", map, "queries", { ...asked, ...change }));
 
-  const body = h("tbody", {});
+  const body = h("tbody", { role: "rowgroup" });
   const columns = ["When", "Robot", "Outcome", "Pose", "Views", "Took", "Why", "Answer"];
   const numbers = new Set(["Views", "Took"]);
-  const table = h("table", { class: "table queries" }, h("caption", { class: "visually-hidden" }, `Queries of ${map}, the newest first`),
-    h("thead", {}, h("tr", {}, columns.map((text) => h("th", { scope: "col", class: numbers.has(text) && "number" }, text)))), body);
+  const table = h("table", { class: "table queries", role: "table" }, h("caption", { class: "visually-hidden" }, `Queries of ${map}, the newest first`),
+    h("thead", { role: "rowgroup" }, h("tr", { role: "row" }, columns.map((text) => h("th", { scope: "col", role: "columnheader", class: numbers.has(text) && "number" }, text)))), body);
   const card = h("div", { class: "card scroll" }, table);
   const none = h("div", { hidden: true });
   const more = h("button", { class: "button", type: "button", onClick: () => older() }, "Show older queries");
@@ -107,16 +107,18 @@ function follow(map, asked, signal, heard) {
 
 function row(one) {
   const [kind, text] = STATUSES[one.status] ?? ["neutral", one.status];
-  return h("tr", { dataset: { query: one.query_id, status: one.status } },
-    h("td", { class: "queries-when" }, time(one.at)),
-    h("th", { scope: "row" }, one.robot ?? h("span", { class: "muted", title: "The query did not say who asked." }, one.key ? `key ${one.key}` : "not named"),
-      one.session && h("span", { class: "queries-session muted" }, one.session)),
-    h("td", {}, h("span", { class: "badge", dataset: { kind } }, text)),
-    h("td", {}, pose(one)),
-    h("td", { class: "number" }, one.pose ? count(one.support) : "–"),
-    h("td", { class: "number" }, ms(one.milliseconds)),
-    h("td", { class: "queries-why" }, why(one)),
-    h("td", {}, answer(one)));
+  // roles: on a phone a row is no row of a table to the browser, as each is laid out by itself
+  const cell = (name, ...children) => h("td", { class: `queries-${name}`, role: "cell" }, children);
+  return h("tr", { role: "row", dataset: { query: one.query_id, status: one.status } },
+    cell("when", time(one.at)),
+    h("th", { class: "queries-who", scope: "row", role: "rowheader" }, one.robot ?? h("span", { class: "muted", title: "The query did not say who asked." }, one.key ? `key ${one.key}` : "not named"),
+      one.session && h("span", { class: "queries-more muted" }, one.session)),
+    cell("outcome", h("span", { class: "badge", dataset: { kind } }, text)),
+    cell("pose", pose(one)),
+    cell("views number", one.pose ? count(one.support) : "–"),
+    cell("took number", ms(one.milliseconds)),
+    cell("why", why(one)),
+    cell("answer", answer(one)));
 }
 
 /** Where it was found. */
@@ -125,7 +127,7 @@ function pose({ pose: found, alternatives, rival_ratio: rival }) {
   const { x, y, z } = found.translation;
   const told = [x, y, z].map((one) => one.toFixed(2)).join(", ");
   const near = typeof rival === "number" && rival > 0 ? `, next best place ${percent(rival)} as good` : "";
-  return h("span", { title: `In ${found.parent_frame}${near}` }, h("span", { class: "number queries-pose" }, told), h("span", { class: "queries-session muted" }, `m in ${found.parent_frame}`));
+  return h("span", { title: `In ${found.parent_frame}${near}` }, h("span", { class: "number" }, told), h("span", { class: "queries-more muted" }, `m in ${found.parent_frame}`));
 }
 
 function why({ reason, frame }) {
@@ -135,7 +137,7 @@ function why({ reason, frame }) {
 /** The answer while it is kept, and afterwards that it is not. */
 function answer({ query_id: id, kept_until: until, status }) {
   if (until && Date.parse(until) > Date.now()) return h("a", { class: "mono", href: link("queries", id), "aria-label": `Answer ${shortId(id)}` }, shortId(id));
-  const text = status === "failed" ? ["none", "There was no answer."] : ["expired", "Answers expire after about an hour; this record stays longer."];
+  const text = status === "failed" ? ["no answer", "The query failed."] : ["expired", "Answers expire after about an hour; this record stays longer."];
   return h("span", { class: "muted", title: `${text[1]} Query ${id}.` }, text[0]);
 }
 
