@@ -126,7 +126,8 @@ def test_pages_are_read_by_index(engine):
     event.listen(engine.store.database._engine, "before_cursor_execute", explain)
     for names, wanted in (
         (None, {}), (["hall"], {}), (["hall"], {"statuses": ("failed",)}), (None, {"robot": "r"}),
-        (["hall"], {"since": 1.0, "until": 2.0}), (["hall"], {"robot": "r", "statuses": ("found",)}),
+        (["hall"], {"since": 1.0, "until": 2.0}),
+        (["hall"], {"robot": "r", "statuses": ("found",)}),
     ):  # fmt: skip
         plans.clear()
         told(engine, names, **wanted)
