@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 
 from sceneprint.engine.results.query_history import AskedQuery, record_of
+from sceneprint.errors import NotFound
 from sceneprint_client.api import Answer
 from service.context import Context
 
@@ -31,6 +32,8 @@ async def run_query(
     """
     try:
         answer = await here.gate.run(do)
+    except NotFound:  # what was asked for is not there: no query was begun
+        raise
     except Exception as error:
         _note(here, asked, error, since)
         raise

@@ -318,9 +318,9 @@ query_records = Table(
     Column("reason", TEXT, nullable=False),
     Column("pose_parent", _string(128)),
     Column("pose", JSON(none_as_null=True)),  # T_parent_query: x, y, z, qx, qy, qz, qw
-    Column("support", Integer),
+    Column("support", WHOLE),
     Column("rival_ratio", Float),
-    Column("alternatives", Integer, nullable=False),
+    Column("alternatives", WHOLE, nullable=False),
     Column("milliseconds", Float, nullable=False),
     Column("kind", _string(8)),
     Column("frame_map", _string(63)),  # the stored frame that was asked for

@@ -79,7 +79,8 @@ def record_of(asked: AskedQuery, came_of_it: Answer | Exception, seconds: float)
     one = _failure(came_of_it) if isinstance(came_of_it, Exception) else _success(came_of_it)
     frame, several = asked.frame, len(asked.maps) > 1
     return NewRecord(
-        id=one.query_id, at=asked.at, map=(several and one.map) or asked.maps[0],
+        # as exact as JSON tells it: who asks for what came before a record's time is not told of it
+        id=one.query_id, at=round(asked.at, 6), map=(several and one.map) or asked.maps[0],
         maps=tuple(asked.maps) if several else None, robot=asked.robot,
         session=asked.session, key_id=asked.key_id, status=one.status, cause=one.cause,
         reason=one.reason, pose_parent=one.pose_parent, pose=one.pose, support=one.support,
