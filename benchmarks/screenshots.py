@@ -162,7 +162,8 @@ def _done(client: httpx.Client, job: str) -> None:
 
 
 def _ask(client: httpx.Client, name: str, shot: Shot) -> dict[str, Any]:
-    fields = {"meta": json.dumps({"intrinsics": shot.meta["intrinsics"]})}
+    known = ("intrinsics", "robot", "session")
+    fields = {"meta": json.dumps({key: shot.meta[key] for key in known if key in shot.meta})}
     files = {"frame": (shot.name, shot.data, "image/png")}
     answer = client.post(f"/v1/maps/{name}/queries", data=fields, files=files)
     found: dict[str, Any] = answer.raise_for_status().json()
@@ -189,6 +190,7 @@ def _views(
     maps, frames = View("maps", "#/"), View("frames", f"#/maps/{MAP}")
     rows = View("answer", f"#/queries/{query}", tall=True)
     aligned = View("overlay", overlay, tall=True)
+    queries = View("queries", f"#/maps/{MAP}/queries")
     paths = View("map-view", f"#/maps/{MAP}/paths?query={query}", tall=True)
     operations = View("operations", "#/operations", tall=True)
     yield from (maps, frames)
@@ -200,6 +202,7 @@ def _views(
     yield View("frame-scan", f"#/maps/{HALL}/frames/{scan}", tall=True)
     yield View("upload", f"#/maps/{MAP}/upload")
     yield View("query", f"#/maps/{MAP}/query?frame={frame}", tall=True)
+    yield from (queries, replace(queries, name="queries-phone", size=PHONE))
     yield rows
     yield aligned
     yield View("overlay-before", f"{overlay}&pose=before", tall=True)

@@ -107,6 +107,10 @@ class Settings(BaseSettings):
     event_streams: int = Field(default=64, ge=0, le=10_000)
     #: Newest events of each map that are kept; older ones are removed, 200 bytes each.
     events_kept: int = Field(default=1_000_000, ge=1000)
+    #: Days for which a small record of each query is kept; 0: none is written.
+    history_days: float = Field(default=30.0, ge=0, le=36_500)
+    #: Newest records of queries of each map that are kept, some 600 bytes each.
+    history_queries: int = Field(default=100_000, ge=1, le=100_000_000)
     #: Seconds after which no byte of a deleted frame is left in the caches of this node.
     purge_s: float = Field(default=3600.0, ge=1, le=31_536_000)
 

@@ -99,7 +99,8 @@ log = logging.getLogger(__name__)
 #: In the order in which the document lists them.
 ROUTERS = (
     maps.router, frames.router, frame_data.router, frame_data.points_router, maps.edits_router,
-    sessions.router, frames.imports_router, queries.router, results.router,
+    sessions.router, frames.imports_router, queries.router, results.history_router,
+    results.router,
     queries.similarity_router, sessions.associations_router, reconstructions.router, jobs.router,
     jobs.events_router, admin.operations_router, admin.snapshots_router, admin.keys_router,
 )  # fmt: skip

@@ -38,12 +38,14 @@ class Caller:
     name : of the key; "" where none is asked for
     grants : scope by name of a map, `*` for all
     expires_at : of the key, seconds since 1970; None: never
+    key_id : of the key; None where none is asked for
     changed : maps of which more than reading was asked, for the audit log
     """
 
     name: str
     grants: Mapping[str, Scope]
     expires_at: float | None = None
+    key_id: str | None = None
     changed: set[str] = field(default_factory=set, compare=False)
 
     def may(self, scope: Scope, map_name: str = EVERY) -> bool:
@@ -134,7 +136,7 @@ async def caller(
         enforce_rate_limit(request, here.limits.failed_keys, network_of(address_of(request)))
         raise KeyRequired(_why(request, here) if key is None else _EXPIRED)
     request.state.caller = key.name
-    found = Caller(key.name, key.grants, key.expires_at)
+    found = Caller(key.name, key.grants, key.expires_at, key.id)
     request.state.changed = found.changed
     enforce_rate_limit(request, here.limits.requests, key.name)
     return found

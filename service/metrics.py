@@ -143,6 +143,11 @@ class Metrics:
             "sceneprint_stage_seconds", "Time of each stage of a query.", ("stage",),
             buckets=_SECONDS, registry=self.registry,
         )  # fmt: skip
+        self._lost = Counter(
+            "sceneprint_query_records_lost", "Records of queries that could not be written.",
+            registry=self.registry,
+        )  # fmt: skip
+        self._told_lost = 0
         self._streams = self._gauge("event_streams", "Streams of events that are open.")
         self._frames = self._gauge("frames", "Frames in each state.", "state")
         self._jobs = self._gauge("jobs", "Jobs in each state.", "state")
@@ -201,8 +206,17 @@ class Metrics:
         used.set(seen.used)
         behind.set(math.inf if seen.behind_s is None else seen.behind_s)
 
-    def text(self, figures: Figures, streams: int) -> bytes:
-        """All figures in Prometheus' text format."""
+    def text(self, figures: Figures, streams: int, lost: int) -> bytes:
+        """All figures in Prometheus' text format.
+
+        Parameters
+        ----------
+        figures : of the store
+        streams : of events that are open
+        lost : records of queries since this process began
+        """
+        self._lost.inc(lost - self._told_lost)
+        self._told_lost = lost
         stats, workers = figures.stats, figures.stats.workers or []
         for state in FrameState:
             self._frames.labels(state).set(stats.frames.get(state, 0))

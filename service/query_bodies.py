@@ -13,6 +13,7 @@ from starlette.datastructures import FormData, UploadFile
 
 from sceneprint.errors import InvalidRequest, MalformedBody
 from sceneprint_client.api import Comparison, FrameMeta, NamedFrame, Query
+from sceneprint_client.api.base import Given, Label
 from service import bodies
 from service.bodies import FORM, FRAME_BODY, FormUpload, form_of, media_type, read_json, uploaded
 from service.problems import invalid
@@ -33,11 +34,24 @@ class QueryBody(Generic[Asked]):
     query : how to ask
     upload : the frame that was sent; None where a stored one is named
     named : what JSON had beside the query, by name
+    robot : who asks, as far as it is told
     """
 
     query: Asked
     upload: FormUpload | None
     named: Mapping[str, Any]
+    robot: str | None = None
+
+    @property
+    def session(self) -> str | None:
+        """In which run an upload was taken."""
+        return None if self.upload is None else self.upload.meta.session
+
+
+class _Asker(Given):
+    """What JSON says of who asks."""
+
+    robot: Label | None = None
 
 
 @asynccontextmanager
@@ -58,12 +72,13 @@ async def question(
     """
     if media_type(request) == JSON:
         given = await read_object(request)
+        asker = checked(_Asker, {"robot": given.pop("robot", None)})
         own = {} if named in kind.model_fields else {named: given.pop(named, None)}
-        yield QueryBody(checked(kind, given), None, own)
+        yield QueryBody(checked(kind, given), None, own, asker.robot)
         return
     options = [name for name in kind.model_fields if name != named]
     async with uploaded(request, *options) as upload:
-        yield QueryBody(checked(kind, upload.fields), upload, {})
+        yield QueryBody(checked(kind, upload.fields), upload, {}, upload.meta.robot)
 
 
 async def read_object(request: Request) -> dict[str, Any]:

@@ -292,7 +292,7 @@ def definitions(path: Path) -> set[str]:
     ("walk", "first", "last", "steps"),
     [
         ("upload", "service/middleware.py", "sceneprint/store/signatures.py", 17),
-        ("query", "service/routes/queries.py", "sceneprint/engine/results/stored_results.py", 11),
+        ("query", "service/routes/queries.py", "sceneprint/engine/results/query_history.py", 12),
         ("deletion", "service/routes/frames.py", "sceneprint/engine/upkeep/purge.py", 4),
         ("re-encoding", "service/routes/admin.py", "sceneprint/store/signatures.py", 4),
     ],

@@ -4,14 +4,17 @@ their answers rest on.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from sceneprint_client.api import (
     Answer,
     Comparison,
+    FrameMeta,
     Localization,
     NamedFrame,
+    Page,
     Query,
     SeveralQuery,
     Similarity,
@@ -24,6 +27,8 @@ from sceneprint_client.api.results import (
     MatchDetails,
     OverlayColour,
     OverlayTransform,
+    QueryRecord,
+    RecordStatus,
     Similarities,
 )
 from sceneprint_client.errors import InvalidRequest
@@ -61,7 +66,7 @@ class QueryMethods(ServiceConnection):
         self, map_name: str | None = None, frame: FrameInput | None = None,
         meta: MetaInput | None = None, *, frame_id: str | None = None,
         maps: str | Iterable[str] | None = None, up: Sequence[float] | None = None,
-        **how: Unpack[QueryOptions],
+        robot: str | None = None, **how: Unpack[QueryOptions],
     ) -> Answer:  # fmt: skip
         """Where was this frame taken? The frame is not added to the map.
 
@@ -73,6 +78,7 @@ class QueryMethods(ServiceConnection):
         maps : names of maps of one model that are asked as one, or `*` for all, in place of
             `map_name`; with `frame_id`, `map_name` says which map that frame is of
         up : unit vector in the sensor's axes, of an IMU; default: as `meta` or a sidecar says
+        robot : who asks, for the record of the query; default: as `meta` says
         how : k, stages, exact, filter, seed and the rest of the fields of Query; a filter, and
             what else has fields, as a dictionary or a record
 
@@ -86,10 +92,8 @@ class QueryMethods(ServiceConnection):
         """
         if maps is None:
             name, wanted = named_or_sent(map_name, frame, meta, frame_id, up)
-            query = query_of(Query, how)
-            return self._ask(
-                Answer, "POST", f"{map_path(name)}/queries", **_query_request(wanted, query)
-            )
+            request = _query_request(wanted, query_of(Query, how), robot)
+            return self._ask(Answer, "POST", f"{map_path(name)}/queries", **request)
         if (frame_id is None) != (map_name is None):
             raise TypeError("with `maps`, give `map_name` where `frame_id` names a frame of it")
         _, wanted = named_or_sent(map_name or "", frame, meta, frame_id, up)
@@ -97,19 +101,20 @@ class QueryMethods(ServiceConnection):
         asked = maps if isinstance(maps, str) else list(maps)
         several = query_of(SeveralQuery, how, maps=asked, frame=named)
         if isinstance(wanted, NamedFrame):
-            request = {"json": query_json(several)}
+            request = {"json": {**query_json(several), **given(robot=robot)}}
         else:
-            request = query_form(*wanted, several)
+            request = query_form(*_asked_by(robot, *wanted), several)
         return self._ask(Answer, "POST", "/v1/queries", **request)
 
     def localize(
         self, map_name: str, frame: FrameInput | None = None,
         meta: MetaInput | None = None, *, frame_id: str | None = None,
-        up: Sequence[float] | None = None, **how: Unpack[QueryOptions],
+        up: Sequence[float] | None = None, robot: str | None = None,
+        **how: Unpack[QueryOptions],
     ) -> Localization:  # fmt: skip
         """Where in a map was this frame taken? One status and one pose; see `query`."""
         name, wanted = named_or_sent(map_name, frame, meta, frame_id, up)
-        request = _query_request(wanted, query_of(Query, how))
+        request = _query_request(wanted, query_of(Query, how), robot)
         return self._ask(Localization, "POST", f"{map_path(name)}/localize", **request)
 
     def localize_sequence(
@@ -178,6 +183,43 @@ class QueryMethods(ServiceConnection):
             return self._ask(Similarity, "POST", "/v1/similarity", json=body)
         fields = {name: form_text(value) for name, value in body.items()}
         return self._ask(Similarity, "POST", "/v1/similarity", files=files, data=fields)
+
+    # the queries that came
+
+    def queries(
+        self, map_name: str | None = None, *,
+        status: RecordStatus | Iterable[RecordStatus] = (), robot: str | None = None,
+        since: datetime | str | None = None, until: datetime | str | None = None,
+    ) -> Iterator[QueryRecord]:  # fmt: skip
+        """Queries that came, the newest first: a small record of each, kept for 30 days by default.
+
+        Parameters
+        ----------
+        map_name : only of this map; default: of all that the key may read
+        status : only with this one, or one of these
+        robot : only of this robot
+        since, until : that came at that time or later, and before that one; with a zone
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        InvalidRequest : a status or time that is none.
+        """
+        statuses = [status] if isinstance(status, str) else list(status)
+        return self._items(
+            Page[QueryRecord], "/v1/queries", map=map_name, status=statuses or None, robot=robot,
+            since=_as_text(since), until=_as_text(until),
+        )  # fmt: skip
+
+    def delete_queries(self, map_name: str) -> None:
+        """Remove the records of all queries of a map, for good.
+
+        Raises
+        ------
+        UnknownMap : no such map.
+        Forbidden : the key is not for `admin` of it.
+        """
+        self._send("DELETE", "/v1/queries", params={"map": map_name})
 
     # what can be looked at after a query
 
@@ -271,8 +313,20 @@ class QueryMethods(ServiceConnection):
         )
 
 
-def _query_request(frame: QueryFrame, query: Query) -> dict[str, Any]:
+def _as_text(at: datetime | str | None) -> str | None:
+    return at.isoformat() if isinstance(at, datetime) else at
+
+
+def _query_request(frame: QueryFrame, query: Query, robot: str | None) -> dict[str, Any]:
     """Arguments of a request that asks for a stored frame of the map, or for one at hand."""
     if isinstance(frame, NamedFrame):
-        return {"json": {"frame_id": frame.frame_id, **query_json(query)}}
-    return query_form(*frame, query)
+        named = {"frame_id": frame.frame_id, **given(robot=robot)}
+        return {"json": {**named, **query_json(query)}}
+    return query_form(*_asked_by(robot, *frame), query)
+
+
+def _asked_by(robot: str | None, data: bytes, meta: FrameMeta) -> tuple[bytes, FrameMeta]:
+    """A frame that is asked for, with who asks where its metadata does not say."""
+    if robot is None or meta.robot is not None:
+        return data, meta
+    return data, meta.model_copy(update={"robot": robot})

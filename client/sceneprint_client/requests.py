@@ -153,6 +153,7 @@ class QueryOptions(TypedDict, total=False):
     explain: bool
     explain_frame: str | None
     keep: bool
+    record: bool
 
 
 def query_of(kind: type[Any], how: QueryOptions, **more: Any) -> Any:

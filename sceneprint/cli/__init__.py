@@ -27,6 +27,7 @@ COMMANDS = {
     "upload": "upload",
     "query": "query",
     "localize": "query",
+    "queries": "inventory",
     "similarity": "query",
     "associate": "sessions",
     "frames": "inventory",

@@ -19,7 +19,7 @@ from sceneprint.errors import InvalidRequest
 from sceneprint.models import PRESETS
 from sceneprint_client.api.base import FrameState, JobState
 from sceneprint_client.api.listing import Clock
-from sceneprint_client.api.results import CLOUD_FRAMES, VIEWS, WIDTH
+from sceneprint_client.api.results import CLOUD_FRAMES, RECORD_STATUSES, VIEWS, WIDTH
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sceneprint_client import Client
     from sceneprint_client.api import Frame, Job, Map
     from sceneprint_client.api.admin import Event
+    from sceneprint_client.api.results import QueryRecord
 
 #: Options that take a file for something of one frame.
 _FILES = ("cloud", "preview", "patches", "signature", "upload")
@@ -298,6 +299,76 @@ def _print(found: Iterable[Event], *, as_json: bool) -> None:
             told = "  ".join(one_line(one) for one in about if one is not None)
             print(f"{event.id}  {event.at:%Y-%m-%d %H:%M:%S}  {event.kind:22}  {told}".rstrip())
         sys.stdout.flush()  # who follows wants it now, also through a pipe
+
+
+# `sceneprint queries`: what robots asked, and what came of it.
+
+
+def add_queries(commands: Any) -> None:
+    """Describe the command to the parser."""
+    command = commands.add_parser(
+        "queries",
+        help="list the queries that came, and what came of them",
+        description="List the latest queries of a map, or of all maps, newest first: when each "
+        "came, what came of it, who asked, where that is, and why it failed.",
+    )
+    command.add_argument("map", nargs="?", metavar="MAP", help="only queries of this map")
+    command.add_argument(
+        "--status", action="append", default=[], choices=RECORD_STATUSES,
+        help="only queries with this outcome; repeatable: matches any",
+    )  # fmt: skip
+    command.add_argument("--robot", metavar="NAME", help="only queries of this robot")
+    command.add_argument(
+        "--since", type=_time, metavar="TIME",
+        help="only queries that came at or after this time: 2026-11-16T09:30:00Z",
+    )  # fmt: skip
+    command.add_argument(
+        "--until", type=_time, metavar="TIME", help="only queries that came before this time"
+    )
+    command.add_argument(
+        "--limit", type=positive, default=LISTED, metavar="N",
+        help=f"maximum number to list (default: {LISTED})",
+    )  # fmt: skip
+    command.add_argument("--json", action="store_true", help="print JSON, one query per line")
+    add_service_options(command)
+    command.set_defaults(run=run_queries)
+
+
+def run_queries(options: argparse.Namespace) -> int:
+    """List."""
+    with open_client(options) as client:
+        found = client.queries(
+            options.map, status=options.status, robot=options.robot, since=options.since,
+            until=options.until,
+        )  # fmt: skip
+        _print_queries(islice(found, options.limit), as_json=options.json)
+    return 0
+
+
+def _print_queries(queries: Iterable[QueryRecord], *, as_json: bool) -> None:
+    any_yet = False
+    for one in queries:
+        if as_json:
+            print(one.model_dump_json())
+            continue
+        if not any_yet:
+            columns = "status          ms  map  robot/session  where or why"
+            print(f"{'query':32}  {'came':19}  {columns}")
+            any_yet = True
+        who = one_line(f"{one.robot or '-'}/{one.session or '-'}")
+        came = f"{one.at:%Y-%m-%d %H:%M:%S}  {one.status:11}  {one.milliseconds:5.0f}"
+        print(f"{one.query_id}  {came}  {one.map}  {who}  {_where_or_why(one)}")
+    if not any_yet and not as_json:
+        print("no queries match")
+
+
+def _where_or_why(one: QueryRecord) -> str:
+    if one.pose is None:
+        return one_line(one.reason)
+    t = one.pose.translation
+    place = f"{t.x:.2f} {t.y:.2f} {t.z:.2f} m in {one_line(one.pose.parent_frame)}"
+    views = "1 view" if one.support == 1 else f"{one.support} views"
+    return f"{place}, {views}"
 
 
 # `sceneprint jobs`: the jobs of a service, given up or tried again.

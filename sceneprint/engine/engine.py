@@ -21,6 +21,7 @@ from sceneprint.engine.maps import map_lifecycle, reencoding
 from sceneprint.engine.maps.map_frames import FrameFiles, list_frames
 from sceneprint.engine.maps.reencoding import Reencodings
 from sceneprint.engine.reconstruction import ReconstructionJobs
+from sceneprint.engine.results.query_history import QueryHistory
 from sceneprint.engine.results.rerun import Rerun
 from sceneprint.engine.results.result_views import Inspection, PointClouds
 from sceneprint.engine.results.stored_results import ResultValidity, open_results
@@ -100,6 +101,7 @@ class Engine:
         self._cores = Cores(settings.query_cores)
         self.queries = Queries(self.store, self.signers, self._readers, self.kept, self._cores)
         self.again = Rerun(self.store, self.kept, self.queries)
+        self.history = QueryHistory(self.store, settings)
         # threads of the service work side by side, and sums have one order: the same bytes always
         self._limits = threadpool_limits(1)
         server = not self.store.database.is_sqlite
@@ -123,6 +125,7 @@ class Engine:
 
     def close(self) -> None:
         """Give back what was opened."""
+        self.history.close()
         self._limits.restore_original_limits()
         self._cores.close()
         self.bell.close()
@@ -157,6 +160,7 @@ class Engine:
 
     def delete_map(self, name: str) -> None:
         """Remove a map with all that is in it; UnknownMap where there is none."""
+        self.history.remove_of_map(name)  # most of them, without keeping other writers waiting
         with self.store.database.write() as connection:
             blobs = remove_map(connection, stored_maps.find_map(connection, name))
         self._readers.forget(name)
@@ -172,6 +176,7 @@ class Engine:
 
     def forget_gone(self) -> None:
         """Give up what is held of maps that another process deleted, and now and then of frames."""
+        self.history.tidy()  # this node may have no worker
         with self.store.database.read() as connection:
             if time.monotonic() - self._purged < self.settings.purge_s / 2:
                 self._readers.tidy(connection)
@@ -214,9 +219,10 @@ class Engine:
         return operations.create_key(self.store, name, grants, expires_at)
 
     def revoke_key(self, name: str) -> None:
-        """Let a key open nothing any more; UnknownKey where there is none."""
+        """Let a key open nothing any more, and remove the records of its queries; UnknownKey."""
         with self.store.database.write() as connection:
             stored_keys.revoke_key(connection, name)
+        self.history.remove_of_former_keys()  # workers remove those that are on their way
 
     def find_key(self, secret: str) -> stored_keys.KeyRow | None:
         """The key with that secret, or None; also one that has expired."""
@@ -344,6 +350,7 @@ class Engine:
         published = self._upkeep.run()
         self._vector_tables.run()
         self.operations.tidy()
+        self.history.tidy()
         self.imports.tidy()
         if self.purging.run() is not None:
             with self.store.database.read() as connection:

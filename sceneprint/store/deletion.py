@@ -7,8 +7,9 @@ same transaction, so that they go whatever happens to this process.
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from sqlalchemy import (
     ColumnElement,
@@ -26,6 +27,7 @@ from sqlalchemy import (
     update,
 )
 
+from sceneprint.store.database import Database
 from sceneprint.store.events import record_event, remember
 from sceneprint.store.maps import ROOMLESS, count_on, next_revision
 from sceneprint.store.queue import cancel_jobs
@@ -41,6 +43,7 @@ from sceneprint.store.tables import (
     jobs,
     map_row,
     maps,
+    query_records,
     signatures,
 )
 from sceneprint_client.api import FrameState
@@ -128,10 +131,48 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     connection.execute(delete(jobs).where(jobs.c.map_number == row.number))
     connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(own)))
     connection.execute(delete(frames).where(frames.c.map_number == row.number))
+    connection.execute(delete(query_records).where(query_records.c.map_number == row.number))
     connection.execute(delete(maps).where(maps.c.number == row.number))
     record_event(connection, "map.deleted", row.name)
     remember(connection, row)
     return referred
+
+
+# Rows that nobody needs any more, however many.
+
+#: Rows removed in one commit: other writers wait meanwhile, for some 30 ms.
+BLOCK = 500
+
+
+def remove_in_blocks(
+    database: Database, find: Callable[[Connection, int], Sequence[int]],
+    remove: Callable[[Connection, Sequence[int]], None], most: float = math.inf,
+) -> int:  # fmt: skip
+    """Remove rows, a block of them in each commit, so that other writers get their turns.
+
+    Parameters
+    ----------
+    database : that has them
+    find : numbers of rows that are to go, at most so many; without the lock, as most often there
+        are none
+    remove : removes them
+    most : end when so many are removed
+
+    Returns
+    -------
+    how many were removed
+    """
+    removed = 0
+    while removed < most:
+        with database.read() as connection:
+            numbers = find(connection, BLOCK)
+        if numbers:
+            with database.write() as connection:
+                remove(connection, numbers)
+        removed += len(numbers)
+        if len(numbers) < BLOCK:
+            break
+    return removed
 
 
 def doom(connection: Connection, blobs: Iterable[str]) -> None:

@@ -27,11 +27,13 @@ class KeyRow:
 
     Parameters
     ----------
+    id : never given to another, unlike its name
     name : unique
     grants : scope by name of a map, `*` for all
     created_at, expires_at : None: it does not expire
     """
 
+    id: str
     name: str
     grants: dict[str, Scope]
     created_at: float
@@ -92,8 +94,8 @@ def revoke_key(connection: Connection, name: str) -> None:
     record_event(connection, "key.revoked", name=name)
 
 
-def _select_keys() -> Select[tuple[str, dict[str, Scope], float, float | None]]:
-    return select(keys.c.name, keys.c.grants, keys.c.created_at, keys.c.expires_at)
+def _select_keys() -> Select[tuple[str, str, dict[str, Scope], float, float | None]]:
+    return select(keys.c.id, keys.c.name, keys.c.grants, keys.c.created_at, keys.c.expires_at)
 
 
 def _digest(secret: str) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hmac
 import re
+import struct
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Literal
@@ -23,9 +24,11 @@ from sceneprint.store.database import Database
 from sceneprint.store.tables import secrets
 
 #: What a number counts: a seal of one kind is none of another.
-Kind = Literal["audit", "event", "frame", "job"]
+Kind = Literal["audit", "event", "frame", "job", "query"]
 #: Before everything: what no row has as its number, and so needs no seal.
 START = "0"
+#: A place in a list that is ordered by time: seconds since 1970, and the number of a row.
+_MOMENT = struct.Struct(">dQ")
 
 
 class OpaqueIds:
@@ -85,6 +88,35 @@ class OpaqueIds:
     def next_cursor(self, kind: Kind, numbers: Sequence[int], limit: int) -> str | None:
         """The cursor of the page after one of `limit` rows; None: no more were found than these."""
         return self.seal(kind, numbers[limit - 1]) if len(numbers) > limit else None
+
+    # of lists that are ordered by time: rows of one time are told apart by their numbers
+
+    def next_moment(
+        self, kind: Kind, moments: Sequence[tuple[float, int]], limit: int
+    ) -> str | None:
+        """The cursor of the page after one of `limit` rows; None: no more were found than these."""
+        if len(moments) <= limit:
+            return None
+        return self._cipher.encrypt(_MOMENT.pack(*moments[limit - 1]), [kind.encode()]).hex()
+
+    def moment(self, kind: Kind, cursor: str | None) -> tuple[float, int] | None:
+        """Time and number of the row that a page before ended with; None for the first page.
+
+        Raises
+        ------
+        InvalidRequest : it was not given out.
+        """
+        if cursor is None:
+            return None
+        try:
+            if not re.fullmatch(r"[0-9a-f]{64}", cursor):
+                raise invalid_cursor(cursor)
+            at, number = _MOMENT.unpack(
+                self._cipher.decrypt(bytes.fromhex(cursor), [kind.encode()])
+            )
+        except InvalidTag:
+            raise invalid_cursor(cursor) from None
+        return at, number
 
     @property
     def owner(self) -> str:

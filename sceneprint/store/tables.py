@@ -305,6 +305,39 @@ former_maps = Table(
     Index(None, "number"),
 )
 
+#: What came of each query, in short, for some time.
+query_records = Table(
+    "query_records",
+    metadata,
+    Column("number", WHOLE, primary_key=True),
+    Column("id", _string(32), nullable=False),  # of the answer
+    Column("at", Float, nullable=False),  # when the query came
+    Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
+    Column("maps", JSON(none_as_null=True)),  # names of all that were asked; null: this one alone
+    Column("robot", _string(128)),
+    Column("session", _string(128)),
+    Column("key_id", _string(32)),  # of the key that was shown
+    Column("status", _string(16), nullable=False),
+    Column("cause", _string(64)),
+    Column("reason", TEXT, nullable=False),
+    Column("pose_parent", _string(128)),
+    Column("pose", JSON(none_as_null=True)),  # T_parent_query: x, y, z, qx, qy, qz, qw
+    Column("support", WHOLE),
+    Column("rival_ratio", Float),
+    Column("alternatives", WHOLE, nullable=False),
+    Column("milliseconds", Float, nullable=False),
+    Column("kind", _string(8)),
+    Column("frame_map", _string(63)),  # the stored frame that was asked for
+    Column("frame_id", _string(64)),
+    Column("kept", Boolean, nullable=False),  # whether its answer was to be kept
+    Index(None, "at", "number"),
+    Index(None, "map_number", "at", "number"),
+    Index(None, "map_number", "status", "at", "number"),
+    Index(None, "robot", "at", "number"),
+    Index(None, "key_id"),
+    sqlite_autoincrement=True,
+)
+
 #: Blobs of what was deleted, until somebody has seen that they are removed.
 doomed = Table(
     "doomed",

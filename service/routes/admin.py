@@ -112,7 +112,8 @@ def _replica(seen: ReplicaSeen | None) -> str | None:
 def metrics(here: Here) -> Response:
     """Figures for Prometheus; a key, where one is asked for, must have `read` for `*`."""
     figures = here.engine.operations.statistics.figures()
-    return Response(here.metrics.text(figures, here.feed.streams), media_type=CONTENT_TYPE_LATEST)
+    text = here.metrics.text(figures, here.feed.streams, here.engine.history.lost)
+    return Response(text, media_type=CONTENT_TYPE_LATEST)
 
 
 # Keys, and who changed what.

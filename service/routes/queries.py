@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from anyio import to_thread
 from fastapi import Depends, Request
 
+from sceneprint.engine.results.query_history import AskedQuery
 from sceneprint.engine.search.query import check_localizes, localization_of
 from sceneprint_client.api import (
     Answer,
     Comparison,
     FrameMeta,
+    FrameName,
     Localization,
     NamedFrame,
     Query,
@@ -21,7 +24,7 @@ from sceneprint_client.api import (
     Similarity,
 )
 from sceneprint_client.api.query import MOST_OF_SEQUENCE
-from service.auth import Asking, may_read, v1_router
+from service.auth import Asking, Caller, may_read, v1_router
 from service.bodies import FORM, frames_of
 from service.context import Context, Here
 from service.problems import declared
@@ -37,14 +40,21 @@ from service.query_bodies import (
     sequence_body,
     unnamed,
 )
+from service.recorded_queries import run_query
 
 router = v1_router(tag="queries")
 
+_ROBOT: dict[str, Any] = {
+    "robot": {
+        "type": "string", "maxLength": 128,
+        "description": "Who asks, for the record; of an upload `meta` says so.",
+    }
+}  # fmt: skip
 _FRAME_ID: dict[str, Any] = {
     "frame_id": {"type": "string", "description": "A frame of the map, in place of an upload."}
 }
-_BODY = described(Query, _FRAME_ID, ["frame_id"])
-_SEVERAL = described(SeveralQuery, {}, ["maps", "frame"])
+_BODY = described(Query, _FRAME_ID | _ROBOT, ["frame_id"])
+_SEVERAL = described(SeveralQuery, _ROBOT, ["maps", "frame"])
 _STATUSES = declared(400, 404, 413, 415, 422)
 
 
@@ -52,24 +62,24 @@ _STATUSES = declared(400, 404, 413, 415, 422)
     "/maps/{map_name}/queries", responses=_STATUSES, openapi_extra=_BODY,
     dependencies=[Depends(may_read)],
 )  # fmt: skip
-async def ask(map_name: str, request: Request, here: Here) -> Answer:
+async def ask(map_name: str, request: Request, here: Here, asking: Asking) -> Answer:
     """Where was this frame taken? Ask with a frame of your own, or with one of the map.
 
     An uploaded frame is not added to the map. A frame of the map does not find itself.
     """
-    return await _asked(map_name, request, here, localizes=False)
+    return await _asked(map_name, request, here, asking, localizes=False)
 
 
 @router.post(
     "/maps/{map_name}/localize", responses=_STATUSES, openapi_extra=_BODY,
     dependencies=[Depends(may_read)],
 )  # fmt: skip
-async def localize(map_name: str, request: Request, here: Here) -> Localization:
+async def localize(map_name: str, request: Request, here: Here, asking: Asking) -> Localization:
     """Where am I in this map? One status and one pose; ask as for a query.
 
     The whole answer, with all candidates, is kept under `query_id` unless `keep` is false.
     """
-    return localization_of(await _asked(map_name, request, here, localizes=True))
+    return localization_of(await _asked(map_name, request, here, asking, localizes=True))
 
 
 _SEQUENCE: dict[str, Any] = sequence_body(Query, MOST_OF_SEQUENCE)
@@ -79,13 +89,15 @@ _SEQUENCE: dict[str, Any] = sequence_body(Query, MOST_OF_SEQUENCE)
     "/maps/{map_name}/localize/sequence", responses=_STATUSES, openapi_extra=_SEQUENCE,
     dependencies=[Depends(may_read)],
 )  # fmt: skip
-async def localize_sequence(map_name: str, request: Request, here: Here) -> Localization:
+async def localize_sequence(
+    map_name: str, request: Request, here: Here, asking: Asking
+) -> Localization:
     """Where am I in this map, by my last few frames? One status and the pose of the last.
 
     Send 2 to 10 frames in the order they were taken, each with a `pose` in one parent frame of any
     name: the odometry. Each is looked up; all of them vote for the pose of the last.
     """
-    since, engine = time.perf_counter(), here.engine
+    since, at, engine = time.perf_counter(), time.time(), here.engine
     options = tuple(Query.model_fields)
     async with (
         here.gate.place(),
@@ -95,12 +107,14 @@ async def localize_sequence(map_name: str, request: Request, here: Here) -> Loca
         wrong = next((one for one in sent.metas if not isinstance(one, FrameMeta)), None)
         if wrong is not None:
             raise wrong
-        answer = await here.gate.run(
+        *_, last = (one for one in sent.metas if isinstance(one, FrameMeta))
+        asked = AskedQuery([map_name], query, last.robot, last.session, asking.key_id, at=at)
+        answer = await run_query(
+            here, asked, since,
             lambda: engine.queries.sequence(
                 map_name, [(one.data, one.meta) for one in sent.read()], query, since
-            )
-        )
-    here.metrics.answer(answer)
+            ),
+        )  # fmt: skip
     return localization_of(answer)
 
 
@@ -111,42 +125,48 @@ async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
     The maps must be of one model. A pose is averaged within one parent frame of one map, which
     `location.map` names.
     """
-    since, queries = time.perf_counter(), here.engine.queries
-    async with here.gate.place(), question(request, SeveralQuery, "frame") as asked:
-        query, upload, frame = asked.query, asked.upload, asked.query.frame
+    since, at, queries = time.perf_counter(), time.time(), here.engine.queries
+    async with here.gate.place(), question(request, SeveralQuery, "frame") as body:
+        query, upload, frame = body.query, body.upload, body.query.frame
         maps = await to_thread.run_sync(queries.maps_of, query, partial(asking.may, "read"))
+        named = None if frame is None else FrameName(map=frame.map, frame_id=frame.frame_id)
+        asked = AskedQuery(maps, query, body.robot, body.session, asking.key_id, named, at)
         if upload is not None:
-            answer = await here.gate.run(
-                lambda: queries.upload(maps, upload.file.read(), upload.meta, query, since)
-            )
-        elif frame is not None:
-            asking.require(frame.map, "read")
-            answer = await here.gate.run(lambda: queries.stored(maps, frame, query, since))
-        else:
+            return await run_query(
+                here, asked, since,
+                lambda: queries.upload(maps, upload.file.read(), upload.meta, query, since),
+            )  # fmt: skip
+        if frame is None:
             raise unnamed("frame")
-    here.metrics.answer(answer)
-    return answer
+        asking.require(frame.map, "read")
+        return await run_query(
+            here, asked, since, lambda: queries.stored(maps, frame, query, since)
+        )
 
 
-async def _asked(map_name: str, request: Request, here: Context, *, localizes: bool) -> Answer:
-    since, engine = time.perf_counter(), here.engine
-    async with here.gate.place(), question(request, Query, "frame_id") as asked:
-        query, upload = asked.query, asked.upload
+async def _asked(
+    map_name: str, request: Request, here: Context, asking: Caller, *, localizes: bool
+) -> Answer:
+    since, at, engine = time.perf_counter(), time.time(), here.engine
+    async with here.gate.place(), question(request, Query, "frame_id") as body:
+        query, upload = body.query, body.upload
+        asked = AskedQuery([map_name], query, body.robot, body.session, asking.key_id, at=at)
         if localizes:
             check_localizes(query)
-        if upload is None:
-            frame_id = asked.named["frame_id"]
-            if not isinstance(frame_id, str):
-                raise unnamed("frame_id")
-            answer = await here.gate.run(
-                lambda: engine.query_frame(map_name, frame_id, query, since)
-            )
-        else:
-            answer = await here.gate.run(
-                lambda: engine.query_upload(map_name, upload.file.read(), upload.meta, query, since)
-            )
-    here.metrics.answer(answer)
-    return answer
+        if upload is not None:
+            return await run_query(
+                here, asked, since,
+                lambda: engine.query_upload(
+                    map_name, upload.file.read(), upload.meta, query, since
+                ),
+            )  # fmt: skip
+        frame_id = body.named["frame_id"]
+        if not isinstance(frame_id, str):
+            raise unnamed("frame_id")
+        asked = replace(asked, frame=FrameName(map=map_name, frame_id=frame_id))
+        return await run_query(
+            here, asked, since, lambda: engine.query_frame(map_name, frame_id, query, since)
+        )
 
 
 # Two frames compared.

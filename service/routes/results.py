@@ -8,19 +8,26 @@ from typing import Annotated, Any
 
 from anyio import to_thread
 from fastapi import Query, Request, Response
+from pydantic import AwareDatetime
 
 from sceneprint.engine.maps.map_frames import PLY, PNG
+from sceneprint.engine.results.query_history import AskedQuery
 from sceneprint.engine.results.stored_results import unknown_query
 from sceneprint.errors import UnsupportedType
-from sceneprint_client.api import Answer, SeveralQuery
+from sceneprint.store.query_records import WantedRecords
+from sceneprint_client.api import Answer, Page, SeveralQuery
 from sceneprint_client.api import Query as Options
+from sceneprint_client.api.base import Label
 from sceneprint_client.api.results import (
+    RECORD_STATUSES,
     WIDTH,
     WIDTHS,
     MatchDetails,
     OverlayColour,
     OverlayTransform,
+    QueryRecord,
     Question,
+    RecordStatus,
     Similarities,
     View,
 )
@@ -29,6 +36,7 @@ from service.bodies import media_type
 from service.context import Context, Here
 from service.problems import declared
 from service.query_bodies import JSON, TEMPLATE, checked, read_object
+from service.recorded_queries import run_query
 
 router = v1_router("/queries/{query_id}", "queries")
 
@@ -212,7 +220,7 @@ async def ask_again(query_id: str, request: Request, here: Here, asking: Asking)
     What the body leaves out is as it was asked, null puts back the default, and `maps` asks others.
     The answer has an id of its own.
     """
-    since, engine = time.perf_counter(), here.engine
+    since, at, engine = time.perf_counter(), time.time(), here.engine
     answer = await to_thread.run_sync(readable_answer, query_id, here, asking)
     if media_type(request) != JSON:
         raise UnsupportedType(
@@ -227,6 +235,59 @@ async def ask_again(query_id: str, request: Request, here: Here, asking: Asking)
         names = await to_thread.run_sync(engine.queries.maps_of, query, partial(asking.may, "read"))
         # which also refuses `frame`, that SeveralQuery has: it is the kept one
         options = checked(Options, fields)
-        told = await here.gate.run(lambda: engine.again.ask(query_id, names, options, since))
-    here.metrics.answer(told)
-    return told
+        asked = AskedQuery(names, options, key_id=asking.key_id, frame=answer.frame, at=at)
+        return await run_query(
+            here, asked, since, lambda: engine.again.ask(query_id, names, options, since)
+        )
+
+
+# What is left of queries for longer than their answers.
+
+history_router = v1_router("/queries", "queries")
+
+
+@history_router.get("", responses=declared(404, 422))
+def list_queries(
+    here: Here,
+    asking: Asking,
+    map_name: Annotated[str | None, Query(alias="map", description="Of this map alone.")] = None,
+    status: Annotated[
+        list[RecordStatus],
+        Query(max_length=len(RECORD_STATUSES), description="More than once for several."),
+    ] = [],  # noqa: B006  (FastAPI copies it)
+    robot: Annotated[Label | None, Query(description="Who asked.")] = None,
+    since: Annotated[
+        AwareDatetime | None, Query(description="That came then or later; with a time zone.")
+    ] = None,
+    until: Annotated[AwareDatetime | None, Query(description="That came before then.")] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> Page[QueryRecord]:
+    """Queries that came, the newest first: who asked, what came of it, how long it took.
+
+    Each query leaves a record within a second, for 30 days by default; not with `record` false.
+    Requests that were refused before a query began leave none. With a key, queries of the maps
+    that it may read.
+    """
+    names = asking.named
+    if map_name is not None:
+        asking.require(map_name, "read")
+        here.engine.get_map(map_name)
+        names = (map_name,)
+    wanted = WantedRecords(
+        statuses=tuple(status), robot=robot,
+        since=None if since is None else since.timestamp(),
+        until=None if until is None else until.timestamp(),
+    )  # fmt: skip
+    return here.engine.history.page(wanted, names, cursor, limit, partial(asking.may, "read"))
+
+
+@history_router.delete("", status_code=204, responses=declared(404, 422))
+def delete_queries(
+    here: Here,
+    asking: Asking,
+    map_name: Annotated[str, Query(alias="map", description="Whose records are removed.")],
+) -> None:
+    """Remove the records of all queries of a map, for good. Needs `admin` of the map."""
+    asking.require(map_name, "admin")
+    here.engine.history.remove_of_map(map_name)

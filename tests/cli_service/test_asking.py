@@ -222,3 +222,36 @@ def test_a_side_is_a_file_or_a_stored_frame(tmp_path: Path, monkeypatch: Any) ->
     assert frame_argument("depth/a.png") == Path("depth/a.png")
     Path("hall:a").touch()
     assert frame_argument("hall:a") == Path("hall:a")
+
+
+def test_queries_that_came_are_listed(sceneprint: Run, service_url: str, rooms: Path) -> None:
+    frames = [rooms / f"room-{i}" / "seq-01" / "frame-000000.depth.png" for i in (0, 1)]
+    sceneprint("upload", "asked", frames[0])
+    assert sceneprint("queries", "asked").stdout == "no queries match\n"
+    with Client(service_url) as client:
+        found = client.localize("asked", frames[0], robot="spot\u2028")
+        lost = client.localize("asked", frames[1], robot="cart")
+    assert (found.status, lost.status) == ("found", "not_found")
+    head, second, first = sceneprint("queries", "asked").stdout.splitlines()
+    assert " ".join(head.split()) == "query came status ms map robot/session where or why"
+    assert found.pose is not None
+    t = found.pose.translation
+    place = f"{t.x:.2f} {t.y:.2f} {t.z:.2f} m in room-0, 1 view"
+    assert re.fullmatch(
+        rf"{found.query_id}  \S+ \S+  found +\d+  asked  spot\S*/seq-01  {place}", first
+    ), first
+    assert re.fullmatch(
+        rf"{lost.query_id}  \S+ \S+  not_found +\d+  asked  cart/seq-01  {re.escape(lost.reason)}",
+        second,
+    )
+    said = sceneprint(
+        "queries", "asked", "--status", "found", "--status", "failed", "--json"
+    ).stdout
+    told = json.loads(said)
+    assert (told["query_id"], told["robot"]) == (found.query_id, "spot\u2028")
+    assert lost.query_id in sceneprint("queries", "--robot", "cart", "--limit", "1").stdout
+    none = sceneprint("queries", "asked", "--until", told["at"], "--json").stdout
+    assert none == ""
+    assert "There is no map 'nowhere'" in sceneprint("queries", "nowhere", expect=2).stderr
+    with pytest.raises(SystemExit):
+        sceneprint("queries", "asked", "--since", "yesterday")

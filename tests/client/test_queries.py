@@ -105,15 +105,35 @@ def test_all_ways_of_asking(
     assert several.maps == [map_name, other]
     stored = client.query(map_name, frame_id=ids[2], maps=f"{other},{map_name}")
     assert (stored.matches[0].map, stored.matches[0].distance) == (other, 0)
-    found = client.localize(map_name, references[0], seed=2)
+    found = client.localize(map_name, references[0], seed=2, robot="spot")
     assert found.pose is not None
     assert (found.pose.parent_frame, found.seed) == ("room-0/seq-01", 2)
-    assert client.localize(map_name, frame_id=ids[3]).map == map_name
+    placed = client.localize(map_name, frame_id=ids[3], robot="cart")
+    assert placed.map == map_name
     named = client.similarity((map_name, ids[0]), (other, added), seed=1)
     sent = client.similarity(NamedFrame(map=other, frame_id=added), references[0])
     assert sent.distance == named.distance > 0
     bare = client.similarity(references[0], references[1], validate=False, model="depth")
     assert bare.validation is None
+    # each query left a record, the newest first; the comparisons left none
+    came = list(client.queries(map_name))
+    assert [one.query_id for one in came[:2]] == [placed.query_id, found.query_id]
+    assert next(client.queries(other)).query_id == stored.query_id  # where its match is
+    assert {one.query_id for one in came} <= {one.query_id for one in client.queries()}
+    (spot,) = client.queries(map_name, robot="spot", status=["found", "failed"])
+    assert (spot.query_id, spot.session, spot.key) == (found.query_id, "room-0/seq-01", None)
+    assert spot.pose is not None
+    assert spot.pose.translation == found.pose.translation
+    (cart,) = client.queries(robot="cart", since=spot.at)
+    assert cart.frame is not None
+    assert cart.frame.frame_id == ids[3]
+    assert list(client.queries(map_name, robot="spot", until=spot.at)) == []
+    with pytest.raises(InvalidRequest, match="status"):
+        client.queries(map_name, status="lost")  # type: ignore[arg-type]
+    with pytest.raises(UnknownMap):
+        client.queries("nowhere")
+    client.delete_queries(map_name)
+    assert list(client.queries(map_name)) == []
 
 
 def test_what_cannot_be_asked_is_refused(

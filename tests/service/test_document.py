@@ -44,7 +44,7 @@ def test_the_document_is_whole(document):
             place = place[step]
         assert isinstance(place, dict)
     names = [operation["operationId"] for operation in operations(document).values()]
-    assert len(names) == len(set(names)) == 74
+    assert len(names) == len(set(names)) == 76
     used = {reference.rpartition("/")[2] for reference in found}
     assert set(document["components"]["schemas"]) == used  # nothing that nothing refers to
 
@@ -97,14 +97,15 @@ def test_bodies_that_are_read_by_hand_are_described(document):
     assert sorted(form["properties"]) == ["frame", "if_novel", "meta", "priority"]
     query = operations(document)["post", "/v1/maps/{map_name}/queries"]["requestBody"]
     options = {"k", "stages", "exact", "filter", "seed", "candidates", "diversity", "validation",
-               "prior", "deadline_ms", "explain", "explain_frame", "keep"}  # fmt: skip
+               "prior", "deadline_ms", "explain", "explain_frame", "keep",
+               "record"}  # fmt: skip
     assert {"application/json", "multipart/form-data", "image/png"} <= set(query["content"])
     beside = operations(document)["post", "/v1/maps/{map_name}/queries"]["parameters"]
     assert {one["name"] for one in beside if one["in"] == "query"} >= options | {"fx", "meta"}
     by_form = query["content"]["multipart/form-data"]["schema"]["properties"]
     by_id = query["content"]["application/json"]["schema"]["properties"]
     assert set(by_form) == {"frame", "meta"} | options
-    assert set(by_id) == {"frame_id"} | options
+    assert set(by_id) == {"frame_id", "robot"} | options
     assert (by_form["k"]["minimum"], by_form["k"]["maximum"], by_form["k"]["default"]) == (1, 50, 5)
     assert by_form["stages"]["type"] == "string"
     assert {"items", "anyOf"} & set(by_form["stages"]) == set()

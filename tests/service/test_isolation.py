@@ -73,6 +73,8 @@ OF_A_MAP = {
     "POST /v1/maps/{map_name}/localize/sequence": Case(),
     "POST /v1/queries": Case(body={"maps": [OWN, "{map}"], "frame": FRAME}),
     "POST /v1/similarity": Case(body={"frame_a": FRAME, "frame_b": FRAME}),
+    "GET /v1/queries": Case(query={"map": "{map}"}),
+    "DELETE /v1/queries": Case("admin", query={"map": "{map}"}),
     "GET /v1/queries/{query_id}": Case(),
     "GET /v1/queries/{query_id}/cloud.ply": Case(),
     "GET /v1/queries/{query_id}/points": Case(),
@@ -115,7 +117,10 @@ OF_ALL = (
     "DELETE /v1/snapshots/{snapshot_id}",
 )  # fmt: skip
 #: Answered to anybody with a key, and by what the key may read.
-BY_KEY = ("GET /v1/maps", "GET /v1/models", "GET /v1/keys/me", "GET /v1/jobs", "GET /v1/events")
+BY_KEY = (
+    "GET /v1/maps", "GET /v1/models", "GET /v1/keys/me", "GET /v1/jobs", "GET /v1/events",
+    "GET /v1/queries",
+)  # fmt: skip
 #: Answered without a key.
 OF_NOBODY = ("GET /healthz", "GET /readyz")
 
@@ -436,5 +441,5 @@ def test_what_is_not_noted_is_said(operations):
         "delete_frame", "patch_session", "delete_session_frames", "cancel_job", "retry_job",
         "retry_dead_jobs", "reencode", "cancel_reencoding",
         "begin_association", "delete_association", "reconstruct", "delete_reconstruction",
-        "add_import", "take_snapshot", "delete_snapshot",
+        "add_import", "take_snapshot", "delete_snapshot", "delete_queries",
     }  # fmt: skip

@@ -27,7 +27,8 @@ from sceneprint.store.tables import MapRow, metadata
 
 TABLES = [
     "audit", "doomed", "events", "former_maps", "frame_tags", "frames", "idempotency", "job_files",
-    "job_items", "jobs", "keys", "maps", "models", "samples", "secrets", "signatures",
+    "job_items", "jobs", "keys", "maps", "models", "query_records", "samples", "secrets",
+    "signatures",
 ]  # fmt: skip
 
 

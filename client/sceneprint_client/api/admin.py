@@ -373,6 +373,10 @@ KINDS = {
         "It was removed; no query finds it. `data.reason` is `retention` where its map keeps none "
         "so old."
     ),
+    "query.answered": (
+        "A query was answered, or failed; `data` has `query_id`, `status`, `robot`, `pose` where "
+        "it was found, and more of its record."
+    ),
     "import.done": "An archive was imported, as far as it could be; `data` is its result.",
     "association.found": "A job that looked for associations is over; `data` is its result.",
     "key.created": "A key was made; of no map.",

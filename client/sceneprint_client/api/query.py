@@ -137,6 +137,10 @@ class Query(Given):
         default=True,
         description="Keep the answer for a while, so that GET /v1/queries/{query_id} has it.",
     )
+    record: bool = Field(
+        default=True,
+        description="Leave a record in GET /v1/queries, an event, and a count in the figures.",
+    )
 
     @field_validator("stages", mode="before", json_schema_input_type=str | tuple[Stage, ...])
     @classmethod

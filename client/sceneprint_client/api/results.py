@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from sceneprint_client.api.base import ApiRecord, Given, Transform
+from sceneprint_client.api.base import ApiRecord, Given, Quaternion, Transform, Vector
 from sceneprint_client.api.frames import Kind
 from sceneprint_client.api.maps import Preset
 from sceneprint_client.api.matches import Uncertainty, Validation
@@ -33,6 +34,60 @@ class Question(ApiRecord):
     model: str
     options: dict[str, Any] = Field(
         description="As they were given; what was left out had its default."
+    )
+
+
+# What is left of a query for longer than its answer, as JSON.
+
+#: What came of a query: the status of its answer, or that there was none.
+RecordStatus = Literal["found", "ambiguous", "not_found", "unvalidated", "failed"]
+RECORD_STATUSES: tuple[RecordStatus, ...] = (
+    "found", "ambiguous", "not_found", "unvalidated", "failed"
+)  # fmt: skip
+
+
+class RecordedPose(ApiRecord):
+    """T_parent_query, metres and a unit quaternion."""
+
+    parent_frame: str
+    translation: Vector
+    rotation: Quaternion
+
+
+class QueryRecord(ApiRecord):
+    """What came of a query, in short; nothing of what its frame shows."""
+
+    query_id: str = Field(description="GET /v1/queries/{query_id} has the answer while it is kept.")
+    at: datetime = Field(description="When the query came.")
+    map: str = Field(
+        description="Of several maps that were asked: the one it was found in, that of the first "
+        "alternative or match, or the first that was named."
+    )
+    maps: list[str] = Field(description="Those that were asked and that you may read.")
+    robot: str | None = Field(description="Who asked, as far as the query said.")
+    session: str | None
+    key: str | None = Field(description="Name of the key that was shown; null without one.")
+    status: RecordStatus = Field(
+        description="Of the answer. `failed`: there was none, and `reason` says why."
+    )
+    cause: str | None = Field(
+        description="Of `not_found`, and of a deadline, as in the answer; of `failed` the type of "
+        "the problem, such as `busy`."
+    )
+    reason: str
+    pose: RecordedPose | None = Field(description="Of `found`, where the matches have poses.")
+    support: int | None = Field(description="Matches that agree on `pose`.")
+    rival_ratio: float | None = Field(description="How near another place comes, 0 to 1.")
+    alternatives: int = Field(description="Of `ambiguous`: poses that the evidence supports.")
+    milliseconds: float
+    kind: Kind | None = Field(description="Of the frame; null where it was not read.")
+    frame: FrameName | None = Field(
+        description="The stored frame that was asked for; null for an upload, and where you may "
+        "not read its map."
+    )
+    kept_until: datetime | None = Field(
+        description="The answer is kept until then, while there is room; null: not any more, or "
+        "it never was."
     )
 
 

@@ -12,6 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sqlalchemy import Connection
+
 from sceneprint.engine.admin.statistics import Statistics, anchors
 from sceneprint.engine.maps.model_catalogue import Catalogue
 from sceneprint.engine.serializers import when
@@ -19,6 +21,7 @@ from sceneprint.errors import InvalidRequest, SceneprintError
 from sceneprint.settings import Settings
 from sceneprint.store import Database, Store
 from sceneprint.store import keys as stored
+from sceneprint.store.deletion import remove_in_blocks
 from sceneprint.store.events import (
     EventRow,
     Wanted,
@@ -107,10 +110,9 @@ def missed(place: int) -> EventRow:
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two looks for events that are no longer kept, and how many are removed in one
-#: commit, and after one look.
+#: Seconds between two looks for events that are no longer kept, and how many are removed after one.
 TIDY_S = 60.0
-AT_ONCE, AT_MOST = 2_000, 20_000
+AT_MOST = 20_000
 #: Most beginnings of kinds that may be asked for.
 MOST_KINDS = 20
 
@@ -198,21 +200,14 @@ class OperatorTasks:
 
     def remove_spent(self) -> int:
         """Remove events that are no longer kept, a few at a time; returns how many."""
-        removed, indexes = 0, Path(self._settings.indexes)
-        while removed < AT_MOST:
-            with self._store.database.read() as connection:  # most often there is none: no lock
-                if not spent_numbers(connection, self._settings.events_kept, (), 1):
-                    break
-                numbers = spent_numbers(
-                    connection, self._settings.events_kept, anchors(indexes), AT_ONCE
-                )
-            if numbers:
-                with self._store.database.write() as connection:
-                    remove_events(connection, numbers)
-            removed += len(numbers)
-            if len(numbers) < AT_ONCE:
-                break
-        return removed
+        kept, indexes = self._settings.events_kept, Path(self._settings.indexes)
+
+        def spent(connection: Connection, limit: int) -> list[int]:
+            if not spent_numbers(connection, kept, (), 1):
+                return []  # most often: no index is looked at
+            return spent_numbers(connection, kept, anchors(indexes), limit)
+
+        return remove_in_blocks(self._store.database, spent, remove_events, AT_MOST)
 
 
 def event_record(seals: OpaqueIds, row: EventRow) -> Event:

@@ -100,6 +100,19 @@ def test_a_row_that_refers_to_none_keeps_all_hands_off(house: Any) -> None:
     assert house.sql("SELECT COUNT(*) FROM signatures") == [(13,)]
 
 
+def test_a_record_of_a_query_is_of_a_map_that_is_there(house: Any) -> None:
+    ((number,),) = house.sql("SELECT number FROM maps WHERE name = 'hall'")
+    house.sql(
+        "INSERT INTO query_records (id, at, map_number, status, reason, alternatives, "
+        "milliseconds, kept) VALUES ('q', 1.0, ?, 'found', '', 0, 1.0, true)", number
+    )  # fmt: skip
+    assert house.look() == []
+    house.sql("UPDATE query_records SET map_number = 99")
+    (found,) = house.look(repair=True)
+    assert (found.finding.kind, found.done) == ("dangling-row", None)
+    assert found.finding.what == "row 1 of table query_records"
+
+
 def test_a_damaged_model_that_ships_is_put_back(house: Any) -> None:
     with Engine(house.settings) as engine:
         engine.create_map(NewMap(name="other", model="depth"))

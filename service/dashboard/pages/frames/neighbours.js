@@ -22,7 +22,7 @@ export function neighbours(frame, signal) {
   async function ask() {
     try {
       const { data } = await send("POST", `${at("maps", frame.map)}/queries`, {
-        json: { frame_id: frame.frame_id, k: K, stages: "retrieve", keep: false }, signal,
+        json: { frame_id: frame.frame_id, k: K, stages: "retrieve", keep: false, record: false }, signal,
       });
       put(place, data.matches.length
         ? h("ol", { class: "neighbours" }, data.matches.map((one) => tileOf(one, signal)))

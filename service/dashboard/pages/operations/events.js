@@ -10,7 +10,7 @@ const KIND = {
   indexed: "good", created: "good", done: "good", found: "good", reencoded: "good",
   failed: "bad", rejected: "warn", missed: "warn", deleted: "warn", revoked: "warn",
 };
-const KINDS = [["", "All kinds"], ["frame.", "Frames"], ["frame.failed", "Failures"], ["map.", "Maps"], ["import.", "Imports"], ["association.", "Associations"], ["key.", "Keys"]];
+const KINDS = [["", "All kinds"], ["frame.", "Frames"], ["frame.failed", "Failures"], ["map.", "Maps"], ["query.", "Queries"], ["import.", "Imports"], ["association.", "Associations"], ["key.", "Keys"]];
 const AT_ONCE = 100;
 const MOST = 500; // rows: a page that is left open for a day stays light
 const RENEW_S = 20;
@@ -33,7 +33,7 @@ export async function renderTab(root, { search, signal }) {
 
 /**
  * A list of events that grows at the top as they happen.
- * @param {{map?: string | null, kind?: string | null, limit: number, older?: boolean, signal: AbortSignal,
+ * @param {{map?: string | null, kind?: string | string[] | null, limit: number, older?: boolean, signal: AbortSignal,
  *   onstate?: (state: "live" | "waiting") => void, onevent?: (event: Object<string, any>) => void}} what
  *   older: with a button for those before; limit: shown at first, and without `older` at most
  * @returns {Promise<HTMLElement>}
@@ -65,7 +65,7 @@ export async function events({ map, kind, limit, older = false, signal, onstate,
   // the stream first, then what was before: what happens between the two comes twice, not never
   const early = [];
   const heard = watch({
-    map: map ?? undefined, kinds: kind ? [kind] : undefined, signal, onstate,
+    map: map ?? undefined, kinds: kind ? [kind].flat() : undefined, signal, onstate,
     onevent: (event) => {
       if (first) early.push(event); else take([event], false);
       onevent(event);

@@ -17,6 +17,8 @@ const POLL_S = 5;
 const SOON_MS = 800; // after an event: many come at once, and one look is enough for all
 const FAILURES = 8;
 const EVENTS = 12;
+// all kinds but queries: robots that ask all the time would leave nothing else to be seen
+const CHANGES = ["map.", "frame.", "import.", "association.", "key."];
 
 /** See operations.js. */
 export async function renderTab(root, { search, signal }) {
@@ -50,7 +52,7 @@ export async function renderTab(root, { search, signal }) {
   const soon = () => { timer ??= setTimeout(() => { timer = null; again(); }, SOON_MS); };
   signal.addEventListener("abort", () => clearTimeout(timer), { once: true });
   failures.onchange = again;
-  const feed = await events({ map, limit: EVENTS, signal, onstate: line.live, onevent: soon });
+  const feed = await events({ map, kind: CHANGES, limit: EVENTS, signal, onstate: line.live, onevent: soon });
   const choose = await mapField(map, signal, (name) => go(link("operations", { map: name })), all);
   put(root, h("div", { class: "toolbar spread" }, line.element, choose),
     !whole && h("p", { class: "muted" }, all ? "Figures of this map only. Workers, requests, query times and disk space cover all maps."

@@ -36,14 +36,14 @@ export async function render(root, { params, signal, title, actions }) {
   put(root, h("div", { class: "query-page is-answer" }, asked(question), body));
   await showAnswer(body, answer, {
     signal, pictures, isOwnPage: true,
-    ask: async (frame) => (await askAgain(answer.query_id, { explain_frame: frame, explain: null, keep: false }, signal)).explained_frame,
+    ask: async (frame) => (await askAgain(answer.query_id, { explain_frame: frame, explain: null, keep: false, record: false }, signal)).explained_frame,
     pick: answer.maps.length === 1 ? () => pickFrame(answer.maps[0], { pictures, signal, title: "Why not this frame?" }) : undefined,
   });
 }
 
 function asked(question) {
   const { options } = question;
-  const said = Object.entries(options).filter(([name]) => !["explain", "explain_frame", "keep"].includes(name));
+  const said = Object.entries(options).filter(([name]) => !["explain", "explain_frame", "keep", "record"].includes(name));
   const who = [question.robot && `robot ${question.robot}`, question.session && `session ${question.session}`].filter(Boolean);
   return h("p", { class: "muted query-note" },
     "Asked ", time(question.asked_at), " of ", question.maps.map((name, i) => [i > 0 && ", ", h("a", { href: link("maps", name) }, name)]),

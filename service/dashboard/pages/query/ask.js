@@ -93,7 +93,8 @@ class Page {
       this.state, h("div", { class: "query-main" }, this.chooser, this.result)));
     if (this.lost !== null) this.say(`Answer ${shortId(this.lost)} has expired. Pick a frame, or drop the file again.`);
     this.chooser.tell(this.source);
-    if (this.source) this.run(); else this.nothing();
+    // what an address asks was asked before: to look at it once more is no query of anybody's
+    if (this.source) this.run({ record: false }); else this.nothing();
   }
 
   nothing() {
@@ -129,7 +130,7 @@ class Page {
   }
 
   /** Ask as things are now; an answer that has not come by then is not waited for. */
-  async run() {
+  async run({ record = true } = {}) {
     clearTimeout(this.timer);
     this.running?.abort();
     if (this.signal.aborted) return;
@@ -141,14 +142,14 @@ class Page {
     if (this.answer === null) put(this.result, loading("Asking"));
     const source = /** @type {import("./asking.js").Source} */ (this.source);
     try {
-      const options = { ...toOptions(this.said, this.rest), explain: true, explain_frame: this.why };
+      const options = { ...toOptions(this.said, this.rest), explain: true, explain_frame: this.why, record: record ? null : false };
       const answer = await this.answered(source, options, signal);
       remember(answer.query_id, this.follow(answer));
       this.panel.refuse([]);
       const shown = await showAnswer(this.result, answer, {
         signal: this.signal, turn: signal, pictures: this.pictures, before: this.answer, chosen: this.choice?.chosen ?? null,
         ask: async (frame) => {
-          const told = await ask(source, this.maps, { ...options, explain: null, explain_frame: frame, keep: false }, this.signal);
+          const told = await ask(source, this.maps, { ...options, explain: null, explain_frame: frame, keep: false, record: false }, this.signal);
           if (this.source === source) this.why = frame; // another may have been taken meanwhile
           return told.explained_frame;
         },
@@ -164,12 +165,12 @@ class Page {
       if (error.status === 401) throw error;
       this.say("");
       if (error.status === 0) {
-        put(this.result, gone(() => this.run(), signal));
+        put(this.result, gone(() => this.run({ record }), signal));
         return;
       }
       this.panel.refuse(error.errors ?? []);
       this.answer = null;
-      put(this.result, failed(error, () => this.run()));
+      put(this.result, failed(error, () => this.run({ record })));
     } finally {
       if (this.running === own) this.result.setAttribute("aria-busy", "false");
     }

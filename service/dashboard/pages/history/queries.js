@@ -1,0 +1,161 @@
+// The queries of a map: who asked, what came of it, where, and why it failed. It reads records that
+// are kept; nothing is asked again.
+import { get, watch } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { count, ms, percent, shortId, time } from "../lib/format.js";
+import { coded, sentence } from "../lib/prose.js";
+import { link } from "../lib/router.js";
+import { empty, soon } from "../lib/states.js";
+import { rows } from "../operations/poll.js";
+
+export const styles = ["operations/operations.css", "history/queries.css"];
+
+/** What came of a query: the kind of its badge, and its words. */
+const STATUSES = {
+  found: ["good", "Found"], ambiguous: ["warn", "Ambiguous"], not_found: ["warn", "Not found"],
+  failed: ["bad", "Failed"], unvalidated: ["neutral", "Not validated"],
+};
+const LOST = ["ambiguous", "not_found", "failed"];
+const CHOICES = [["", "All outcomes"], ["lost", "Without a pose"], ...Object.entries(STATUSES).map(([name, [, text]]) => [name, text])];
+const PERIODS = [["", "Any time"], ["1", "Last hour"], ["24", "Last 24 hours"], ["168", "Last 7 days"]];
+const HOUR_MS = 3_600_000;
+const AT_ONCE = 50;
+const TOGETHER_MS = 500; // events of a burst are one look
+
+/** @param {HTMLElement} root @param {Object<string, any>} context see main.js */
+export async function render(root, { params, search, signal, go, title }) {
+  const { map } = params;
+  title(`Queries of ${map}`);
+  const come = soon(root, "Loading the queries");
+  /** @type {any} */
+  const asked = Object.fromEntries(["status", "robot", "last", "since", "until"].map((name) => [name, search.get(name)]));
+  const to = (change) => go(link("maps", map, "queries", { ...asked, ...change }));
+
+  const body = h("tbody", { role: "rowgroup" });
+  const columns = ["When", "Robot", "Outcome", "Pose", "Views", "Took", "Why", "Answer"];
+  const numbers = new Set(["Views", "Took"]);
+  const table = h("table", { class: "table queries", role: "table" }, h("caption", { class: "visually-hidden" }, `Queries of ${map}, the newest first`),
+    h("thead", { role: "rowgroup" }, h("tr", { role: "row" }, columns.map((text) => h("th", { scope: "col", role: "columnheader", class: numbers.has(text) && "number" }, text)))), body);
+  const card = h("div", { class: "card scroll" }, table);
+  const none = h("div", { hidden: true });
+  const more = h("button", { class: "button", type: "button", onClick: () => older() }, "Show older queries");
+  const news = h("button", { class: "button primary", type: "button", hidden: true, onClick: () => newest() });
+  const show = rows(body, (one) => one.query_id, row);
+  let found = [];
+  let fresh = 0;
+  /** @type {string | null} */
+  let cursor = null;
+
+  const page = (from) => get("queries", { params: { map, ...wanted(asked), cursor: from, limit: AT_ONCE }, signal });
+
+  function tell() {
+    show(found);
+    more.hidden = cursor === null;
+    card.hidden = found.length === 0;
+    none.hidden = found.length > 0;
+    news.hidden = fresh === 0;
+    put(news, `Show ${fresh === 1 ? "1 new query" : `${count(fresh)} new queries`}`);
+  }
+  async function newest() {
+    const told = await page(null);
+    [found, cursor, fresh] = [told.items, told.next_cursor, 0];
+    tell();
+  }
+  async function older() {
+    const told = await page(cursor);
+    const known = new Set(found.map((one) => one.query_id));
+    found = [...found, ...told.items.filter((one) => !known.has(one.query_id))];
+    cursor = told.next_cursor;
+    tell();
+  }
+
+  await newest();
+  come();
+  const isFiltered = Object.values(asked).some((value) => value !== null);
+  put(none, isFiltered
+    ? empty({ title: "No queries match", text: "Choose other filters, or none.", actions: h("a", { class: "button", href: link("maps", map, "queries") }, "Show all queries") })
+    : empty({ title: "No queries yet", text: "Each query leaves a record here within a second: who asked, what came of it, and where.", actions: h("a", { class: "button", href: link("maps", map, "query") }, "Run a query") }));
+  put(root, h("div", { class: "toolbar spread" },
+    h("div", { class: "toolbar", role: "group", "aria-label": "Filters" },
+      select("queries-status", "Outcome", CHOICES, asked.status, (status) => to({ status })),
+      select("queries-last", "Period", periods(asked), asked.last ?? (isPeriod(asked) ? "chosen" : null), (last) => to({ last, since: null, until: null })),
+      robotField(asked.robot, (robot) => to({ robot }))),
+    news), card, none, more);
+  follow(map, asked, signal, (events) => { fresh += events; tell(); });
+}
+
+/** Parameters of the list, by what the address says. */
+function wanted({ status, robot, last, since, until }) {
+  const hours = Number(last);
+  return {
+    status: status === "lost" ? LOST : status, robot, until,
+    since: last && Number.isFinite(hours) ? new Date(Date.now() - hours * HOUR_MS).toISOString() : since,
+  };
+}
+
+/** Hear of queries that came, where they would be in the list; of many at once only once. */
+function follow(map, asked, signal, heard) {
+  let waiting = 0;
+  const fits = ({ status, robot }) => (!asked.robot || asked.robot === robot)
+    && (!asked.status || asked.status === status || (asked.status === "lost" && LOST.includes(status)));
+  watch({ map, kinds: ["query.answered"], signal, onevent: (event) => {
+    if (asked.until !== null || !fits(event.data)) return;
+    waiting += 1;
+    if (waiting === 1) setTimeout(() => { if (!signal.aborted) heard(waiting); waiting = 0; }, TOGETHER_MS);
+  } });
+}
+
+function row(one) {
+  const [kind, text] = STATUSES[one.status] ?? ["neutral", one.status];
+  // roles: on a phone a row is no row of a table to the browser, as each is laid out by itself
+  const cell = (name, ...children) => h("td", { class: `queries-${name}`, role: "cell" }, children);
+  return h("tr", { role: "row", dataset: { query: one.query_id, status: one.status } },
+    cell("when", time(one.at)),
+    h("th", { class: "queries-who", scope: "row", role: "rowheader" }, one.robot ?? h("span", { class: "muted", title: "The query did not say who asked." }, one.key ? `key ${one.key}` : "not named"),
+      one.session && h("span", { class: "queries-more muted" }, one.session)),
+    cell("outcome", h("span", { class: "badge", dataset: { kind } }, text)),
+    cell("pose", pose(one)),
+    cell("views number", one.pose ? count(one.support) : "–"),
+    cell("took number", ms(one.milliseconds)),
+    cell("why", why(one)),
+    cell("answer", answer(one)));
+}
+
+/** Where it was found. */
+function pose({ pose: found, alternatives, rival_ratio: rival }) {
+  if (!found) return alternatives ? `${count(alternatives)} possible` : "–";
+  const { x, y, z } = found.translation;
+  const told = [x, y, z].map((one) => one.toFixed(2)).join(", ");
+  const near = typeof rival === "number" && rival > 0 ? `, next best place ${percent(rival)} as good` : "";
+  return h("span", { title: `In ${found.parent_frame}${near}` }, h("span", { class: "number" }, told), h("span", { class: "queries-more muted" }, `m in ${found.parent_frame}`));
+}
+
+function why({ reason, frame }) {
+  return [coded(sentence(reason)), frame && [" ", h("a", { class: "mono", href: link("maps", frame.map, "frames", frame.frame_id), title: frame.frame_id }, `frame ${shortId(frame.frame_id)}`)]];
+}
+
+/** The answer while it is kept, and afterwards that it is not. */
+function answer({ query_id: id, kept_until: until, status }) {
+  if (until && Date.parse(until) > Date.now()) return h("a", { class: "mono", href: link("queries", id), "aria-label": `Answer ${shortId(id)}` }, shortId(id));
+  const text = status === "failed" ? ["no answer", "The query failed."] : ["expired", "Answers expire after about an hour; this record stays longer."];
+  return h("span", { class: "muted", title: `${text[1]} Query ${id}.` }, text[0]);
+}
+
+function select(id, label, choices, value, choose) {
+  const field = h("select", { id, onChange: () => choose(field.value || null) },
+    choices.map(([name, text]) => h("option", { value: name, selected: name === (value ?? "") }, text)));
+  return h("label", { class: "inline-field", for: id }, h("span", { class: "visually-hidden" }, label), field);
+}
+
+function isPeriod({ since, until }) {
+  return since !== null || until !== null;
+}
+
+function periods(asked) {
+  return isPeriod(asked) ? [...PERIODS, ["chosen", "As in the address"]] : PERIODS;
+}
+
+function robotField(value, choose) {
+  const field = h("input", { id: "queries-robot", type: "search", value: value ?? "", placeholder: "Any robot", "aria-label": "Robot", onChange: () => choose(field.value.trim() || null) });
+  return h("span", { class: "inline-field" }, field);
+}

@@ -1,0 +1,104 @@
+"""The queries of a map in a real browser: every row is a record, and looking leaves none."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+ROWS = """() => [...document.querySelectorAll(".queries tbody tr")].map((row) => ({
+    id: row.dataset.query, status: row.dataset.status,
+    cells: [...row.cells].map((one) => one.innerText.trim()),
+    answer: row.querySelector("td:last-child a")?.getAttribute("href") ?? null,
+  }))"""
+BROKEN = ("frame.png", b"\x89PNG\r\n\x1a\n", "image/png")
+
+
+@pytest.fixture(scope="module")
+def asked(station):
+    """Answers to four queries of a map of their own: two found, one of nobody, one that failed."""
+    path = station.make_map("seen")
+    for sent in station.frames[:2]:
+        form = sent.form(priority="10")
+        form["data"]["meta"] = json.dumps(sent.meta)
+        added = station.client.post(
+            f"{path}/frames", headers={"Prefer": "wait=60"}, **form
+        )  # fmt: skip
+        assert added.json()["state"] == "indexed", added.text
+    found = []
+    for who, sent in (("spot", 0), ("cart", 1), (None, 8)):
+        form = station.frames[sent].form()
+        camera = json.loads(form["data"]["meta"])
+        form["data"]["meta"] = json.dumps(
+            camera | ({"robot": who, "session": "run"} if who else {})
+        )
+        found.append(station.client.post(f"{path}/queries", **form).json())
+    form = station.frames[0].form(keep="false")
+    form["files"] = {"frame": BROKEN}
+    assert station.client.post(f"{path}/queries", **form).status_code == 422
+    return found
+
+
+def records(station, **params):
+    return station.client.get("/v1/queries", params={"map": "seen", **params}).json()["items"]
+
+
+def test_the_rows_are_the_records_and_filters_are_in_the_address(station, asked, page, settle, axe):
+    page.goto(f"{station.home}#/maps/seen/queries")
+    settle(page)
+    told = records(station)
+    rows = page.evaluate(ROWS)
+    assert [(one["id"], one["status"]) for one in rows] == [
+        (one["query_id"], one["status"]) for one in told
+    ]
+    assert [one["status"] for one in rows] == ["failed", "not_found", "found", "found"]
+    failed, lost, second, first = (one["cells"] for one in rows)
+    assert (failed[1:5], failed[7]) == (["not named", "Failed", "–", "–"], "no answer")
+    assert failed[6] == told[0]["reason"]
+    assert lost[2] == "Not found"
+    assert lost[6] == asked[2]["reason"][0].upper() + asked[2]["reason"][1:] + "."
+    assert (second[1], first[1]) == ("cart\nrun", "spot\nrun")
+    place = asked[0]["location"]["pose"]["translation"]
+    there = ", ".join(f"{place[axis]:.2f}" for axis in "xyz")
+    assert first[3] == f"{there}\nm in room-0"
+    assert first[4] == str(asked[0]["location"]["support"])
+    assert [one["answer"] for one in rows] == [
+        None, *(f"#/queries/{one['query_id']}" for one in reversed(asked))
+    ]  # fmt: skip
+    assert axe(page) == []
+    page.select_option("#queries-status", "lost")
+    settle(page)
+    assert page.url.endswith("#/maps/seen/queries?status=lost")
+    assert [one["status"] for one in page.evaluate(ROWS)] == ["failed", "not_found"]
+    page.reload()
+    settle(page)
+    assert [one["status"] for one in page.evaluate(ROWS)] == ["failed", "not_found"]
+    page.goto(f"{station.home}#/maps/seen/queries?robot=spot&last=1")
+    settle(page)
+    assert [one["id"] for one in page.evaluate(ROWS)] == [asked[0]["query_id"]]
+    page.goto(f"{station.home}#/maps/seen/queries?until={told[-1]['at']}")
+    settle(page)
+    assert page.locator(".state h2").inner_text() == "No queries match"
+
+
+def test_new_queries_are_announced_and_looking_leaves_none(station, asked, page, settle, until):
+    before = records(station)
+    page.goto(f"{station.home}#/maps/seen/queries")
+    settle(page)
+    # the answer, a stored frame with its neighbours, and a query that an address asks once more
+    page.get_by_role("link", name=f"Answer {asked[0]['query_id'][:8]}").click()
+    settle(page)
+    assert page.locator("h1").inner_text().startswith("Answer")
+    frame = asked[0]["matches"][0]["frame_id"]
+    for place in (f"frames/{frame}", f"query?frame={frame}", "queries"):
+        page.goto(f"{station.home}#/maps/seen/{place}")
+        settle(page)
+    assert records(station) == before
+    sent = station.frames[1].form()
+    for _ in range(2):
+        assert station.client.post("/v1/maps/seen/queries", **sent).status_code == 200
+    page.get_by_role("button", name="Show 2 new queries").click()
+    settle(page)
+    rows = page.evaluate(ROWS)
+    assert [one["id"] for one in rows] == [one["query_id"] for one in records(station)]
+    assert len(rows) == len(before) + 2
