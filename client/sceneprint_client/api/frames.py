@@ -35,7 +35,7 @@ MOST_PRIORITY = 10
 #: What a frame is: a depth image or a point cloud.
 Kind = Literal["depth", "cloud"]
 #: How files of clouds are packed; all but KITTI's say so themselves.
-CloudFormat = Literal["ply", "pcd", "kitti", "npy", "las"]
+CloudFormat = Literal["ply", "pcd", "kitti", "npy", "las", "pointcloud2"]
 
 Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
 

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sceneprint.errors import DatasetError
-from sceneprint.types import Floats
+from sceneprint_client.errors import DatasetError
+from sceneprint_client.rotations import Floats
 
 #: Seconds before and after a stamp over which accelerations are averaged.
 WINDOW_S = 0.5
@@ -53,6 +53,14 @@ class Accelerations:
             )
         self._stamps_ns.append(stamp_ns)
         self._rows.extend(row)
+
+    def forget(self, before_ns: int) -> None:
+        """Drop measurements that came before the first one of a time or later."""
+        recorded = np.frombuffer(self._stamps_ns, np.int64)
+        late = recorded >= before_ns
+        old = int(np.argmax(late)) if late.any() else len(recorded)
+        del recorded, late  # a view keeps an array from shrinking
+        del self._stamps_ns[:old], self._rows[: 6 * old]
 
     def up_at(self, stamps_ns: Sequence[int]) -> list[Floats | None]:
         """Up (3,) in the IMU's axes at each stamp; None where the robot was not at rest.

@@ -15,17 +15,15 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.errors import DatasetError
-from sceneprint.formats.dataset.frame_reference import SensorTrajectory, interpolate
-from sceneprint.formats.recording.bag import printable
-from sceneprint.geometry.pose.rigid import rotation_of
-from sceneprint.types import Floats
+from sceneprint_client.errors import DatasetError, printable
+from sceneprint_client.rotations import Floats, rotation_of
+from sceneprint_client.trajectories import SensorTrajectory, interpolate
 
 #: Seconds between two samples of a transform beyond which nothing between them is known.
 LONGEST_GAP_S = 0.5
 #: Seconds before the first sample of a transform, or after its last, for which that one stands.
 TOLERANCE_S = 0.02
-#: Most samples of moving transforms of a recording: hours at the rate of any odometry.
+#: Most samples of moving transforms: hours at the rate of any odometry.
 MOST_SAMPLES = 5_000_000
 #: How far the length of a recorded quaternion may be from 1.
 _UNIT = 1e-2
@@ -74,7 +72,7 @@ class TransformTree:
 
         Raises
         ------
-        DatasetError : there are more than 5 million.
+        DatasetError : there are more than 5 million; `forget` makes room.
         """
         parent, child = frame_name(parent), frame_name(child)
         row = np.asarray(sample, np.float64)
@@ -85,7 +83,7 @@ class TransformTree:
         self._count += 1
         if self._count > MOST_SAMPLES:
             raise DatasetError(
-                f"The recording has more than {MOST_SAMPLES} transforms. Cut it into parts."
+                f"There are more than {MOST_SAMPLES} transforms. Cut the recording into parts."
             )
         row[3:] /= length
         edges = self._edges.setdefault(child, {})
@@ -99,6 +97,18 @@ class TransformTree:
         edge.samples.extend(row)
         if self._origin_ns is None:
             self._origin_ns = stamp_ns
+
+    def forget(self, before_ns: int) -> None:
+        """Drop samples of moving transforms from before a time; the latest of each stays."""
+        for edges in self._edges.values():
+            for edge in edges.values():
+                recorded = np.frombuffer(edge.stamps_ns, np.int64)
+                old = int(np.argmax(recorded >= before_ns)) if len(recorded) else 0
+                if len(recorded) and recorded[-1] < before_ns:
+                    old = len(recorded) - 1
+                del recorded  # a view keeps an array from shrinking
+                del edge.stamps_ns[:old], edge.samples[: 7 * old]
+                self._count -= old
 
     def frames(self) -> list[str]:
         """Names of all frames."""
