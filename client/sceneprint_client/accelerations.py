@@ -12,6 +12,7 @@ import numpy as np
 
 from sceneprint_client.errors import DatasetError
 from sceneprint_client.rotations import Floats
+from sceneprint_client.transform_tree import first_since
 
 #: Seconds before and after a stamp over which accelerations are averaged.
 WINDOW_S = 0.5
@@ -54,12 +55,9 @@ class Accelerations:
         self._stamps_ns.append(stamp_ns)
         self._rows.extend(row)
 
-    def forget(self, before_ns: int) -> None:
-        """Drop measurements that came before the first one of a time or later."""
-        recorded = np.frombuffer(self._stamps_ns, np.int64)
-        late = recorded >= before_ns
-        old = int(np.argmax(late)) if late.any() else len(recorded)
-        del recorded, late  # a view keeps an array from shrinking
+    def forget(self, span_ns: int) -> None:
+        """Drop measurements that came before those of so long until the latest."""
+        old = first_since(self._stamps_ns, span_ns)
         del self._stamps_ns[:old], self._rows[: 6 * old]
 
     def up_at(self, stamps_ns: Sequence[int]) -> list[Floats | None]:

@@ -287,7 +287,8 @@ def cloud_table(message: Any) -> NDArray[np.void]:
     if not width * height:
         return np.empty((0, 0), [(name, "f4") for name in "xyz"])
     kind = _point_type(message, step)
-    return np.ndarray((height, width), kind, data, strides=(row, step))
+    table: NDArray[np.void] = np.ndarray((height, width), kind, data, strides=(row, step))
+    return table
 
 
 def cloud_blocks(table: NDArray[np.void]) -> Iterator[Floats]:

@@ -98,17 +98,21 @@ class TransformTree:
         if self._origin_ns is None:
             self._origin_ns = stamp_ns
 
-    def forget(self, before_ns: int) -> None:
-        """Drop samples of moving transforms from before a time; the latest of each stays."""
+    def forget_moving(self) -> None:
+        """Drop all that may move, as where the clock jumped."""
+        for edges in self._edges.values():
+            for parent in [name for name, edge in edges.items() if not edge.fixed]:
+                self._count -= len(edges.pop(parent).stamps_ns)
+        self._origin_ns = None
+
+    def forget(self, span_ns: int) -> None:
+        """Drop samples of moving transforms that came before those of so long until the latest."""
         for edges in self._edges.values():
             for edge in edges.values():
-                recorded = np.frombuffer(edge.stamps_ns, np.int64)
-                old = int(np.argmax(recorded >= before_ns)) if len(recorded) else 0
-                if len(recorded) and recorded[-1] < before_ns:
-                    old = len(recorded) - 1
-                del recorded  # a view keeps an array from shrinking
-                del edge.stamps_ns[:old], edge.samples[: 7 * old]
-                self._count -= old
+                if not edge.fixed:
+                    old = first_since(edge.stamps_ns, span_ns)
+                    del edge.stamps_ns[:old], edge.samples[: 7 * old]
+                    self._count -= old
 
     def frames(self) -> list[str]:
         """Names of all frames."""
@@ -269,6 +273,12 @@ class TransformTree:
         asked = np.where(near, np.clip(asked, times[0], times[-1]), asked)
         trajectory = SensorTrajectory(times, rows[first, :3], rows[first, 3:])
         return interpolate(trajectory, asked.tolist(), longest_gap=LONGEST_GAP_S)
+
+
+def first_since(stamps_ns: array[int], span_ns: int) -> int:
+    """Place of the first stamp, in the order in which they came, within a span until the last."""
+    times = np.frombuffer(stamps_ns, np.int64)
+    return int(np.argmax(times >= times[-1] - span_ns)) if len(times) else 0
 
 
 def frame_name(name: str) -> str:
