@@ -89,6 +89,21 @@ class Level(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
+class TrackedPose:
+    """Where a robot is that is tracked.
+
+    Parameters
+    ----------
+    T_map_odom, T_map_base : (4, 4)
+    covariance : (6, 6) of T_map_base, errors (x, y, z, rx, ry, rz) along the axes of the map
+    """
+
+    T_map_odom: Floats
+    T_map_base: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True, eq=False)
 class Report:
     """What may be told to other nodes.
 
@@ -96,17 +111,14 @@ class Report:
     ----------
     state : of the tracker
     stamp_ns : of the frame that it is told for, nanoseconds; 0 before the first
-    T_map_odom, T_map_base : (4, 4) while tracking, else None
-    covariance : (6, 6) of T_map_base, errors (x, y, z, rx, ry, rz) along the axes of the map
+    pose : while tracking, else None
     is_fix : whether it tracks now, and did not by the last report
     level, message, values : for diagnostics
     """
 
     state: State
     stamp_ns: int
-    T_map_odom: Floats | None
-    T_map_base: Floats | None
-    covariance: Floats | None
+    pose: TrackedPose | None
     is_fix: bool
     level: Level
     message: str
@@ -343,13 +355,13 @@ class Relocaliser:
         if is_tracking and not self._parent:
             self._parent = state.parent_frame or ""
         is_elsewhere = is_tracking and state.parent_frame != self._parent
-        T_map_odom, T_map_base, covariance = None, None, None
+        pose = None
         if is_tracking and not is_elsewhere and last is not None:
-            T_map_odom, T_map_base, covariance = self._told(state, last)
-        is_fix = T_map_odom is not None and not self._was_tracking
+            pose = self._pose(state, last)
+        is_fix = pose is not None and not self._was_tracking
         if not is_stale:
-            self._was_tracking = T_map_odom is not None
-        level = Level.OK if T_map_odom is not None else Level.WARN
+            self._was_tracking = pose is not None
+        level = Level.OK if pose is not None else Level.WARN
         message = f"{state.status}: {state.reason}"
         if is_elsewhere:
             message = f"tracked in {state.parent_frame}, and the map here is {self._parent}"
@@ -361,12 +373,11 @@ class Relocaliser:
         if self._error:
             level, message = Level.ERROR, self._error
         return Report(
-            state, self._last_ns, T_map_odom, T_map_base, covariance, is_fix, level, message,
-            self._values(state),
+            state, self._last_ns, pose, is_fix, level, message, self._values(state)
         )  # fmt: skip
 
-    def _told(self, state: State, last: _Place) -> tuple[Floats, Floats, Floats]:
-        """T_map_odom, T_map_base and its covariance of a state that is tracked."""
+    def _pose(self, state: State, last: _Place) -> TrackedPose:
+        """Of a state that is tracked."""
         if state.T_map_odom is None or state.T_map_sensor is None or state.covariance is None:
             raise AssertionError("what is tracked has a pose")
         T_map_odom, T_map_base = state.T_map_odom, state.T_map_odom @ last.T_odom_base
@@ -376,7 +387,7 @@ class Relocaliser:
         if self.parameters.planar:
             T_map_base = planar(T_map_base)
             T_map_odom = T_map_base @ inverse(planar(last.T_odom_base))
-        return T_map_odom, T_map_base, covariance
+        return TrackedPose(T_map_odom, T_map_base, covariance)
 
     def _silence(self, silent_s: float) -> str:
         """Why there is no frame that could be told of."""

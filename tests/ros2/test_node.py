@@ -100,7 +100,8 @@ def test_a_node_on_a_drive(
     bus.timers[0][1]()
     assert len(bus.published) == count  # nothing is told of a place that is forgotten
     node.destroy_node()
-    states = list(replay((tmp_path / "drive.jsonl").open()))
+    with (tmp_path / "drive.jsonl").open() as log:
+        states = list(replay(log))
     assert "tracking" in {one.status for one in states}
     assert states[-1].status == "lost"
 

@@ -120,14 +120,14 @@ def test_a_drive_is_tracked_as_the_truth_is(
             "unreadable": 0,
         }
     assert len(reports) == count
-    tracked = [i for i, one in enumerate(reports) if one.T_map_base is not None]
+    tracked = [i for i, one in enumerate(reports) if one.pose is not None]
     assert tracked[0] <= 2
     assert tracked == list(range(tracked[0], count))
     assert [one.is_fix for one in reports] == [i == tracked[0] for i in range(count)]
     for i in tracked:
         report = reports[i]
-        assert report.T_map_base is not None
-        step, turn = difference(report.T_map_base, room[i].pose @ np.linalg.inv(ros.camera))
+        assert report.pose is not None
+        step, turn = difference(report.pose.T_map_base, room[i].pose @ np.linalg.inv(ros.camera))
         assert step < 0.08
         assert np.degrees(turn) < 2
         assert report.level is Level.OK
@@ -139,9 +139,7 @@ def test_nothing_is_told_of_a_place_that_is_not_known(ros: SimpleNamespace) -> N
         before = core.report(ros.start * SECOND)
         assert (before.level, before.message) == (Level.STALE, "no frame has come")
         (report,) = run(core, still(ros).written)
-    assert report.T_map_odom is None
-    assert report.T_map_base is None
-    assert report.covariance is None
+    assert report.pose is None
     assert (report.level, report.is_fix) == (Level.WARN, False)
     assert report.message.startswith("lost: ")
 
@@ -174,7 +172,7 @@ def test_a_frame_waits_for_its_transform_and_no_longer_than_told(ros: SimpleName
         assert core.step() == 0
         assert core.counts["without_transform"] == 1  # of 0.7, which waited for half a second
         told = core.report((ros.start + 10) * SECOND)
-        assert (told.level, told.T_map_odom) == (Level.STALE, None)
+        assert (told.level, told.pose) == (Level.STALE, None)
         assert told.message == "no transforms from odom to camera and base_link at its stamps"
     assert len(client.asked) == 2
 
@@ -183,12 +181,12 @@ def test_what_is_silent_is_not_told(ros: SimpleNamespace) -> None:
     with scripted() as (core, _):
         (report,) = run(core, still(ros).written)
         assert report.is_fix
-        assert core.report(ros.start * SECOND + 2 * SECOND).T_map_odom is not None
+        assert core.report(ros.start * SECOND + 2 * SECOND).pose is not None
         silent = core.report(ros.start * SECOND + 3 * SECOND)
-        assert (silent.T_map_odom, silent.level) == (None, Level.STALE)
+        assert (silent.pose, silent.level) == (None, Level.STALE)
         assert silent.message == "no frame has come for 3.0 s"
         again = core.report(ros.start * SECOND)
-        assert (again.T_map_odom is not None, again.is_fix) == (True, False)
+        assert (again.pose is not None, again.is_fix) == (True, False)
 
 
 def test_relocalising_forgets_and_asks_at_once(ros: SimpleNamespace) -> None:
@@ -198,7 +196,7 @@ def test_relocalising_forgets_and_asks_at_once(ros: SimpleNamespace) -> None:
         assert len(client.asked) == 1
         core.relocalise()
         lost = core.report(ros.start * SECOND + SECOND)
-        assert (lost.state.status, lost.T_map_odom) == ("lost", None)
+        assert (lost.state.status, lost.pose) == ("lost", None)
         assert "relocalise" in lost.message
         (found,) = run(core, still(ros, 1, start=2.0).written)
         assert found.is_fix
@@ -230,19 +228,20 @@ def test_the_pose_is_that_of_the_base_and_so_is_its_covariance(ros: SimpleNamesp
     with scripted(lambda number: T_map_camera) as (core, _):
         (report,) = run(core, writer.written)
         state = report.state
-    assert report.T_map_base is not None
-    assert report.covariance is not None
+    assert report.pose is not None
     assert state.covariance is not None
-    np.testing.assert_allclose(report.T_map_base, T_map_camera @ np.linalg.inv(T_base_camera))
+    np.testing.assert_allclose(report.pose.T_map_base, T_map_camera @ np.linalg.inv(T_base_camera))
     np.testing.assert_allclose(
-        report.T_map_odom, report.T_map_base @ np.linalg.inv(ros.transform(5, 0, 0)), atol=1e-12
+        report.pose.T_map_odom,
+        report.pose.T_map_base @ np.linalg.inv(ros.transform(5, 0, 0)),
+        atol=1e-12,
     )
     heading = np.array([np.cos(1), np.sin(1)])
     sideways = np.array([-heading[1], heading[0]])
-    variance = sideways @ report.covariance[:2, :2] @ sideways
+    variance = sideways @ report.pose.covariance[:2, :2] @ sideways
     own = sideways @ state.covariance[:2, :2] @ sideways
     assert variance == pytest.approx(own + 4 * state.covariance[5, 5])
-    along = heading @ report.covariance[:2, :2] @ heading
+    along = heading @ report.pose.covariance[:2, :2] @ heading
     assert along == pytest.approx(heading @ state.covariance[:2, :2] @ heading)
 
 
@@ -256,14 +255,14 @@ def test_on_a_plane_only_heading_and_place_are_told(ros: SimpleNamespace) -> Non
     )
     with scripted(lambda number: tilted, planar=True) as (core, _):
         (report,) = run(core, still(ros).written)
-    np.testing.assert_allclose(report.T_map_base, flat)
-    np.testing.assert_allclose(report.T_map_odom, flat)  # odometry is at its origin
+    np.testing.assert_allclose(report.pose.T_map_base, flat)
+    np.testing.assert_allclose(report.pose.T_map_odom, flat)  # odometry is at its origin
 
 
 def test_a_fix_in_another_frame_is_not_told(ros: SimpleNamespace) -> None:
     with scripted(parent_frame="hall") as (core, _):
         (report,) = run(core, still(ros).written)
-    assert (report.state.status, report.T_map_odom) == ("tracking", None)
+    assert (report.state.status, report.pose) == ("tracking", None)
     assert (report.level, report.message) == (
         Level.WARN, "tracked in site, and the map here is hall"
     )  # fmt: skip
@@ -281,7 +280,7 @@ def test_odometry_of_its_own_topic_serves_where_tf_has_none(ros: SimpleNamespace
         assert core.step() == 1
         assert core.wait(60)
         report = core.report(ros.start * SECOND)
-        np.testing.assert_allclose(report.T_map_odom, ros.transform(-1, 0, 0), atol=1e-12)
+        np.testing.assert_allclose(report.pose.T_map_odom, ros.transform(-1, 0, 0), atol=1e-12)
         # once tf says the same, odometry is passed over
         writer.transforms(1.0, {("odom", "base_link"): ros.transform(2, 0, 0)})
         writer.odometry(2.0, ros.transform(9, 0, 0))

@@ -29,7 +29,7 @@ from sceneprint_client.errors import InvalidRequest, SceneprintError
 from sceneprint_client.relocaliser import (
     Relocaliser,
     RelocaliserParameters,
-    Report,
+    TrackedPose,
     write_pose,
     write_stamp,
     write_transform,
@@ -109,11 +109,11 @@ class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
                 f"{self._p.kind!r} name no map, no topic of frames, or none of {', '.join(KINDS)}."
                 " Set them in the launch file or with -p."
             )
+        self._client = Client(self._p.url, self._p.key or os.environ.get("SCENEPRINT_KEY") or None)
         self._log: TextIO | None = None
         if self._p.log_file:
             path = Path(self._p.log_file)
             self._log = path.open("w", buffering=1, encoding="utf-8")
-        self._client = Client(self._p.url, self._p.key or os.environ.get("SCENEPRINT_KEY") or None)
         tracker = Tracker(self._client, self._p.map, parameters=tracking, log=self._log)
         self._core = Relocaliser(tracker, self._p.relocaliser())
         self._told = ("", 0)
@@ -163,30 +163,32 @@ class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
         if report.state.status != self._told[0]:
             self.get_logger().info(f"{report.state.status}: {report.state.reason}")
         self._told = (report.state.status, report.stamp_ns)
-        if report.T_map_odom is None:
+        if report.pose is None:
             return
         if self._p.publish_tf:
-            self._transforms.publish(TFMessage(transforms=[self._transform(report)]))
+            transform = self._transform(report.pose, report.stamp_ns)
+            self._transforms.publish(TFMessage(transforms=[transform]))
+        pose = self._pose(report.pose, report.stamp_ns)
         if is_new:
-            self._poses.publish(self._pose(report))
+            self._poses.publish(pose)
         if report.is_fix and self._fixes is not None:
-            self._fixes.publish(self._pose(report))
+            self._fixes.publish(pose)
 
-    def _transform(self, report: Report) -> Any:
+    def _transform(self, pose: TrackedPose, stamp_ns: int) -> Any:
         """map -> odom: it holds a little into the future, so that nobody has to wait for it."""
         message = TransformStamped()
         tolerance_ns = round(self._p.transform_tolerance_s * 1e9)
-        write_stamp(message.header.stamp, report.stamp_ns + tolerance_ns)
+        write_stamp(message.header.stamp, stamp_ns + tolerance_ns)
         message.header.frame_id, message.child_frame_id = self._p.map_frame, self._p.odom_frame
-        write_transform(message.transform, report.T_map_odom)
+        write_transform(message.transform, pose.T_map_odom)
         return message
 
-    def _pose(self, report: Report) -> Any:
+    def _pose(self, pose: TrackedPose, stamp_ns: int) -> Any:
         message = PoseWithCovarianceStamped()
-        write_stamp(message.header.stamp, report.stamp_ns)
+        write_stamp(message.header.stamp, stamp_ns)
         message.header.frame_id = self._p.map_frame
-        write_pose(message.pose.pose, report.T_map_base)
-        message.pose.covariance = report.covariance.ravel()
+        write_pose(message.pose.pose, pose.T_map_base)
+        message.pose.covariance = pose.covariance.ravel()
         return message
 
     def _diagnose(self) -> None:
