@@ -48,7 +48,10 @@ from service.problems import invalid
 # curl --data-binary @scan.ply -H 'Content-Type: application/ply' '...?robot=spot'
 
 #: Types of a body that is a frame; its first bytes decide which of them it is.
-TYPES = ("image/png", "application/x-npy", "application/ply", "application/octet-stream")
+TYPES = (
+    "image/png", "application/x-npy", "application/ply", "application/x-ros-pointcloud2",
+    "application/octet-stream",
+)  # fmt: skip
 #: Bytes of a body that are kept in memory until they are read; the rest waits on disk.
 _IN_MEMORY = 1 << 20
 
@@ -301,7 +304,8 @@ FRAME_BODY: dict[str, Any] = {
                         "description": "A depth image: 16-bit greyscale PNG in stored units (0 and "
                         "65535 where missing), or a two-dimensional NPY: float in metres, or "
                         "uint16 in stored units. Or a "
-                        "point cloud: PLY, PCD, LAS, LAZ, NPY of shape (N, 3), or KITTI's .bin.",
+                        "point cloud: PLY, PCD, LAS, LAZ, NPY of shape (N, 3), KITTI's .bin, or "
+                        "PointCloud2 as ROS 2 serialises it.",
                     },
                     "meta": {"$ref": "#/components/schemas/FrameMeta"},
                 },

@@ -13,7 +13,9 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import cache
+from importlib import util
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -270,6 +272,21 @@ def data_root() -> Path:
     if not root.is_dir():
         pytest.skip(f"no real recordings at {root} (set SCENEPRINT_DATA)")
     return root
+
+
+@pytest.fixture(scope="session")
+def ros() -> SimpleNamespace:
+    """How messages of ROS and bags of them are written, and what most of them have in common."""
+    spec = util.spec_from_file_location("bag_writer", ROOT / "tests" / "bag_writer.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = util.module_from_spec(spec)
+    spec.loader.exec_module(module)  # rosbags takes half a second
+    return SimpleNamespace(
+        write=module.write, transform=module.transform, camera=module.T_BASE_CAMERA,
+        start=module.START, k=module.K, size=(module.WIDTH, module.HEIGHT),
+        containers=module.CONTAINERS, messages=module.MessageWriter,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="session")

@@ -28,6 +28,7 @@ MODEL = (ROOT / "docs/model.md").read_text()
 PAGES = [
     *map(ROOT.joinpath, ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
     *sorted((ROOT / "docs").glob("*.md")),
+    *map(ROOT.joinpath, ("client/README.md", "ros2/sceneprint_ros/README.md")),
 ]
 GEOMETRY = sorted((ROOT / "sceneprint/geometry").rglob("*.py"))
 ROWS = re.findall(r"^\| ((?:Eq\.|Sec\.)[^|]+) \| `([^`:]+):(\w+)`", PAPER, re.MULTILINE)
@@ -237,7 +238,7 @@ def run_example(code: str, folder: Path) -> str:
 
 
 PLACES = re.findall(
-    r"`((?:client|sceneprint|service|worker|migrations|benchmarks|tests)/[\w/.]*)(?::([\w.]+))?`",
+    r"`((?:client|sceneprint|service|worker|migrations|benchmarks|tests|ros2)/[\w/.]*)(?::([\w.]+))?`",
     ARCHITECTURE,
 )
 
@@ -245,8 +246,9 @@ PLACES = re.findall(
 def test_architecture_has_a_line_for_every_package() -> None:
     folders = {
         f"{one.parent.relative_to(ROOT).as_posix()}/"
-        for top in ("client", "sceneprint", "service", "worker", "migrations", "benchmarks")
+        for top in ("client", "sceneprint", "service", "worker", "migrations", "benchmarks", "ros2")
         for one in (ROOT / top).rglob("__init__.py")
+        if not {"build", "install"} & set(one.relative_to(ROOT).parts)  # what builds leave behind
     } - {"sceneprint/"}  # fmt: skip
     layout = ARCHITECTURE.split("\n## ")[1]
     lines = set(re.findall(r"^\| `([\w/]+/)` \| \S", layout, re.MULTILINE))

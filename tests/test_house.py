@@ -11,7 +11,7 @@ from itertools import combinations
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("sceneprint", "service", "worker", "client")
+PACKAGES = ("sceneprint", "service", "worker", "client", "ros2")
 MOST_LINES = 60
 #: Words that an engineer of the field would not know, and the standard term.
 RETIRED = {
@@ -35,8 +35,12 @@ RETIRED = {
 
 @cache
 def modules() -> dict[str, ast.Module]:
-    """Syntax trees of all product modules, by path."""
-    paths = (path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py")))
+    """Syntax trees of all product modules, by path; not of copies that builds leave behind."""
+    built = {"build", "install", "log"}
+    paths = (
+        path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))
+        if built.isdisjoint(path.relative_to(ROOT / package).parts[:-1])
+    )  # fmt: skip
     return {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in paths}
 
 

@@ -81,6 +81,11 @@ def naming(subject: str) -> Iterator[None]:
         raise type(error)(f"{subject}: {error}") from error
 
 
+def printable(text: str) -> str:
+    """A text from outside as it can stand in a line: names in damaged files may be anything."""
+    return text if text.isprintable() else ascii(text)[1:-1]
+
+
 class FrameError(SceneprintError):
     """The caller's frame cannot be used."""
 

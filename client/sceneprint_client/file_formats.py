@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sceneprint_client.api.frames import CloudFormat
+from sceneprint_client.cdr import is_point_cloud
 from sceneprint_client.errors import FrameError, UnreadableCloud
 from sceneprint_client.sidecars import MAXIMUM_SAMPLES
 
@@ -26,6 +27,7 @@ MAXIMUM_CLOUD_BYTES = 512 << 20
 HEAD = 10_016
 
 
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 NPY_SIGNATURE = b"\x93NUMPY"
 _MAXIMUM_HEADER = 10_000  #: bytes, as in numpy; a literal that long can still be parsed safely
 _FLOATING = ("<f4", "<f8", "<f2", ">f4", ">f8", ">f2")
@@ -122,6 +124,7 @@ _MAXIMUM_PCD_HEADER = 65_536  #: bytes
 #: Suffixes of file names, in lower case. A .npy may be a depth image as well: its shape tells.
 SUFFIXES: dict[str, CloudFormat] = {
     ".ply": "ply", ".pcd": "pcd", ".bin": "kitti", ".npy": "npy", ".las": "las", ".laz": "las",
+    ".cdr": "pointcloud2",
 }  # fmt: skip
 
 
@@ -146,6 +149,8 @@ def format_of(data: bytes) -> CloudFormat | None:
         return "ply"
     if data.startswith(LAS_SIGNATURE):
         return "las"
+    if is_point_cloud(data):
+        return "pointcloud2"
     return "pcd" if is_pcd(data) else None
 
 

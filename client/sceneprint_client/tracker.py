@@ -108,6 +108,11 @@ class Tracker:
             self._write({"stamp": stamp, "odometry": _listed(odom_pose)})
             return state
 
+    def state(self) -> State:
+        """The state as it is, by what came so far."""
+        with self._lock:
+            return self._core.state()
+
     def reset(self, reason: str = "it was reset") -> State:
         """Forget the place: after a lift or a ride, which odometry does not see. Clock and odometry
         may begin anew; answers to frames from before are not used.
@@ -172,6 +177,7 @@ class AsyncTracker:
 
     def __init__(self, tracker: Tracker) -> None:
         self.dropped = 0  #: frames that a later one superseded
+        self.answered = 0  #: questions that ended without an error
         self._tracker = tracker
         self._waiting: dict[str, Any] | None = None
         self._busy = self._closed = False
@@ -242,6 +248,9 @@ class AsyncTracker:
             except Exception as error:
                 with self._changed:
                     self._error = error
+            else:
+                with self._changed:
+                    self.answered += 1
 
 
 # A log of what came in, from which the states can be computed again.

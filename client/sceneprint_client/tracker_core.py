@@ -433,11 +433,9 @@ class TrackerCore:
         if belief is None:
             raise AssertionError("nothing is tracked")
         T = belief.T_map_sensor @ inverse(belief.mark.T_odom_sensor) @ mark.T_odom_sensor
-        x, y, z = T[:3, 3] - belief.T_map_sensor[:3, 3]
-        F = np.eye(6)  # an error of the rotation moves what lies ahead: e x (x, y, z)
-        F[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
         drift_m, drift_rad = self._drifts(belief.mark, mark)
-        return T, F @ belief.covariance @ F.T + _diagonal(drift_m, drift_rad)
+        carried = shifted_covariance(belief.covariance, T[:3, 3] - belief.T_map_sensor[:3, 3])
+        return T, carried + _diagonal(drift_m, drift_rad)
 
     def _is_tracked(self, pose: PoseEvidence, T: Array, P: Array) -> bool:
         """Whether a pose is the tracked one, as far as the gate and its covariance say."""
@@ -577,6 +575,20 @@ def rotation_matrix(vector: Array) -> Array:
     if angle > 1e-9:
         sine, cosine = math.sin(angle) / angle, (1 - math.cos(angle)) / angle**2
     return np.asarray(np.eye(3) + sine * K + cosine * K @ K, np.float64)
+
+
+def shifted_covariance(P: Array, offset: Array) -> Array:
+    """Covariance (6, 6) of the pose of something that is rigidly joined to what P is of.
+
+    Parameters
+    ----------
+    P : (6, 6) of errors (x, y, z, rx, ry, rz) along the axes of the parent frame
+    offset : (3,) from the one to the other, along the same axes, metres
+    """
+    x, y, z = offset
+    F = np.eye(6)  # an error of the rotation moves what lies ahead: e x (x, y, z)
+    F[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+    return np.asarray(F @ P @ F.T, np.float64)
 
 
 def _diagonal(metres: float, radians: float) -> Array:

@@ -14,8 +14,8 @@ from typing import Any
 from tqdm import tqdm
 
 from sceneprint.cli.options import one_line
-from sceneprint.formats.dataset import FrameSequence, find_sequences
-from sceneprint.formats.recording import BagOutline, RecordingOptions, bag_outline, is_recording
+from sceneprint.formats.dataset import FrameSequence, find_recordings, find_sequences
+from sceneprint.formats.recording import BagOutline, RecordingOptions, bag_outline
 from sceneprint_client.frame_files import meta_of
 
 _DEFAULT = RecordingOptions()
@@ -96,8 +96,6 @@ def sequences_at(path: Path, options: argparse.Namespace) -> tuple[FrameSequence
     """The sequences at a path, of a recording as the options say; what was left out of one is told
     on standard error. Raises as `find_sequences`.
     """
-    if not is_recording(path):
-        return find_sequences(path)
     with recording_options(options) as recording:
         found = find_sequences(path, recording)
     for sequence in found:
@@ -127,17 +125,19 @@ def add_bag(commands: Any) -> None:
         "info",
         help="list topics, and which frames, camera and poses would be taken; exit code 1 if none",
     )
-    info.add_argument("path", type=Path, metavar="FILE")
+    info.add_argument("path", type=Path, metavar="PATH", help="a recording, or a folder of them")
     add_recording_options(info)
     command.set_defaults(run=run_bag)
 
 
 def run_bag(options: argparse.Namespace) -> int:
-    """Print what is in a recording; returns 1 where nothing of it would be taken."""
-    with recording_options(options) as recording:
-        outline = bag_outline(options.path, recording)
-    print("\n".join(_lines(options.path, outline)))
-    return 1 if outline.sequence is None else 0
+    """Print what is in recordings; returns 1 where nothing of one would be taken."""
+    outlines: list[BagOutline] = []
+    for path in find_recordings(options.path) or [options.path]:
+        with recording_options(options) as recording:
+            outlines.append(bag_outline(path, recording))
+        print("\n".join(_lines(path, outlines[-1])))
+    return 1 if any(one.sequence is None for one in outlines) else 0
 
 
 def _lines(path: Path, outline: BagOutline) -> list[str]:

@@ -15,7 +15,6 @@ from sqlalchemy import Connection
 
 from sceneprint.errors import InvalidPose, naming
 from sceneprint.formats.dataset import rigid_transform
-from sceneprint.geometry.pose.rigid import quaternion_of, rotation_of
 from sceneprint.store.deletion import DAY_S, count_old
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import model_names
@@ -37,6 +36,7 @@ from sceneprint_client.api import (
 )
 from sceneprint_client.api.base import Direction
 from sceneprint_client.api.frames import GivenTransform, Kind
+from sceneprint_client.rotations import quaternion_of, rotation_of
 
 # Entity tags: short texts that change when what they stand for does.
 

@@ -8,7 +8,16 @@ from typing import Annotated
 from anyio import to_thread
 from fastapi import Depends, Query, Request, Response
 
-from sceneprint.engine.maps.map_frames import BYTES, JSON, NPY, PLY, PNG, Output, upload_type
+from sceneprint.engine.maps.map_frames import (
+    BYTES,
+    JSON,
+    NPY,
+    PLY,
+    PNG,
+    POINTCLOUD2,
+    Output,
+    upload_type,
+)
 from sceneprint.errors import DamagedBlob
 from sceneprint.formats.points.web import LIMIT, MEDIA_TYPE, MOST
 from sceneprint_client.api.results import (
@@ -140,7 +149,7 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
 @router.get(
     "/upload",
     response_class=Response,
-    responses=files((PNG, NPY, PLY, BYTES), "Byte for byte as it came.", 409),
+    responses=files((PNG, NPY, PLY, POINTCLOUD2, BYTES), "Byte for byte as it came.", 409),
 )
 async def get_upload(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """The frame's upload: what you sent in is yours to take out."""

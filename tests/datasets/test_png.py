@@ -261,8 +261,15 @@ def test_a_compressed_depth_message_of_ros() -> None:
         assert size_of(data[:64]) == (8, 6)
         frame = decode_frame(data, camera)
         np.testing.assert_array_equal(frame.depth, (samples / 1000).astype(np.float32))
+    # 32FC1 with the transport's defaults: q = 100, at most 10 m
     inverse = struct.pack("<iff", 0, 10100.0, -1009.0) + encode_png(samples)
-    with pytest.raises(UnreadableFrame, match=r"inverse depth \(a = 10100, b = -1009\)"):
-        decode_frame(inverse, camera)
+    frame = decode_frame(inverse, camera)
+    np.testing.assert_allclose(frame.depth, 10100.0 / (samples + 1009.0), rtol=1e-6)
+    nothing = struct.pack("<iff", 0, 10100.0, -1009.0) + encode_png(samples - 1)
+    assert decode_frame(nothing, camera).depth[0, 0] == 0  # 0 is missing
+    for a, b in ((10100.0, 1009.0), (10100.0, -2.0), (1e-2, -1.0), (2e8, -1e8)):
+        odd = struct.pack("<iff", 0, a, b) + encode_png(samples)
+        with pytest.raises(UnreadableFrame, match="neither that of 16UC1 nor of 32FC1"):
+            decode_frame(odd, camera)
     with pytest.raises(UnreadableFrame, match="ends early"):
         decode_frame(bytes(12) + encode_png(samples)[:-5], camera)

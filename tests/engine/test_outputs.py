@@ -25,7 +25,6 @@ from sceneprint.engine.maps.map_frames import (
 from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnknownFrame, UnknownMap
 from sceneprint.formats.dataset import read_trajectory
-from sceneprint.geometry.pose.rigid import rotation_of
 from sceneprint.lab.synth.dataset import room_and_rng
 from sceneprint.pipeline import Signature, Signer
 from sceneprint.previews import depth_view, normals_view, picture
@@ -36,6 +35,7 @@ from sceneprint.types import Geometry
 from sceneprint_client.api import FrameMeta, NewMap
 from sceneprint_client.api.listing import Run
 from sceneprint_client.api.results import View
+from sceneprint_client.rotations import rotation_of
 
 Ids = Callable[[Engine], list[str]]
 Prepared = list[tuple[Signature, Geometry]]

@@ -6,7 +6,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -71,14 +71,12 @@ def folder(building: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-@pytest.fixture(scope="module")
-def recording(folder: Path, ros: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same frames as a robot would have recorded them, its camera off its base."""
-    (sequence,) = find_sequences(folder)
+def record(ros: SimpleNamespace, place: Path, name: str, frames: Sequence[Any]) -> Path:
+    """Frames as a robot would have recorded them, its camera off its base."""
 
     def fill(writer: Any) -> None:
         writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
-        for i, one in enumerate(sequence.frames):
+        for i, one in enumerate(frames):
             assert one.pose is not None
             assert one.camera is not None
             k = one.camera.intrinsics
@@ -88,7 +86,28 @@ def recording(folder: Path, ros: SimpleNamespace, tmp_path_factory: pytest.TempP
             writer.transforms(t, {("odom", "base_link"): T_odom_base})
             writer.image(t, decode_png(one.read_bytes()))
 
-    return ros.write(tmp_path_factory.mktemp("recording"), fill, name="lab")
+    return Path(ros.write(place, fill, name=name))
+
+
+@pytest.fixture(scope="module")
+def recording(folder: Path, ros: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The frames of the folder."""
+    (sequence,) = find_sequences(folder)
+    return record(ros, tmp_path_factory.mktemp("recording"), "lab", sequence.frames)
+
+
+@pytest.fixture(scope="module")
+def bags(folder: Path, ros: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two bags of some of the frames, one in the folder of a day: an MCAP file, and
+    a rosbag2 folder.
+    """
+    (sequence,) = find_sequences(folder)
+    runs = tmp_path_factory.mktemp("bags") / "runs"
+    first = record(ros, runs.with_name("first"), "first", sequence.frames[:2])
+    runs.mkdir()
+    first.rename(runs / first.name)
+    record(ros, runs / "day2", "second", sequence.frames[2:5])
+    return runs
 
 
 @pytest.fixture(scope="module")
@@ -196,6 +215,59 @@ def test_an_evaluation_of_a_bag(sceneprint: Run, recording: Path, tmp_path: Path
     )  # fmt: skip
     assert json.loads(figures.read_text())
     assert done.stderr.count("frames of /camera/depth/image_raw taken") == 1
+
+
+def test_each_bag_of_a_folder_is_a_session(sceneprint: Run, bags: Path, service_url: str) -> None:
+    options = ("--keyframe-m", 0)
+    done = sceneprint("upload", "days", bags, *options)
+    assert done.stdout.splitlines()[-1].startswith("5 frames: 5 received")
+    assert f"{bags}/first.mcap: 2 of 2 frames of /camera" in done.stderr
+    assert f"{bags}/day2/second: 3 of 3 frames of /camera" in done.stderr
+    with Client(service_url) as client:
+        found = sorted((one.session, one.pose.parent_frame) for one in client.frames("days")
+                       if one.pose is not None)  # fmt: skip
+    assert found == [("day2/second", "day2/second/odom")] * 3 + [("first", "first/odom")] * 2
+    done = sceneprint("query", "days", bags, *options, "--frame", 4, "--json")
+    assert json.loads(done.stdout)["name"] == "day2/second/000002"
+    done = sceneprint("localize", "days", bags, *options, "--frame", 0)
+    assert done.stdout.startswith("first/000000: found")
+    done = sceneprint("bag", "info", bags, *options)
+    assert done.stdout.count(" frames of /camera/depth/image_raw taken, poses in odom") == 2
+
+
+def test_a_folder_of_bags_is_signed_and_evaluated(
+    sceneprint: Run, bags: Path, tmp_path: Path
+) -> None:
+    sceneprint("sign", bags, "--out", tmp_path / "signed", "--keyframe-m", 0)
+    signed = {one.relative_to(tmp_path / "signed").as_posix()
+              for one in (tmp_path / "signed").rglob("*.sig")}  # fmt: skip
+    assert signed == {"first/000000.sig", "first/000001.sig", "day2/second/000000.sig",
+                      "day2/second/000001.sig", "day2/second/000002.sig"}  # fmt: skip
+    figures = tmp_path / "figures.json"
+    sceneprint("evaluate", bags, "--db", "0:1", "--queries", "1:2", "--keyframe-m", 0,
+               "--json", figures)  # fmt: skip
+    assert json.loads(figures.read_text())
+
+
+def test_bags_beside_other_frames_are_an_error(
+    sceneprint: Run, bags: Path, folder: Path, tmp_path: Path
+) -> None:
+    mixed = tmp_path / "mixed"
+    (mixed / "room").mkdir(parents=True)
+    (mixed / "run.mcap").write_bytes(b"never read")
+    for one in folder.iterdir():
+        (mixed / "room" / one.name).write_bytes(one.read_bytes())
+    for command in (("upload", "mixed"), ("query", "folder"), ("localize", "folder"), ("sign",)):
+        done = sceneprint(*command, mixed, expect=2)
+        assert done.stderr == (
+            f"sceneprint {command[0]}: {mixed}: There are recordings of ROS here, such as "
+            "run.mcap, and other frames, in room (7-Scenes). Name one of them, or put the "
+            "recordings into a folder of their own.\n"
+        )
+    (mixed / "room").rename(tmp_path / "room")
+    (mixed / "run.bag").write_bytes(b"")
+    done = sceneprint("upload", "mixed", mixed, expect=2)
+    assert "The recording would have the same name, run, as run.bag." in done.stderr
 
 
 def test_what_a_bag_holds(sceneprint: Run, recording: Path) -> None:

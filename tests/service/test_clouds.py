@@ -142,6 +142,56 @@ def test_a_cloud_finds_the_image_of_its_place_and_an_image_the_cloud(served, hal
     assert np.allclose(there["base"]["matrix"], expected @ back, atol=0.1)
 
 
+def pointcloud2(ros: Any, points: Floats, *, little: bool = True) -> bytes:
+    """As a node of ROS 2 would send it, serialised by rosbags: fields in another order."""
+    rows = np.zeros(len(points), [("z", "<f4"), ("ring", "<u2"), ("x", "<f4"), ("y", "<f4")])
+    for axis, name in enumerate("xyz"):
+        rows[name] = points[:, axis]
+    writer = ros.messages()
+    writer.points(0.0, rows)
+    kind = "sensor_msgs/msg/PointCloud2"
+    return bytes(writer.types.serialize_cdr(writer.last(), kind, little_endian=little))
+
+
+def test_a_pointcloud2_is_the_cloud_of_its_points(served, hall, shots, clouds, ros):
+    path, ids = hall
+    http, kind = served.client, {"Content-Type": "application/x-ros-pointcloud2"}
+    sent = {"content": pointcloud2(ros, clouds[1]), "headers": {**kind, **WAIT}}
+    meta = {"pose": {"parent_frame": "room", "matrix": shots[1].pose}}
+    same = http.post(f"{path}/frames", **sent, params={"meta": json.dumps(meta)})
+    assert (same.status_code, same.json()["frame_id"]) == (200, ids[1])
+    asked = {"content": pointcloud2(ros, clouds[1], little=False), "headers": kind}
+    there = found(http.post(f"{path}/queries", **asked, params={"k": 1}))
+    assert (there["kind"], there["matches"][0]["frame_id"]) == ("cloud", ids[1])
+
+    moved = pointcloud2(ros, clouds[0][::2])
+    new = http.post(f"{path}/frames", **form(moved, robot="r"))
+    assert new.status_code in (201, 202)
+    upload = http.get(f"{path}/frames/{new.json()['frame_id']}/upload")
+    assert (upload.content, upload.headers["content-type"]) == (moved, kind["Content-Type"])
+    assert upload.headers["content-disposition"].endswith('.cdr"')
+    assert http.delete(f"{path}/frames/{new.json()['frame_id']}").status_code == 204
+
+
+def test_a_damaged_pointcloud2_is_refused_with_a_reason(served, hall, clouds, ros):
+    path, _ = hall
+    data, rng = pointcloud2(ros, clouds[1][:50]), np.random.default_rng(3)
+    kind = {"Content-Type": "application/x-ros-pointcloud2"}
+    bodies = [data[:place] for place in (0, 1, 4, 16, 100, len(data) // 2, len(data) - 1)]
+    for _ in range(20):  # header and fields
+        place = int(rng.integers(0, 140))
+        bodies.append(data[:place] + struct.pack("<I", 2**32 - 1) + data[place + 4 :])
+    statuses = set()
+    for body in bodies:
+        answer = served.client.post(f"{path}/queries", content=body, headers=kind)
+        statuses.add(answer.status_code)
+        if answer.status_code != 200:  # the stamp may be anything
+            assert answer.json()["detail"].isprintable()
+            assert answer.json()["detail"].endswith(".")
+    assert statuses <= {200, 422}
+    assert 422 in statuses
+
+
 def test_two_uploads_are_compared_whatever_they_are(served, shots, clouds):
     files = {"a": ("a", shots[0].png), "b": ("b", write_ply(clouds[0]))}
     metas = {"meta_a": json.dumps({"intrinsics": shots[0].camera}), "meta_b": "{}"}

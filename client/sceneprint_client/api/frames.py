@@ -41,7 +41,7 @@ Place = Annotated[int, Field(ge=0, le=MOST_SEQUENCE)]
 #: What a frame is: a depth image or a point cloud.
 Kind = Literal["depth", "cloud"]
 #: How files of clouds are packed; all but KITTI's say so themselves.
-CloudFormat = Literal["ply", "pcd", "kitti", "npy", "las"]
+CloudFormat = Literal["ply", "pcd", "kitti", "npy", "las", "pointcloud2"]
 
 Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
 

@@ -250,8 +250,8 @@ def _without_camera(data: bytes) -> errors.SceneprintError:
     if not data:
         return errors.UnreadableFrame("The file is empty. Write it again.")
     return errors.UnreadableFrame(
-        "The file is neither a depth image (PNG or NPY) nor a point cloud (PLY, PCD, LAS, LAZ "
-        "or NPY). For a KITTI file, set format=kitti."
+        "The file is neither a depth image (PNG or NPY) nor a point cloud (PLY, PCD, LAS, LAZ, "
+        "NPY, or PointCloud2 in CDR). For a KITTI file, set format=kitti."
     )
 
 

@@ -48,6 +48,7 @@ from sceneprint_client.api.frames import MOST_SEQUENCE
 from sceneprint_client.api.listing import FrameListing, Run, Session, Trajectory
 from sceneprint_client.api.maps import By, Grown, Growth
 from sceneprint_client.api.results import CloudFrame, FramePatches, FrameSignature, PatchLevel, View
+from sceneprint_client.cdr import is_point_cloud
 
 # An indexed frame as it was found, with what its map's model made of it.
 
@@ -378,6 +379,7 @@ PLY, PNG, NPY, BYTES, JSON = (
     "application/ply", "image/png", "application/x-npy", "application/octet-stream",
     "application/json",
 )  # fmt: skip
+POINTCLOUD2 = "application/x-ros-pointcloud2"
 #: How uploads begin, their media types, and what their names end with.
 _UPLOADS = (
     (b"\x89PNG", PNG, "png"), (b"\x93NUMPY", NPY, "npy"), (b"ply", PLY, "ply"),
@@ -406,7 +408,7 @@ def upload_type(data: bytes) -> tuple[str, str]:
     for magic, media_type, suffix in _UPLOADS:
         if data.startswith(magic):
             return media_type, suffix
-    return BYTES, "bin"
+    return (POINTCLOUD2, "cdr") if is_point_cloud(data) else (BYTES, "bin")
 
 
 def level_of(patches: Patches) -> PatchLevel:

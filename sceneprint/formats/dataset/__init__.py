@@ -15,13 +15,11 @@ from sceneprint.formats.dataset.frame_reference import (
     FrameReference,
     FrameSequence,
     Layout,
-    SensorTrajectory,
     Split,
-    interpolate,
     read_cloud,
     read_trajectory,
 )
-from sceneprint.formats.dataset.sequences import find_sequences
+from sceneprint.formats.dataset.sequences import find_recordings, find_sequences
 from sceneprint.formats.image.depth_file import (
     decode_frame,
     decode_npy,
@@ -38,6 +36,7 @@ from sceneprint_client.sidecars import (
     read_pose,
     rigid_transform,
 )
+from sceneprint_client.trajectories import SensorTrajectory, interpolate
 
 __all__ = [
     "Camera",
@@ -52,6 +51,7 @@ __all__ = [
     "decode_png",
     "find_camera",
     "find_cloud_source",
+    "find_recordings",
     "find_sequences",
     "interpolate",
     "make_frame",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
@@ -13,35 +12,19 @@ import numpy as np
 from sceneprint.errors import DatasetError, InvalidPose, UnreadableCloud, naming
 from sceneprint.formats.image.depth_file import decode_frame
 from sceneprint.formats.points import SUFFIXES, Scan, decode_scan
-from sceneprint.geometry.pose.rigid import rotation_of
 from sceneprint.types import AnyFrame, DepthFrame, Floats
 from sceneprint_client.file_formats import MAXIMUM_CLOUD_BYTES
 from sceneprint_client.files import data_lines, read_bytes, read_text
 from sceneprint_client.frame_files import FrameFile
 from sceneprint_client.sidecars import CloudSource
+from sceneprint_client.trajectories import SensorTrajectory
 
 # Trajectories with time stamps.
 #
-# text  --read_trajectory-->  Trajectory, stamps (M,)  --interpolate-->  M poses or None
+# text  --read_trajectory-->  SensorTrajectory
 
 _TOLERANCE = 1e-2  #: how far a written quaternion may be from a true one
 _MAXIMUM_TRAJECTORY_BYTES = 2**26  # an hour at 200 Hz
-
-
-@dataclass(frozen=True, eq=False)
-class SensorTrajectory:
-    """Poses of a sensor over time.
-
-    Parameters
-    ----------
-    stamps : (N,) seconds, strictly increasing
-    positions : (N, 3) metres, of the sensor in the parent frame
-    quaternions : (N, 4) x, y, z, w of unit length, sensor to parent
-    """
-
-    stamps: Floats
-    positions: Floats
-    quaternions: Floats
 
 
 def read_trajectory(path: Path) -> SensorTrajectory:
@@ -77,61 +60,6 @@ def read_trajectory(path: Path) -> SensorTrajectory:
     quaternions = table[first, 4:]
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     return SensorTrajectory(stamps, table[first, 1:4], quaternions)
-
-
-def interpolate(
-    trajectory: SensorTrajectory, stamps: Sequence[float], *, longest_gap: float = 0.1
-) -> list[Floats | None]:
-    """Return the poses at the stamps: positions linear, rotations by slerp.
-
-    Parameters
-    ----------
-    trajectory : N poses
-    stamps : M seconds, in any order
-    longest_gap : seconds between two poses beyond which nothing between them is known
-
-    Returns
-    -------
-    poses : M times T_parent_sensor (4, 4), or None before the first pose, after the last,
-        and within a longer gap
-    """
-    times = np.asarray(stamps, dtype=np.float64)
-    t, last = trajectory.stamps, len(trajectory.stamps) - 1
-    after = np.clip(np.searchsorted(t, times), 0, last)  # t[after - 1] < time <= t[after]
-    before = np.where(t[after] == times, after, np.maximum(after - 1, 0))
-    span = t[after] - t[before]
-    known = (t[before] <= times) & (times <= t[after]) & (span <= longest_gap)
-    w = np.where(span > 0.0, times - t[before], 0.0) / np.where(span > 0.0, span, 1.0)
-
-    positions = trajectory.positions[before]
-    positions = positions + w[:, None] * (trajectory.positions[after] - positions)
-    quaternions = _slerp(trajectory.quaternions[before], trajectory.quaternions[after], w)
-    return [
-        _transform(p, q) if ok else None
-        for p, q, ok in zip(positions, quaternions, known, strict=True)
-    ]
-
-
-def _slerp(q: Floats, other: Floats, w: Floats) -> Floats:
-    """Quaternions (M, 4) at the share w of the shorter arc from q to the other."""
-    cosine = np.sum(q * other, axis=1)
-    other = np.where(cosine[:, None] < 0.0, -other, other)  # q and -q are one rotation
-    angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
-    sine = np.sin(angle)
-    small = sine < 1e-6  # the arc is its chord there, and 0/0 is not
-    safe = np.where(small, 1.0, sine)
-    a = np.where(small, 1.0 - w, np.sin((1.0 - w) * angle) / safe)
-    b = np.where(small, w, np.sin(w * angle) / safe)
-    mixed: Floats = a[:, None] * q + b[:, None] * other
-    mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
-    return mixed
-
-
-def _transform(position: Floats, quaternion: Floats) -> Floats:
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_of(quaternion)
-    pose[:3, 3] = position
-    return pose
 
 
 def _numbers(words: list[str]) -> list[float]:

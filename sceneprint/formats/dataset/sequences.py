@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -19,13 +19,13 @@ from sceneprint.formats.dataset.frame_reference import (
     FrameSequence,
     Layout,
     Split,
-    interpolate,
     read_trajectory,
 )
-from sceneprint_client.file_formats import is_cloud
+from sceneprint_client.file_formats import RECORDING_SUFFIXES, is_cloud
 from sceneprint_client.files import data_lines, read_text
 from sceneprint_client.frame_files import SEVEN_SCENES, find_frame_file, seven_scenes_number
 from sceneprint_client.sidecars import CLOUDS_FILE, find_camera, find_cloud_source
+from sceneprint_client.trajectories import interpolate
 
 if TYPE_CHECKING:
     from sceneprint.formats.recording import RecordingOptions
@@ -255,7 +255,7 @@ def find_sequences(
     out), a folder of point clouds (PLY, PCD, KITTI .bin, LAS, LAZ; NPY beside a clouds.json),
     one depth image or cloud, and folders of these. A sequence is named by its place below
     the path, or by its own folder where that is the path. A recording of ROS (.mcap, .db3, .bag,
-    a rosbag2 folder) is one sequence, named after it.
+    a rosbag2 folder) is one sequence, named after it; so is each of a folder of recordings.
 
     Parameters
     ----------
@@ -269,7 +269,7 @@ def find_sequences(
     Raises
     ------
     DatasetError : nothing is there, there is no intrinsics.json for depth, a list names what is
-        not there, or two scenes have one name.
+        not there, two scenes or recordings have one name, or recordings lie among other frames.
     InvalidIntrinsics : an intrinsics.json describes no camera.
     InvalidPose : a groundtruth.txt holds a line that is no pose.
     MissingDependency : it is a recording, and rosbags is not installed.
@@ -285,23 +285,75 @@ def find_sequences(
         return (_single(root),)
     if not root.is_dir():
         raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
-    found = tuple(_sequence(*one, _name(one[0], root)) for one in _walk(root))
+    walked = list(_walk(root))
+    if any(layout is Layout.RECORDING for _, _, layout in walked):
+        return _recordings(root, walked, recording or ros.RecordingOptions())
+    found = tuple(_sequence(*one, _name(one[0], root)) for one in walked)
     if not found:
         raise DatasetError(
             f"{path}: There is no depth image or cloud here or up to {_DEPTH} folders below. Name "
             "a 7-Scenes scene or sequence (frame-000000.depth.png), a TUM RGB-D folder "
             "(depth.txt), a folder of 16-bit PNG or float NPY depth images, one of PLY, PCD, "
-            "KITTI .bin, LAS or LAZ clouds, one such file, or a recording of ROS (.mcap, .db3 or "
-            ".bag file, rosbag2 folder)."
+            "KITTI .bin, LAS or LAZ clouds, one such file, or recordings of ROS (.mcap, .db3 or "
+            ".bag files, rosbag2 folders)."
         )
     _check_parent_frames(found)
     return found
 
 
+def find_recordings(path: Path) -> list[Path]:
+    """The recordings of ROS at a path: itself, or those in a folder and up to 4 below it, in
+    natural order.
+    """
+    from sceneprint.formats.recording import is_recording
+
+    if is_recording(path):
+        return [path]
+    return _bags(_walk(path)) if path.is_dir() else []
+
+
+def _bags(walked: Iterable[tuple[Path, list[str], Layout]]) -> list[Path]:
+    """The recordings among what `_walk` yields."""
+    return [folder / name for folder, names, layout in walked
+            if layout is Layout.RECORDING for name in names]  # fmt: skip
+
+
+def _recordings(
+    root: Path, walked: list[tuple[Path, list[str], Layout]], options: RecordingOptions
+) -> tuple[FrameSequence, ...]:
+    """The frames of several recordings, a sequence each, named by their places.
+
+    Raises
+    ------
+    DatasetError : as `recording_sequence`; other frames are there too, or two have one name.
+    """
+    from sceneprint.formats.recording import recording_name, recording_sequence
+
+    bags = _bags(walked)
+    other = next((one for one in walked if one[2] is not Layout.RECORDING), None)
+    if other is not None:
+        raise DatasetError(
+            f"{root}: There are recordings of ROS here, such as {bags[0].relative_to(root)}, and "
+            f"other frames, in {_name(other[0], root)} ({other[2].value}). Name one of them, or "
+            "put the recordings into a folder of their own."
+        )
+    first: dict[str, Path] = {}
+    for bag in bags:
+        name = (bag.parent / recording_name(bag)).relative_to(root).as_posix()
+        if name in first:
+            raise DatasetError(
+                f"{bag}: The recording would have the same name, {name}, as {first[name].name}. "
+                "Rename or remove one of them."
+            )
+        first[name] = bag
+    return tuple(recording_sequence(bag, options, name) for name, bag in first.items())
+
+
 def find_each(
     root: Path,
 ) -> tuple[tuple[FrameSequence, ...], tuple[tuple[str, SceneprintError], ...]]:
-    """As `find_sequences`, where a sequence that is damaged must not cost the others.
+    """As `find_sequences`, where a sequence that is damaged must not cost the others; recordings
+    of ROS are passed over.
 
     Parameters
     ----------
@@ -318,6 +370,8 @@ def find_each(
     """
     found, refused = [], []
     for one in _walk(root):
+        if one[2] is Layout.RECORDING:
+            continue
         name = _name(one[0], root)
         try:
             found.append(_sequence(*one, name))
@@ -329,7 +383,9 @@ def find_each(
 
 
 def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
-    """Yield the folders that are sequences, depth first in natural order."""
+    """Yield the folders that are sequences, depth first in natural order; and those that hold
+    recordings of ROS, with their names.
+    """
     seen: set[Path] = set()  # resolved: a symlink back up is not entered twice
     waiting = [(root, 0)]
     while waiting:
@@ -347,6 +403,10 @@ def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
                 "Name the folder of the data set."
             )
         files, folders = list_folder(folder)
+        bags = _recordings_in(folder, files, folders)
+        if bags:
+            yield folder, bags, Layout.RECORDING
+            folders = [name for name in folders if name not in bags]
         layout = layout_of(files)
         # a scene may hold a picture or a mesh of itself beside its sequences
         scene = any(_SEQUENCE_FOLDER.fullmatch(name) for name in folders) or (
@@ -359,6 +419,15 @@ def _walk(root: Path) -> Iterator[tuple[Path, list[str], Layout]]:
             waiting += [
                 (folder / name, depth + 1) for name in reversed(folders) if not is_of_colour(name)
             ]
+
+
+def _recordings_in(folder: Path, files: list[str], folders: list[str]) -> list[str]:
+    """Names of the recordings of ROS among the files and folders of a folder."""
+    from sceneprint.formats.recording import is_recording
+
+    found = [name for name in files if name.lower().endswith(RECORDING_SUFFIXES)]
+    found += [name for name in folders if is_recording(folder / name)]
+    return sorted(found, key=natural)
 
 
 def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: int) -> bool:

@@ -22,8 +22,15 @@ from numpy.typing import NDArray
 from sceneprint.errors import InvalidIntrinsics, UnreadableFrame, UselessFrame, naming
 from sceneprint.geometry.surface.rectification import ray_to_axis, undistort
 from sceneprint.types import MAXIMUM_SAMPLES, DepthFrame, Floats, Floats32, Intrinsics
-from sceneprint_client.file_formats import MAXIMUM_IMAGE_BYTES, NPY_SIGNATURE, NpyHeader, npy_header
+from sceneprint_client.file_formats import (
+    MAXIMUM_IMAGE_BYTES,
+    NPY_SIGNATURE,
+    PNG_SIGNATURE,
+    NpyHeader,
+    npy_header,
+)
 from sceneprint_client.files import read_bytes
+from sceneprint_client.ros_messages import TRANSPORT_BYTES
 from sceneprint_client.sidecars import rigid_transform
 
 # 16-bit greyscale PNG, read so that no file can surprise.
@@ -34,7 +41,6 @@ from sceneprint_client.sidecars import rigid_transform
 # the check sums of the data. So the file is taken apart and checked here, and Pillow undoes
 # filters and interlacing of rows whose number is right.
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 #: Most bytes a frame may have: all samples as float64, and room for a header.
 _MAXIMUM_CHUNKS = 65_536  # 16 megapixels in pieces of 1 KB; each costs time even if empty
 _COLOURS = {2: "colour (RGB)", 3: "palette", 4: "greyscale with alpha", 6: "colour with alpha"}
@@ -213,25 +219,40 @@ def _png(header: bytes, pixels: bytes) -> bytes:
 
 # Images of ROS's compressed_depth_image_transport: a PNG after a header of 12 bytes.
 
-_TRANSPORT_BYTES = 12
+#: What a of 32FC1 images may be: q (q + 1) of a quantisation q, which is 100 unless it is set.
+_A = (1.0, 1e8)
+#: Depth that an inverse depth of 1 may stand for, metres: the transport's limit, 10 by default.
+_DEEPEST_M = (0.1, 1e3)
 
 
 def has_transport_header(data: bytes) -> bool:
     """Whether bytes are the data of a compressedDepth message, of which a PNG is the rest."""
-    return data.startswith(PNG_SIGNATURE, _TRANSPORT_BYTES)
+    return data.startswith(PNG_SIGNATURE, TRANSPORT_BYTES)
 
 
-def _decode_transported(data: bytes) -> NDArray[np.uint16]:
-    """Samples of a 16UC1 image; the header of a 32FC1 image says how its depth is quantised."""
+def _decode_transported(data: bytes) -> NDArray[np.uint16] | Floats32:
+    """Samples of a 16UC1 image as they are, metres of one of 32FC1, by what the header says."""
+    samples = decode_png(data[TRANSPORT_BYTES:])
     a, b = struct.unpack_from("<ff", data, 4)
     # of 16UC1 images the transport leaves these numbers unset: most often zero, or tiny
-    if 1e-3 < a < 1e9 and 1e-3 < abs(b) < 1e9:
-        raise UnreadableFrame(
-            f"The compressedDepth image has inverse depth (a = {a:g}, b = {b:g}), as of 32FC1. "
-            "Send float32 metres a / (v - b) as NPY, or upload the recording with `sceneprint "
-            "upload`."
-        )
-    return decode_png(data[_TRANSPORT_BYTES:])
+    if not (1e-3 < a < 1e9 and 1e-3 < abs(b) < 1e9):
+        return samples
+    if b < 1 and _A[0] < a < _A[1] and _DEEPEST_M[0] <= a / (1 - b) <= _DEEPEST_M[1]:
+        return inverse_depth(samples, a, b)
+    raise UnreadableFrame(
+        f"The header of the compressedDepth image (a = {a:g}, b = {b:g}) is neither that of 16UC1 "
+        "nor of 32FC1. Send the PNG after its 12 bytes, or float32 metres a / (v - b) as NPY."
+    )
+
+
+def inverse_depth(samples: NDArray[np.uint16], a: float, b: float) -> Floats32:
+    """Metres (H, W) of quantised inverse depth, z = a / (v - b); 0 where missing."""
+    values = np.arange(65_536, dtype=np.float64)
+    with np.errstate(all="ignore"):
+        table = (a / (values - b)).astype(np.float32)
+    table[~(np.isfinite(table) & (table > 0))] = 0.0
+    table[0] = 0.0
+    return table[samples]
 
 
 # NPY files of float metres or of stored units, read without trusting their header.
@@ -484,7 +505,7 @@ def size_of(head: bytes) -> tuple[int, int] | None:
     head : first HEAD bytes of the file (sceneprint_client.file_formats): of a PNG 24 are enough
     """
     if has_transport_header(head):
-        head = head[_TRANSPORT_BYTES:]
+        head = head[TRANSPORT_BYTES:]
     if head.startswith(PNG_SIGNATURE) and len(head) >= 24:
         width, height = struct.unpack_from(">II", head, 16)
         return width, height

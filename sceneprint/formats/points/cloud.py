@@ -18,6 +18,7 @@ from sceneprint.formats.points.las import read_las
 from sceneprint.formats.points.npy_points import read_kitti, read_npy
 from sceneprint.formats.points.pcd import read_pcd
 from sceneprint.formats.points.ply import read_ply
+from sceneprint.formats.points.pointcloud2 import read_pointcloud2
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Cloud, Floats, Floats32
 from sceneprint_client.api.frames import CloudFormat
@@ -103,6 +104,7 @@ _READERS = {
     "kitti": read_kitti,
     "npy": read_npy,
     "las": read_las,
+    "pointcloud2": read_pointcloud2,
 }
 
 
@@ -153,7 +155,7 @@ def decode_scan(
     name: str = "",
     pose: Floats | None = None,
 ) -> Scan:
-    """Return the cloud of the bytes of a PLY, PCD, KITTI, NPY, LAS or LAZ file.
+    """Return the cloud of a PLY, PCD, KITTI, NPY, LAS or LAZ file, or of a PointCloud2 in CDR.
 
     Parameters
     ----------
@@ -232,8 +234,9 @@ def _format(data: bytes, told: CloudFormat | None) -> CloudFormat:
         raise UnreadableCloud("The file is empty. Copy or write it again.")
     if told is None and found is None:
         raise UnreadableCloud(
-            "This is none of PLY, PCD, LAS, LAZ and NPY of shape (N, 3) or (N, 4), by its first "
-            "bytes. Write one of these; for a KITTI scan (.bin), say kitti as its format."
+            "This is none of PLY, PCD, LAS, LAZ, NPY of shape (N, 3) or (N, 4) and PointCloud2 in "
+            "CDR, by its first bytes. Write one of these; for a KITTI scan (.bin), say kitti as "
+            "its format."
         )
     chosen = told or found
     assert chosen is not None

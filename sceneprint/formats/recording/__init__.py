@@ -10,6 +10,7 @@ from sceneprint.formats.recording.selection import (
     BagOutline,
     RecordingOptions,
     bag_outline,
+    recording_name,
     recording_sequence,
 )
 
@@ -19,5 +20,6 @@ __all__ = [
     "RecordingOptions",
     "bag_outline",
     "is_recording",
+    "recording_name",
     "recording_sequence",
 ]

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.errors import DatasetError, MissingDependency, SceneprintError
+from sceneprint_client.errors import printable
 from sceneprint_client.file_formats import RECORDING_SUFFIXES
 
 if TYPE_CHECKING:
@@ -255,11 +256,6 @@ def _stated(path: Path, what: str = "The recording cannot be read") -> Iterator[
         what = what[0].upper() + what[1:]
         told = printable(f"{what} ({reason:.200}). {_advice(path)}")
         raise DatasetError(f"{path}: {told}") from cause
-
-
-def printable(text: str) -> str:
-    """A text of a bag as it can stand in a line: names in damaged bags may be anything."""
-    return text if text.isprintable() else ascii(text)[1:-1]
 
 
 def _advice(path: Path) -> str:

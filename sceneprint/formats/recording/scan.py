@@ -20,9 +20,15 @@ from sceneprint.formats.recording.bag import (
     BagTopic,
     RawMessage,
 )
-from sceneprint.formats.recording.gravity import Accelerations
-from sceneprint.formats.recording.image_messages import is_calibrated
-from sceneprint.formats.recording.transform_tree import MOST_SAMPLES, TransformTree, frame_name
+from sceneprint_client.accelerations import Accelerations
+from sceneprint_client.ros_messages import (
+    is_calibrated,
+    pose_row,
+    stamp_of,
+    transform_row,
+    vector_row,
+)
+from sceneprint_client.transform_tree import MOST_SAMPLES, TransformTree, frame_name
 
 #: What to call when so many of all messages have been read.
 Progress = Callable[[int, int], None]
@@ -124,15 +130,17 @@ def _take(
             return
         measured = scan.imus.setdefault(frame_name(fields.header.frame_id), Accelerations())
         measured.add(
-            bag.stamp_ns(message), _xyz(fields.linear_acceleration), _xyz(fields.angular_velocity)
+            bag.stamp_ns(message),
+            vector_row(fields.linear_acceleration),
+            vector_row(fields.angular_velocity),
         )
     elif kind == ODOMETRY:
-        pose = fields.pose.pose
-        sample = [*_xyz(pose.position), *_xyz(pose.orientation), float(pose.orientation.w)]
         parent, child = frame_name(fields.header.frame_id), frame_name(fields.child_frame_id)
         known = odometry.setdefault(message.topic, [])
         if parent and child and len(known) < MOST_SAMPLES:
-            known.append(_Odometry(parent, child, bag.stamp_ns(message), sample))
+            known.append(
+                _Odometry(parent, child, bag.stamp_ns(message), pose_row(fields.pose.pose))
+            )
     else:
         _take_transforms(scan.tree, message, fields)
 
@@ -140,11 +148,9 @@ def _take(
 def _take_transforms(tree: TransformTree, message: RawMessage, fields: Any) -> None:
     fixed = message.topic.rpartition("/")[2] == "tf_static"
     for one in fields.transforms:
-        turn, stamp = one.transform.rotation, one.header.stamp
         tree.add(
             str(one.header.frame_id), str(one.child_frame_id),
-            int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec),
-            [*_xyz(one.transform.translation), *_xyz(turn), float(turn.w)], fixed=fixed,
+            stamp_of(one.header), transform_row(one.transform), fixed=fixed,
         )  # fmt: skip
 
 
@@ -160,7 +166,3 @@ def _add_odometry(tree: TransformTree, odometry: dict[str, list[_Odometry]]) -> 
         for one in samples:
             if (one.parent, one.child) == (parent, child):
                 tree.add(parent, child, one.stamp_ns, one.sample, fixed=False)
-
-
-def _xyz(vector: Any) -> list[float]:
-    return [float(vector.x), float(vector.y), float(vector.z)]

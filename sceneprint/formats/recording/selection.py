@@ -28,23 +28,24 @@ from sceneprint.formats.recording.bag import (
     POINTS,
     Bag,
     BagTopic,
-    printable,
     shared_bag,
 )
-from sceneprint.formats.recording.image_messages import (
-    DEPTH_SCALE,
-    depth_file,
-    image_encoding,
-    intrinsics_of,
-)
+from sceneprint.formats.recording.frame_bytes import cloud_file, depth_file
 from sceneprint.formats.recording.keyframes import keyframes
-from sceneprint.formats.recording.point_messages import cloud_file
 from sceneprint.formats.recording.scan import BagScan, Progress, scan_bag
-from sceneprint.formats.recording.transform_tree import frame_name
 from sceneprint.types import Floats
 from sceneprint_client.api.base import checked
 from sceneprint_client.api.frames import GivenBase
+from sceneprint_client.errors import printable
+from sceneprint_client.ros_messages import (
+    DEPTH_SCALE,
+    camera_intrinsics,
+    image_encoding,
+    is_rectified,
+    topic_without_transport,
+)
 from sceneprint_client.sidecars import Camera, CloudSource, find_camera
+from sceneprint_client.transform_tree import frame_name
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ class FrameTopic:
     @property
     def is_rectified(self) -> bool:
         """Whether its images have been rectified, by the name that ROS gives them."""
-        return "rect" in _without_transport(self.topic.name).rpartition("/")[2]
+        return is_rectified(self.topic.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +160,7 @@ def frame_topics(bag: Bag) -> list[FrameTopic]:
     return [
         one
         for one in found
-        if not (one.is_compressed and _without_transport(one.topic.name) in raw)
+        if not (one.is_compressed and topic_without_transport(one.topic.name) in raw)
     ]
 
 
@@ -236,7 +237,7 @@ def camera_topic(bag: Bag, frames: FrameTopic, wanted: str | None) -> BagTopic |
                 f"{_listed(known)} with --camera-info."
             )
         return found
-    beside = _without_transport(frames.topic.name).rpartition("/")[0] + "/camera_info"
+    beside = topic_without_transport(frames.topic.name).rpartition("/")[0] + "/camera_info"
     for one in known:
         if one.name == beside:
             return one
@@ -259,12 +260,6 @@ def _frame_of(bag: Bag, topic: BagTopic) -> str | None:
     return None if fields is None else frame_name(str(fields.header.frame_id))
 
 
-def _without_transport(topic: str) -> str:
-    """The name of an image's topic without that of how it is compressed."""
-    base, _, last = topic.rpartition("/")
-    return base if last in ("compressedDepth", "compressed") else topic
-
-
 def _listed(topics: Iterable[BagTopic]) -> str:
     """Names for people."""
     names = [f"{one.name} ({one.type.rpartition('/')[2]}, {one.count} messages)" for one in topics]
@@ -274,17 +269,20 @@ def _listed(topics: Iterable[BagTopic]) -> str:
 # Frames.
 
 
-def recording_sequence(path: Path, options: RecordingOptions) -> FrameSequence:
+def recording_sequence(
+    path: Path, options: RecordingOptions, name: str | None = None
+) -> FrameSequence:
     """Return the frames of a recording that are taken; their samples are read when asked for.
 
     Parameters
     ----------
     path : an .mcap, .db3 or .bag file, or a rosbag2 folder
     options : what to take
+    name : of the sequence; default: that of the file
 
     Returns
     -------
-    sequence : named after the file; its `note` says what was left out, and why
+    sequence : its `note` says what was left out, and why
 
     Raises
     ------
@@ -298,7 +296,7 @@ def recording_sequence(path: Path, options: RecordingOptions) -> FrameSequence:
     info = None if frames.encoding is None else camera_topic(bag, frames, options.camera_info)
     scan = scan_bag(bag, frames.topic, info, options.progress)
     camera = None if frames.encoding is None else _camera(bag, frames, info, scan)
-    name = path.name if path.is_dir() else path.stem
+    name = recording_name(path) if name is None else name
     motion = _motion(bag, scan, frames, options)
     references = [
         _reference(bag, frames, scan, camera, motion, name, place) for place in motion.taken
@@ -312,6 +310,11 @@ def recording_sequence(path: Path, options: RecordingOptions) -> FrameSequence:
         tuple(references),
         note=_note(frames, scan, motion),
     )
+
+
+def recording_name(path: Path) -> str:
+    """The name of a recording without what tells its format."""
+    return path.name if path.is_dir() else path.stem
 
 
 @dataclass(eq=False)
@@ -418,7 +421,7 @@ def _camera(bag: Bag, frames: FrameTopic, topic: BagTopic | None, scan: BagScan)
     """The camera of depth images: of the bag, else of an intrinsics.json beside it."""
     if topic is not None and scan.info is not None:
         with naming(f"{bag.path}, {topic.name}"):
-            return Camera(intrinsics_of(scan.info, rectified=frames.is_rectified), DEPTH_SCALE)
+            return Camera(camera_intrinsics(scan.info, rectified=frames.is_rectified), DEPTH_SCALE)
     try:
         return find_camera(bag.path.parent)
     except DatasetError as cause:

@@ -10,7 +10,7 @@ const HEAD = 1024;
 const MOST_TEXT = 65_536;
 const SUFFIXES = {
   ".png": "depth", ".npy": "depth", ".ply": "cloud", ".pcd": "cloud", ".las": "cloud",
-  ".laz": "cloud", ".bin": "cloud", ".zip": "archive", ".tar": "archive", ".tgz": "archive",
+  ".laz": "cloud", ".bin": "cloud", ".cdr": "cloud", ".zip": "archive", ".tar": "archive", ".tgz": "archive",
   ".gz": "archive", ".tbz2": "archive", ".bz2": "archive", ".txz": "archive", ".xz": "archive",
 };
 /** What a file picker offers. */

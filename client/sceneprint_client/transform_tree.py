@@ -15,17 +15,15 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.errors import DatasetError
-from sceneprint.formats.dataset.frame_reference import SensorTrajectory, interpolate
-from sceneprint.formats.recording.bag import printable
-from sceneprint.geometry.pose.rigid import rotation_of
-from sceneprint.types import Floats
+from sceneprint_client.errors import DatasetError, printable
+from sceneprint_client.rotations import Floats, rotation_of
+from sceneprint_client.trajectories import SensorTrajectory, interpolate
 
 #: Seconds between two samples of a transform beyond which nothing between them is known.
 LONGEST_GAP_S = 0.5
 #: Seconds before the first sample of a transform, or after its last, for which that one stands.
 TOLERANCE_S = 0.02
-#: Most samples of moving transforms of a recording: hours at the rate of any odometry.
+#: Most samples of moving transforms: hours at the rate of any odometry.
 MOST_SAMPLES = 5_000_000
 #: How far the length of a recorded quaternion may be from 1.
 _UNIT = 1e-2
@@ -74,7 +72,7 @@ class TransformTree:
 
         Raises
         ------
-        DatasetError : there are more than 5 million.
+        DatasetError : there are more than 5 million; `forget` makes room.
         """
         parent, child = frame_name(parent), frame_name(child)
         row = np.asarray(sample, np.float64)
@@ -85,7 +83,7 @@ class TransformTree:
         self._count += 1
         if self._count > MOST_SAMPLES:
             raise DatasetError(
-                f"The recording has more than {MOST_SAMPLES} transforms. Cut it into parts."
+                f"There are more than {MOST_SAMPLES} transforms. Cut the recording into parts."
             )
         row[3:] /= length
         edges = self._edges.setdefault(child, {})
@@ -99,6 +97,22 @@ class TransformTree:
         edge.samples.extend(row)
         if self._origin_ns is None:
             self._origin_ns = stamp_ns
+
+    def forget_moving(self) -> None:
+        """Drop all that may move, as where the clock jumped."""
+        for edges in self._edges.values():
+            for parent in [name for name, edge in edges.items() if not edge.fixed]:
+                self._count -= len(edges.pop(parent).stamps_ns)
+        self._origin_ns = None
+
+    def forget(self, span_ns: int) -> None:
+        """Drop samples of moving transforms that came before those of so long until the latest."""
+        for edges in self._edges.values():
+            for edge in edges.values():
+                if not edge.fixed:
+                    old = first_since(edge.stamps_ns, span_ns)
+                    del edge.stamps_ns[:old], edge.samples[: 7 * old]
+                    self._count -= old
 
     def frames(self) -> list[str]:
         """Names of all frames."""
@@ -259,6 +273,12 @@ class TransformTree:
         asked = np.where(near, np.clip(asked, times[0], times[-1]), asked)
         trajectory = SensorTrajectory(times, rows[first, :3], rows[first, 3:])
         return interpolate(trajectory, asked.tolist(), longest_gap=LONGEST_GAP_S)
+
+
+def first_since(stamps_ns: array[int], span_ns: int) -> int:
+    """Place of the first stamp, in the order in which they came, within a span until the last."""
+    times = np.frombuffer(stamps_ns, np.int64)
+    return int(np.argmax(times >= times[-1] - span_ns)) if len(times) else 0
 
 
 def frame_name(name: str) -> str:

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sceneprint.errors import DatasetError
-from sceneprint.types import Floats
+from sceneprint_client.errors import DatasetError
+from sceneprint_client.rotations import Floats
+from sceneprint_client.transform_tree import first_since
 
 #: Seconds before and after a stamp over which accelerations are averaged.
 WINDOW_S = 0.5
@@ -53,6 +54,11 @@ class Accelerations:
             )
         self._stamps_ns.append(stamp_ns)
         self._rows.extend(row)
+
+    def forget(self, span_ns: int) -> None:
+        """Drop measurements that came before those of so long until the latest."""
+        old = first_since(self._stamps_ns, span_ns)
+        del self._stamps_ns[:old], self._rows[: 6 * old]
 
     def up_at(self, stamps_ns: Sequence[int]) -> list[Floats | None]:
         """Up (3,) in the IMU's axes at each stamp; None where the robot was not at rest.

@@ -1,0 +1,450 @@
+"""Where a robot is, of the messages that its topics carry: the node for ROS 2 without ROS.
+
+Image | CompressedImage | PointCloud2  --Relocaliser.take_frame-->  questions to a service
+CameraInfo, TFMessage, Odometry, Imu  --Relocaliser.take_...-->  camera, poses, up
+stamp  --Relocaliser.report-->  Report  --write_pose | write_transform-->  messages
+
+Messages are any objects with the attributes that ROS gives them: see ros_messages.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sceneprint_client.accelerations import WINDOW_S, Accelerations
+from sceneprint_client.api.frames import CameraIntrinsics
+from sceneprint_client.errors import SceneprintError
+from sceneprint_client.ros_messages import (
+    camera_intrinsics,
+    cloud_points,
+    compressed_depth,
+    depth_samples,
+    is_calibrated,
+    pose_row,
+    stamp_of,
+    transform_row,
+    vector_row,
+)
+from sceneprint_client.rotations import Floats, quaternion_of
+from sceneprint_client.tracker import AsyncTracker, State, Tracker
+from sceneprint_client.tracker_core import inverse, shifted_covariance
+from sceneprint_client.transform_tree import TransformTree, frame_name
+
+if TYPE_CHECKING:
+    from sceneprint_client.requests import FrameInput
+
+#: Seconds of transforms and accelerations that are remembered.
+_MEMORY_S = 10.0
+#: Messages after which the rest is forgotten.
+_SWEPT_AFTER = 512
+#: A frame so many seconds older than the last one says that the clock jumped.
+_JUMP_S = 1.0
+#: Frames that may wait for their transforms.
+_MOST_WAITING = 64
+#: What `report` says of a robot that saw nothing yet.
+_NOTHING = "no frame has come"
+
+
+@dataclass(frozen=True)
+class RelocaliserParameters:
+    """What the relocaliser takes for granted.
+
+    Parameters
+    ----------
+    odom_frame : what the robot's odometry leads to
+    base_frame : of the robot
+    parent_frame : what of the service's map is called `map` here; empty: what the first fix leads
+        to. A fix that leads elsewhere is not reported, as nothing joins the two
+    rectified : whether depth images are rectified, so that their camera is P of the camera info
+    interval_s : fewest seconds between two frames that are asked for
+    wait_s : how long a frame waits for its transforms, by the stamps of later frames
+    stale_s : without a frame for so long nothing is reported as known
+    planar : whether the robot drives on the plane z = 0 of the map: `T_map_odom` then keeps x, y
+        and the heading of the base, and the rest is zero
+    """
+
+    odom_frame: str = "odom"
+    base_frame: str = "base_link"
+    parent_frame: str = ""
+    rectified: bool = False
+    interval_s: float = 0.5
+    wait_s: float = 0.5
+    stale_s: float = 2.0
+    planar: bool = False
+
+
+class Level(IntEnum):
+    """Levels of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPose:
+    """Where a robot is that is tracked.
+
+    Parameters
+    ----------
+    T_map_odom, T_map_base : (4, 4)
+    covariance : (6, 6) of T_map_base, errors (x, y, z, rx, ry, rz) along the axes of the map
+    """
+
+    T_map_odom: Floats
+    T_map_base: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What may be told to other nodes.
+
+    Parameters
+    ----------
+    state : of the tracker
+    stamp_ns : of the frame that it is told for, nanoseconds; 0 before the first
+    pose : while tracking, else None
+    is_fix : whether it tracks now, and did not by the last report
+    level, message, values : for diagnostics
+    """
+
+    state: State
+    stamp_ns: int
+    pose: TrackedPose | None
+    is_fix: bool
+    level: Level
+    message: str
+    values: dict[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where odometry says that the robot was when a frame was taken."""
+
+    stamp_ns: int
+    T_odom_sensor: Floats
+    T_odom_base: Floats
+
+
+class Relocaliser:
+    """Takes messages in the order in which they come, and asks a service in a thread of its own.
+
+    To be called by one thread; to be closed, or used in `with`.
+
+    Parameters
+    ----------
+    tracker : which nobody else updates
+    parameters : default: RelocaliserParameters()
+    """
+
+    def __init__(self, tracker: Tracker, parameters: RelocaliserParameters | None = None) -> None:
+        self.parameters = parameters or RelocaliserParameters()
+        self.counts = {"frames": 0, "asked": 0, "without_transform": 0, "unreadable": 0}
+        self._tracker, self._questions = tracker, AsyncTracker(tracker)
+        self._tree = TransformTree()
+        self._edges_of_tf: set[tuple[str, str]] = set()
+        self._imu: tuple[str, Accelerations] | None = None
+        self._info: Any = None
+        self._waiting: deque[tuple[int, Any]] = deque()
+        self._newest_ns = self._unswept = 0
+        self._last: _Place | None = None
+        self._asked_ns: int | None = None
+        self._parent = self.parameters.parent_frame
+        self._was_tracking = False
+        self._error, self._error_at = "", 0
+
+    # What comes in.
+
+    def take_camera_info(self, message: Any) -> None:
+        """Take a sensor_msgs CameraInfo; one of a camera that is not calibrated says nothing."""
+        if is_calibrated(message):
+            self._info = message
+
+    def take_transforms(self, message: Any, *, fixed: bool) -> None:
+        """Take a tf2_msgs TFMessage; `fixed` are those of /tf_static."""
+        for one in message.transforms:
+            parent, child = str(one.header.frame_id), str(one.child_frame_id)
+            self._edges_of_tf.add((frame_name(parent), frame_name(child)))
+            row = transform_row(one.transform)
+            self._tree.add(parent, child, stamp_of(one.header), row, fixed=fixed)
+        self._sweep()
+
+    def take_odometry(self, message: Any) -> None:
+        """Take a nav_msgs Odometry; where tf says the same, it is passed over."""
+        parent, child = frame_name(message.header.frame_id), frame_name(message.child_frame_id)
+        if parent and child and (parent, child) not in self._edges_of_tf:
+            row = pose_row(message.pose.pose)
+            self._tree.add(parent, child, stamp_of(message.header), row, fixed=False)
+            self._sweep()
+
+    def take_imu(self, message: Any) -> None:
+        """Take a sensor_msgs Imu; one without an accelerometer says nothing."""
+        if float(message.linear_acceleration_covariance[0]) < 0:
+            return
+        frame = frame_name(message.header.frame_id)
+        if self._imu is None or self._imu[0] != frame:
+            self._imu = frame, Accelerations()
+        self._imu[1].add(
+            stamp_of(message.header), vector_row(message.linear_acceleration),
+            vector_row(message.angular_velocity),
+        )  # fmt: skip
+        self._sweep()
+
+    def take_frame(self, message: Any) -> None:
+        """Take a sensor_msgs Image or CompressedImage of depth, or PointCloud2; it waits until
+        its transforms are there, and `step` looks.
+        """
+        stamp = stamp_of(message.header)
+        self.counts["frames"] += 1
+        if stamp <= 0:
+            self.counts["unreadable"] += 1
+            self._note(SceneprintError("A frame has no stamp. Set the clock of its driver."))
+            return
+        if self._newest_ns - stamp > _JUMP_S * 1e9:
+            self._restart("the clock jumped back")
+        self._newest_ns = max(self._newest_ns, stamp)
+        self._waiting.append((stamp, message))
+        if len(self._waiting) > _MOST_WAITING:
+            self._waiting.popleft()
+            self.counts["without_transform"] += 1
+
+    def relocalise(self, reason: str = "it was asked to relocalise") -> None:
+        """Forget the place; the next frame is asked for at once, without a prior."""
+        self._tracker.reset(reason)
+        self._asked_ns, self._was_tracking = None, False
+
+    def step(self) -> int:
+        """Go on with frames whose transforms are there now; how many they were."""
+        done = 0
+        while self._waiting:
+            stamp, message = self._waiting[0]
+            place = self._place(stamp, frame_name(message.header.frame_id))
+            if place is None and self._newest_ns - stamp <= self.parameters.wait_s * 1e9:
+                break
+            self._waiting.popleft()
+            if place is None:
+                self.counts["without_transform"] += 1
+            elif stamp > self._last_ns:
+                self._go_on(place, message)
+                done += 1
+        return done
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Until all that was asked is answered; False where that takes longer."""
+        return self._questions.wait(timeout_s)
+
+    def close(self) -> None:
+        """Ask no more; a question that is under way is waited for."""
+        self._questions.close()
+
+    def __enter__(self) -> Relocaliser:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def _last_ns(self) -> int:
+        return 0 if self._last is None else self._last.stamp_ns
+
+    def _sweep(self) -> None:
+        """Forget what is too old for any frame, now and then."""
+        self._unswept += 1
+        if self._unswept >= _SWEPT_AFTER:
+            self._unswept = 0
+            self._tree.forget(round(_MEMORY_S * 1e9))
+            if self._imu is not None:
+                self._imu[1].forget(round(_MEMORY_S * 1e9))
+
+    def _restart(self, reason: str) -> None:
+        """Begin anew with another clock; what is fixed stays."""
+        self._tree.forget_moving()
+        self._imu, self._last = None, None
+        self._waiting.clear()
+        self._newest_ns = 0
+        self.relocalise(reason)
+
+    # Frames.
+
+    def _place(self, stamp_ns: int, sensor: str) -> _Place | None:
+        odom, base = self.parameters.odom_frame, self.parameters.base_frame
+        (T_odom_sensor,) = self._tree.poses(odom, sensor, [stamp_ns])
+        (T_odom_base,) = self._tree.poses(odom, base, [stamp_ns])
+        if T_odom_sensor is None or T_odom_base is None:
+            return None
+        return _Place(stamp_ns, T_odom_sensor, T_odom_base)
+
+    def _go_on(self, place: _Place, message: Any) -> None:
+        """Move the tracker to a frame, and ask for the frame where it is time to."""
+        self._last = place
+        stamp = place.stamp_ns * 1e-9
+        asked = self._asked_ns
+        if asked is not None and place.stamp_ns - asked < self.parameters.interval_s * 1e9:
+            self._tracker.move(place.T_odom_sensor, stamp)
+            return
+        try:
+            frame, camera = self._frame(message)
+        except SceneprintError as error:
+            self.counts["unreadable"] += 1
+            self._note(error)
+            self._tracker.move(place.T_odom_sensor, stamp)
+            return
+        try:
+            up = self._up(message, place.stamp_ns)
+            self._questions.submit(frame, place.T_odom_sensor, up, stamp, meta=camera)
+        except SceneprintError as error:  # of the question before
+            self._note(error)
+        else:
+            self._asked_ns = place.stamp_ns
+            self.counts["asked"] += 1
+
+    def _frame(self, message: Any) -> tuple[FrameInput, CameraIntrinsics | None]:
+        """What is sent of a message; raises as the functions of ros_messages."""
+        if hasattr(message, "point_step"):
+            return cloud_points(message), None
+        if self._info is None:
+            raise SceneprintError(
+                "No calibrated camera info has come. Check the topic of the camera info."
+            )
+        k = camera_intrinsics(self._info, rectified=self.parameters.rectified)
+        camera = CameraIntrinsics(
+            width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy,
+            distortion=list(k.distortion),
+        )  # fmt: skip
+        if hasattr(message, "encoding"):
+            return depth_samples(message), camera
+        return compressed_depth(message).body(), camera
+
+    def _up(self, message: Any, stamp_ns: int) -> tuple[float, float, float] | None:
+        """Up in the sensor's axes, while the robot is at rest."""
+        if self._imu is None:
+            return None
+        frame, accelerations = self._imu
+        T_sensor_imu = self._tree.fixed_transform(frame_name(message.header.frame_id), frame)
+        # what comes after the frame is not there yet: the window ends with it
+        (up,) = accelerations.up_at([stamp_ns - round(WINDOW_S * 1e9)])
+        if T_sensor_imu is None or up is None:
+            return None
+        x, y, z = T_sensor_imu[:3, :3] @ up
+        return float(x), float(y), float(z)
+
+    def _note(self, error: SceneprintError) -> None:
+        self._error, self._error_at = str(error), self._questions.answered
+
+    # What goes out.
+
+    def report(self, now_ns: int) -> Report:
+        """What may be told by what has come so far.
+
+        Parameters
+        ----------
+        now_ns : by the clock of the stamps
+        """
+        state, last = self._tracker.state(), self._last
+        silent_s = (now_ns - self._last_ns) * 1e-9
+        is_stale = last is None or silent_s > self.parameters.stale_s
+        is_tracking = state.status == "tracking" and not is_stale
+        if is_tracking and not self._parent:
+            self._parent = state.parent_frame or ""
+        is_elsewhere = is_tracking and state.parent_frame != self._parent
+        pose = None
+        if is_tracking and not is_elsewhere and last is not None:
+            pose = self._pose(state, last)
+        is_fix = pose is not None and not self._was_tracking
+        if not is_stale:
+            self._was_tracking = pose is not None
+        level = Level.OK if pose is not None else Level.WARN
+        message = f"{state.status}: {state.reason}"
+        if is_elsewhere:
+            message = f"tracked in {state.parent_frame}, and the map here is {self._parent}"
+        if is_stale:
+            level = Level.STALE
+            message = self._silence(silent_s)
+        if self._questions.answered > self._error_at:
+            self._error = ""
+        if self._error:
+            level, message = Level.ERROR, self._error
+        return Report(
+            state, self._last_ns, pose, is_fix, level, message, self._values(state)
+        )  # fmt: skip
+
+    def _pose(self, state: State, last: _Place) -> TrackedPose:
+        """Of a state that is tracked."""
+        if state.T_map_odom is None or state.T_map_sensor is None or state.covariance is None:
+            raise AssertionError("what is tracked has a pose")
+        T_map_odom, T_map_base = state.T_map_odom, state.T_map_odom @ last.T_odom_base
+        covariance = shifted_covariance(
+            state.covariance, T_map_base[:3, 3] - state.T_map_sensor[:3, 3]
+        )
+        if self.parameters.planar:
+            T_map_base = planar(T_map_base)
+            T_map_odom = T_map_base @ inverse(planar(last.T_odom_base))
+        return TrackedPose(T_map_odom, T_map_base, covariance)
+
+    def _silence(self, silent_s: float) -> str:
+        """Why there is no frame that could be told of."""
+        p = self.parameters
+        if not self.counts["frames"]:
+            return _NOTHING
+        if self._last is not None and not self._waiting:
+            return f"no frame has come for {silent_s:.1f} s"
+        sensor = frame_name(self._waiting[-1][1].header.frame_id) if self._waiting else "the sensor"
+        return f"no transforms from {p.odom_frame} to {sensor} and {p.base_frame} at its stamps"
+
+    def _values(self, state: State) -> dict[str, str]:
+        """Values for diagnostics."""
+        values = {
+            "status": state.status, "reason": state.reason,
+            "parent_frame": state.parent_frame or "", "map_is": self._parent,
+        }  # fmt: skip
+        if state.covariance is not None and state.age is not None:
+            values["age_s"] = f"{state.age:.1f}"
+            deviations = np.sqrt(np.diag(state.covariance))
+            values["deviation_m"] = f"{deviations[:3].max():.3f}"
+            values["deviation_deg"] = f"{math.degrees(deviations[3:].max()):.2f}"
+        counts = {**self.counts, "answered": self._questions.answered,
+                  "superseded": self._questions.dropped}  # fmt: skip
+        return {**values, **{name: str(count) for name, count in counts.items()}}
+
+
+def planar(T: Floats) -> Floats:
+    """The pose (4, 4) on the plane z = 0 with the same x, y and heading of its x axis."""
+    cosine, sine = T[0, 0], T[1, 0]
+    length = math.hypot(cosine, sine) or 1.0
+    flat = np.eye(4)
+    flat[:2, :2] = np.array([[cosine, -sine], [sine, cosine]]) / length
+    flat[:2, 3] = T[:2, 3]
+    return flat
+
+
+def write_pose(message: Any, T: Floats) -> None:
+    """Fill a geometry_msgs Pose."""
+    _write_vector(message.position, T[:3, 3])
+    _write_rotation(message.orientation, T)
+
+
+def write_transform(message: Any, T: Floats) -> None:
+    """Fill a geometry_msgs Transform."""
+    _write_vector(message.translation, T[:3, 3])
+    _write_rotation(message.rotation, T)
+
+
+def write_stamp(message: Any, stamp_ns: int) -> None:
+    """Fill a builtin_interfaces Time."""
+    message.sec, message.nanosec = divmod(stamp_ns, 1_000_000_000)
+
+
+def _write_vector(message: Any, vector: Floats) -> None:
+    message.x, message.y, message.z = (float(value) for value in vector)
+
+
+def _write_rotation(message: Any, T: Floats) -> None:
+    message.x, message.y, message.z, message.w = map(float, quaternion_of(T[:3, :3]))

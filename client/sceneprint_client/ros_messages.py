@@ -1,0 +1,360 @@
+"""What messages of ROS say, whoever decoded them: depth, points, cameras, poses.
+
+Image  --depth_samples-->  (H, W);  CompressedImage  --compressed_depth-->  CompressedDepth
+PointCloud2  --cloud_points-->  (N, 3)
+CameraInfo  --camera_intrinsics-->  Intrinsics
+Transform | Pose  --transform_row | pose_row-->  x y z, quaternion
+
+A message is any object with the attributes that ROS gives it: of rclpy, of rosbags, of ROS 1.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint_client.errors import (
+    InvalidIntrinsics,
+    UnreadableCloud,
+    UnreadableFrame,
+    printable,
+)
+from sceneprint_client.file_formats import PNG_SIGNATURE
+from sceneprint_client.rotations import Floats
+from sceneprint_client.sidecars import MAXIMUM_SAMPLES, Intrinsics
+
+# Depth images.
+
+#: Encodings of images that are depth: 16-bit millimetres, or metres (REP 118).
+ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+#: Stored units per metre of the 16-bit ones.
+DEPTH_SCALE = 1000.0
+#: Bytes before the PNG of a compressedDepth message: a format, and two floats a and b.
+TRANSPORT_BYTES = 12
+#: Bytes within which the PNG begins.
+_MOST_BEFORE_PNG = 64
+
+
+def image_encoding(message: Any, *, compressed: bool) -> str | None:
+    """Encoding of an image's depth; None where it is of colour, or compressed otherwise.
+
+    Parameters
+    ----------
+    message : sensor_msgs Image, or CompressedImage
+    compressed : which of them
+    """
+    if not compressed:
+        return str(message.encoding) if message.encoding in ENCODINGS else None
+    told = str(message.format)
+    if "compressedDepth" not in told:
+        return None
+    encoding = told.partition(";")[0].strip()
+    return encoding if encoding in ENCODINGS else None
+
+
+def depth_samples(message: Any) -> NDArray[Any]:
+    """Return the samples (H, W) of a depth image: uint16 millimetres, or float32 metres.
+
+    Parameters
+    ----------
+    message : sensor_msgs Image
+
+    Raises
+    ------
+    UnreadableFrame : it is of another encoding, or its sizes contradict each other.
+    """
+    kind = ENCODINGS.get(message.encoding)
+    if kind is None:
+        raise UnreadableFrame(
+            f"The image has the encoding {message.encoding!r:.40}, and depth is 16UC1, mono16 or "
+            "32FC1. Name the topic of the depth images."
+        )
+    samples = _samples(message, np.dtype((">" if message.is_bigendian else "<") + kind))
+    return samples.astype("<" + kind)
+
+
+def _samples(message: Any, kind: np.dtype[Any]) -> NDArray[Any]:
+    """Samples (H, W) of an image whose rows may be longer than they need to be."""
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    row = width * kind.itemsize
+    if not 0 < width * height <= MAXIMUM_SAMPLES or step < row:
+        raise UnreadableFrame(
+            f"The image announces {width} x {height} samples in rows of {step} bytes; 1 to "
+            f"{MAXIMUM_SAMPLES} samples are read. Record it again."
+        )
+    data = np.frombuffer(memoryview(message.data), np.uint8)
+    if len(data) < step * height:
+        raise UnreadableFrame(
+            f"The image has {len(data)} bytes, and {height} rows of {step} bytes are announced. "
+            "Record it again."
+        )
+    rows = data[: step * height].reshape(height, step)[:, :row]
+    return np.ascontiguousarray(rows).view(kind)
+
+
+@dataclass(frozen=True)
+class CompressedDepth:
+    """An image of compressed_depth_image_transport.
+
+    Parameters
+    ----------
+    png : its samples, 16 bits each
+    inverse : a and b of a 32FC1 image, where z = a / (v - b) metres; None of 16UC1 millimetres
+    """
+
+    png: bytes
+    inverse: tuple[float, float] | None
+
+    def body(self) -> bytes:
+        """The bytes that a service takes as a frame: a PNG, after its header where that matters."""
+        if self.inverse is None:
+            return self.png
+        return struct.pack("<iff", 0, *self.inverse) + self.png
+
+
+def compressed_depth(message: Any) -> CompressedDepth:
+    """Return the PNG of a compressed depth image, and how its samples stand for metres.
+
+    Parameters
+    ----------
+    message : sensor_msgs CompressedImage
+
+    Raises
+    ------
+    UnreadableFrame : it is compressed otherwise, or lacks the header that says how.
+    """
+    encoding = image_encoding(message, compressed=True)
+    data = bytes(memoryview(message.data))
+    at = data.find(PNG_SIGNATURE, 0, _MOST_BEFORE_PNG)
+    if encoding is None or at < 0:
+        raise UnreadableFrame(
+            f"The image has the format {message.format!r:.60}, and of compressed depth only PNG of "
+            "16UC1 and 32FC1 is read. Record the raw topic, or set the transport's format to png."
+        )
+    if encoding != "32FC1":
+        return CompressedDepth(data[at:], None)
+    if at < TRANSPORT_BYTES:
+        raise UnreadableFrame(
+            "The image of 32FC1 lacks the 12 bytes that say how its depth is stored. Record it "
+            "again."
+        )
+    a, b = struct.unpack_from("<ff", data, 4)
+    if not (math.isfinite(a) and math.isfinite(b) and a > 0):
+        raise UnreadableFrame(
+            f"The image stores inverse depth by a = {a:g} and b = {b:g}, and these are no such "
+            "numbers. Record it again."
+        )
+    return CompressedDepth(data[at:], (a, b))
+
+
+# Cameras.
+
+
+def is_calibrated(info: Any) -> bool:
+    """Whether a CameraInfo says anything: drivers without a calibration send zeros."""
+    k = _numbers(info, "k", 9)
+    return k is not None and k[0] > 0 and k[4] > 0
+
+
+def camera_intrinsics(info: Any, *, rectified: bool) -> Intrinsics:
+    """Return the camera that a CameraInfo describes.
+
+    Parameters
+    ----------
+    info : sensor_msgs CameraInfo
+    rectified : whether the images have been rectified: their camera is P, without distortion
+
+    Raises
+    ------
+    InvalidIntrinsics : it describes no camera, or a lens that is not supported.
+    """
+    k, p = _numbers(info, "k", 9), _numbers(info, "p", 12)
+    if k is None:
+        raise InvalidIntrinsics("The camera info has no matrix K. Calibrate the camera.")
+    fx, fy, cx, cy = k[0], k[4], k[2], k[5]
+    distortion: tuple[float, ...] = ()
+    if rectified and p is not None and p[0] > 0 and p[5] > 0:
+        fx, fy, cx, cy = p[0], p[5], p[2], p[6]
+    elif not rectified:
+        distortion = _distortion(info)
+    if int(info.binning_x) > 1 or int(info.binning_y) > 1:
+        raise InvalidIntrinsics(
+            f"The camera info has a binning of {info.binning_x} x {info.binning_y}, which is not "
+            "supported. Write the camera of the binned images into an intrinsics.json."
+        )
+    width, height, roi = int(info.width), int(info.height), info.roi
+    if int(roi.width) and int(roi.height):
+        width, height = int(roi.width), int(roi.height)
+        cx, cy = cx - int(roi.x_offset), cy - int(roi.y_offset)
+    return Intrinsics(width, height, fx, fy, cx, cy, distortion)
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether a topic's images have been rectified, by the name that ROS gives them."""
+    return "rect" in topic_without_transport(topic).rpartition("/")[2]
+
+
+def topic_without_transport(topic: str) -> str:
+    """The name of an image's topic without that of how it is compressed."""
+    base, _, last = topic.rpartition("/")
+    return base if last in ("compressedDepth", "compressed") else topic
+
+
+def _distortion(info: Any) -> tuple[float, ...]:
+    """Coefficients k1, k2, p1, p2[, k3] of a lens, none where it does not distort."""
+    told = getattr(info, "d", None)
+    d = [float(value) for value in (info.D if told is None else told)]
+    if not any(d):
+        return ()
+    model = str(info.distortion_model)
+    if model in ("plumb_bob", "rational_polynomial", "") and len(d) in (4, 5, 8, 12, 14):
+        if not any(d[5:]):
+            return tuple(d[:5])
+        raise InvalidIntrinsics(
+            "The camera info has the lens model rational_polynomial with k4, k5 or k6, of which "
+            "only k1, k2, p1, p2 and k3 are supported. Record the rectified images."
+        )
+    raise InvalidIntrinsics(
+        f"The camera info has the lens model {model!r:.40} with {len(d)} coefficients; supported "
+        "is plumb_bob. Record the rectified images."
+    )
+
+
+def _numbers(info: Any, name: str, count: int) -> list[float] | None:
+    """A matrix of a CameraInfo: ROS 1 has capital names, ROS 2 small ones."""
+    found = getattr(info, name, None)
+    numbers = [float(value) for value in (getattr(info, name.upper()) if found is None else found)]
+    return numbers if len(numbers) == count else None
+
+
+# Points.
+
+#: Types of fields, by the number that sensor_msgs/PointField has for them.
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+#: Most points of a message.
+MOST_POINTS = 20_000_000
+#: Points that are converted at a time.
+_BLOCK = 1 << 16
+
+
+def cloud_points(message: Any) -> NDArray[np.float32]:
+    """Return the points (N, 3) of a message that are there, metres.
+
+    Points that are not finite, or exactly at the sensor as some drivers write what they missed, are
+    left out.
+
+    Parameters
+    ----------
+    message : sensor_msgs PointCloud2, of any fields with x, y and z, organised or not
+
+    Raises
+    ------
+    UnreadableCloud : it has no x, y and z, or its sizes contradict each other.
+    """
+    table, found = cloud_table(message), []
+    with np.errstate(all="ignore"):  # what overflows is no number, and so missing
+        for block in cloud_blocks(table):
+            points = block.astype(np.float32)
+            found.append(points[np.isfinite(points).all(axis=1)])
+    return np.concatenate(found) if found else np.empty((0, 3), np.float32)
+
+
+def cloud_table(message: Any) -> NDArray[np.void]:
+    """Records (rows, columns) of x, y and z in the bytes of a PointCloud2, which are not copied;
+    raises as `cloud_points`.
+    """
+    width, height = int(message.width), int(message.height)
+    step, row = int(message.point_step), int(message.row_step)
+    data = memoryview(message.data).cast("B")
+    if width * height > MOST_POINTS:
+        raise UnreadableCloud(
+            f"The cloud announces {width} x {height} points; at most {MOST_POINTS} are read. "
+            "Thin it out."
+        )
+    if height == 1 or row == 0:  # some drivers leave it out
+        row = width * step
+    if step < 1 or row < width * step or len(data) < row * height:
+        raise UnreadableCloud(
+            f"The cloud has {len(data)} bytes, and {height} rows of {width} points of {step} bytes "
+            "are announced. Record it again."
+        )
+    if not width * height:
+        return np.empty((0, 0), [(name, "f4") for name in "xyz"])
+    kind = _point_type(message, step)
+    table: NDArray[np.void] = np.ndarray((height, width), kind, data, strides=(row, step))
+    return table
+
+
+def cloud_blocks(table: NDArray[np.void]) -> Iterator[Floats]:
+    """Points (n, 3) of records with x, y and z in their order, many at a time; NaN where one lies
+    exactly at the sensor.
+    """
+    height, width = table.shape
+    rows = max(1, _BLOCK // max(width, 1))
+    for first in range(0, height, rows):
+        for column in range(0, width, _BLOCK):
+            part = table[first : first + rows, column : column + _BLOCK]
+            block = np.empty((part.size, 3))
+            for axis, name in enumerate("xyz"):
+                block[:, axis] = part[name].reshape(-1)
+            block[~block.any(axis=1)] = np.nan
+            yield block
+
+
+def _point_type(message: Any, step: int) -> np.dtype[Any]:
+    """x, y and z of a point of so many bytes."""
+    order = ">" if message.is_bigendian else "<"
+    found = {}
+    for field in message.fields:
+        kind = _TYPES.get(int(field.datatype))
+        if field.name in ("x", "y", "z") and kind is not None and int(field.count) in (0, 1):
+            found[str(field.name)] = (order + kind, int(field.offset))
+    if len(found) != 3:
+        names = ", ".join(str(field.name) for field in message.fields[:20])
+        raise UnreadableCloud(
+            f"The cloud has the fields {printable(names[:120]) or 'none'}, and x, y and z are "
+            "needed. Name the topic of the points."
+        )
+    if any(offset + np.dtype(kind).itemsize > step for kind, offset in found.values()):
+        raise UnreadableCloud(
+            f"The fields of the cloud do not fit into its points of {step} bytes. Record it again."
+        )
+    return np.dtype(
+        {
+            "names": list(found),
+            "formats": [kind for kind, _ in found.values()],
+            "offsets": [offset for _, offset in found.values()],
+            "itemsize": step,
+        }
+    )
+
+
+# Poses and what moves.
+
+
+def stamp_of(header: Any) -> int:
+    """When a message with a header was measured, nanoseconds."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def transform_row(transform: Any) -> list[float]:
+    """x y z, and the quaternion x y z w, of a geometry_msgs Transform."""
+    turn = transform.rotation
+    return [*vector_row(transform.translation), *vector_row(turn), float(turn.w)]
+
+
+def pose_row(pose: Any) -> list[float]:
+    """x y z, and the quaternion x y z w, of a geometry_msgs Pose."""
+    turn = pose.orientation
+    return [*vector_row(pose.position), *vector_row(turn), float(turn.w)]
+
+
+def vector_row(vector: Any) -> list[float]:
+    """x y z of a geometry_msgs Vector3, Point or Quaternion."""
+    return [float(vector.x), float(vector.y), float(vector.z)]

@@ -1,0 +1,75 @@
+"""Navigation of Nav2 with the relocaliser: ros2 launch sceneprint_ros nav2.launch.py map:=...
+
+With `amcl:=true` AMCL localises, and the relocaliser gives it its initial pose; else the
+relocaliser alone publishes map -> odom.
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.conditions import IfCondition, UnlessCondition
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration, NotSubstitution, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+
+def _nav2(name: str, **more: object) -> IncludeLaunchDescription:
+    """A launch file of nav2_bringup."""
+    file = PathJoinSubstitution([FindPackageShare("nav2_bringup"), "launch", name])
+    return IncludeLaunchDescription(PythonLaunchDescriptionSource(file), **more)
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Nav2 and the relocaliser, of which one alone publishes map -> odom."""
+    own = PathJoinSubstitution([FindPackageShare("sceneprint_ros"), "config", "relocaliser.yaml"])
+    amcl, sim = LaunchConfiguration("amcl"), LaunchConfiguration("use_sim_time")
+    nav2 = {"use_sim_time": sim, "params_file": LaunchConfiguration("nav2_params_file")}
+    nav2_own = PathJoinSubstitution(
+        [FindPackageShare("nav2_bringup"), "params", "nav2_params.yaml"]
+    )
+    yaml = LaunchConfiguration("map")
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("map", description="map of nav2_map_server, YAML"),
+            DeclareLaunchArgument("params_file", default_value=own),
+            DeclareLaunchArgument("nav2_params_file", default_value=nav2_own),
+            DeclareLaunchArgument("use_sim_time", default_value="false"),
+            DeclareLaunchArgument("amcl", default_value="false"),
+            Node(
+                package="sceneprint_ros",
+                executable="relocaliser",
+                name="relocaliser",
+                output="screen",
+                parameters=[
+                    LaunchConfiguration("params_file"),
+                    {
+                        "use_sim_time": sim,
+                        "publish_tf": ParameterValue(NotSubstitution(amcl), value_type=bool),
+                    },
+                ],
+            ),
+            _nav2(
+                "localization_launch.py",
+                launch_arguments={**nav2, "map": yaml}.items(),
+                condition=IfCondition(amcl),
+            ),
+            Node(
+                package="nav2_map_server",
+                executable="map_server",
+                name="map_server",
+                output="screen",
+                parameters=[{"yaml_filename": yaml, "use_sim_time": sim}],
+                condition=UnlessCondition(amcl),
+            ),
+            Node(
+                package="nav2_lifecycle_manager",
+                executable="lifecycle_manager",
+                name="lifecycle_manager_map",
+                output="screen",
+                parameters=[{"use_sim_time": sim, "autostart": True, "node_names": ["map_server"]}],
+                condition=UnlessCondition(amcl),
+            ),
+            _nav2("navigation_launch.py", launch_arguments=nav2.items()),
+        ]
+    )

@@ -1,0 +1,279 @@
+"""Messages of ROS, and bags of them in every container, with a camera off the base."""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from sceneprint.types import Floats
+from sceneprint_client.rotations import quaternion_of, rotation_of
+
+#: Of all stamps in seconds: a date, so that frames get `captured_at`.
+START = 1_700_000_000
+CONTAINERS = ("mcap", "sqlite3", "ros1")
+K = (70.0, 71.0, 39.5, 29.5)
+WIDTH, HEIGHT = 80, 60
+
+
+def transform(x: float, y: float, z: float, *quaternion: float) -> Floats:
+    T = np.eye(4)
+    q = np.array(quaternion or (0, 0, 0, 1), float)
+    T[:3, :3], T[:3, 3] = rotation_of(q / np.linalg.norm(q)), (x, y, z)
+    return T
+
+
+#: A camera that looks ahead and a little down, before the base and above it.
+T_BASE_CAMERA = transform(0.21, -0.05, 0.93, -0.53, 0.49, -0.47, 0.51)
+
+
+class BagWriter:
+    """Messages of ROS 1 or 2, written by rosbags."""
+
+    def __init__(self, writer: Any, *, ros1: bool) -> None:
+        self.ros1, self.writer = ros1, writer
+        self.types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+        if ros1:  # rosbags has it of ROS 2 alone
+            of_tf = "geometry_msgs/TransformStamped[] transforms"
+            self.types.register(get_types_from_msg(of_tf, "tf2_msgs/msg/TFMessage"))
+        self.connections: dict[str, Any] = {}
+        self.late = 0.0  #: seconds from the stamp of a message to its recording
+
+    def make(self, name: str, /, **fields: Any) -> Any:
+        kind = self.types.types[name]
+        if self.ros1 and name == "std_msgs/msg/Header":
+            fields["seq"] = 0
+        if self.ros1 and name == "sensor_msgs/msg/CameraInfo":
+            fields = {k.upper() if k in "dkrp" else k: v for k, v in fields.items()}
+        return kind(**fields)
+
+    def header(self, t: float, frame: str) -> Any:
+        ns = round(t * 1e9)
+        stamp = self.make(
+            "builtin_interfaces/msg/Time", sec=START + ns // 10**9, nanosec=ns % 10**9
+        )
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+    def write(self, topic: str, name: str, t: float, message: Any) -> None:
+        self.raw(topic, name, t, self.serialized(name, message))
+
+    def serialized(self, name: str, message: Any) -> bytes:
+        if self.ros1:
+            return bytes(self.types.serialize_ros1(message, name))
+        return bytes(self.types.serialize_cdr(message, name))
+
+    def raw(self, topic: str, name: str, t: float, data: bytes) -> None:
+        if topic not in self.connections:
+            self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.types)
+        self.writer.write(
+            self.connections[topic], START * 10**9 + round((t + self.late) * 1e9), data
+        )
+
+    # What robots record.
+
+    def transforms(
+        self, t: float, edges: dict[tuple[str, str], Floats], topic: str = "/tf"
+    ) -> None:
+        made = []
+        for (parent, child), T in edges.items():
+            x, y, z, w = quaternion_of(T[:3, :3])
+            tx, ty, tz = T[:3, 3]
+            made.append(
+                self.make(
+                    "geometry_msgs/msg/TransformStamped",
+                    header=self.header(t, parent),
+                    child_frame_id=child,
+                    transform=self.make(
+                        "geometry_msgs/msg/Transform",
+                        translation=self.make("geometry_msgs/msg/Vector3", x=tx, y=ty, z=tz),
+                        rotation=self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+                    ),
+                )
+            )
+        message = self.make("tf2_msgs/msg/TFMessage", transforms=made)
+        self.write(topic, "tf2_msgs/msg/TFMessage", t, message)
+
+    def odometry(self, t: float, T: Floats, topic: str = "/odom", child: str = "base_link") -> None:
+        x, y, z, w = quaternion_of(T[:3, :3])
+        tx, ty, tz = T[:3, 3]
+        zero = self.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        pose = self.make(
+            "geometry_msgs/msg/Pose",
+            position=self.make("geometry_msgs/msg/Point", x=tx, y=ty, z=tz),
+            orientation=self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        )
+        twist = self.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+        message = self.make(
+            "nav_msgs/msg/Odometry",
+            header=self.header(t, "odom"),
+            child_frame_id=child,
+            pose=self.make(
+                "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)
+            ),
+            twist=self.make(
+                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)
+            ),
+        )
+        self.write(topic, "nav_msgs/msg/Odometry", t, message)
+
+    def imu(self, t: float, acceleration: Any, turn: Any = (0, 0, 0), frame: str = "imu") -> None:
+        def vector(values: Any) -> Any:
+            x, y, z = map(float, values)
+            return self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+        message = self.make(
+            "sensor_msgs/msg/Imu",
+            header=self.header(t, frame),
+            orientation=self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=np.zeros(9),
+            angular_velocity=vector(turn),
+            angular_velocity_covariance=np.zeros(9),
+            linear_acceleration=vector(acceleration),
+            linear_acceleration_covariance=np.zeros(9),
+        )
+        self.write("/imu", "sensor_msgs/msg/Imu", t, message)
+
+    def camera_info(
+        self, t: float, topic: str = "/camera/depth/camera_info", *, frame: str = "camera",
+        k: tuple[float, ...] = K, size: tuple[int, int] = (WIDTH, HEIGHT), d: Any = (),
+        model: str = "plumb_bob", p: tuple[float, ...] | None = None, **more: Any,
+    ) -> None:  # fmt: skip
+        def matrix(fx: float, fy: float, cx: float, cy: float) -> list[float]:
+            return [fx, 0, cx, 0, fy, cy, 0, 0, 1]
+
+        projection = np.zeros((3, 4))
+        projection[:, :3] = np.reshape(matrix(*(p or k)), (3, 3))
+        roi = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+        message = self.make(
+            "sensor_msgs/msg/CameraInfo",
+            header=self.header(t, frame),
+            height=size[1], width=size[0], distortion_model=model,
+            d=np.array(d, np.float64), k=np.array(matrix(*k), np.float64),
+            r=np.eye(3).ravel(), p=projection.ravel(),
+            binning_x=more.pop("binning", 0), binning_y=0,
+            roi=self.make("sensor_msgs/msg/RegionOfInterest", **(roi | more)),
+        )  # fmt: skip
+        self.write(topic, "sensor_msgs/msg/CameraInfo", t, message)
+
+    def image(
+        self, t: float, samples: Any, encoding: str = "16UC1",
+        topic: str = "/camera/depth/image_raw", *, frame: str = "camera", padding: int = 0,
+        big: bool = False,
+    ) -> None:  # fmt: skip
+        """An image; its rows may be padded, and its samples big-endian."""
+        kind = np.dtype({"32FC1": "f4", "rgb8": "u1"}.get(encoding, "u2"))
+        data = np.asarray(samples).astype(kind.newbyteorder(">" if big else "<"))
+        rows = data.view(np.uint8).reshape(len(data), -1)
+        rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=0xAB)
+        message = self.make(
+            "sensor_msgs/msg/Image",
+            header=self.header(t, frame), height=data.shape[0], width=data.shape[1],
+            encoding=encoding, is_bigendian=int(big), step=rows.shape[1],
+            data=rows.reshape(-1),
+        )  # fmt: skip
+        self.write(topic, "sensor_msgs/msg/Image", t, message)
+
+    def compressed(
+        self, t: float, samples: Any, encoding: str = "16UC1",
+        topic: str = "/camera/depth/image_raw/compressedDepth", *, a: float = 0.0, b: float = 0.0,
+        form: str | None = None, frame: str = "camera",
+    ) -> None:  # fmt: skip
+        """An image of compressed_depth_image_transport: a header of 12 bytes before the PNG."""
+        file = io.BytesIO()
+        Image.fromarray(np.asarray(samples, np.uint16)).save(file, "PNG")
+        data = struct.pack("<iff", 0, a, b) + file.getvalue()
+        message = self.make(
+            "sensor_msgs/msg/CompressedImage",
+            header=self.header(t, frame),
+            format=f"{encoding}; compressedDepth" if form is None else form,
+            data=np.frombuffer(data, np.uint8),
+        )  # fmt: skip
+        self.write(topic, "sensor_msgs/msg/CompressedImage", t, message)
+
+    def points(
+        self, t: float, rows: np.ndarray, topic: str = "/points", *, frame: str = "lidar",
+        height: int = 1, padding: int = 0, big: bool = False, **more: Any,
+    ) -> None:  # fmt: skip
+        """Points of a structured array, its fields as they lie in it."""
+        numbers = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+        fields = [
+            self.make(
+                "sensor_msgs/msg/PointField", name=name, offset=int(offset), count=1,
+                datatype=numbers[kind.str[1:]],
+            )
+            for name, (kind, offset) in (rows.dtype.fields or {}).items()
+        ]  # fmt: skip
+        data = rows.view(np.uint8).reshape(height, -1)
+        data = np.pad(data, ((0, 0), (0, padding)), constant_values=0xCD)
+        told = {
+            "height": height, "width": len(rows) // height, "point_step": rows.dtype.itemsize,
+            "row_step": data.shape[1],
+        } | more  # fmt: skip
+        message = self.make(
+            "sensor_msgs/msg/PointCloud2",
+            header=self.header(t, frame), fields=fields, is_bigendian=big,
+            data=data.reshape(-1), is_dense=False, **told,
+        )  # fmt: skip
+        self.write(topic, "sensor_msgs/msg/PointCloud2", t, message)
+
+
+@contextmanager
+def open_writer(folder: Path, container: str, name: str, compression: str) -> Iterator[BagWriter]:
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+    if container == "ros1":
+        ros1 = Ros1Writer(folder / f"{name}.bag")
+        if compression:
+            ros1.set_compression(ros1.CompressionFormat[compression.upper()])
+        with ros1 as writer:
+            yield BagWriter(writer, ros1=True)
+        return
+    plugin = StoragePlugin.MCAP if container == "mcap" else StoragePlugin.SQLITE3
+    ros2 = Ros2Writer(folder / name, version=9, storage_plugin=plugin)
+    if compression:
+        ros2.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
+    with ros2 as writer:
+        yield BagWriter(writer, ros1=False)
+
+
+def path_of(folder: Path, container: str, name: str) -> Path:
+    """What a user names: the file of an MCAP, the folder of a rosbag2 database."""
+    if container == "ros1":
+        return folder / f"{name}.bag"
+    return folder / name / f"{name}.mcap" if container == "mcap" else folder / name
+
+
+def write(
+    folder: Path, fill: Callable[[BagWriter], None], container: str = "mcap", name: str = "run",
+    compression: str = "",
+) -> Path:  # fmt: skip
+    """A bag that `fill` writes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with open_writer(folder, container, name, compression) as writer:
+        fill(writer)
+    return path_of(folder, container, name)
+
+
+class MessageWriter(BagWriter):
+    """Messages of ROS 2 as they come out of their bytes; in no bag."""
+
+    def __init__(self) -> None:
+        super().__init__(None, ros1=False)
+        self.written: list[tuple[str, str, Any]] = []  #: topic, type, message
+
+    def raw(self, topic: str, name: str, t: float, data: bytes) -> None:
+        self.written.append((topic, name, self.types.deserialize_cdr(data, name)))
+
+    def last(self) -> Any:
+        """The message written last."""
+        return self.written[-1][2]

@@ -1,0 +1,266 @@
+"""A drive through a room as topics carry it, a service with a map of it, and a stand-in for rclpy.
+
+Messages are made by rosbags, go through their bytes, and come out as rosbags reads them.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.cli.demo import serving
+from sceneprint.formats.dataset import decode_png, find_sequences
+from sceneprint_client import Client
+from sceneprint_client.frame_files import meta_of
+
+PACKAGE = Path(__file__).resolve().parents[2] / "ros2" / "sceneprint_ros"
+#: Frames of the room, of which every second is in the map; and seconds from one to the next.
+FRAMES, STEP_S = 12, 0.5
+#: Where odometry begins in the map: it knows nothing of it.
+T_MAP_ODOM = np.array([[0.0, -1, 0, 2], [1, 0, 0, -3], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+#: A topic, a type, and a message of it.
+Arrived = tuple[str, str, Any]
+
+
+@pytest.fixture(scope="session")
+def room(building: Path) -> tuple[Any, ...]:
+    (sequence,) = find_sequences(building / "room-0" / "seq-01")
+    return sequence.frames[:FRAMES]
+
+
+@pytest.fixture(scope="session")
+def service_url(room: tuple[Any, ...], tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A service with a map `room`."""
+    with serving(tmp_path_factory.mktemp("service"), 1) as url:
+        with Client(url) as client:
+            client.create_map("room", model="depth")
+            added = [
+                client.upload("room", one, meta_of(one, session="s", parent_frame="site"))
+                for one in room[::2]
+            ]
+            client.wait([one.job_id for one in added])
+        yield url
+
+
+@pytest.fixture(scope="session")
+def drive(room: tuple[Any, ...], ros: SimpleNamespace) -> Callable[..., list[Arrived]]:
+    """What topics carry while a robot drives through the room, a frame every half second.
+
+    `kind` is how depth is sent; with `turn`, everything happens so many seconds later.
+    """
+
+    def carried(kind: str = "depth", *, later: float = 0.0, frames: int = FRAMES) -> list[Arrived]:
+        writer = ros.messages()
+        writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
+        for i, one in enumerate(room[:frames]):
+            t = later + STEP_S * i
+            k = one.camera.intrinsics
+            T_odom_base = np.linalg.inv(T_MAP_ODOM) @ one.pose @ np.linalg.inv(ros.camera)
+            samples = decode_png(one.read_bytes())
+            writer.camera_info(t, k=(k.fx, k.fy, k.cx, k.cy), size=(k.width, k.height))
+            send(writer, kind, t, samples, k)  # odometry of its time comes after it
+            writer.transforms(t, {("odom", "base_link"): T_odom_base})
+        return list(writer.written)
+
+    return carried
+
+
+def send(writer: Any, kind: str, t: float, samples: np.ndarray, k: Any) -> None:
+    if kind == "depth":
+        writer.image(t, samples)
+    elif kind == "metres":
+        writer.image(t, samples / 1000.0, "32FC1")
+    elif kind == "compressed_depth":
+        writer.compressed(t, samples)
+    elif kind == "compressed_metres":  # quantised as the transport does: z = a / (v - b)
+        a, b = 10_100.0, 1 - 10_100.0 / 10.0
+        with np.errstate(divide="ignore"):
+            quantised = np.where(samples > 0, a / (samples / 1000.0) + b, 0)
+        quantised[(quantised < 1) | (quantised > 65_535)] = 0
+        writer.compressed(t, quantised.round(), "32FC1", a=a, b=b)
+    else:
+        v, u = np.mgrid[0 : k.height : 2, 0 : k.width : 2]
+        z = np.where(samples[v, u] > 0, samples[v, u] / 1000.0, np.nan)
+        points = np.zeros(z.shape, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+        points["x"], points["y"], points["z"] = (u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z
+        writer.points(t, points.reshape(-1), frame="camera", height=len(points))
+
+
+# What rclpy gives a node, as far as ours asks for it.
+
+
+@dataclass
+class Bus:
+    """What a node subscribed to, and what it published.
+
+    Parameters
+    ----------
+    parameters : that are set, others have their defaults
+    now_ns : of its clock
+    """
+
+    parameters: dict[str, Any] = field(default_factory=dict)
+    now_ns: int = 0
+    callbacks: dict[str, Callable[[Any], None]] = field(default_factory=dict)
+    kinds: dict[str, str] = field(default_factory=dict)
+    declared: dict[str, Any] = field(default_factory=dict)
+    services: dict[str, Callable[[Any, Any], Any]] = field(default_factory=dict)
+    timers: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
+    published: list[Arrived] = field(default_factory=list)
+    log: list[str] = field(default_factory=list)
+    is_up: bool = False
+
+    def on(self, topic: str) -> list[Any]:
+        """Messages that were published on a topic."""
+        return [message for name, _, message in self.published if name == topic]
+
+
+class StubNode:
+    """rclpy.node.Node on a bus: messages that it publishes go through their bytes."""
+
+    bus: Bus
+    types: Any
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def get_name(self) -> str:
+        return self.name
+
+    def declare_parameter(self, name: str, default: Any) -> SimpleNamespace:
+        self.bus.declared[name] = default
+        value = self.bus.parameters.get(name, default)
+        assert type(value) is type(default), name  # as rclpy sees to it
+        return SimpleNamespace(value=value)
+
+    def create_subscription(
+        self, kind: Any, topic: str, callback: Callable[[Any], None], qos: object
+    ) -> None:
+        self.bus.callbacks[topic], self.bus.kinds[topic] = callback, kind.ros_name
+
+    def create_publisher(self, kind: Any, topic: str, qos: object) -> SimpleNamespace:
+        def publish(message: Any) -> None:
+            data = self.types.serialize_cdr(plain(message), kind.ros_name)
+            read = self.types.deserialize_cdr(data, kind.ros_name)
+            self.bus.published.append((topic, kind.ros_name, read))
+
+        return SimpleNamespace(publish=publish)
+
+    def create_service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
+        self.bus.services[name] = callback
+
+    def create_timer(self, period_s: float, callback: Callable[[], None]) -> None:
+        self.bus.timers.append((period_s, callback))
+
+    def get_clock(self) -> Any:
+        return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=self.bus.now_ns))
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(info=self.bus.log.append)
+
+    def destroy_node(self) -> None:
+        self.bus.is_up = False
+
+
+def plain(message: Any) -> Any:
+    """A message for rosbags, which has numbers for what rclpy has bytes of length 1."""
+    if hasattr(message, "level"):
+        assert isinstance(message.level, bytes)
+        assert len(message.level) == 1
+        message.level = message.level[0]
+    for one in getattr(message, "status", ()):
+        plain(one)
+    return message
+
+
+def message_class(types: Any, name: str) -> Any:
+    """A class that makes messages as rclpy's do: of named fields, the others zero."""
+
+    def make(**fields: Any) -> Any:
+        message = zero(types, name)
+        for key, value in fields.items():
+            assert hasattr(message, key), key
+            setattr(message, key, value)
+        return message
+
+    make.ros_name = name  # type: ignore[attr-defined]
+    return make
+
+
+def zero(types: Any, name: str) -> Any:
+    """A message whose numbers are 0 and whose lists are empty."""
+    from rosbags.interfaces import Nodetype
+
+    plain_values = {"string": "", "bool": False, "float64": 0.0, "float32": 0.0}
+    values: dict[str, Any] = {}
+    for key, (kind, told) in types.fielddefs[name][1]:
+        if kind == Nodetype.NAME:
+            values[key] = zero(types, told)
+        elif kind == Nodetype.BASE:
+            values[key] = plain_values.get(told[0], 0)
+        elif kind == Nodetype.ARRAY:
+            values[key] = np.zeros(told[1])
+        else:
+            values[key] = []
+    return types.types[name](**values)
+
+
+@pytest.fixture
+def bus(ros: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> Bus:
+    """What `start_node` runs a node on, whose modules are stand-ins."""
+    made = Bus()
+    types = ros.messages().types
+
+    def module(name: str, **names: Any) -> None:
+        one = ModuleType(name)
+        vars(one).update(names)
+        monkeypatch.setitem(sys.modules, name, one)
+
+    kind = type("Node", (StubNode,), {"bus": made, "types": types})
+    stopped = type("ExternalShutdownException", (Exception,), {})
+    module(
+        "rclpy",
+        init=lambda args=None: setattr(made, "is_up", True),
+        spin=lambda node: made.timers[0][1](),
+        try_shutdown=lambda: setattr(made, "is_up", False),
+    )
+    module("rclpy.node", Node=kind)
+    module("rclpy.executors", ExternalShutdownException=stopped)
+    module(
+        "rclpy.qos", qos_profile_sensor_data="sensor",
+        DurabilityPolicy=SimpleNamespace(TRANSIENT_LOCAL="latched"),
+        QoSProfile=lambda depth, durability: (depth, durability),
+    )  # fmt: skip
+    module("std_srvs")
+    module("std_srvs.srv", Trigger=SimpleNamespace(ros_name="std_srvs/srv/Trigger"))
+    for package, names in {
+        "diagnostic_msgs": ("DiagnosticArray", "DiagnosticStatus", "KeyValue"),
+        "geometry_msgs": ("PoseWithCovarianceStamped", "TransformStamped"),
+        "nav_msgs": ("Odometry",),
+        "sensor_msgs": ("CameraInfo", "CompressedImage", "Image", "Imu", "PointCloud2"),
+        "tf2_msgs": ("TFMessage",),
+    }.items():
+        module(package)
+        made_of = {one: message_class(types, f"{package}/msg/{one}") for one in names}
+        module(f"{package}.msg", **made_of)
+    monkeypatch.syspath_prepend(str(PACKAGE))
+    for name in ("sceneprint_ros", "sceneprint_ros.relocaliser_node"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    return made
+
+
+@pytest.fixture
+def node_module(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The file of the node, on the stand-ins."""
+    yield import_module("sceneprint_ros.relocaliser_node")
+    for name in ("sceneprint_ros", "sceneprint_ros.relocaliser_node"):
+        sys.modules.pop(name, None)

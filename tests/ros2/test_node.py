@@ -1,0 +1,205 @@
+"""The node over a stand-in for rclpy: topics, parameters, and what it publishes through its bytes.
+
+What the real rclpy does is not tried here.
+"""
+
+from __future__ import annotations
+
+import ast
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint_client.relocaliser import RelocaliserParameters
+from sceneprint_client.rotations import rotation_of
+from sceneprint_client.tracker import TrackerParameters, replay
+from sceneprint_client.tracker_core import difference
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "ros2" / "sceneprint_ros"
+SECOND = 1_000_000_000
+DEPTH = "/camera/depth/image_raw"
+
+
+def pose_of(message: Any) -> np.ndarray:
+    """(4, 4) of a Pose or a Transform."""
+    place = getattr(message, "position", None) or message.translation
+    turn = getattr(message, "orientation", None) or message.rotation
+    T = np.eye(4)
+    T[:3, 3] = place.x, place.y, place.z
+    T[:3, :3] = rotation_of(np.array([turn.x, turn.y, turn.z, turn.w]))
+    return T
+
+
+def play(node: Any, bus: Any, arrived: list[Any]) -> None:
+    """Give a node its messages; its timers run when a transform came, answers are waited for."""
+    for topic, name, message in arrived:
+        assert bus.kinds[topic] == name
+        bus.callbacks[topic](message)
+        if topic == "/tf":
+            stamp = message.transforms[0].header.stamp
+            bus.now_ns = stamp.sec * SECOND + stamp.nanosec
+            tick, diagnose = (callback for _, callback in bus.timers)
+            tick()
+            assert node._core.wait(120)
+            tick()
+            diagnose()
+
+
+def test_a_node_on_a_drive(
+    bus: Any, node_module: ModuleType, drive: Any, room: Any, service_url: str,
+    ros: SimpleNamespace, tmp_path: Path,
+) -> None:  # fmt: skip
+    bus.parameters = {
+        "url": service_url, "map": "room", "topic": DEPTH, "map_frame": "world",
+        "transform_tolerance_s": 0.25, "log_file": str(tmp_path / "drive.jsonl"),
+    }  # fmt: skip
+    node = node_module.RelocaliserNode()
+    assert bus.kinds == {
+        "/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage",
+        DEPTH: "sensor_msgs/msg/Image",
+        "/camera/depth/camera_info": "sensor_msgs/msg/CameraInfo",
+    }  # fmt: skip
+    arrived = drive(frames=6)
+    play(node, bus, arrived)
+
+    (fix,) = bus.on("/initialpose")
+    poses = bus.on("~/pose")
+    assert fix.header.frame_id == poses[0].header.frame_id == "world"
+    np.testing.assert_array_equal(pose_of(fix.pose.pose), pose_of(poses[0].pose.pose))
+    stamps = [ros.start + 0.5 * i for i in range(6)]
+    for message in poses:
+        i = stamps.index(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
+        truth = room[i].pose @ np.linalg.inv(ros.camera)
+        assert difference(pose_of(message.pose.pose), truth)[0] < 0.08
+        covariance = np.reshape(message.pose.covariance, (6, 6))
+        assert (np.linalg.eigvalsh(covariance) > 0).all()
+    assert len(poses) >= 4
+    transforms = [one for message in bus.on("/tf") for one in message.transforms]
+    T_odom_base = pose_of(arrived[-1][2].transforms[0].transform)
+    last = transforms[-1]
+    assert (last.header.frame_id, last.child_frame_id) == ("world", "odom")
+    assert (last.header.stamp.sec, last.header.stamp.nanosec) == (ros.start + 2, 750_000_000)
+    np.testing.assert_allclose(
+        pose_of(last.transform) @ T_odom_base, pose_of(poses[-1].pose.pose), atol=1e-9
+    )
+    (status,) = bus.on("/diagnostics")[-1].status
+    assert (status.level, status.hardware_id) == (0, DEPTH)
+    assert status.message.startswith("tracking: ")
+    values = {one.key: one.value for one in status.values}
+    assert (values["map"], values["map_is"], values["frames"]) == ("room", "site", "6")
+    assert bus.log[0].startswith("lost: ") or bus.log[0].startswith("tracking: ")
+
+    response = bus.services["~/relocalise"](None, SimpleNamespace(success=False, message=""))
+    assert response.success
+    count = len(bus.published)
+    bus.timers[0][1]()
+    assert len(bus.published) == count  # nothing is told of a place that is forgotten
+    node.destroy_node()
+    with (tmp_path / "drive.jsonl").open() as log:
+        states = list(replay(log))
+    assert "tracking" in {one.status for one in states}
+    assert states[-1].status == "lost"
+
+
+def test_without_transforms_and_initial_poses(
+    bus: Any, node_module: ModuleType, drive: Any, service_url: str
+) -> None:
+    """Beside AMCL, or with another source of map -> odom: only poses are told."""
+    bus.parameters = {"url": service_url, "map": "room", "topic": "/points", "kind": "points",
+                      "publish_tf": False, "initial_pose_topic": "", "imu_topic": "/imu",
+                      "odometry_topic": "/odom", "tracker.drift": 0.02}  # fmt: skip
+    node = node_module.RelocaliserNode()
+    assert set(bus.kinds) == {"/tf", "/tf_static", "/points", "/imu", "/odom"}
+    arrived = [one for one in drive("points", frames=4) if one[0] != "/camera/depth/camera_info"]
+    play(node, bus, arrived)
+    assert {topic for topic, _, _ in bus.published} == {"~/pose", "/diagnostics"}
+    assert node._core._tracker._core.parameters.drift == 0.02
+    node.destroy_node()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"map": ""}, {"topic": ""}, {"kind": "colour"}, {"url": "no address"}]
+)
+def test_parameters_that_are_none_end_it(
+    wrong: dict[str, str], bus: Any, node_module: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bus.parameters = {"map": "m", "topic": DEPTH, **wrong}
+    assert node_module.main() == 2
+    said = capsys.readouterr().err
+    assert said.startswith("relocaliser: ")
+    assert said.count("\n") == 1
+    assert not bus.is_up
+
+
+def test_a_node_that_is_stopped_closes(bus: Any, node_module: ModuleType) -> None:
+    """Without a service and without frames it says so, and goes."""
+    bus.parameters = {"map": "m", "topic": "/camera/depth/image_rect_raw",
+                      "url": "http://127.0.0.1:9"}  # fmt: skip
+    assert node_module.main() == 0
+    assert not bus.is_up
+    assert bus.log == ["lost: nothing was seen yet"]
+
+
+# What lies beside the node.
+
+
+def test_every_parameter_is_in_the_readme(bus: Any, node_module: ModuleType) -> None:
+    bus.parameters = {"map": "m", "topic": DEPTH}
+    node_module.RelocaliserNode().destroy_node()
+    text = (PACKAGE / "README.md").read_text()
+    missing = [name for name in bus.declared if f"`{name}`" not in text
+               and not name.startswith("tracker.")]  # fmt: skip
+    assert missing == []
+    assert {f"tracker.{name}" for name in TrackerParameters.__dataclass_fields__} \
+        == {name for name in bus.declared if name.startswith("tracker.")}  # fmt: skip
+    for name, one in RelocaliserParameters.__dataclass_fields__.items():
+        assert bus.declared.get(name, one.default) == one.default  # in two places, and equal
+
+
+def test_launch_files_set_what_the_node_declares(bus: Any, node_module: ModuleType) -> None:
+    from ruamel.yaml import YAML
+
+    bus.parameters = {"map": "m", "topic": DEPTH}
+    node_module.RelocaliserNode().destroy_node()
+    told = YAML(typ="safe").load(PACKAGE / "config" / "relocaliser.yaml")
+    values = told["/**"]["relocaliser"]["ros__parameters"]
+    assert values.keys() <= bus.declared.keys()
+    assert [name for name, value in values.items()
+            if type(value) is not type(bus.declared[name])] == []  # fmt: skip
+    for path in sorted(PACKAGE.glob("launch/*.py")):
+        for call in ast.walk(ast.parse(path.read_text())):
+            if isinstance(call, ast.Call) and "relocaliser" in (
+                one.value.value for one in call.keywords if isinstance(one.value, ast.Constant)
+            ):
+                (given,) = (one.value for one in call.keywords if one.arg == "parameters")
+                keys = {key.value for one in ast.walk(given) if isinstance(one, ast.Dict)
+                        for key in one.keys if isinstance(key, ast.Constant)}  # fmt: skip
+                assert keys - {"use_sim_time"} <= bus.declared.keys(), path
+
+
+def test_the_package_names_what_it_is_made_of() -> None:
+    manifest = ElementTree.parse(PACKAGE / "package.xml").getroot()
+    needed = {one.text for one in manifest.iter("exec_depend")}
+    imported = set()
+    for path in PACKAGE.rglob("*.py"):
+        for one in ast.walk(ast.parse(path.read_text())):
+            if isinstance(one, ast.ImportFrom) and one.module:
+                imported.add(one.module.partition(".")[0])
+            elif isinstance(one, ast.Import):
+                imported |= {name.name.partition(".")[0] for name in one.names}
+    ours = {"sceneprint_client", "setuptools", "__future__", "os", "sys", "dataclasses", "pathlib",
+            "typing"}  # fmt: skip
+    assert imported - ours <= needed
+    setup = (PACKAGE / "setup.py").read_text()
+    version = manifest.findtext("version")
+    assert f'version="{version}"' in setup
+    assert (
+        f'__version__ = "{version}"' in (ROOT / "client/sceneprint_client/__init__.py").read_text()
+    )
+    for path in [*PACKAGE.glob("launch/*"), *PACKAGE.glob("config/*")]:
+        assert path.relative_to(PACKAGE).as_posix() in setup

@@ -1,0 +1,374 @@
+"""The core of the node: messages through their bytes in, transforms and poses out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint_client import Client, Tracker
+from sceneprint_client.api import Localization
+from sceneprint_client.relocaliser import (
+    Level,
+    Relocaliser,
+    RelocaliserParameters,
+    Report,
+    planar,
+    write_pose,
+    write_stamp,
+    write_transform,
+)
+from sceneprint_client.rotations import quaternion_of, rotation_of
+from sceneprint_client.tracker_core import difference
+
+KINDS = ("depth", "metres", "compressed_depth", "compressed_metres", "points")
+SECOND = 1_000_000_000
+
+
+class ScriptedLocalizer:
+    """A client that answers every question with the truth, or as it was told."""
+
+    def __init__(self, found_at: Callable[[int], np.ndarray | None] | None = None) -> None:
+        self.asked: list[dict[str, Any]] = []
+        self.found_at = found_at or (lambda number: np.eye(4))
+
+    def localize(self, map_name: str, frame: Any, meta: Any = None, **how: Any) -> Localization:
+        self.asked.append({"frame": frame, "meta": meta, **how})
+        matrix = self.found_at(len(self.asked) - 1)
+        pose = None
+        if matrix is not None:
+            x, y, z, w = quaternion_of(matrix[:3, :3]).tolist()
+            tx, ty, tz = matrix[:3, 3].tolist()
+            pose = {
+                "parent_frame": "site", "child_frame": "query.optical", "matrix": matrix.tolist(),
+                "translation": {"x": tx, "y": ty, "z": tz},
+                "rotation": {"x": x, "y": y, "z": z, "w": w},
+            }  # fmt: skip
+        found = pose is not None
+        return Localization.model_validate({
+            "status": "found" if found else "not_found", "reason": "told by a test", "map": "m",
+            "pose": pose, "support": 3 * found, "votes": 3 * found, "spread_m": None,
+            "spread_deg": None, "strength": "strong" if found else None,
+            "verified_by": "matches" if found else None, "rival_ratio": 0.0 if found else None,
+            "best": None, "matches": [], "query_id": "q", "seed": 0, "model": "depth",
+            "milliseconds": {}, "alternatives": [],
+        })  # fmt: skip
+
+
+@contextmanager
+def scripted(
+    found_at: Callable[[int], np.ndarray | None] | None = None, **parameters: Any
+) -> Iterator[tuple[Relocaliser, ScriptedLocalizer]]:
+    client: Any = ScriptedLocalizer(found_at)
+    with Relocaliser(Tracker(client, "m"), RelocaliserParameters(**parameters)) as core:
+        yield core, client
+
+
+def take(core: Relocaliser, topic: str, name: str, message: Any) -> None:
+    """As the node does it."""
+    kind = name.rpartition("/")[2]
+    if kind == "TFMessage":
+        core.take_transforms(message, fixed=topic == "/tf_static")
+    elif kind == "CameraInfo":
+        core.take_camera_info(message)
+    elif kind == "Odometry":
+        core.take_odometry(message)
+    elif kind == "Imu":
+        core.take_imu(message)
+    else:
+        core.take_frame(message)
+
+
+def run(core: Relocaliser, arrived: list[Any]) -> list[Report]:
+    """A report for each frame that went on, when its answer is there."""
+    reports = []
+    for one in arrived:
+        take(core, *one)
+        if core.step():
+            assert core.wait(120)
+            reports.append(core.report(one[2].transforms[0].header.stamp.sec * SECOND))
+    return reports
+
+
+def still(ros: SimpleNamespace, count: int = 1, every: float = 0.5, start: float = 0.0) -> Any:
+    """A writer with images of a robot that stands at the origin of its odometry."""
+    writer = ros.messages()
+    writer.transforms(start, {("base_link", "camera"): np.eye(4)}, "/tf_static")
+    writer.camera_info(start, size=(8, 6))
+    for i in range(count):
+        writer.image(start + every * i, np.full((6, 8), 1000))
+        writer.transforms(start + every * i, {("odom", "base_link"): np.eye(4)})
+    return writer
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_drive_is_tracked_as_the_truth_is(
+    kind: str, drive: Any, service_url: str, room: Any, ros: SimpleNamespace
+) -> None:
+    count = 6 if kind == "depth" else 4
+    arrived = drive(kind, frames=count)
+    with Client(service_url) as client, Relocaliser(Tracker(client, "room")) as core:
+        reports = run(core, arrived)
+        assert core.counts == {
+            "frames": count,
+            "asked": count,
+            "without_transform": 0,
+            "unreadable": 0,
+        }
+    assert len(reports) == count
+    tracked = [i for i, one in enumerate(reports) if one.pose is not None]
+    assert tracked[0] <= 2
+    assert tracked == list(range(tracked[0], count))
+    assert [one.is_fix for one in reports] == [i == tracked[0] for i in range(count)]
+    for i in tracked:
+        report = reports[i]
+        assert report.pose is not None
+        step, turn = difference(report.pose.T_map_base, room[i].pose @ np.linalg.inv(ros.camera))
+        assert step < 0.08
+        assert np.degrees(turn) < 2
+        assert report.level is Level.OK
+        assert report.values["map_is"] == "site"
+
+
+def test_nothing_is_told_of_a_place_that_is_not_known(ros: SimpleNamespace) -> None:
+    with scripted(lambda number: None) as (core, _):
+        before = core.report(ros.start * SECOND)
+        assert (before.level, before.message) == (Level.STALE, "no frame has come")
+        (report,) = run(core, still(ros).written)
+    assert report.pose is None
+    assert (report.level, report.is_fix) == (Level.WARN, False)
+    assert report.message.startswith("lost: ")
+
+
+def test_frames_are_asked_for_no_oftener_than_told(ros: SimpleNamespace) -> None:
+    with scripted(interval_s=0.5) as (core, client):
+        reports = run(core, still(ros, 31, every=1 / 15).written)
+    assert len(reports) == 31
+    assert len(client.asked) == 4  # at 0, 8, 16 and 24 fifteenths of a second
+    assert [round((one.stamp_ns - ros.start * SECOND) * 15e-9) for one in reports] == [*range(31)]
+
+
+def test_a_frame_waits_for_its_transform_and_no_longer_than_told(ros: SimpleNamespace) -> None:
+    writer = still(ros, 1)
+    with scripted(interval_s=0.0, wait_s=0.4) as (core, client):
+        for one in writer.written:
+            take(core, *one)
+        assert core.step() == 1
+        assert core.wait(60)  # else a later frame may overtake it
+        for t in (0.5, 0.7, 0.85):
+            writer.image(t, np.full((6, 8), 1000))
+            take(core, *writer.written[-1])
+            assert core.step() == 0
+        for t in (0.4, 0.6):
+            writer.transforms(t, {("odom", "base_link"): np.eye(4)})
+            take(core, *writer.written[-1])
+        assert core.step() == 1  # of 0.5, between the two
+        assert core.wait(60)
+        writer.image(1.2, np.full((6, 8), 1000))
+        take(core, *writer.written[-1])
+        assert core.step() == 0
+        assert core.counts["without_transform"] == 1  # of 0.7, which waited for half a second
+        told = core.report((ros.start + 10) * SECOND)
+        assert (told.level, told.pose) == (Level.STALE, None)
+        assert told.message == "no transforms from odom to camera and base_link at its stamps"
+    assert len(client.asked) == 2
+
+
+def test_what_is_silent_is_not_told(ros: SimpleNamespace) -> None:
+    with scripted() as (core, _):
+        (report,) = run(core, still(ros).written)
+        assert report.is_fix
+        assert core.report(ros.start * SECOND + 2 * SECOND).pose is not None
+        silent = core.report(ros.start * SECOND + 3 * SECOND)
+        assert (silent.pose, silent.level) == (None, Level.STALE)
+        assert silent.message == "no frame has come for 3.0 s"
+        again = core.report(ros.start * SECOND)
+        assert (again.pose is not None, again.is_fix) == (True, False)
+
+
+def test_relocalising_forgets_and_asks_at_once(ros: SimpleNamespace) -> None:
+    with scripted(interval_s=60.0) as (core, client):
+        reports = run(core, still(ros, 3).written)
+        assert [one.state.status for one in reports] == ["tracking"] * 3
+        assert len(client.asked) == 1
+        core.relocalise()
+        lost = core.report(ros.start * SECOND + SECOND)
+        assert (lost.state.status, lost.pose) == ("lost", None)
+        assert "relocalise" in lost.message
+        (found,) = run(core, still(ros, 1, start=2.0).written)
+        assert found.is_fix
+        assert len(client.asked) == 2
+        assert client.asked[1]["prior"] is None
+
+
+def test_a_clock_that_jumps_back_begins_anew(ros: SimpleNamespace) -> None:
+    with scripted() as (core, client):
+        run(core, still(ros, 3, start=100.0).written)
+        reports = run(core, still(ros, 2, start=0.0).written)
+    assert [one.is_fix for one in reports] == [True, False]
+    assert [one.stamp_ns for one in reports] == [
+        ros.start * SECOND,
+        ros.start * SECOND + SECOND // 2,
+    ]
+    assert len(client.asked) == 5
+
+
+def test_the_pose_is_that_of_the_base_and_so_is_its_covariance(ros: SimpleNamespace) -> None:
+    """The camera sits 2 m before the base: its heading's error moves the base sideways."""
+    T_base_camera = ros.transform(2.0, 0, 0)
+    writer = ros.messages()
+    writer.transforms(0.0, {("base_link", "camera"): T_base_camera}, "/tf_static")
+    writer.camera_info(0.0, size=(8, 6))
+    writer.image(0.0, np.full((6, 8), 1000))
+    writer.transforms(0.0, {("odom", "base_link"): ros.transform(5, 0, 0)})
+    T_map_camera = ros.transform(1, 1, 0, 0, 0, np.sin(0.5), np.cos(0.5))
+    with scripted(lambda number: T_map_camera) as (core, _):
+        (report,) = run(core, writer.written)
+        state = report.state
+    assert report.pose is not None
+    assert state.covariance is not None
+    np.testing.assert_allclose(report.pose.T_map_base, T_map_camera @ np.linalg.inv(T_base_camera))
+    np.testing.assert_allclose(
+        report.pose.T_map_odom,
+        report.pose.T_map_base @ np.linalg.inv(ros.transform(5, 0, 0)),
+        atol=1e-12,
+    )
+    heading = np.array([np.cos(1), np.sin(1)])
+    sideways = np.array([-heading[1], heading[0]])
+    variance = sideways @ report.pose.covariance[:2, :2] @ sideways
+    own = sideways @ state.covariance[:2, :2] @ sideways
+    assert variance == pytest.approx(own + 4 * state.covariance[5, 5])
+    along = heading @ report.pose.covariance[:2, :2] @ heading
+    assert along == pytest.approx(heading @ state.covariance[:2, :2] @ heading)
+
+
+def test_on_a_plane_only_heading_and_place_are_told(ros: SimpleNamespace) -> None:
+    tilted = ros.transform(1, 2, 0.3, 0.02, -0.03, np.sin(0.4), np.cos(0.4))
+    flat = planar(tilted)
+    np.testing.assert_allclose(flat[:3, 3], (1, 2, 0))
+    np.testing.assert_allclose(flat[2], (0, 0, 1, 0))
+    assert np.arctan2(flat[1, 0], flat[0, 0]) == pytest.approx(
+        np.arctan2(tilted[1, 0], tilted[0, 0])
+    )
+    with scripted(lambda number: tilted, planar=True) as (core, _):
+        (report,) = run(core, still(ros).written)
+    np.testing.assert_allclose(report.pose.T_map_base, flat)
+    np.testing.assert_allclose(report.pose.T_map_odom, flat)  # odometry is at its origin
+
+
+def test_a_fix_in_another_frame_is_not_told(ros: SimpleNamespace) -> None:
+    with scripted(parent_frame="hall") as (core, _):
+        (report,) = run(core, still(ros).written)
+    assert (report.state.status, report.pose) == ("tracking", None)
+    assert (report.level, report.message) == (
+        Level.WARN, "tracked in site, and the map here is hall"
+    )  # fmt: skip
+
+
+def test_odometry_of_its_own_topic_serves_where_tf_has_none(ros: SimpleNamespace) -> None:
+    writer = ros.messages()
+    writer.transforms(0.0, {("base_link", "camera"): np.eye(4)}, "/tf_static")
+    writer.camera_info(0.0, size=(8, 6))
+    writer.odometry(0.0, ros.transform(1, 0, 0))
+    writer.image(0.0, np.full((6, 8), 1000))
+    with scripted() as (core, _):
+        for one in writer.written:
+            take(core, *one)
+        assert core.step() == 1
+        assert core.wait(60)
+        report = core.report(ros.start * SECOND)
+        np.testing.assert_allclose(report.pose.T_map_odom, ros.transform(-1, 0, 0), atol=1e-12)
+        # once tf says the same, odometry is passed over
+        writer.transforms(1.0, {("odom", "base_link"): ros.transform(2, 0, 0)})
+        writer.odometry(2.0, ros.transform(9, 0, 0))
+        writer.image(2.0, np.full((6, 8), 1000))
+        for one in writer.written[-3:]:
+            take(core, *one)
+        assert core.step() == 0
+
+
+def test_up_is_sent_while_the_robot_is_at_rest(ros: SimpleNamespace) -> None:
+    """The IMU is mounted on its side: its x axis points up."""
+    T_base_imu = ros.transform(0, 0, 0.2, 0, -np.sin(np.pi / 4), 0, np.cos(np.pi / 4))
+    for moves, expected in ((False, (0, 0, 1)), (True, None)):
+        writer = ros.messages()
+        fixed = {("base_link", "camera"): np.eye(4), ("base_link", "imu"): T_base_imu}
+        writer.transforms(0.0, fixed, "/tf_static")
+        writer.camera_info(0.0, size=(8, 6))
+        for i in range(100):
+            writer.imu(0.01 * i, (9.81, 0, 0), (0, 0, 0.5 * moves))
+        writer.image(1.0, np.full((6, 8), 1000))
+        writer.transforms(1.0, {("odom", "base_link"): np.eye(4)})
+        with scripted() as (core, client):
+            run(core, writer.written)
+        told = client.asked[0]["up"]
+        if expected is None:
+            assert told is None
+        else:
+            np.testing.assert_allclose(told, expected, atol=1e-9)
+
+
+def test_what_cannot_be_used_is_told_and_the_robot_goes_on(ros: SimpleNamespace) -> None:
+    writer = ros.messages()
+    writer.transforms(0.0, {("base_link", "camera"): np.eye(4)}, "/tf_static")
+    for i, encoding in enumerate(("16UC1", "rgb8", "16UC1")):
+        if i == 1:
+            writer.camera_info(0.4, size=(8, 6))
+        writer.image(0.5 * i, np.full((6, 8), 1000), encoding)
+        writer.transforms(0.5 * i, {("odom", "base_link"): np.eye(4)})
+    with scripted() as (core, _):
+        reports = run(core, writer.written)
+        assert core.counts == {"frames": 3, "asked": 1, "without_transform": 0, "unreadable": 2}
+        writer.image(-ros.start, np.full((6, 8), 1000))
+        take(core, *writer.written[-1])
+        assert core.report((ros.start + 1) * SECOND).message.startswith("A frame has no stamp.")
+    assert [one.level for one in reports] == [Level.ERROR, Level.ERROR, Level.OK]
+    assert reports[0].message.startswith("No calibrated camera info has come.")
+    assert "encoding 'rgb8'" in reports[1].message
+
+
+def test_an_error_of_the_service_is_told(service_url: str, ros: SimpleNamespace) -> None:
+    with Client(service_url) as client, Relocaliser(Tracker(client, "nowhere")) as core:
+        reports = run(core, still(ros, 2).written)
+    assert reports[1].level is Level.ERROR
+    assert "nowhere" in reports[1].message
+
+
+def test_transforms_of_hours_take_no_more_memory(ros: SimpleNamespace) -> None:
+    writer = ros.messages()
+    with scripted() as (core, _):
+        for i in range(3000):
+            writer.transforms(0.05 * i, {("odom", "base_link"): ros.transform(0.01 * i, 0, 0)})
+            take(core, *writer.written.pop())
+            writer.imu(0.05 * i, (0, 0, 9.81))
+            take(core, *writer.written.pop())
+        edge = core._tree._edges["base_link"]["odom"]
+        assert len(edge.stamps_ns) <= 10 / 0.05 + 512
+        assert core._imu is not None
+        assert len(core._imu[1]) <= 10 / 0.05 + 512
+        assert core._tree._count == len(edge.stamps_ns)
+
+
+def test_messages_of_ros_are_filled_as_rosbags_reads_them(ros: SimpleNamespace) -> None:
+    writer = ros.messages()
+    T = ros.transform(1, -2, 3, 0.1, 0.2, -0.3, 0.9)
+    writer.transforms(0.0, {("a", "b"): np.eye(4)})
+    message = writer.last()
+    write_transform(message.transforms[0].transform, T)
+    write_stamp(message.transforms[0].header.stamp, 12 * SECOND + 345)
+    name = "tf2_msgs/msg/TFMessage"
+    (read,) = writer.types.deserialize_cdr(
+        writer.types.serialize_cdr(message, name), name
+    ).transforms
+    assert (read.header.stamp.sec, read.header.stamp.nanosec) == (12, 345)
+    turn, place = read.transform.rotation, read.transform.translation
+    np.testing.assert_allclose(rotation_of(np.array([turn.x, turn.y, turn.z, turn.w])), T[:3, :3])
+    assert (place.x, place.y, place.z) == (1, -2, 3)
+    writer.odometry(0.0, np.eye(4))
+    pose = writer.last().pose.pose
+    write_pose(pose, T)
+    np.testing.assert_allclose((pose.position.x, pose.orientation.w), (1, turn.w))

@@ -1,0 +1,178 @@
+"""PointCloud2 as ROS 2 serialises it: by rosbags, read by us; damaged, in bounded memory."""
+
+from __future__ import annotations
+
+import random
+import struct
+import tracemalloc
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import FrameError, UnreadableCloud, UselessFrame
+from sceneprint.formats.points import decode_scan, format_of
+from sceneprint_client.cdr import is_point_cloud, read_point_cloud
+from sceneprint_client.ros_messages import cloud_points
+
+NAME = "sensor_msgs/msg/PointCloud2"
+LAYOUTS = (
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4")],
+    [("ring", "<u2"), ("z", "<f8"), ("x", "<f4"), ("intensity", "u1"), ("y", "<i2")],
+    [("x", ">f8"), ("rgb", ">u4"), ("y", ">f4"), ("z", ">i4")],
+)
+
+
+def rows_of(points: np.ndarray, layout: list[tuple[str, str]]) -> np.ndarray:
+    rows = np.zeros(len(points), layout)
+    for axis, name in enumerate("xyz"):
+        rows[name] = points[:, axis]
+    return rows
+
+
+@pytest.fixture(scope="module")
+def serialize(ros: SimpleNamespace) -> Any:
+    """Bytes of a PointCloud2 of records, by rosbags."""
+    writer = ros.messages()
+
+    def made(rows: np.ndarray, *, little: bool = True, **how: Any) -> bytes:
+        writer.points(1.5, rows, **how)
+        return bytes(writer.types.serialize_cdr(writer.last(), NAME, little_endian=little))
+
+    return made
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("little", [True, False])
+@pytest.mark.parametrize(("height", "padding"), [(1, 0), (3, 0), (3, 5)])
+def test_any_layout_is_read_as_rosbags_wrote_it(
+    serialize: Any, points: np.ndarray, layout: Any, little: bool, height: int, padding: int
+) -> None:
+    whole = np.round(points)  # as some fields are whole numbers
+    rows = rows_of(whole, layout)
+    big = layout[0][1].startswith(">")
+    data = serialize(rows, little=little, height=height, padding=padding, big=big)
+    assert format_of(data[:10_016]) == "pointcloud2"
+    scan = decode_scan(data)
+    assert (scan.file_format, scan.given) == ("pointcloud2", len(points))
+    expected = whole[whole.any(axis=1)]
+    np.testing.assert_array_equal(scan.cloud.points, expected.astype(np.float32))
+
+
+def test_its_fields_are_those_that_rosbags_reads(
+    ros: SimpleNamespace, serialize: Any, points: np.ndarray
+) -> None:
+    for little in (True, False):
+        data = serialize(rows_of(points, LAYOUTS[0]), little=little, frame="os_sensor")
+        ours = read_point_cloud(data)
+        theirs = ros.messages().types.deserialize_cdr(data, NAME)
+        for name in ("height", "width", "point_step", "row_step", "is_bigendian"):
+            assert getattr(ours, name) == getattr(theirs, name)
+        for a, b in zip(ours.fields, theirs.fields, strict=True):
+            assert (a.name, a.offset, a.datatype, a.count) \
+                == (b.name, b.offset, b.datatype, b.count)  # fmt: skip
+        assert bytes(ours.data) == theirs.data.tobytes()
+        assert (ours.frame_id, ours.stamp_ns) == ("os_sensor", ros.start * 10**9 + 1_500_000_000)
+        np.testing.assert_array_equal(cloud_points(ours), cloud_points(theirs))
+
+
+def test_what_a_sensor_missed_is_left_out(serialize: Any, points: np.ndarray) -> None:
+    rows = rows_of(np.vstack([points + 10, np.zeros((2, 3)), np.full((3, 3), np.nan)]), LAYOUTS[0])
+    scan = decode_scan(serialize(rows))
+    np.testing.assert_array_equal(scan.cloud.points, (points + 10).astype(np.float32))
+    assert scan.cloud.note == "5 missing points left out"
+    with pytest.raises(UselessFrame, match="0 of 0 points are missing"):
+        decode_scan(serialize(rows[:0]))
+
+
+def test_other_files_are_no_clouds(serialize: Any, points: np.ndarray) -> None:
+    data = serialize(rows_of(points, LAYOUTS[0]))
+    flat = serialize(np.zeros(3, [("x", "<f4"), ("y", "<f4")]))
+    empty = (b"", b"\0", b"\0\1\0\0", bytes(16), bytes(4096), b"\0\1\0\0" * 4)
+    for other in (*empty, data[4:], flat):
+        assert not is_point_cloud(other)
+    kitti = np.hstack([points, np.ones((len(points), 1))]).astype("<f4").tobytes()
+    assert not is_point_cloud(kitti)
+    with pytest.raises(UnreadableCloud, match="This is no KITTI scan"):
+        decode_scan(data, file_format="kitti")
+
+
+def fields_at(data: bytes) -> int:
+    """Where point_step is, and row_step and the size of the data after it."""
+    return data.index(b"z\0") + 2 + 2 + 4 + 4 + 4 + 4
+
+
+def patched(data: bytes, place: int, word: int) -> bytes:
+    return data[:place] + struct.pack("<I", word) + data[place + 4 :]
+
+
+def test_wrong_numbers_are_named(serialize: Any, points: np.ndarray) -> None:
+    data = serialize(rows_of(points, LAYOUTS[0]), frame="lidar")
+    read_point_cloud(data)
+    count = data.index(b"lidar\0") + 8  # of height, after what aligns it
+    assert struct.unpack_from("<3I", data, count) == (1, len(points), 3)
+    step = fields_at(data)
+    assert struct.unpack_from("<3I", data, step) == (12, 12 * len(points), 12 * len(points))
+    huge = 2**32 - 1
+    for place, word, why in (
+        (4 + 4, 10**9, "stamp"), (12, huge, "A name"), (count, huge, "20000000"),
+        (count, 2, "2 rows"), (count + 4, huge, "20000000"), (count + 8, huge, "fields"),
+        (count + 8, 4, "ends early|fields|is announced|name"), (step, 0, "0 bytes"),
+        (step, huge, "are announced"), (step, 11, "do not fit|are announced"),
+        (step + 8, huge, "ends early"), (step + 8, 0, "follow the end"),
+    ):  # fmt: skip
+        changed = patched(data, place, word)
+        with pytest.raises(UnreadableCloud, match=why):
+            list(cloud_points(read_point_cloud(changed)))
+        with pytest.raises(FrameError):
+            decode_scan(changed)
+    for place in range(len(data)):
+        with pytest.raises(FrameError):
+            decode_scan(data[:place])
+    assert decode_scan(data + bytes(3)).given == len(points)  # as middleware fills up
+    with pytest.raises(UnreadableCloud, match="8 bytes follow"):
+        decode_scan(data + bytes(8))
+
+
+def test_damaged_messages_are_refused_or_read_in_bounded_memory(
+    serialize: Any, points: np.ndarray
+) -> None:
+    rng, read, refused = random.Random(5), 0, 0
+    whole = [serialize(rows_of(points, layout), little=little, height=height)
+             for layout in LAYOUTS[:2] for little in (True, False)
+             for height in (1, 3)]  # fmt: skip
+    decode_scan(whole[0])
+    tracemalloc.start()
+    try:
+        for data in whole * 150:
+            changed = bytearray(data)
+            for _ in range(rng.choice((1, 1, 2, 5))):
+                place = rng.randrange(len(changed))
+                word = rng.choice((0, 1, 255, 2**31 - 1, 2**32 - 1, 10**9, rng.randrange(2**32)))
+                kind = rng.randrange(4)
+                if kind == 0:
+                    changed[place] = word % 256
+                elif kind == 1:
+                    changed[place : place + 4] = struct.pack(rng.choice("<>") + "I", word)
+                elif kind == 2:
+                    del changed[place:]
+                    break
+                else:
+                    changed[place:place] = bytes(rng.randrange(9))
+            tracemalloc.reset_peak()
+            before, _ = tracemalloc.get_traced_memory()
+            said = "none"
+            try:
+                scan = decode_scan(bytes(changed), file_format=rng.choice((None, "pointcloud2")))
+            except FrameError as error:
+                refused, said = refused + 1, str(error)
+            else:
+                read += 1
+                assert np.isfinite(scan.cloud.points).all()
+            assert tracemalloc.get_traced_memory()[1] - before < 1 << 20
+            assert said.isprintable()
+            assert len(said) < 600
+    finally:
+        tracemalloc.stop()
+    assert min(read, refused) > 100
