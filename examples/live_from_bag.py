@@ -10,6 +10,7 @@ printed is what a robot would publish: T_map_odom, while it is tracking. `--url`
 from __future__ import annotations
 
 import argparse
+import os
 from collections import Counter
 from pathlib import Path
 
@@ -84,7 +85,8 @@ def main() -> None:
     parser.add_argument("map", help="name of the map")
     parser.add_argument("bag", type=Path, help=".mcap, .db3 or .bag file, or rosbag2 folder")
     parser.add_argument("--truth", type=Path, help="TUM trajectory of the camera, to compare with")
-    parser.add_argument("--url", default=DEFAULT_URL, help="of a service")
+    url = os.environ.get("SCENEPRINT_URL") or DEFAULT_URL
+    parser.add_argument("--url", default=url, help=f"of a service (default: {url})")
     parser.add_argument("--key", help="where it asks for one")
     parser.add_argument("--data", help="data folder, without a service")
     options = parser.parse_args()

@@ -126,6 +126,7 @@ def test_a_bag_becomes_live_poses(
     assert told[-1].endswith(f"at most {max(off)}")
 
 
+@pytest.mark.thorough
 def test_two_recordings_become_one_map(drives: Path, example: Callable[..., str]) -> None:
     told = example("join_robots.py", drives / "mapping", drives / "later")
     found = re.search(r"later/odom begins in mapping/map at (\S+) (\S+) (\S+) m", told)
