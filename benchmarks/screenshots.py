@@ -198,6 +198,8 @@ def _views(
     yield View("frames-patches", f"#/maps/{MAP}?view=patches")
     yield View("frames-scans", f"#/maps/{HALL}")
     yield View("frames-none", "#/maps/empty")
+    yield View("sessions", f"#/maps/{MAP}/sessions")
+    yield View("session-tags", f"#/maps/{MAP}/sessions", press=("Tag session room-0/ann",))
     yield View("frame", f"#/maps/{MAP}/frames/{frame}", tall=True)
     yield View("frame-scan", f"#/maps/{HALL}/frames/{scan}", tall=True)
     yield View("upload", f"#/maps/{MAP}/upload")

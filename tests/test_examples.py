@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sceneprint.formats.dataset import find_sequences
+from sceneprint.geometry.pose.rigid import rotation_of
+from sceneprint_client import Client
+from sceneprint_client.frame_files import meta_of
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -62,3 +72,75 @@ def test_every_example_is_listed() -> None:
     listed = (ROOT / "examples" / "README.md").read_text()
     for path in (ROOT / "examples").glob("*.py"):
         assert f"({path.name})" in listed
+
+
+# Recordings, and what is made of them: one pair of drives, one data folder.
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded") / "drives"
+    ran = subprocess.run(
+        [sys.executable, ROOT / "examples" / "record_drives.py", folder, "--frames", "8"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    assert f"{folder}/later: 8 frames in 3.5 s" in ran.stdout
+    return folder
+
+
+@pytest.fixture
+def example(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., str]:
+    """Runs an example as a command, in this process, which has compiled code loaded already."""
+
+    def run(name: str, *arguments: object) -> str:
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+        capsys.readouterr()
+        runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
+
+
+def test_a_bag_becomes_live_poses(
+    drives: Path, tmp_path: Path, example: Callable[..., str]
+) -> None:
+    (mapping,) = find_sequences(drives / "mapping")
+    with Client.embedded(tmp_path) as client:
+        client.create_map("office")
+        meta = {"parent_frame": mapping.parent_frame}
+        added = [client.upload("office", one, meta_of(one, **meta)) for one in mapping.frames]
+        client.wait([one.job_id for one in added])
+    told = example(
+        "live_from_bag.py", "office", drives / "later", "--truth", drives / "later.tum",
+        "--data", tmp_path,
+    ).splitlines()  # fmt: skip
+    assert told[0].startswith("8 of 8 frames of /camera/depth/image_raw taken, poses in odom")
+    live = [line for line in told if "tracking  mapping/map <- odom:" in line]
+    assert len(live) >= 7
+    off = [float(line.rpartition("off by ")[2].removesuffix(" cm")) for line in live]
+    assert max(off) < 5
+    assert told[-2].startswith(f"tracking on {len(live)} of 8 frames, first fix after ")
+    assert told[-1].endswith(f"at most {max(off)}")
+
+
+@pytest.mark.thorough
+def test_two_recordings_become_one_map(drives: Path, example: Callable[..., str]) -> None:
+    told = example("join_robots.py", drives / "mapping", drives / "later")
+    found = re.search(r"later/odom begins in mapping/map at (\S+) (\S+) (\S+) m", told)
+    assert found is not None, told
+    # odometry begins where the base does: 10 cm behind the camera and 1.2 m below it
+    start = np.loadtxt(drives / "later.tum")[0]
+    forward = rotation_of(start[4:])[:2, 2]
+    base = start[1:3] - 0.1 * forward / np.linalg.norm(forward)
+    assert np.linalg.norm([float(one) for one in found.groups()] - np.array([*base, 0])) < 0.05
+    turn = re.search(r"turned by (\S+) deg, tilted by (\S+) deg", told)
+    assert turn is not None
+    yaw = np.degrees(np.arctan2(forward[1], forward[0]))
+    assert abs((float(turn[1]) - yaw + 180) % 360 - 180) < 1.5
+    assert float(turn[2]) < 1.5
+    agree = re.search(r"(strong|weak): (\d+) of (\d+) pairs agree", told)
+    assert agree is not None
+    assert int(agree[2]) >= 0.9 * int(agree[3]) >= 5

@@ -42,6 +42,10 @@ class Status(ApiRecord):
     jobs: dict[str, int] | None = Field(
         description="How many jobs are in each state that has any; None as `frames`."
     )
+    read_only: bool = Field(default=False, description="Whether it answers, and takes nothing.")
+    replica: str | None = Field(
+        default=None, description="What queries are answered from, where there is a read replica."
+    )
 
 
 class Client(MapMethods, UploadMethods, QueryMethods, AdminMethods):

@@ -12,17 +12,17 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from sceneprint import __version__
-from sceneprint.cli.options import add_service_options, one_line, open_client
+from sceneprint.cli.checks import APART_S, Check, Verdict, disk_check, seconds_apart
+from sceneprint.cli.options import add_service_options, one_line
 from sceneprint.cli.serve import add_data_option, settings_of
-from sceneprint.errors import KeyRequired, SceneprintError, Unreachable
+from sceneprint.cli.service_checks import service_checks, version_check
+from sceneprint.errors import SceneprintError
 from sceneprint_client.addresses import DEFAULT_URL
 
 if TYPE_CHECKING:
@@ -30,29 +30,6 @@ if TYPE_CHECKING:
 
     from sceneprint.settings import Settings
     from sceneprint.store import Database
-    from sceneprint_client import Client, Status
-
-# What a look at one part of the machine has shown.
-
-Verdict = Literal["ok", "note", "WRONG"]
-
-
-@dataclass(frozen=True)
-class Check:
-    """What one look has shown.
-
-    Parameters
-    ----------
-    verdict : ok; note: something optional is missing, or will be made when it is needed; WRONG:
-        something needed is not there
-    subject : what was looked at
-    text : what is there, and what to do
-    """
-
-    verdict: Verdict
-    subject: str
-    text: str
-
 
 # What `sceneprint doctor` says of the database, which is only ever read.
 
@@ -218,8 +195,6 @@ def _looked_at(subject: str, setting: str, url: str) -> Check:
 
 # What `sceneprint doctor` says of a database server and its replica; they are only read.
 
-#: Clocks that differ by more are told, and by more than a lease are wrong, seconds.
-APART_S = 2.0
 #: What a commit that was acknowledged needs to survive the loss of power.
 _DURABLE = ("fsync", "full_page_writes")
 _ASKED = """
@@ -348,7 +323,7 @@ def _vector(told: Mapping[str, object], settings: Settings) -> Check:
 
 def _clock(before: float, there: float, after: float, settings: Settings) -> Check:
     """The clocks of this host and of the server, as far as the answer's way can tell."""
-    apart = max(before - there, there - after, 0.0)
+    apart = seconds_apart(before, there, after)
     text = f"the server's clock differs from this host's by {apart:.1f} s"
     if apart > APART_S:
         verdict: Verdict = "WRONG" if apart > settings.lease_s else "note"
@@ -394,8 +369,6 @@ def _replica(url: str, settings: Settings) -> Check:
 
 #: The oldest SQLite with all that the store asks for (UPDATE ... RETURNING).
 OLDEST_SQLITE = (3, 35, 0)
-#: Free space below which uploads are soon refused, and below which it is time to look, bytes.
-LEAST_FREE, LITTLE_FREE = 100 << 20, 5 << 30
 #: What open3d loads of the system, and the Debian packages that bring it.
 OPEN3D_LIBRARIES = {
     "libGL.so.1": "libgl1",
@@ -477,6 +450,8 @@ def _tables(cache_dir: Path) -> Iterator[Check]:
 
 
 def _folder(data_dir: Path) -> Iterator[Check]:
+    from sceneprint.settings import default_data_dir
+
     there = _nearest(data_dir)
     why = _unwritable(data_dir)
     if why == errno.ENOSPC:
@@ -497,13 +472,10 @@ def _folder(data_dir: Path) -> Iterator[Check]:
         yield Check("WRONG", "data folder", text)
     else:
         text = f"{data_dir} is writable" if there == data_dir else f"{data_dir} can be created"
+        if data_dir == default_data_dir():
+            text += ": the default, --data names another"
         yield Check("ok", "data folder", text)
-    free = shutil.disk_usage(there).free
-    text = f"{free / 1e9:.1f} GB free; a frame takes about 0.8 MB"
-    if free < LEAST_FREE:
-        yield Check("WRONG", "disk", f"{text}. Free some space, or uploads will be rejected.")
-    else:
-        yield Check("note" if free < LITTLE_FREE else "ok", "disk", text)
+    yield disk_check("disk", shutil.disk_usage(there).free)
 
 
 def _embree() -> Check:
@@ -551,18 +523,15 @@ def _unwritable(folder: Path) -> int | None:
         return error.errno or errno.EIO
 
 
-#: Age of a frame that nobody signs at which workers are missed, seconds.
-LONGEST_S = 60.0
-
-
 def add_doctor(commands: Any) -> None:
     """Describe the command to the parser."""
     command = commands.add_parser(
         "doctor",
         help="check this machine, the data folder and the service",
         description="Check this machine, the data folder and the service, and suggest fixes. "
-        "Changes nothing. Exit code 2 if something required is missing; missing optional parts "
-        "are noted.",
+        "With --url alone, ask that service: version, store, workers, queue, disk, clock and "
+        "models. Changes nothing. Exit code 2 if something required is missing; missing optional "
+        "parts are noted.",
     )
     add_data_option(command)
     add_service_options(command)
@@ -581,65 +550,32 @@ def run_doctor(options: argparse.Namespace) -> int:
 
 
 def _all(options: argparse.Namespace) -> Iterator[Check]:
-    yield from machine(settings_of(options))
+    settings = settings_of(options)
+    # with the address of a service alone, what lies here is of no interest
+    stores = {"data_dir", "database_url", "blob_url"} & settings.model_fields_set
+    if options.url is None or stores:
+        yield from machine(settings)
     yield from _service(options)
 
 
 def _service(options: argparse.Namespace) -> Iterator[Check]:
     """Findings about the service; that none runs is wrong only where one was named."""
+    from sceneprint_client import Client
+
     url = options.url or DEFAULT_URL
     try:
-        with open_client(options) as client:
+        with Client(url, options.key) as client:
             if not client.healthy():
                 text = f"no service answers at {url}; `sceneprint serve` starts one"
                 yield Check("WRONG" if options.url else "note", "service", text)
-                return
-            status = client.status()
-            yield _version(url, status)
-            yield _workers(client, status)
-    except KeyRequired:
-        text = f"{url} requires a key; pass one with --key to see whether workers keep up"
-        yield Check("note", "workers", text)
-    except (Unreachable, SceneprintError) as error:
+            elif options.url is None:
+                found = version_check(url, client.status())
+                text = (
+                    f"{found.text}. Its data folder may be another: `sceneprint doctor --url "
+                    f"{url}` asks the service itself"
+                )
+                yield Check(found.verdict, "service", text)
+            else:
+                yield from service_checks(client, url)
+    except SceneprintError as error:
         yield Check("WRONG", "service", str(error))
-
-
-def _version(url: str, status: Status) -> Check:
-    text = f"{url} answers, version {status.version}"
-    if status.frames is not None:
-        text += f", {sum(status.frames.values())} frames"
-    if status.version == __version__:
-        return Check("ok", "service", text)
-    return Check("note", "service", f"{text}; this is version {__version__}")
-
-
-def _workers(client: Client, status: Status) -> Check:
-    if status.jobs is None:
-        text = "the service shows them only to a key for all maps; pass one with --key"
-        return Check("note", "workers", text)
-    queued, running = status.jobs.get("queued", 0), status.jobs.get("running", 0)
-    text = f"{queued} jobs waiting, {running} running"
-    oldest = _oldest_s(client) if queued else 0.0
-    if queued:
-        text += f", the oldest for {oldest:.0f} s"
-    if running == 0 and oldest > LONGEST_S:
-        text += (
-            ". No worker seems to be running. Start some with `sceneprint work`, and see their log."
-        )
-        return Check("WRONG", "workers", text)
-    dead = status.jobs.get("dead", 0)
-    if dead:
-        text += f"; {dead} failed for good; see the `traceback` of these jobs"
-    return Check("note" if dead else "ok", "workers", text)
-
-
-def _oldest_s(client: Client) -> float:
-    """Age of the frame that has waited longest, seconds."""
-    from sceneprint_client.api import FrameState
-
-    now, ages = datetime.now(UTC), [0.0]
-    for one in client.maps():
-        first = next(client.frames(one.name, FrameState.RECEIVED), None)
-        if first is not None:
-            ages.append((now - first.received_at).total_seconds())
-    return max(ages)

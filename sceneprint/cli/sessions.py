@@ -109,17 +109,21 @@ def _sessions(sessions: Iterable[Session], *, as_json: bool) -> None:
             print(one.model_dump_json())
             continue
         if not any_yet:
-            print("frames  indexed  poses  first captured       last captured        robot/session")
+            print(
+                "frames  indexed  poses  first captured       last captured        robot/session  "
+                "[tags]"
+            )
             any_yet = True
         first, last = (
             "" if at is None else f"{at:%Y-%m-%d %H:%M:%S}"
             for at in (one.first_captured_at, one.last_captured_at)
         )
         who = one_line(f"{one.robot or '-'}/{one.session or '-'}")
+        tags = one_line(f"  [{', '.join(one.tags)}]") if one.tags else ""
         n = sum(one.frames.values())
         print(
             f"{n:6}  {one.frames.get('indexed', 0):7}  {one.with_pose:5}  {first:19}  {last:19}  "
-            f"{who}"
+            f"{who}{tags}"
         )
     if not any_yet and not as_json:
         print("no sessions yet")

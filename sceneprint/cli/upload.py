@@ -24,6 +24,7 @@ from sceneprint.cli.options import (
     share_of,
 )
 from sceneprint.errors import (
+    Busy,
     DatasetError,
     FrameConflict,
     FrameError,
@@ -147,9 +148,19 @@ def wait_for_all(client: Client, map_name: str, tally: Tally, *, may_be_redundan
             for job in over:
                 redundant = may_be_redundant and _is_redundant(client, map_name, job)
                 tally.end(job, redundant=redundant)
-            if not over:
+            if not over and not is_starting(client):
                 return False
     return True
+
+
+def is_starting(client: Client) -> bool:
+    """Whether the service still compiles kernels, so that its workers have not begun."""
+    try:
+        client.status()
+    except Busy:
+        print("the service compiles its kernels, once after an installation", file=sys.stderr)
+        return True
+    return False
 
 
 def _is_redundant(client: Client, map_name: str, job: Job) -> bool:
@@ -225,7 +236,9 @@ def _waited(client: Client, name: str, job: Job) -> tuple[Job, bool]:
             if done != seen:
                 moved, seen = time.monotonic(), done
             elif time.monotonic() - moved > STALL_S:
-                return job, False
+                if not is_starting(client):
+                    return job, False
+                moved = time.monotonic()
     return job, True
 
 

@@ -277,6 +277,7 @@ class Held:
     posed : how many have a pose
     first, last : when they were taken, seconds since 1970
     parents : how many poses lead where
+    tags : how many frames have which
     """
 
     robot: str | None
@@ -286,6 +287,7 @@ class Held:
     first: float | None = None
     last: float | None = None
     parents: Counter[str] = field(default_factory=Counter)
+    tags: Counter[str] = field(default_factory=Counter)
 
 
 def list_runs(
@@ -303,6 +305,7 @@ def list_runs(
     """
     key = (func.coalesce(frames.c.session, ""), func.coalesce(frames.c.robot, ""))
     of_map = [frames.c.map_number == map_number, frames.c.state.in_(_LIVING)]
+    number, tag = frame_tags.c.frame_number, frame_tags.c.tag
     beyond = [] if after is None else [tuple_(*key) > tuple_(*after)]
     names = connection.execute(
         select(*key).where(*of_map, *beyond).group_by(*key).order_by(*key).limit(limit)
@@ -311,13 +314,14 @@ def list_runs(
     if not runs:
         return []
     keys = list(runs)
+    of_page = [*of_map, tuple_(*key) >= tuple_(*keys[0]), tuple_(*key) <= tuple_(*keys[-1])]
     found = connection.execute(
         select(
             *key, frames.c.state, frames.c.pose_parent, func.count(),
             func.count(frames.c.pose_x), func.min(frames.c.captured_at),
             func.max(frames.c.captured_at),
         )
-        .where(*of_map, tuple_(*key) >= tuple_(*keys[0]), tuple_(*key) <= tuple_(*keys[-1]))
+        .where(*of_page)
         .group_by(*key, frames.c.state, frames.c.pose_parent)
     )  # fmt: skip
     for session, robot, state, parent, count, posed, first, last in found:
@@ -328,6 +332,15 @@ def list_runs(
         run.last = max((one for one in (run.last, last) if one is not None), default=None)
         if parent is not None:
             run.parents[parent] += posed
+    tagged = (
+        select(*key, tag, func.count())
+        .join_from(frames, frame_tags, number == frames.c.number)
+        .where(*of_page)
+        .group_by(*key, tag)
+        .order_by(tag)  # of equally many, by name
+    )
+    for session, robot, name, count in connection.execute(tagged):
+        runs[session, robot].tags[name] += count
     return list(runs.values())
 
 

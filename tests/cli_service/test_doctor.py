@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 import shutil
 import sqlite3
+import time
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,18 @@ import pytest
 from pydantic import SecretStr
 
 from sceneprint import __version__
-from sceneprint.cli import doctor
-from sceneprint.cli.doctor import Check
+from sceneprint.cli import checks, doctor
+from sceneprint.cli.checks import Check
 from sceneprint.cli.options import prepare_presets
+from sceneprint.cli.service_checks import (
+    clock_check,
+    model_check,
+    queue_check,
+    ready_check,
+    service_checks,
+    version_check,
+    worker_check,
+)
 from sceneprint.engine import compilation
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.geometry.signature import pair_table
@@ -24,6 +33,10 @@ from sceneprint.settings import Settings
 from sceneprint_client import Client, Status
 
 Run = Callable[..., Any]
+#: What is said of a service.
+SERVICE = [
+    "service", "ready", "service clock", "store", "service disk", "workers", "queue", "models",
+]  # fmt: skip
 
 
 def verdicts(text: str) -> dict[str, str]:
@@ -32,19 +45,83 @@ def verdicts(text: str) -> dict[str, str]:
     return {line[7:23].strip(): line[:5].strip() for line in lines}
 
 
+@pytest.fixture(scope="module")
+def working(service_url: str) -> str:
+    """The service, whose worker has begun: that is a while after it answers."""
+    with Client(service_url) as client:
+        until = time.monotonic() + 300
+        while not client.stats(minutes=1).workers:
+            assert time.monotonic() < until
+            time.sleep(0.1)
+    return service_url
+
+
 @pytest.mark.sqlite_only("this server is told not to wait for its disk")
-def test_a_sound_machine(sceneprint: Run, data_folder: Path, service_url: str) -> None:
+def test_a_sound_machine(sceneprint: Run, data_folder: Path, working: str) -> None:
     done = sceneprint("doctor", "--data", data_folder)
     found = verdicts(done.stdout)
     assert list(found) == [
         "python", "sqlite", "kernels", "table depth", "table lidar", "table paper", "data folder",
-        "disk", "database", "embreex", "open3d libraries", "service", "workers",
+        "disk", "database", "embreex", "open3d libraries", *SERVICE,
     ]  # fmt: skip
     for needed in ("python", "sqlite", "data folder", "database", "service", "workers"):
         assert found[needed] == "ok"
     assert set(found.values()) <= {"ok", "note"}
-    assert f"{service_url} answers, version {__version__}" in done.stdout
+    assert f"{working} answers, version {__version__}" in done.stdout
+    assert "--data names another" not in done.stdout
     assert done.stdout.splitlines()[-1] == "no problems found"
+
+
+@pytest.mark.sqlite_only("what its file takes")
+def test_a_running_service(sceneprint: Run, working: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The address alone: what the service tells, and nothing of this machine."""
+    with Client(working) as client:
+        if not any(one.name == "looked-at" for one in client.maps()):
+            client.create_map("looked-at", model="lidar")
+        model = client.map("looked-at").model
+    monkeypatch.delenv("SCENEPRINT_URL")
+    done = sceneprint("doctor", "--url", working)
+    found = verdicts(done.stdout)
+    assert list(found) == SERVICE
+    assert set(found.values()) <= {"ok", "note"}
+    for told in (
+        "takes uploads and answers queries", r"clock differs from this machine's by 0\.\d s",
+        r"SQLite of \d+\.\d MB, blobs of", "1 worker runs, ", "0 jobs waiting, 0 running",
+        rf"{model}: .*looked-at",
+    ):  # fmt: skip
+        assert re.search(told, done.stdout), told
+
+
+def test_a_key_that_may_not_see_all(
+    sceneprint: Run, service_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def asked(key: str | None) -> list[Check]:
+        with Client(service_url, key) as client:
+            client._http.headers["X-Forwarded-For"] = "192.0.2.7"  # as behind a proxy
+            return list(service_checks(client, service_url))
+
+    with Client(service_url) as client:
+        few = client.create_key("doctor-few", {"nowhere": "read"}).secret
+    none, few_found, wrong = asked(None), asked(few), asked("sp_wrong")
+    assert [one.subject for one in none] == ["service", "ready", "workers"]
+    assert "requires a key; pass one with --key" in none[-1].text
+    assert [one.subject for one in few_found] == ["service", "ready", "workers", "models"]
+    assert "only to a key for all maps" in few_found[-2].text
+    assert few_found[-1].text == "no maps yet"
+    assert [one.verdict for one in wrong] == ["WRONG"]
+
+
+@pytest.mark.sqlite_only("this server is told not to wait for its disk")
+def test_without_an_address_the_default_folder_is_named(
+    sceneprint: Run, service_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("SCENEPRINT_URL")
+    monkeypatch.setattr(doctor, "DEFAULT_URL", service_url)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    done = sceneprint("doctor")
+    assert f"{tmp_path}/sceneprint can be created: the default, --data names another" in done.stdout
+    assert f"`sceneprint doctor --url {service_url}` asks the service itself" in done.stdout
+    assert list(verdicts(done.stdout))[-1] == "service"
 
 
 @pytest.mark.sqlite_only("this server is told not to wait for its disk")
@@ -180,7 +257,7 @@ def test_addresses_of_databases(
 
 def test_what_a_machine_may_lack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(doctor.OPEN3D_LIBRARIES, "libabsent.so.1", "libabsent1")
-    monkeypatch.setattr(doctor, "LEAST_FREE", 1 << 62)
+    monkeypatch.setattr(checks, "LEAST_FREE", 1 << 62)
     monkeypatch.setattr(doctor, "OLDEST_SQLITE", (99, 0, 0))
     found = found_in(Settings(data_dir=tmp_path, database_url=None))
     assert found["open3d libraries"].verdict == "note"
@@ -198,30 +275,47 @@ def waiting(tmp_path: Path, rooms: Path) -> Iterator[Client]:
         yield client
 
 
-def test_workers_that_are_missing(waiting: Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    finding = doctor._workers(waiting, waiting.status())
-    assert finding.verdict == "ok"
-    assert re.match(r"1 jobs waiting, 0 running, the oldest for \d s", finding.text)
-
-    class Later(datetime):
-        @classmethod
-        def now(cls, tz: object = None) -> datetime:
-            return datetime.now(UTC) + timedelta(seconds=100)
-
-    monkeypatch.setattr(doctor, "datetime", Later)
-    finding = doctor._workers(waiting, waiting.status())
-    assert finding.verdict == "WRONG"
-    assert "the oldest for 100 s. No worker seems to be running. Start some with" in finding.text
-    busy = Status(version="1", frames={}, jobs={"queued": 1, "running": 1, "dead": 2})
-    finding = doctor._workers(waiting, busy)
-    assert (finding.verdict, "2 failed for good" in finding.text) == ("note", True)
+def test_workers_that_are_missing(waiting: Client) -> None:
+    stats = waiting.stats(minutes=1)
+    assert (stats.workers, stats.waiting) == ([], 1)
+    found = worker_check(stats, read_only=False)
+    assert found.verdict == "note"
+    assert "wait if the service has just started" in found.text
+    assert re.fullmatch(r"1 job waiting, 0 running, the oldest for \d+ s", queue_check(stats).text)
+    late = stats.model_copy(update={"oldest_waiting_s": 100.0, "jobs": {"queued": 1, "dead": 2}})
+    found = worker_check(late, read_only=False)
+    assert found.verdict == "WRONG"
+    assert "not signed. Start some with `sceneprint work`, and see their log" in found.text
+    assert worker_check(late, read_only=True).verdict == "ok"  # there is nothing for them to do
+    queue = queue_check(late)
+    assert queue.verdict == "note"
+    assert "the oldest for 100 s; 2 failed for good: `sceneprint jobs --state dead`" in queue.text
 
 
-def test_a_service_of_another_version() -> None:
+def test_what_a_service_may_tell(waiting: Client) -> None:
     status = Status(version="99.1", frames={"indexed": 2, "rejected": 1}, jobs={})
-    finding = doctor._version("http://x", status)
-    assert finding.verdict == "note"
-    assert f"version 99.1, 3 frames; this is version {__version__}" in finding.text
+    found = version_check("http://x", status)
+    assert found.verdict == "note"
+    assert f"version 99.1, 3 frames; this is version {__version__}" in found.text
+    told = {"read_only": True, "replica": "queries read a replica"}
+    found = ready_check(status.model_copy(update=told))
+    assert (found.verdict, "rejects uploads" in found.text) == ("note", True)
+    assert "queries read a replica" in found.text
+    for there, verdict, text in (
+        (99.0, "ok", "0.0 s"),
+        (103.5, "note", "3.5 s"),
+        (90.0, "note", "5.0 s"),
+    ):
+        found = clock_check(95.0, there, 100.0)
+        assert (found.verdict, text in found.text) == (verdict, True)
+    (one,) = waiting.maps()
+    assert model_check([one], waiting.models()).verdict == "ok"
+    old = one.model_copy(update={"model": "depth-00000000", "model_id": "0" * 64})
+    found = model_check([one, old, old], waiting.models())
+    assert found.verdict == "note"
+    assert (
+        "2 maps have an older model than this version brings: `sceneprint reencode m" in found.text
+    )
 
 
 def test_the_first_use_says_what_it_waits_for(

@@ -9,7 +9,8 @@ import pytest
 from pydantic import SecretStr
 
 from benchmarks.fleet.postgres import Server
-from sceneprint.cli.doctor import Check, database, object_stores, server
+from sceneprint.cli.checks import Check
+from sceneprint.cli.doctor import database, object_stores, server
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
 

@@ -75,7 +75,8 @@ def test_lists_files_and_edits(
     assert said.stdout == f"wrote {tum}: 2 poses\n"
     assert len(read_trajectory(tum).stamps) == 2
     sessions = sceneprint("sessions", name).stdout.splitlines()
-    assert [line.split()[-1] for line in sessions[1:]] == ["r1/room-0/seq-01", "r1/s"]
+    assert sessions[1].endswith("  r1/room-0/seq-01")
+    assert sessions[2].endswith("  r1/s  [door]")
     told = sceneprint("sessions", name, "--json").stdout.splitlines()
     assert [json.loads(line)["frames"] for line in told] == [{"indexed": 1}, {"indexed": 2}]
 
@@ -108,7 +109,7 @@ def test_a_session_is_renamed_tagged_and_deleted(
     said = sceneprint("sessions", name, old, "--rename", new, "--tag", "door").stdout
     assert said == f"edited 3 frames of session {old}\n"
     listed = sceneprint("sessions", name, new, "--robot", "r1").stdout.splitlines()
-    assert listed[1].endswith(f"r1/{new}")
+    assert listed[1].endswith(f"  r1/{new}  [door]")
     assert sceneprint("sessions", name, old).stdout == "no sessions yet\n"
     assert len(sceneprint("frames", name, "--tag", "door", "--json").stdout.splitlines()) == 3
 

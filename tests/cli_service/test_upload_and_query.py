@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sceneprint.cli.upload import is_starting
 from sceneprint.errors import MissingDependency, TooLarge
 from sceneprint.formats.dataset import read_pose, write_depth_png
 from sceneprint_client import Client, http
@@ -312,3 +313,14 @@ def test_a_map_has_limits(sceneprint: Run, house: str) -> None:
     assert "There is nothing to change" in sceneprint("maps", "--edit", house, expect=2).stderr
     assert "--create NAME or --edit" in sceneprint("maps", "--quota-bytes", "1", expect=2).stderr
     sceneprint("maps", "--delete", "small", "--yes")
+
+
+def test_an_upload_waits_for_a_service_that_compiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(http, "LIMIT_S", 0.0)  # asked once
+    with Client.embedded(tmp_path) as client:
+        assert not is_starting(client)
+        client._worker._engine.signers._compiled.clear()  # type: ignore[union-attr]
+        assert is_starting(client)
+    assert "the service compiles its kernels" in capsys.readouterr().err

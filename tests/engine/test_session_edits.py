@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from sceneprint.engine import Engine
+from sceneprint.engine.maps.map_frames import list_sessions
 from sceneprint.engine.sessions import session_edits
 from sceneprint.engine.sessions.session_edits import delete_session, edit_session
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap, UnknownSession
@@ -78,6 +79,11 @@ def test_tags_are_added_once_and_removed(empty: Engine, ids: list[str]) -> None:
     assert (change.frames, change.session, change.robot) == (5, "a", "r1")
     tags = [one.tags for one in frames(empty).values()]
     assert tags == [["old", "new"]] * 5 + [["old"]] * 7
+    listed = list_sessions(empty.store, "hall", None, 10).items
+    assert [(one.session, one.robot, one.tags) for one in listed] == [
+        (None, "r1", ["old"]), ("a", "r1", ["new", "old"]), ("a", "r2", ["old"]),
+        ("a/..", "r1", ["old"]),
+    ]  # fmt: skip
     edit_session(empty.store, "hall", "a", SessionEdit(remove_tags=["old"]))
     found = empty.list_frames("hall", None, 100, wanted=FrameListing(tag=["old"])).items
     assert [one.frame_id for one in found] == ids[8:]

@@ -227,7 +227,7 @@ def test_sessions_and_a_trajectory(served, shown, refused):
     assert session == {
         "robot": "r2", "session": "monday", "frames": {"indexed": 3}, "with_pose": 3,
         "first_captured_at": "2026-11-16T09:30:00Z", "last_captured_at": "2026-11-16T09:30:02Z",
-        "parent_frames": ["hall"],
+        "parent_frames": ["hall"], "tags": ["door"],
     }  # fmt: skip
     text = served.client.get(f"{path}/trajectory?session=monday")
     assert text.headers["content-type"].partition(";")[0] == "text/plain"

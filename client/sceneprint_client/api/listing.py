@@ -102,6 +102,9 @@ class Session(ApiRecord):
     parent_frames: list[str] = Field(
         description="Where their poses lead, at most 20: those of most frames first."
     )
+    tags: list[str] = Field(
+        default=[], description="Of their frames, at most 20: those of most frames first."
+    )
 
 
 #: By what poses are stamped.

@@ -139,8 +139,8 @@ def check_unchanged(store: Store, found: IndexedFrame) -> None:
 
 #: Most poses of one trajectory: more are asked for in parts.
 MOST_POSES = 100_000
-#: Most parent frames that are told of a session.
-_MOST_PARENTS = 20
+#: Most parent frames, and most tags, that are told of a session.
+_MOST_NAMES = 20
 
 
 def list_frames(
@@ -316,7 +316,8 @@ def _session(run: Held) -> Session:
         with_pose=run.posed,
         first_captured_at=when(run.first),
         last_captured_at=when(run.last),
-        parent_frames=[name for name, _ in run.parents.most_common(_MOST_PARENTS)],
+        parent_frames=[name for name, _ in run.parents.most_common(_MOST_NAMES)],
+        tags=[name for name, _ in run.tags.most_common(_MOST_NAMES)],
     )
 
 

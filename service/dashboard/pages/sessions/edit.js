@@ -1,0 +1,136 @@
+// A session renamed, tagged or deleted: one call each, repeated for what it had no time for.
+import { at, send } from "../lib/api.js";
+import { h, put } from "../lib/dom.js";
+import { count } from "../lib/format.js";
+import { confirm, sheet, toast } from "../lib/states.js";
+
+/**
+ * @typedef {{say: (text: string) => void, changed: () => Promise<void>}} How say: of what is under
+ *   way; changed: called when it is over
+ * @typedef {Object<string, any>} Session as the API lists it
+ */
+
+/** Ask for a name, and give it to all frames of a session. @param {string} map @param {Session} one
+ * @param {Session[]} all that are listed @param {How} how */
+export function renameSession(map, one, all, how) {
+  const known = new Set(all.map((other) => other.session));
+  let joins = ""; // the name that was said to join two sessions
+  form(one, all, {
+    title: "Rename the session", label: "Name", value: one.session, action: "Rename",
+    async save(name, dialog) {
+      if (name === one.session) return;
+      if (known.has(name) && joins !== name) {
+        joins = name;
+        throw Object.assign(new Error(`There is a session ${name}. Rename again to join the two; they cannot be told apart afterwards.`), { status: 409 });
+      }
+      const frames = await edit(map, one, { session: name }, how, dialog);
+      toast(`${one.session} is called ${name} now: ${of(frames)}.`);
+    },
+  });
+}
+
+/** Ask for tags, and add and remove what was changed on all frames. @param {string} map
+ * @param {Session} one @param {Session[]} all @param {How} how */
+export function tagSession(map, one, all, how) {
+  form(one, all, {
+    title: "Tags of the session", label: "Tags", value: one.tags.join(", "), action: "Save tags",
+    hint: "Comma-separated. A tag that you add goes on every frame; one that you remove is removed from every frame.",
+    async save(text, dialog) {
+      const tags = text.split(",").map((tag) => tag.trim()).filter(Boolean);
+      const known = one.tags.join(",").split(",").map((tag) => tag.trim());
+      const added = tags.filter((tag) => !known.includes(tag));
+      const removed = one.tags.filter((tag) => !tag.split(",").every((part) => tags.includes(part.trim())));
+      if (!added.length && !removed.length) return;
+      const frames = await edit(map, one, { add_tags: added, remove_tags: removed }, how, dialog);
+      toast(`${of(frames)} of ${one.session} were tagged.`);
+    },
+  });
+}
+
+/** Ask for the name of a session to be typed, and delete all its frames. @param {string} map
+ * @param {Session} one @param {Session[]} all @param {How} how */
+export async function deleteSession(map, one, all, how) {
+  const text = [h("p", {}, `All its ${of(framesOf(one, all))} with their uploads and signatures are permanently deleted. Only a snapshot can restore them.`), others(one, all)];
+  if (!(await confirm({ title: `Delete ${one.session}?`, text, word: one.session, action: "Delete session" }))) return;
+  let done = 0;
+  try {
+    for (let left = 1; left > 0;) {
+      const { data } = await send("DELETE", at("maps", map, "sessions"), { params: chosen(one) });
+      [done, left] = [done + data.frames, data.remaining];
+      how.say(left ? `Deleting ${one.session}: ${of(left)} left…` : "");
+    }
+  } finally {
+    how.say("");
+    await how.changed(); // of one that broke off a part is gone
+  }
+  toast(`${one.session} was deleted with ${of(done)}.`);
+  if (document.activeElement === document.body) document.getElementById("title").focus({ preventScroll: true }); // its row is gone
+}
+
+/** Send an edit until no frame remains; how many were edited. */
+async function edit(map, one, json, how, dialog) {
+  let [done, after] = [0, null];
+  try {
+    do {
+      const { data } = await send("PATCH", at("maps", map, "sessions"), { json, params: { ...chosen(one), after } });
+      [done, after] = [done + data.frames, data.remaining ? data.last_frame_id : null];
+      if (after) put(dialog.querySelector(".sessions-left"), `${of(data.remaining)} left…`);
+    } while (after !== null);
+  } finally {
+    await how.changed();
+  }
+  return done;
+}
+
+/** A dialog with one field that stays until it is saved; what is refused is told at the field. */
+function form(one, all, { title, label, value, action, hint = "", save }) {
+  const input = h("input", { id: "session-field", autocomplete: "off", spellcheck: "false", value, "aria-describedby": "session-why session-hint" });
+  const why = h("p", { class: "field-error", id: "session-why", role: "alert" });
+  const button = h("button", { class: "button primary" }, action);
+  const dialog = sheet({ title, buttons: button, children: [
+    h("p", { class: "dialog-text muted" }, `${one.session}: ${of(framesOf(one, all))}`), others(one, all),
+    h("div", { class: "field" }, h("label", { for: input.id }, label), input, why, h("p", { class: "muted", id: "session-hint" }, hint)),
+    h("p", { class: "muted sessions-left", role: "status" }),
+  ] });
+  dialog.querySelector("form").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    if (button.disabled) return;
+    button.disabled = true;
+    put(why);
+    input.removeAttribute("aria-invalid");
+    try {
+      await save(input.value.trim(), dialog);
+      dialog.close();
+    } catch (error) {
+      if (error.status === undefined || error.status === 401 || !dialog.open) { dialog.close(); throw error; }
+      put(why, error.errors?.length ? error.errors.map((part) => part.reason).join(". ") : error.message);
+      input.setAttribute("aria-invalid", "true");
+      input.focus();
+    } finally {
+      button.disabled = false;
+    }
+  });
+}
+
+/** What the API asks for to find the session. @param {Session} one */
+function chosen(one) {
+  return { session: one.session, robot: one.robot };
+}
+
+/** Rows that a call for one changes: where it names no robot, those of all robots. */
+function reached(one, all) {
+  return one.robot === null ? all.filter((other) => other.session === one.session) : [one];
+}
+
+function framesOf(one, all) {
+  return reached(one, all).flatMap((row) => Object.values(row.frames)).reduce((a, b) => a + b, 0);
+}
+
+function others(one, all) {
+  const robots = reached(one, all).map((row) => row.robot).filter((robot) => robot !== one.robot);
+  return robots.length > 0 && h("p", {}, h("strong", {}, "Frames that name no robot cannot be chosen alone"), `: those of ${robots.join(", ")} in this session are meant as well.`);
+}
+
+function of(frames) {
+  return `${count(frames)} ${frames === 1 ? "frame" : "frames"}`;
+}

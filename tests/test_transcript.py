@@ -1,0 +1,136 @@
+"""docs/from_bag_to_pose.md: its commands are run in a fresh folder, and say what the page says.
+
+With SCENEPRINT_UPDATE_GOLDEN=1 the page has from then on what they said.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs/from_bag_to_pose.md"
+BLOCK = re.compile(r"(?<=^```console\n)(.*?)(?=^```$)", re.DOTALL | re.MULTILINE)
+#: Where the reader of the page is, and the service.
+HERE, URL = "/home/robot/sceneprint", "http://127.0.0.1:8008"
+#: Seconds for one command: what compiles on a slow machine takes minutes.
+PATIENCE_S = 900
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
+#: What is another each time.
+SPEED = re.compile(r"\d+\.\d frames/s")
+
+
+def transcripts(text: str) -> list[list[tuple[str, list[str]]]]:
+    """Of each block its commands, each with the lines that it prints."""
+    found = []
+    for block in BLOCK.findall(text):
+        commands: list[tuple[str, list[str]]] = []
+        for line in block.splitlines():
+            if line.startswith("$ "):
+                commands.append((line[2:], []))
+            else:
+                commands[-1][1].append(line)
+        found.append(commands)
+    return found
+
+
+def alike(line: str, other: str) -> bool:
+    """Whether two lines say the same: numbers with decimals may differ a little, others not."""
+    ours, theirs = (SPEED.sub("N frames/s", one) for one in (line, other))
+    if NUMBER.sub("#", ours).split() != NUMBER.sub("#", theirs).split():
+        return False
+    is_pose = "off by" in line  # another processor rounds poses otherwise
+
+    def near(a: str, b: str) -> bool:
+        """Equal, or of a fraction to ten of the last digit; deviations in whole cm to one."""
+        apart = 10.0 ** (1 - len(a.partition(".")[2])) if "." in a else float(is_pose)
+        return a == b or abs(float(a) - float(b)) <= apart
+
+    pairs = zip(NUMBER.findall(ours), NUMBER.findall(theirs), strict=True)
+    return all(near(a, b) for a, b in pairs)
+
+
+@pytest.mark.parametrize(
+    ("line", "other", "same"),
+    [
+        ("x: 1.02 m", "x: 1.04 m", True),
+        ("x: 1.02 m", "x: 1.14 m", False),
+        ("8 of 12 frames, 3.1 frames/s", "8 of 12 frames, 16.0 frames/s", True),
+        ("8 of 12 frames", "9 of 12 frames", False),
+        ("  0.0 s  tracking", "  0.0 s  lost", False),
+        ("+-5 cm, off by 0.3 cm", "+-4 cm, off by 0.4 cm", True),
+    ],
+)
+def test_lines_are_compared(line: str, other: str, same: bool) -> None:
+    assert alike(line, other) is same
+
+
+@pytest.fixture
+def said(tmp_path: Path) -> Iterator[Callable[[str, int], list[str]]]:
+    """Runs a command as the page's reader does; with a number of lines it is left running."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "examples").symlink_to(ROOT / "examples")
+    environment = {
+        **os.environ, "PYTHONUNBUFFERED": "1", "SCENEPRINT_WORKERS": "1",
+        "SCENEPRINT_PORT": str(port), "SCENEPRINT_URL": f"http://127.0.0.1:{port}",
+        "SCENEPRINT_DATA_DIR": str(tmp_path / "data"),
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+    }  # fmt: skip
+    running: list[subprocess.Popen[str]] = []
+
+    def shown(text: str) -> str:
+        return text.replace(str(tmp_path / "here"), HERE).replace(f"127.0.0.1:{port}", URL[7:])
+
+    def run(command: str, lines: int) -> list[str]:
+        # `exec`: what is left running is the command itself, and no shell around it
+        process = subprocess.Popen(
+            ["bash", "-c", f"exec {command}"], cwd=tmp_path / "here", env=environment,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        assert process.stdout is not None
+        if lines:
+            running.append(process)
+            return [shown(process.stdout.readline()).rstrip() for _ in range(lines)]
+        text, _ = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 0, text
+        return shown(text).splitlines()
+
+    yield run
+    for process in running:
+        process.terminate()
+        process.communicate(timeout=PATIENCE_S)
+
+
+@pytest.mark.thorough
+def test_the_page_says_what_happens(said: Callable[[str, int], list[str]]) -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    blocks = transcripts(text)
+    assert sum(len(block) for block in blocks[:3]) == 5
+    for block in blocks:
+        for place, (command, _) in enumerate(block):
+            if not command.startswith("pip "):  # it is installed, and nothing is downloaded here
+                block[place] = (command, said(command, 2 if " serve" in command else 0))
+    if os.environ.get("SCENEPRINT_UPDATE_GOLDEN") == "1":
+        told = iter(
+            "".join(f"{line}\n" for command, lines in block for line in (f"$ {command}", *lines))
+            for block in blocks
+        )
+        text = BLOCK.sub(lambda _: next(told), text)
+        PAGE.write_text(text, encoding="utf-8")
+    for page, ran in zip(transcripts(text), blocks, strict=True):
+        for (command, expected), (_, lines) in zip(page, ran, strict=True):
+            assert len(lines) == len(expected), (command, lines)
+            for line, other in zip(expected, lines, strict=True):
+                assert alike(line, other), (command, line, other)
+    tracked = [line for block in blocks for _, lines in block for line in lines]
+    assert "tracking on 12 of 12 frames, first fix after 0 s" in tracked
