@@ -1,0 +1,261 @@
+"""A plan of a map's coverage as a picture: cells coloured by outcome, queried frames as dots.
+
+CoveragePlan, DrawnFrame  --coverage_picture-->  PNG
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sceneprint.engine.maps.coverage_plan import queried_in
+from sceneprint_client.api.coverage import (
+    COVERAGE_OUTCOMES,
+    CoverageCell,
+    CoverageOutcome,
+    CoveragePlan,
+    CoverageResult,
+)
+
+if TYPE_CHECKING:
+    from PIL import ImageDraw
+
+#: A point or a size: on the plan in metres, of the picture in pixels.
+Pair = tuple[float, float]
+
+#: Of dots; cells have the same, paler. Told apart without red and green, and by their shapes.
+COLOURS: dict[CoverageOutcome, tuple[int, int, int]] = {
+    "found": (27, 158, 119), "wrong": (117, 30, 140), "ambiguous": (230, 159, 0),
+    "not_found": (200, 40, 40),
+}  # fmt: skip
+_LABELS: dict[CoverageOutcome, str] = {
+    "found": "found",
+    "wrong": "wrong place",
+    "ambiguous": "ambiguous",
+    "not_found": "not found",
+}
+_NOT_QUERIED = (226, 229, 233)
+_INK, _FAINT, _PAPER = (34, 38, 46), (116, 122, 132), (255, 255, 255)
+#: How much of its colour a cell has; the rest is white.
+_CELL_SHADE = 0.42
+#: Samples along each edge of a pixel.
+_FINER = 2
+#: Of the picture, pixels: width, most and least height of the plan, margins, header and footer.
+WIDTH = 1400
+_TALLEST, _LOWEST, _MARGIN, _HEADER, _FOOTER = 1400, 240, 44, 92, 84
+#: Widest cell, pixels: a plan of few cells does not fill the picture.
+_WIDEST_CELL = 96.0
+#: Most lines to look-alikes; more would hide the plan.
+_MOST_LINKS = 400
+
+
+@dataclass(frozen=True)
+class DrawnFrame:
+    """A queried frame on a plan.
+
+    Parameters
+    ----------
+    at : where it was taken, metres along the axes of the plan
+    outcome : what became of it
+    look_alikes : where frames were taken that it is mistaken for
+    """
+
+    at: Pair
+    outcome: CoverageOutcome
+    look_alikes: tuple[Pair, ...]
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """Where metres of a plan are in the picture, in fine pixels.
+
+    Parameters
+    ----------
+    left, top : metres at the plan's upper left corner, which is at `origin`
+    scale : fine pixels of a metre
+    """
+
+    left: float
+    top: float
+    scale: float
+    origin: Pair
+    size: tuple[int, int]
+
+    def pixel(self, at: Pair) -> Pair:
+        x, y = self.origin
+        return x + (at[0] - self.left) * self.scale, y + (self.top - at[1]) * self.scale
+
+
+def coverage_picture(
+    plan: CoveragePlan, result: CoverageResult, drawn: Sequence[DrawnFrame], title: str
+) -> bytes:
+    """A plan as a PNG on white, seen from above.
+
+    Parameters
+    ----------
+    plan : its cells
+    result : of the whole map, told in the header
+    drawn : queried frames of the plan
+    title : over the picture
+    """
+    from PIL import Image, ImageDraw
+
+    sheet = _sheet(plan, result.cell_m)
+    image = Image.new("RGB", sheet.size, _PAPER)
+    draw = ImageDraw.Draw(image, "RGBA")
+    for cell in plan.cells:
+        _draw_cell(draw, sheet, cell, result.cell_m)
+    links = [(one.at, there) for one in drawn for there in one.look_alikes]
+    for here, there in links[:: -(-len(links) // _MOST_LINKS) or 1]:
+        draw.line([sheet.pixel(here), sheet.pixel(there)], fill=(*_INK, 90), width=_FINER)
+    radius = _FINER * min(max(0.11 * result.cell_m * sheet.scale / _FINER, 3.0), 7.0)
+    # what is found last of all lies undermost: failures must be seen
+    for outcome in ("found", "not_found", "ambiguous", "wrong"):
+        for one in drawn:
+            if one.outcome == outcome:
+                _draw_dot(draw, sheet.pixel(one.at), outcome, radius)
+    _draw_header(draw, result, drawn, title)
+    _draw_footer(draw, sheet, plan)
+    small = image.resize((sheet.size[0] // _FINER, sheet.size[1] // _FINER), Image.Resampling.BOX)
+    buffer = io.BytesIO()
+    small.save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
+def cell_outcome(cell: CoverageCell) -> CoverageOutcome | None:
+    """What colours a cell: `wrong` where any frame is, else what most queried frames have, of
+    equally many the worse; None where none was queried.
+    """
+    if not queried_in(cell):
+        return None
+    if cell.wrong:
+        return "wrong"
+    worst_first: tuple[CoverageOutcome, ...] = ("not_found", "ambiguous", "found")
+    return max(worst_first, key=lambda name: getattr(cell, name))
+
+
+def _sheet(plan: CoveragePlan, cell_m: float) -> _Sheet:
+    places = np.array([(cell.column, cell.row) for cell in plan.cells])
+    low, high = places.min(axis=0), places.max(axis=0) + 1
+    columns, rows = (high - low).tolist()
+    cell = min((WIDTH - 2 * _MARGIN) / columns, _TALLEST / rows, _WIDEST_CELL)
+    height = max(round(rows * cell), _LOWEST)
+    left = (WIDTH - columns * cell) / 2
+    top = _HEADER + (height - rows * cell) / 2
+    return _Sheet(
+        float(low[0] * cell_m), float(high[1] * cell_m), _FINER * cell / cell_m,
+        (_FINER * left, _FINER * top),
+        (_FINER * WIDTH, _FINER * (_HEADER + height + _FOOTER)),
+    )  # fmt: skip
+
+
+def _draw_cell(draw: ImageDraw.ImageDraw, sheet: _Sheet, cell: CoverageCell, cell_m: float) -> None:
+    corners = (
+        sheet.pixel((cell.column * cell_m, (cell.row + 1) * cell_m)),
+        sheet.pixel(((cell.column + 1) * cell_m, cell.row * cell_m)),
+    )
+    outcome = cell_outcome(cell)
+    fill = _NOT_QUERIED
+    if outcome is not None:
+        fill = _paler(COLOURS[outcome])
+    draw.rectangle(corners, fill=fill, outline=_PAPER, width=_FINER)
+    wide = corners[1][0] - corners[0][0]
+    if wide >= 26 * _FINER:
+        place = corners[0][0] + 4 * _FINER, corners[0][1] + 2 * _FINER
+        draw.text(place, str(cell.frames), _FAINT, _font(11))
+
+
+def _paler(colour: tuple[int, int, int]) -> tuple[int, int, int]:
+    r, g, b = (round(255 + _CELL_SHADE * (part - 255)) for part in colour)
+    return r, g, b
+
+
+def _draw_dot(draw: ImageDraw.ImageDraw, at: Pair, outcome: CoverageOutcome, r: float) -> None:
+    """A disc, a square, a triangle or a diamond, by outcome."""
+    x, y = at
+    colour, edge = COLOURS[outcome], _PAPER
+    if outcome == "found":
+        draw.ellipse((x - r, y - r, x + r, y + r), colour, edge, _FINER)
+    elif outcome == "not_found":
+        draw.rectangle((x - r, y - r, x + r, y + r), colour, edge, _FINER)
+    else:
+        far = 1.35 * r
+        shape = [(x, y - far), (x + far, y), (x, y + far), (x - far, y)]
+        if outcome == "ambiguous":
+            shape = [(x, y - far), (x + far, y + r), (x - far, y + r)]
+        draw.polygon(shape, colour, edge, _FINER)
+
+
+def _draw_header(
+    draw: ImageDraw.ImageDraw, result: CoverageResult, drawn: Sequence[DrawnFrame], title: str
+) -> None:
+    left = _MARGIN * _FINER
+    draw.text((left, 20 * _FINER), _fitting(draw, title, 22), _INK, _font(22))
+    shares = ", ".join(
+        f"{_LABELS[name]} {getattr(result, name) / max(result.frames, 1):.0%}"
+        for name in COVERAGE_OUTCOMES
+    )
+    text = (
+        f"{result.frames} frames queried against the rest of {result.map_frames}: {shares}. "
+        f"{len(drawn)} on this plan. Map revision {result.last_revision}."
+    )
+    draw.text((left, 54 * _FINER), _fitting(draw, text, 15), _FAINT, _font(15))
+
+
+def _draw_footer(draw: ImageDraw.ImageDraw, sheet: _Sheet, plan: CoveragePlan) -> None:
+    """Legend, and a scale bar at the right."""
+    middle = sheet.size[1] - 0.5 * _FOOTER * _FINER
+    x = float(_MARGIN * _FINER)
+    font = _font(15)
+
+    def label(text: str) -> None:
+        nonlocal x
+        draw.text((x, middle), text, _INK, font, anchor="lm")
+        x += draw.textlength(text, font) + 22 * _FINER
+
+    for name in COVERAGE_OUTCOMES:
+        _draw_dot(draw, (x + 6 * _FINER, middle), name, 6 * _FINER)
+        x += 18 * _FINER
+        label(_LABELS[name])
+    side = 7 * _FINER
+    draw.rectangle((x, middle - side, x + 2 * side, middle + side), _NOT_QUERIED)
+    x += 2 * side + 6 * _FINER
+    label("not queried")
+    if any(cell.ambiguous or cell.wrong for cell in plan.cells):
+        draw.line([(x, middle), (x + 18 * _FINER, middle)], (*_INK, 120), _FINER)
+        x += 24 * _FINER
+        label("look-alike")
+    label("number: frames in the cell")
+    length = _bar_m((sheet.size[0] / 6) / sheet.scale)
+    right = sheet.size[0] - _MARGIN * _FINER
+    start = right - length * sheet.scale
+    for end in (start, right):
+        draw.line([(end, middle - 5 * _FINER), (end, middle + 5 * _FINER)], _INK, 2 * _FINER)
+    draw.line([(start, middle), (right, middle)], _INK, 2 * _FINER)
+    draw.text(((start + right) / 2, middle - 8 * _FINER), f"{length:g} m", _INK, font, anchor="mb")
+
+
+def _bar_m(most: float) -> float:
+    """The longest of 1, 2, 5, 10 and so on that is no longer than that, metres."""
+    power = 10.0 ** np.floor(np.log10(most))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= most))
+
+
+def _fitting(draw: ImageDraw.ImageDraw, text: str, size: int) -> str:
+    """A text that fits the picture's width; its end is left out where it does not."""
+    room, font = (WIDTH - 2 * _MARGIN) * _FINER, _font(size)
+    if draw.textlength(text, font) <= room:
+        return text
+    while text and draw.textlength(f"{text}…", font) > room:
+        text = text[:-1]
+    return f"{text}…"
+
+
+def _font(size: int) -> Any:
+    from PIL import ImageFont
+
+    return ImageFont.load_default(size * _FINER)
