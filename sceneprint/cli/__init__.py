@@ -29,6 +29,7 @@ COMMANDS = {
     "localize": "query",
     "similarity": "query",
     "associate": "sessions",
+    "coverage": "coverage",
     "frames": "inventory",
     "sessions": "sessions",
     "reconstruct": "sessions",

@@ -44,9 +44,10 @@ _INK, _FAINT, _PAPER = (34, 38, 46), (116, 122, 132), (255, 255, 255)
 _CELL_SHADE = 0.42
 #: Samples along each edge of a pixel.
 _FINER = 2
-#: Of the picture, pixels: width, most and least height of the plan, margins, header and footer.
-WIDTH = 1400
-_TALLEST, _LOWEST, _MARGIN, _HEADER, _FOOTER = 1400, 240, 44, 92, 84
+#: Of the picture, pixels: width, and height of the footer with the legend.
+WIDTH, FOOTER = 1400, 84
+#: Most and least height of the plan, margins, header.
+_TALLEST, _LOWEST, _MARGIN, _HEADER = 1400, 240, 44, 92
 #: Widest cell, pixels: a plan of few cells does not fill the picture.
 _WIDEST_CELL = 96.0
 #: Most lines to look-alikes; more would hide the plan.
@@ -149,7 +150,7 @@ def _sheet(plan: CoveragePlan, cell_m: float) -> _Sheet:
     return _Sheet(
         float(low[0] * cell_m), float(high[1] * cell_m), _FINER * cell / cell_m,
         (_FINER * left, _FINER * top),
-        (_FINER * WIDTH, _FINER * (_HEADER + height + _FOOTER)),
+        (_FINER * WIDTH, _FINER * (_HEADER + height + FOOTER)),
     )  # fmt: skip
 
 
@@ -208,7 +209,7 @@ def _draw_header(
 
 def _draw_footer(draw: ImageDraw.ImageDraw, sheet: _Sheet, plan: CoveragePlan) -> None:
     """Legend, and a scale bar at the right."""
-    middle = sheet.size[1] - 0.5 * _FOOTER * _FINER
+    middle = sheet.size[1] - 0.5 * FOOTER * _FINER
     x = float(_MARGIN * _FINER)
     font = _font(15)
 
