@@ -1,6 +1,6 @@
-"""A plan of a map's coverage as a picture: cells coloured by outcome, queried frames as dots.
+"""A plan of a map's coverage as a picture: what its frames see, cells coloured by outcome, dots.
 
-CoveragePlan, DrawnFrame  --coverage_picture-->  PNG
+CoveragePlan, DrawnFrame, points  --coverage_picture-->  PNG
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sceneprint.engine.maps.coverage_plan import queried_in
+from sceneprint.types import Bytes, Floats
 from sceneprint_client.api.coverage import (
     COVERAGE_OUTCOMES,
     CoverageCell,
@@ -40,8 +41,11 @@ _LABELS: dict[CoverageOutcome, str] = {
 }
 _NOT_QUERIED = (226, 229, 233)
 _INK, _FAINT, _PAPER = (34, 38, 46), (116, 122, 132), (255, 255, 255)
-#: How much of its colour a cell has; the rest is white.
-_CELL_SHADE = 0.42
+#: How opaque cells are: what frames see shows through.
+_CELL_OPACITY = 110
+#: Of surfaces seen, where most of them stand upright; pixels of a dot of them; percentiles of
+#: their points that are shown.
+_SURFACE, _SURFACE_PIXELS, _SHOWN = (96, 102, 112), 2, (1.0, 99.0)
 #: Samples along each edge of a pixel.
 _FINER = 2
 #: Of the picture, pixels: width, and height of the footer with the legend.
@@ -86,14 +90,20 @@ class _Sheet:
     origin: Pair
     size: tuple[int, int]
 
+    @property
+    def plan_rows(self) -> tuple[int, int]:
+        """First and last row of the picture between header and footer."""
+        return _FINER * _HEADER, self.size[1] - _FINER * FOOTER
+
     def pixel(self, at: Pair) -> Pair:
         x, y = self.origin
         return x + (at[0] - self.left) * self.scale, y + (self.top - at[1]) * self.scale
 
 
 def coverage_picture(
-    plan: CoveragePlan, result: CoverageResult, drawn: Sequence[DrawnFrame], title: str
-) -> bytes:
+    plan: CoveragePlan, result: CoverageResult, drawn: Sequence[DrawnFrame], points: Floats,
+    title: str,
+) -> bytes:  # fmt: skip
     """A plan as a PNG on white, seen from above.
 
     Parameters
@@ -101,12 +111,13 @@ def coverage_picture(
     plan : its cells
     result : of the whole map, told in the header
     drawn : queried frames of the plan
+    points : (n, 2) of surfaces that frames see, metres along the axes of the plan
     title : over the picture
     """
     from PIL import Image, ImageDraw
 
-    sheet = _sheet(plan, result.cell_m)
-    image = Image.new("RGB", sheet.size, _PAPER)
+    sheet = _sheet(plan, result.cell_m, points)
+    image = Image.fromarray(_surfaces(sheet, points))
     draw = ImageDraw.Draw(image, "RGBA")
     for cell in plan.cells:
         _draw_cell(draw, sheet, cell, result.cell_m)
@@ -119,11 +130,13 @@ def coverage_picture(
         for one in drawn:
             if one.outcome == outcome:
                 _draw_dot(draw, sheet.pixel(one.at), outcome, radius)
+    for cell in plan.cells:
+        _draw_count(draw, sheet, cell, result.cell_m)
     _draw_header(draw, result, drawn, title)
     _draw_footer(draw, sheet, plan)
     small = image.resize((sheet.size[0] // _FINER, sheet.size[1] // _FINER), Image.Resampling.BOX)
     buffer = io.BytesIO()
-    small.save(buffer, "PNG", optimize=True)
+    small.save(buffer, "PNG")
     return buffer.getvalue()
 
 
@@ -139,9 +152,14 @@ def cell_outcome(cell: CoverageCell) -> CoverageOutcome | None:
     return max(worst_first, key=lambda name: getattr(cell, name))
 
 
-def _sheet(plan: CoveragePlan, cell_m: float) -> _Sheet:
+def _sheet(plan: CoveragePlan, cell_m: float, points: Floats) -> _Sheet:
+    """Room for all cells, and for the surfaces but for a few stray points."""
     places = np.array([(cell.column, cell.row) for cell in plan.cells])
     low, high = places.min(axis=0), places.max(axis=0) + 1
+    if len(points):
+        first, last = np.percentile(points / cell_m, _SHOWN, axis=0)
+        low = np.minimum(low, np.floor(first)).astype(np.int64)
+        high = np.maximum(high, np.ceil(last)).astype(np.int64)
     columns, rows = (high - low).tolist()
     cell = min((WIDTH - 2 * _MARGIN) / columns, _TALLEST / rows, _WIDEST_CELL)
     height = max(round(rows * cell), _LOWEST)
@@ -154,25 +172,47 @@ def _sheet(plan: CoveragePlan, cell_m: float) -> _Sheet:
     )  # fmt: skip
 
 
+def _surfaces(sheet: _Sheet, points: Floats) -> Bytes:
+    """(h, w, 3) picture of what frames see, the darker the more of it stands upright there."""
+    width, height = sheet.size
+    picture = np.full((height, width, 3), 255, np.uint8)
+    if not len(points):
+        return picture
+    step = _SURFACE_PIXELS * _FINER
+    x = (sheet.origin[0] + (points[:, 0] - sheet.left) * sheet.scale) // step
+    y = (sheet.origin[1] + (sheet.top - points[:, 1]) * sheet.scale) // step
+    low, high = sheet.plan_rows
+    counts, _, _ = np.histogram2d(
+        y, x, bins=(height // step, width // step),
+        range=((0, height // step), (0, width // step)),
+    )  # fmt: skip
+    most = np.percentile(counts[counts > 0], 98) if counts.any() else 1.0
+    shade = np.minimum(np.sqrt(counts / most), 1.0)[..., None]
+    grey = np.rint(255 - shade * (255 - np.array(_SURFACE))).astype(np.uint8)
+    large = grey.repeat(step, axis=0).repeat(step, axis=1)
+    picture[low:high, : large.shape[1]] = large[low:high]
+    return picture
+
+
 def _draw_cell(draw: ImageDraw.ImageDraw, sheet: _Sheet, cell: CoverageCell, cell_m: float) -> None:
     corners = (
         sheet.pixel((cell.column * cell_m, (cell.row + 1) * cell_m)),
         sheet.pixel(((cell.column + 1) * cell_m, cell.row * cell_m)),
     )
     outcome = cell_outcome(cell)
-    fill = _NOT_QUERIED
-    if outcome is not None:
-        fill = _paler(COLOURS[outcome])
+    fill = (*(_NOT_QUERIED if outcome is None else COLOURS[outcome]), _CELL_OPACITY)
     draw.rectangle(corners, fill=fill, outline=_PAPER, width=_FINER)
-    wide = corners[1][0] - corners[0][0]
-    if wide >= 26 * _FINER:
-        place = corners[0][0] + 4 * _FINER, corners[0][1] + 2 * _FINER
-        draw.text(place, str(cell.frames), _FAINT, _font(11))
 
 
-def _paler(colour: tuple[int, int, int]) -> tuple[int, int, int]:
-    r, g, b = (round(255 + _CELL_SHADE * (part - 255)) for part in colour)
-    return r, g, b
+def _draw_count(
+    draw: ImageDraw.ImageDraw, sheet: _Sheet, cell: CoverageCell, cell_m: float
+) -> None:
+    """How many frames a cell has, where there is room."""
+    if cell_m * sheet.scale < 26 * _FINER:
+        return
+    x, y = sheet.pixel((cell.column * cell_m, (cell.row + 1) * cell_m))
+    place = (x + 4 * _FINER, y + 2 * _FINER)
+    draw.text(place, str(cell.frames), _INK, _font(11), stroke_width=_FINER, stroke_fill=_PAPER)
 
 
 def _draw_dot(draw: ImageDraw.ImageDraw, at: Pair, outcome: CoverageOutcome, r: float) -> None:
@@ -223,9 +263,13 @@ def _draw_footer(draw: ImageDraw.ImageDraw, sheet: _Sheet, plan: CoveragePlan) -
         x += 18 * _FINER
         label(_LABELS[name])
     side = 7 * _FINER
-    draw.rectangle((x, middle - side, x + 2 * side, middle + side), _NOT_QUERIED)
+    box = (x, middle - side, x + 2 * side, middle + side)
+    draw.rectangle(box, (*_NOT_QUERIED, _CELL_OPACITY), _FAINT)
     x += 2 * side + 6 * _FINER
     label("not queried")
+    draw.rectangle((x, middle - side, x + 2 * side, middle + side), _SURFACE)
+    x += 2 * side + 6 * _FINER
+    label("surfaces")
     if any(cell.ambiguous or cell.wrong for cell in plan.cells):
         draw.line([(x, middle), (x + 18 * _FINER, middle)], (*_INK, 120), _FINER)
         x += 24 * _FINER

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,13 +18,16 @@ from sceneprint.engine.maps.coverage_picture import DrawnFrame, coverage_picture
 from sceneprint.engine.maps.coverage_plan import plan_changes
 from sceneprint.engine.maps.map_frames import Output
 from sceneprint.engine.serializers import job_progress, tag_of, when
-from sceneprint.errors import InvalidRequest, NotIndexed
+from sceneprint.errors import DamagedBlob, InvalidRequest, NotIndexed, UnreadableGeometry
+from sceneprint.geometry.pose.rigid import moved
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import PathFrame, stops_of
 from sceneprint.store.maps import find_map
 from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.queue import items_of
+from sceneprint.store.signatures import geometry_blobs
 from sceneprint.store.tables import JobRow
+from sceneprint.types import Floats
 from sceneprint_client.api import JobState, Page, Progress, Vector
 from sceneprint_client.api.coverage import (
     CELL_TRENDS,
@@ -38,6 +42,8 @@ from sceneprint_client.api.coverage import (
 
 #: Items that are read at once.
 _BLOCK = 500
+#: Frames whose surfaces a plan shows, at most.
+_SEEN_FRAMES = 48
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,10 +155,18 @@ class CoverageJobs:
             plan = _chosen_plan(measured.plans, parent)
             items = [item for item in items if item["parent"] == plan.parent_frame]
             stops = stops_of(connection, _numbers(items))
+            own = [item["frame"] for item in items if item["frame"] in stops]
+            row = find_map(connection, map_name)
+            blobs = geometry_blobs(connection, _spread(own, _SEEN_FRAMES), row.model_id)
         drawn = [_drawn_frame(item, stops, plan) for item in items if item["frame"] in stops]
         tag = tag_of("coverage", job_id, plan.parent_frame, [repr(one) for one in drawn])
-        title = f"{map_name}: {plan.parent_frame}"
-        return Output(tag, lambda: coverage_picture(plan, measured.result, drawn, title))
+        title = f"Coverage of {map_name}, parent frame {plan.parent_frame}"
+
+        def make() -> bytes:
+            points = self._points([(stops[number], blob) for number, blob in blobs.items()], plan)
+            return coverage_picture(plan, measured.result, drawn, points, title)
+
+        return Output(tag, make)
 
     def changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
         """A result compared with an earlier one of the same map and the same options.
@@ -178,6 +192,18 @@ class CoverageJobs:
             trends={name: trends[name] for name in CELL_TRENDS}, result_before=before.result,
             result_after=after.result, plans=plans,
         )  # fmt: skip
+
+    def _points(self, seen: Sequence[tuple[PathFrame, str]], plan: CoveragePlan) -> Floats:
+        """(n, 2) what frames see, along the axes of a plan; without those that are damaged."""
+        axes, found = np.array([plan.x_axis, plan.y_axis]), [np.empty((0, 2))]
+        for stop, blob in seen:
+            if stop.pose is None or stop.parent != plan.parent_frame:
+                continue  # edited since
+            with suppress(DamagedBlob, UnreadableGeometry):
+                surface = self._store.geometries.read(blob).surface
+                points = surface.points[surface.valid].astype(np.float64)
+                found.append(moved(np.array(stop.pose), points) @ axes.T)
+        return np.concatenate(found)
 
     def _measured(self, connection: Connection, map_name: str, job_id: str) -> _Measured:
         job = self._jobs.find(connection, map_name, job_id)
@@ -263,6 +289,11 @@ def _frame_items(
     if job.result is not None:
         limit = max(min(limit, job.result["frames"] - first), 0)
     return items_of(connection, job.number, first, limit)
+
+
+def _spread(numbers: Sequence[int], most: int) -> list[int]:
+    """At most so many of some numbers, evenly spaced."""
+    return list(numbers[:: -(-len(numbers) // most) or 1])
 
 
 def _numbers(items: Sequence[dict[str, Any]]) -> set[int]:
