@@ -446,8 +446,8 @@ class JobMethods(ServiceConnection):
         Raises
         ------
         UnknownMap, UnknownJob : there is none.
-        NotIndexed : it is not over, or did not succeed.
-        InvalidRequest : it has no such plan.
+        NotIndexed : it is not over, did not succeed, or no queried frame has a pose.
+        InvalidRequest : it has no plan of that parent frame.
         """
         path = f"{coverage_path(map_name, coverage_id)}/plan.png"
         return self._bytes(path, params=given(parent_frame=parent_frame))

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sceneprint.engine.maps.coverage_picture import cell_outcome
+from sceneprint.engine.maps.coverage_picture import cell_outcome, coverage_picture
 from sceneprint.engine.maps.coverage_plan import (
     MOST_CELLS,
     PlanAxes,
@@ -19,7 +19,12 @@ from sceneprint.engine.maps.coverage_plan import (
     plan_changes,
     upright,
 )
-from sceneprint_client.api.coverage import CoverageCell, CoverageOutcome, CoveragePlan
+from sceneprint_client.api.coverage import (
+    CoverageCell,
+    CoverageOutcome,
+    CoveragePlan,
+    CoverageResult,
+)
 
 LEVEL = PlanAxes(np.eye(3)[:2], "map")
 
@@ -95,6 +100,20 @@ def test_frames_are_counted_by_cell() -> None:
     ]  # fmt: skip
     assert plans[1].cells == [cell(3, -1, 0, not_found=1)]  # its frame was deleted meanwhile
     assert coverage_plans({}, taken, {}, None)[0] == []
+
+
+def test_a_pose_far_beyond_all_sense_has_a_cell() -> None:
+    taken = {"map": np.array([[1e300, 0.0, 0.0], [-1e300, 0.0, 0.0], [0.0, 0.0, 0.0]])}
+    asked = {"map": queried((0.0, 0.0, "found"))}
+    (one,), cell_m = coverage_plans(asked, taken, {"map": LEVEL}, None)
+    assert cell_m == 500_000
+    assert [cell.column for cell in one.cells] == [-(2**52), 0, 2**52]
+    result = CoverageResult(
+        found=1, wrong=0, ambiguous=0, not_found=0, frames=1, skipped=0, unchecked=0, model="m",
+        revision=1, last_revision=1, map_frames=3, cell_m=cell_m,
+    )  # fmt: skip
+    drawn = coverage_picture(one, result, [], np.empty((0, 2)), "hall")
+    assert drawn.startswith(b"\x89PNG")
 
 
 def test_cells_widen_where_there_would_be_too_many() -> None:

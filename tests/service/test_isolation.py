@@ -374,7 +374,7 @@ def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
 def unseen(walled: Any, method: str, path: str, id_: str) -> None:
     """See that an id is to the key as one that nothing has."""
     answers = [
-        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"----"))
+        (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"-----"))
         for one in (id_, NO_ID)
     ]
     assert told(*answers[0]) == told(*answers[1])
@@ -457,6 +457,7 @@ def test_what_is_not_noted_is_said(operations):
         "create_key", "revoke_key", "create_map", "patch_map", "delete_map", "patch_frame",
         "delete_frame", "patch_session", "delete_session_frames", "cancel_job", "retry_job",
         "reencode", "cancel_reencoding",
-        "begin_association", "delete_association", "reconstruct", "delete_reconstruction",
+        "begin_association", "delete_association", "begin_coverage", "delete_coverage",
+        "reconstruct", "delete_reconstruction",
         "add_import", "take_snapshot", "delete_snapshot",
     }  # fmt: skip

@@ -133,7 +133,7 @@ def coverage_picture(
     for cell in plan.cells:
         _draw_count(draw, sheet, cell, result.cell_m)
     _draw_header(draw, result, drawn, title)
-    _draw_footer(draw, sheet, plan)
+    _draw_footer(draw, sheet, with_links=bool(links))
     small = image.resize((sheet.size[0] // _FINER, sheet.size[1] // _FINER), Image.Resampling.BOX)
     buffer = io.BytesIO()
     small.save(buffer, "PNG")
@@ -247,7 +247,7 @@ def _draw_header(
     draw.text((left, 54 * _FINER), _fitting(draw, text, 15), _FAINT, _font(15))
 
 
-def _draw_footer(draw: ImageDraw.ImageDraw, sheet: _Sheet, plan: CoveragePlan) -> None:
+def _draw_footer(draw: ImageDraw.ImageDraw, sheet: _Sheet, *, with_links: bool) -> None:
     """Legend, and a scale bar at the right."""
     middle = sheet.size[1] - 0.5 * FOOTER * _FINER
     x = float(_MARGIN * _FINER)
@@ -270,7 +270,7 @@ def _draw_footer(draw: ImageDraw.ImageDraw, sheet: _Sheet, plan: CoveragePlan) -
     draw.rectangle((x, middle - side, x + 2 * side, middle + side), _SURFACE)
     x += 2 * side + 6 * _FINER
     label("surfaces")
-    if any(cell.ambiguous or cell.wrong for cell in plan.cells):
+    if with_links:
         draw.line([(x, middle), (x + 18 * _FINER, middle)], (*_INK, 120), _FINER)
         x += 24 * _FINER
         label("look-alike")

@@ -32,6 +32,9 @@ _LEAST_CELL_M = 0.25
 #: Most cells of all plans together: wider ones are taken where there would be more.
 MOST_CELLS = 10_000
 
+#: Farthest column and row: JSON has numbers beyond that no longer exactly.
+_FARTHEST_CELL = 2**52
+
 #: Column and row of a cell.
 Place = tuple[int, int]
 
@@ -148,7 +151,9 @@ def coverage_plans(
 
 
 def _places(flat: Floats, cell_m: float) -> list[Place]:
-    return [(column, row) for column, row in np.floor(flat / cell_m).astype(np.int64).tolist()]
+    # a pose may be of any size: those beyond lie in the outermost cell
+    places = np.clip(np.floor(flat / cell_m), -_FARTHEST_CELL, _FARTHEST_CELL)
+    return [(column, row) for column, row in places.astype(np.int64).tolist()]
 
 
 def _cells(

@@ -146,8 +146,9 @@ class CoverageJobs:
 
         Raises
         ------
-        UnknownMap, UnknownJob, NotIndexed : there is none, or it did not succeed.
-        InvalidRequest : it has no plan of that parent frame, or none at all.
+        UnknownMap, UnknownJob : there is none.
+        NotIndexed : it did not succeed, or no queried frame has a pose.
+        InvalidRequest : it has no plan of that parent frame.
         """
         with self._store.database.read() as connection:
             measured = self._measured(connection, map_name, job_id)
@@ -254,7 +255,7 @@ def _chosen_plan(plans: Sequence[CoveragePlan], parent: str | None) -> CoverageP
         if parent in (None, plan.parent_frame):
             return plan
     if not plans:
-        raise InvalidRequest(
+        raise NotIndexed(
             "There is no plan, as no queried frame has a pose. Upload frames with poses."
         )
     names = ", ".join(plan.parent_frame for plan in plans)
